@@ -248,9 +248,9 @@ def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch:
     save(tmp_path / "plan", "plan", {}, FIGURES[:1], machine)
     (tmp_path / "plan/options.json").write_text(json.dumps(["abc", "--body", "foot"]))
     (done,) = measure_all(tmp_path, False, [BenchPart("plan", ("--body", "foot"))])
-    assert done.figures == (FIGURES[0],) and whole._kept(tmp_path / "plan", ["--body", "chest"], machine) is None
+    assert done.figures == (FIGURES[0],) and whole._earlier(tmp_path / "plan", ["--body", "chest"], machine) is None
     other = replace(machine, commit="abd")
-    assert whole._kept(tmp_path / "plan", ["--body", "foot"], other) is None
+    assert whole._earlier(tmp_path / "plan", ["--body", "foot"], other) is None
 
 
 @pytest.mark.parametrize(("line", "quick"), [(["--all"], False), (["--quick"], True), (["--all", "--quick"], True)])

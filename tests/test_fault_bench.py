@@ -81,21 +81,21 @@ def ran(
         holds = held is not None and held[0] <= stamp < held[1]
         talks = said is not None and said[0] <= stamp < said[1]
         words.append(Statement(stamp, "x" if holds or talks else "", not holds, False, stamp - 0.05))
-    return FaultRunRecord(words=words, log=log, ended=8.0)
+    return FaultRunRecord(statements=words, log=log, ended=8.0)
 
 
 def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:
     verdict = judge_fault(ran(said=(4.06, 4.6)), FAULT, 7.0)
     assert verdict is not None and not (verdict.silent or verdict.restless or verdict.operator)
-    assert verdict.detected == pytest.approx(0.06) and verdict.seen == pytest.approx(0.01)
+    assert verdict.detected == pytest.approx(0.06) and verdict.exposure == pytest.approx(0.01)
     assert verdict.recovered == pytest.approx(0.1) and verdict.worst == 0.0
-    silent = replace(ran(), missed=[Statement(4.08, "the motion process has said nothing", False, False, 4.08)])
+    silent = replace(ran(), timeouts=[Statement(4.08, "the motion process has said nothing", False, False, 4.08)])
     hung = judge_fault(silent, replace(FAULT, part=FaultPart.MOTION, kind=FaultKind.HANG), 7.0)
-    assert hung is not None and hung.seen == hung.detected == pytest.approx(0.08) and not hung.restless
+    assert hung is not None and hung.exposure == hung.detected == pytest.approx(0.08) and not hung.restless
     jumped = judge_fault(
         ran(said=(4.06, 4.6)), replace(FAULT, part=FaultPart.CLOCK, kind=FaultKind.JUMP, amount=1.0), 7.0
     )
-    assert jumped is not None and jumped.seen == jumped.detected and np.isnan(jumped.recovered)
+    assert jumped is not None and jumped.exposure == jumped.detected and np.isnan(jumped.recovered)
 
 
 def test_an_error_of_which_nobody_says_a_word_is_silent_and_one_that_is_told_is_not() -> None:
@@ -131,7 +131,7 @@ def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: py
     hung = FaultRun(prepare_scenario(SCENARIOS / "still.toml"), faults, 1)()
     for fault, until in zip(faults, (4.7, 6.0), strict=True):
         verdict = judge_fault(hung, fault, until)
-        assert verdict is not None and 0 < verdict.seen == verdict.detected <= MAX_DETECTION
+        assert verdict is not None and 0 < verdict.exposure == verdict.detected <= MAX_DETECTION
         assert verdict.recovered <= MAX_RECOVERY and not (verdict.silent or verdict.restless)
 
 

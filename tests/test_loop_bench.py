@@ -12,14 +12,13 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.bench import recordings as growth
-from hardware.bench.estimator import CLAIM_SETTLED_SETS, consistency_figures, scene_errors
+from hardware.bench.estimator import SETTLING_SETS, consistency_figures, scene_errors
 from hardware.bench.prediction import (
     FORECAST_INPUT,
     MOTION_INPUTS,
     Print,
     StillBed,
-    as_it_is,
-    last_seen,
+    at_rest,
     loop_page,
     steady,
 )
@@ -36,10 +35,10 @@ def pose(stamp: float, state: TrackState = TrackState.TRACKING) -> SurfacePose:
 def test_each_way_knows_of_the_future_what_it_says() -> None:
     seen = pose(1.0)
     then = seen.stamp + 0.1
-    assert np.allclose(last_seen(seen).predict(then).base_from_surface, seen.base_from_surface)
+    assert np.allclose(at_rest(seen).predict(then).base_from_surface, seen.base_from_surface)
     assert np.allclose(steady(seen).predict(then).base_from_surface, se3.exp(TWIST * then))
-    assert as_it_is(seen) is seen
-    for way in (last_seen, steady):
+    assert MOTION_INPUTS[FORECAST_INPUT]()(seen) is seen
+    for way in (at_rest, steady):
         assert way(seen).predict(then).error_at(np.zeros((1, 3)))[0] < 1e-9
         assert (way(seen).stamp, way(seen).state) == (seen.stamp, seen.state)
 
@@ -56,9 +55,9 @@ def test_a_still_bed_stays_at_the_first_measured_pose() -> None:
 def test_a_print_counts_what_leaves_the_nozzle() -> None:
     error = np.array([np.nan, 0.1, 0.2, np.nan, 0.3, np.nan])
     one = Print(np.arange(6.0), error)
-    assert (one.largest, one.duty) == (0.3, 0.75)
+    assert (one.percentile(100), one.duty) == (0.3, 0.75)
     nothing = Print(np.arange(6.0), np.full(6, np.nan))
-    assert np.isnan(nothing.largest) and np.isnan(nothing.p95) and nothing.duty == 0.0
+    assert np.isnan(nothing.percentile(100)) and np.isnan(nothing.percentile(95)) and nothing.duty == 0.0
 
 
 def test_the_page_shows_every_way_of_every_scenario() -> None:
@@ -103,7 +102,7 @@ def test_the_claim_is_held_against_the_error(claimed: float, inside: float) -> N
 
 
 def test_a_surface_that_is_hardly_followed_has_no_consistency() -> None:
-    for count, waiting in ((CLAIM_SETTLED_SETS, 5), (20, 20)):
+    for count, waiting in ((SETTLING_SETS, 5), (20, 20)):
         assert np.isnan(figures(1.0, count, waiting)["x: NEES/6"])
 
 

@@ -68,8 +68,8 @@ def test_breathing_of_the_simulator_is_foretold_better_than_it_is_held() -> None
 
 def test_a_recording_too_short_to_be_judged_is_refused(tmp_path: Path) -> None:
     chest = gliding(1.0)
-    write_tum(tmp_path / "short.tum", chest.seen)
-    assert len(recorded(tmp_path / "short.tum", WARM).seen) == len(chest.seen)
+    write_tum(tmp_path / "short.tum", chest.observed)
+    assert len(recorded(tmp_path / "short.tum", WARM).observed) == len(chest.observed)
     with pytest.raises(InputError, match=r"short\.tum: duration"):
         recorded(tmp_path / "short.tum", 60.0)
 

@@ -1,4 +1,4 @@
-"""Subjects `estimator` and `consistency`: are poses near what tracks allow, and errors as large as is reported?
+"""Subjects `estimator` and `consistency`: are errors near their lower bound, and as large as the covariance says?
 
 `estimator` follows tracks of synthetic worlds, beside the Cramer-Rao bound and OpenCV's solvePnP, and soaks.
 `consistency` follows pictures: loops of the outages' scenes (outage_run.py), shown with fresh noise each time round.
@@ -50,18 +50,18 @@ HALF_PERIOD = 0.016  # s, half a frame period at 30 Hz: webcams are not synchron
 
 @dataclass(frozen=True, slots=True)
 class TrackScene:
-    """One world, but for its seed."""
+    """One world, except for its seed."""
 
     name: str
     movement: str
     conditions: dict[str, Any] = field(default_factory=dict)  # of `estimation.synthetic.world`
     error: Target | None = None  # mm
-    rigid: bool = False  # whether all is as the model says, so that the error is asked to be near the bound
+    rigid: bool = False  # whether all is as the model assumes, so that the error has to be near the bound
     surface: str = "patch"
 
     @property
     def seconds(self) -> float:
-        """How long it lasts: offsets are asked to be known after 20 s."""
+        """Its duration: offsets have to be known after 20 s."""
         return 24.0 if "offsets" in self.conditions else 10.0
 
 
@@ -93,34 +93,30 @@ TRACK_SCENES = (
 )
 
 
-MIN_PNP_TRACKS = 6  # tracks that a pose is sought from
+MIN_PNP_TRACKS = 6  # for a pose
 PNP_GATE_PX = 8.0  # px: OpenCV's own gate of an outlier
 
 
 def best_camera(worlds: Sequence[World]) -> tuple[float, float]:
     """RMSE, mm and degrees over the three axes together, of the camera that is nearest to the truth by itself.
 
-    Of the frame sets in which it finds a pose. The landmarks are the world's own map, as in `follow(world, "told")`.
+    Of the frame sets in which it has a pose. The landmarks are the world's own map, as in `follow(world, "told")`.
     """
-    errors = [np.concatenate(of_camera) for of_camera in zip(*map(_errors, worlds), strict=True)]
-    squares = [np.array([(e[:, 3:] ** 2).sum(1).mean(), (e[:, :3] ** 2).sum(1).mean()]) for e in errors if len(e)]
+    errors: dict[int, list[Array]] = {}  # of each camera, rad and mm
+    for world in worlds:
+        for tracks, true in zip(world, world.truth.base_from_surface, strict=True):
+            points = world.map.points[tracks.track]
+            for number, camera in enumerate(world.rig.cameras):
+                own = tracks.camera == number
+                pose = pnp_pose(camera, points[own], tracks.pixels[own])
+                if pose is not None:
+                    errors.setdefault(number, []).append(se3.log(se3.inverse(pose) @ true))
+    arrays = [np.array(errors[number]) for number in sorted(errors)]  # (N, 6)
+    squares = [np.array([(e[:, 3:] ** 2).sum(1).mean(), (e[:, :3] ** 2).sum(1).mean()]) for e in arrays]
     if not squares:
         return np.nan, np.nan
     place, turn = np.sqrt(min(squares, key=lambda square: float(square[0])))
     return float(place), float(np.degrees(turn))
-
-
-def _errors(world: World) -> list[Array]:
-    """Errors (N, 6), rad and mm, of each camera's poses in one world."""
-    errors: list[list[Array]] = [[] for _ in world.rig.cameras]
-    for seen, true in zip(world, world.truth.base_from_surface, strict=True):
-        points = world.map.points[seen.track]
-        for number, camera in enumerate(world.rig.cameras):
-            own = seen.camera == number
-            pose = pnp_pose(camera, points[own], seen.pixels[own])
-            if pose is not None:
-                errors[number].append(se3.log(se3.inverse(pose) @ true))
-    return [np.reshape(of_camera, (-1, 6)) for of_camera in errors]
 
 
 def pnp_pose(camera: Camera, points: Array, pixels: Array) -> Array | None:
@@ -132,8 +128,8 @@ def pnp_pose(camera: Camera, points: Array, pixels: Array) -> Array | None:
     )
     if not ok or inliers is None or len(inliers) < MIN_PNP_TRACKS:
         return None
-    kept = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[kept], pixels[kept], camera.matrix, None, turn, shift)
+    rows = inliers[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(points[rows], pixels[rows], camera.matrix, None, turn, shift)
     return np.asarray(camera.base_from_camera @ se3.make(se3.exp_rotation(turn[:, 0]), shift[:, 0]))
 
 
@@ -148,8 +144,8 @@ def soak_figures(hours: float, mapping: Mapping, of_map: str) -> list[Figure]:
     seconds, errors = np.ones(count), np.ones(count)  # written to, so that they count as memory from the start
     settled, before = min(count // 2, round(WARM_UP * SOAK_RATE)), np.nan
     run = follow_steps(world, mapping, CpuClock().now)
-    begun = next(run).pose
-    constant = se3.inverse(world.base_from_surface(np.array(begun.stamp))) @ begun.base_from_surface
+    first_pose = next(run).pose
+    constant = se3.inverse(world.base_from_surface(np.array(first_pose.stamp))) @ first_pose.base_from_surface
     for k, step in enumerate(with_progress(f"soak, {of_map}", "frame sets", run, count)):
         true = world.base_from_surface(np.array(step.pose.stamp)) @ constant
         seconds[k], errors[k] = step.seconds, np.linalg.norm(step.pose.base_from_surface[:3, 3] - true[:3, 3])
@@ -167,7 +163,7 @@ def soak_figures(hours: float, mapping: Mapping, of_map: str) -> list[Figure]:
 
 
 def resident() -> float:
-    """Memory that this process holds, MB; nan where the system does not tell."""
+    """Resident memory of this process, MB; nan where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:
@@ -191,29 +187,18 @@ class PooledErrors:
     nees: float  # mean over 6
     twist_nees: float
     inside: float  # share of the six axes' errors inside their 95 % intervals
-    measured: float  # share
-
-    def __str__(self) -> str:
-        """All of it in one line."""
-        error, turn = self.error_mm / self.bound_mm, self.error_deg / self.bound_deg
-        return (
-            f"{self.error_mm:7.4f} mm x{error:5.2f} {self.error_deg:7.4f} deg x{turn:5.2f}  NEES/6 {self.nees:6.2f}"
-            f"  twist {self.twist_nees:6.2f}  inside {self.inside:.3f}  measured {self.measured:.3f}"
-        )
+    measured: float  # share of the frame sets
 
 
 def pool_errors(runs: Sequence[FollowResult]) -> PooledErrors:
     """The figures of `runs`, at least one of which was measured somewhere."""
 
-    def all_of(values: Callable[[FollowResult], Array]) -> Array:
+    def measured(values: Callable[[FollowResult], Array]) -> Array:
         return np.concatenate([values(run)[run.measured] for run in runs])
 
-    errors, covariances = all_of(lambda run: run.errors), all_of(lambda run: run.covariances)
-    bounds, filtered = all_of(lambda run: run.bounds), all_of(lambda run: run.filtered_bounds())
-    twist_nees = np.concatenate(
-        [nees(run.twist_errors[run.measured], run.twist_covariances[run.measured]) for run in runs]
-    )
-    claimed = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    errors, covariances = measured(lambda run: run.errors), measured(lambda run: run.covariances)
+    bounds, filtered = measured(lambda run: run.bounds), measured(lambda run: run.filtered_bounds())
+    twists, twist_covariances = measured(lambda run: run.twist_errors), measured(lambda run: run.twist_covariances)
     return PooledErrors(
         error_mm=_rms_length(errors[:, 3:]),
         error_deg=float(np.degrees(_rms_length(errors[:, :3]))),
@@ -222,8 +207,8 @@ def pool_errors(runs: Sequence[FollowResult]) -> PooledErrors:
         filtered_mm=_rms_bound(filtered, 3),
         filtered_deg=float(np.degrees(_rms_bound(filtered, 0))),
         nees=float(nees(errors, covariances).mean() / 6),
-        twist_nees=float(twist_nees.mean() / 6),
-        inside=float(np.mean(np.abs(errors) <= NORMAL_95 * claimed)),
+        twist_nees=float(nees(twists, twist_covariances).mean() / 6),
+        inside=_inside_95(errors, covariances),
         measured=float(np.concatenate([run.measured for run in runs]).mean()),
     )
 
@@ -231,6 +216,11 @@ def pool_errors(runs: Sequence[FollowResult]) -> PooledErrors:
 def nees(errors: Array, covariances: Array) -> Array:
     """Normalised estimation errors squared (N,) of errors (N, 6) under covariances (N, 6, 6)."""
     return np.asarray(np.einsum("ni,nij,nj->n", errors, np.linalg.pinv(covariances, hermitian=True), errors))
+
+
+def _inside_95(errors: Array, covariances: Array) -> float:
+    """Share of the errors (N, 6) inside their 95 % intervals."""
+    return float(np.mean(np.abs(errors) <= NORMAL_95 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))))
 
 
 def _rms_length(vectors: Array) -> float:
@@ -246,7 +236,7 @@ MAP_NAMES: dict[Mapping, str] = {"told": "exact map", "seen": "own map"}
 
 
 def run_estimator(options: argparse.Namespace) -> list[Figure]:
-    """All figures of the scenes asked for, or those of the soak."""
+    """All figures of the chosen scenes, or those of the soak."""
     if options.soak is not None:
         return [f for mapping in options.maps for f in soak_figures(options.soak, mapping, MAP_NAMES[mapping])]
     figures: list[Figure] = []
@@ -256,77 +246,67 @@ def run_estimator(options: argparse.Namespace) -> list[Figure]:
         names = "; ".join(scene.name for scene in TRACK_SCENES)
         raise InputError("command line", "--only", options.only, f"a pattern of {names}")
     for scene in scenes:
-        worlds = [_world(scene, seed, options) for seed in range(options.seeds)]
+        conditions = {"count": options.count, "surface": scene.surface, "noise": options.noise, **scene.conditions}
+        seconds = scene.seconds if options.seconds is None else options.seconds
+        worlds = [synthetic_world(scene.movement, seconds, seed=n, **conditions) for n in range(options.seeds)]
         pnp = best_camera(worlds)
         for mapping in options.maps:
-            followed = [follow(world, mapping, CpuClock().now) for world in worlds]
-            found = pool_errors(followed)
-            print(f"{scene.name + ', ' + MAP_NAMES[mapping]:<48}{found}", file=sys.stderr, flush=True)
-            figures += scene_figures(scene, MAP_NAMES[mapping], found, pnp)
-            figures += _offset_figures(scene, MAP_NAMES[mapping], followed)
-            runs[mapping] += followed
+            results = [follow(world, mapping, CpuClock().now) for world in worlds]
+            figures += _scene_figures(scene, f"{scene.name}, {MAP_NAMES[mapping]}", results, pnp)
+            runs[mapping] += results
     return figures + [f for mapping in options.maps for f in _work_figures(mapping, runs[mapping])]
 
 
-def _world(scene: TrackScene, seed: int, options: argparse.Namespace) -> World:
-    conditions = {"noise": options.noise, **scene.conditions}
-    seconds = scene.seconds if options.seconds is None else options.seconds
-    return synthetic_world(scene.movement, seconds, count=options.count, surface=scene.surface, seed=seed, **conditions)
-
-
-def scene_figures(scene: TrackScene, of_map: str, found: PooledErrors, pnp: tuple[float, float]) -> list[Figure]:
+def _scene_figures(
+    scene: TrackScene, name: str, runs: Sequence[FollowResult], pnp: tuple[float, float]
+) -> list[Figure]:
     """The figures of one scene with one kind of map. pnp: RMSE by solvePnP with the exact one, mm and degrees."""
-    name = f"{scene.name}, {of_map}"
+    e = pool_errors(runs)
+    by_bound, turn_by_bound = e.error_mm / e.bound_mm, e.error_deg / e.bound_deg
+    text = (
+        f"{e.error_mm:7.4f} mm x{by_bound:5.2f} {e.error_deg:7.4f} deg x{turn_by_bound:5.2f}  NEES/6 {e.nees:6.2f}"
+        f"  twist {e.twist_nees:6.2f}  inside {e.inside:.3f}  measured {e.measured:.3f}"
+    )
+    print(f"{name:<48}{text}", file=sys.stderr, flush=True)
     rigid = scene.rigid and scene.error is not None
     near = at_most(1.3) if scene.rigid else None
-    moved = f"bound {found.bound_mm:.4f}, filtered {found.filtered_mm:.4f}, solvePnP {pnp[0]:.3f}"
-    turned = f"bound {found.bound_deg:.4f}, filtered {found.filtered_deg:.4f}, solvePnP {pnp[1]:.3f}"
-    return [
-        Figure(f"{name}: error", found.error_mm, "mm", scene.error, moved),
-        Figure(f"{name}: turn", found.error_deg, "deg", at_most(0.05) if rigid else None, turned),
-        Figure(f"{name}: error by bound", found.error_mm / found.bound_mm, "", near),
-        Figure(f"{name}: turn by bound", found.error_deg / found.bound_deg, "", near),
-        Figure(f"{name}: NEES/6", found.nees, "", CONSISTENT_NEES),
-        Figure(f"{name}: twist NEES/6", found.twist_nees, "", CONSISTENT_NEES),
-        Figure(f"{name}: inside 95 %", found.inside, "", INSIDE_95),
+    shift_bounds = f"bound {e.bound_mm:.4f}, filtered {e.filtered_mm:.4f}, solvePnP {pnp[0]:.3f}"
+    turn_bounds = f"bound {e.bound_deg:.4f}, filtered {e.filtered_deg:.4f}, solvePnP {pnp[1]:.3f}"
+    figures = [
+        Figure(f"{name}: error", e.error_mm, "mm", scene.error, shift_bounds),
+        Figure(f"{name}: turn", e.error_deg, "deg", at_most(0.05) if rigid else None, turn_bounds),
+        Figure(f"{name}: error by bound", by_bound, "", near),
+        Figure(f"{name}: turn by bound", turn_by_bound, "", near),
+        Figure(f"{name}: NEES/6", e.nees, "", CONSISTENT_NEES),
+        Figure(f"{name}: twist NEES/6", e.twist_nees, "", CONSISTENT_NEES),
+        Figure(f"{name}: inside 95 %", e.inside, "", INSIDE_95),
     ]
-
-
-def _offset_figures(scene: TrackScene, of_map: str, runs: Sequence[FollowResult]) -> list[Figure]:
-    """How well the cameras' offsets are known at the end; what all clocks have in common cannot be seen."""
-    if "offsets" not in scene.conditions:
-        return []
-    true = np.array(scene.conditions["offsets"])
-    known = np.array([run.offsets - run.offsets.mean() for run in runs])
-    off, note = (1000 * rms(known - true + true.mean()), "") if len(known) else (math.nan, "not estimated")
-    return [Figure(f"{scene.name}, {of_map}: offsets off by", off, "ms", at_most(2.0), "thesis under 1 s", note)]
+    if "offsets" in scene.conditions:  # at the end; an offset that all clocks have in common cannot be observed
+        true = np.array(scene.conditions["offsets"])
+        errors = np.array([run.offsets - run.offsets.mean() for run in runs]) - true + true.mean()
+        figures.append(Figure(f"{name}: offsets off by", 1000 * rms(errors), "ms", at_most(2.0), "thesis under 1 s"))
+    return figures
 
 
 def _work_figures(mapping: Mapping, runs: Sequence[FollowResult]) -> list[Figure]:
     """Time over all runs, and whether a world run twice gives the same bits."""
     if not runs:
         return []
-    spent, name = 1000 * np.concatenate([run.seconds for run in runs]), MAP_NAMES[mapping]
+    ms, name, note = 1000 * np.concatenate([run.seconds for run in runs]), MAP_NAMES[mapping], "CPU, tracks given"
+    twice = [follow(synthetic_world(seconds=3.0, offsets=(0.0, 0.01, 0.0)), mapping) for _ in range(2)]
+    bits = [
+        [p.base_from_surface.tobytes() + p.covariance.tobytes() + p.twist.tobytes() for p in r.poses] for r in twice
+    ]
+    differing = float(sum(first != second for first, second in zip(*bits, strict=True)))
     return [
-        Figure(
-            f"time, {name}: median", percentile(spent, 50), "ms", None, "thesis 70 ms with flow", "CPU, tracks given"
-        ),
-        Figure(f"time, {name}: p99", percentile(spent, 99), "ms", at_most(4.0), "", "CPU, tracks given"),
-        Figure(f"poses that differ run twice, {name}", float(_differing(mapping)), "", at_most(0), "open_vins #553"),
+        Figure(f"time, {name}: median", percentile(ms, 50), "ms", None, "thesis 70 ms with flow", note),
+        Figure(f"time, {name}: p99", percentile(ms, 99), "ms", at_most(4.0), "", note),
+        Figure(f"poses that differ run twice, {name}", differing, "", at_most(0), "open_vins #553"),
     ]
 
 
-def _differing(mapping: Mapping) -> int:
-    first, second = (follow(synthetic_world(seconds=3.0, offsets=(0.0, 0.01, 0.0)), mapping) for _ in range(2))
-    return sum(
-        a.base_from_surface.tobytes() + a.covariance.tobytes() + a.twist.tobytes()
-        != b.base_from_surface.tobytes() + b.covariance.tobytes() + b.twist.tobytes()
-        for a, b in zip(first.poses, second.poses, strict=True)
-    )
-
-
 LOOP_SETS = 40  # frame sets of a loop
-CLAIM_SETTLED_SETS = 32  # frame sets after the first TRACKING pose: until then the widest claim is given out
+SETTLING_SETS = 32  # frame sets after the first TRACKING pose in which the covariance is the widest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -335,30 +315,26 @@ class SceneRun:
 
     errors: Array  # (N, 6) rad and mm, surface frame
     covariances: Array  # (N, 6, 6) as reported
-    late: NDArray[np.int64]  # (N,) frame sets since the first
-    share: float  # that was measured
+    late: NDArray[np.int64]  # (N,) frame sets since the first TRACKING pose
+    share: float  # of the frame sets that were measured
 
 
 def run_consistency(options: argparse.Namespace) -> list[Figure]:
     """Figures over all scenes, and each scene's own."""
-    seeds = range(options.seed, options.seed + options.scenes)
-    runs = {f"scene {seed}": track_scene(seed, round(options.seconds * FPS)) for seed in seeds}
+    runs, count = {}, round(options.seconds * FPS)
+    for seed in range(options.seed, options.seed + options.scenes):
+        rig, scene, loop = picture_loop(seed, LOOP_SETS)
+        step = TrackingStep(rig, rois(scene, rig, loop.poses[0], 0.0))
+        poses = []
+        for number in range(count):
+            stamp = number / FPS
+            frames = [Frame(c, stamp, loop.noisy(image)) for c, image in enumerate(loop.images(number))]
+            poses.append(step(FrameSet(stamp, tuple(frames))))
+            step.idle()
+        runs[f"scene {seed}"] = scene_errors(poses, loop.poses[np.arange(count) % len(loop)])
     figures = consistency_figures("all", list(runs.values()))
     each = [f for name, run in runs.items() for f in consistency_figures(name, [run]) if "NEES/6" in f.what]
     return figures + each if len(runs) > 1 else figures
-
-
-def track_scene(seed: int, count: int) -> SceneRun:
-    """What the tracking step makes of `count` frame sets of one scene."""
-    rig, scene, loop = picture_loop(seed, LOOP_SETS)
-    step = TrackingStep(rig, rois(scene, rig, loop.poses[0], 0.0))
-    poses = []
-    for number in range(count):
-        stamp = number / FPS
-        frames = [Frame(c, stamp, loop.noisy(image)) for c, image in enumerate(loop.images(number))]
-        poses.append(step(FrameSet(stamp, tuple(frames))))
-        step.idle()
-    return scene_errors(poses, loop.poses[np.arange(count) % len(loop)])
 
 
 def scene_errors(poses: list[SurfacePose], truth: Array) -> SceneRun:
@@ -368,29 +344,27 @@ def scene_errors(poses: list[SurfacePose], truth: Array) -> SceneRun:
     if not len(rows):
         return SceneRun(np.zeros((0, 6)), np.zeros((0, 6, 6)), rows, 0.0)
     constant = se3.inverse(truth[first]) @ poses[first].base_from_surface
-    found = np.stack([poses[i].base_from_surface for i in rows])
-    errors = se3.log(se3.inverse(found) @ truth[rows] @ constant)
+    estimated = np.stack([poses[i].base_from_surface for i in rows])
+    errors = se3.log(se3.inverse(estimated) @ truth[rows] @ constant)
     share = len(rows) / (len(poses) - first - 1)
     return SceneRun(errors, np.stack([poses[i].covariance for i in rows]), rows - first, share)
 
 
 def consistency_figures(name: str, runs: list[SceneRun]) -> list[Figure]:
-    """Of all poses but those of the first second, when the claim is still that of unknown cameras."""
+    """Of all poses but those of the first second, whose covariance is still that of unknown cameras."""
     errors, covariances = (np.concatenate([getattr(r, n) for r in runs]) for n in ("errors", "covariances"))
-    late = np.concatenate([run.late for run in runs])
-    kept = late > CLAIM_SETTLED_SETS
-    if not kept.any():
+    settled = np.concatenate([run.late for run in runs]) > SETTLING_SETS
+    if not settled.any():
         return [Figure(f"{name}: NEES/6", math.nan, "", CONSISTENT_NEES, note="not followed for longer than a second")]
     squares = nees(errors, covariances) / 6
-    errors, covariances = errors[kept], covariances[kept]
-    inside = np.abs(errors) <= NORMAL_95 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    claim = float(np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2).mean() / 3))
-    note = f"{len(errors)} poses; {squares[~kept].mean():.3f} in the first second" if (~kept).any() else ""
+    errors, covariances = errors[settled], covariances[settled]
+    sigma = float(np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2).mean() / 3))
+    note = f"{len(errors)} poses; {squares[~settled].mean():.3f} in the first second" if (~settled).any() else ""
     return [
-        Figure(f"{name}: NEES/6", float(squares[kept].mean()), "", CONSISTENT_NEES, "", note),
-        Figure(f"{name}: NEES/6, largest", float(squares[kept].max()), "", None, "", "of one pose"),
-        Figure(f"{name}: inside 95 %", float(inside.mean()), "", INSIDE_95, "", "of six axes"),
+        Figure(f"{name}: NEES/6", float(squares[settled].mean()), "", CONSISTENT_NEES, "", note),
+        Figure(f"{name}: NEES/6, largest", float(squares[settled].max()), "", None, "", "of one pose"),
+        Figure(f"{name}: inside 95 %", _inside_95(errors, covariances), "", INSIDE_95, "", "of six axes"),
         Figure(f"{name}: error of an axis", 1000 * rms(errors[:, 3:]), "um"),
-        Figure(f"{name}: claim of an axis", 1000 * claim, "um"),
+        Figure(f"{name}: claim of an axis", 1000 * sigma, "um"),
         Figure(f"{name}: measured", 100 * float(np.mean([r.share for r in runs])), "%", at_least(99)),
     ]

@@ -12,20 +12,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path as File
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import LinkSettings
 from hardware.files.path_file import read_path
 from hardware.live.state_machine import silence_text
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock
 from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner, faults_striking
-from hardware.recording.schemas import WARNING
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults, VirtualDevice
 from hardware.simulator.arm.settings import ReplyMode
@@ -37,8 +35,7 @@ from hardware.simulator.scenario_tables import bare_scene
 from hardware.simulator.scene.shape import Shape
 from hardware.simulator.simulate import LandmarkTracker
 from hardware.simulator.truth import Truth, TruthLog, disturbed_motion, drape_path, fold_deformation, row_instants
-from perception.frames import FrameSet, PrintHead
-from perception.tracking.step import StepReport
+from perception.frames import FrameSet
 from planning.command import Move
 from planning.limits import MotionLimits
 from planning.path import Path
@@ -57,7 +54,7 @@ class AxesOracle:
 
     def __init__(self, axes: Array, limits: MotionLimits, tick: float) -> None:
         """axes: (6,) where the arm stands at first, at rest."""
-        self._limits, self._tick = limits, tick
+        self._limits = limits
         self._bounds = np.stack([limits.speed, limits.acceleration, limits.jerk]) * tick ** np.arange(1, 4)[:, None]
         self.samples = 0
         self.over, self.worst = np.zeros(len(AXES_LIMITS), np.int64), np.zeros(len(AXES_LIMITS))
@@ -68,42 +65,37 @@ class AxesOracle:
         self._last = np.tile(self._last[-1], (4, 1))
 
     def stands(self, axes: Array) -> None:
-        """What was sent beyond was called back: the arm stands at `axes` (6,)."""
+        """Commands were recalled: the arm stands at `axes` (6,)."""
         self._last = np.tile(axes, (4, 1))
 
     def __call__(self, axes: Array | None) -> None:
         """One tick: the axes (6,) that are reached by its end, None where the arm is held."""
-        self._last = np.vstack([self._last[1:], self._last[-1] if axes is None else axes])
-        shares = self._shares()
+        p = self._last = np.vstack([self._last[1:], self._last[-1] if axes is None else axes])
+        step = p[3] - p[2]
+        quotients = np.abs(np.stack([step, step - (p[2] - p[1]), p[3] - 3 * p[2] + 3 * p[1] - p[0]])) / self._bounds
+        jump, turn = np.linalg.norm(step[:3]) / self._limits.jump, np.abs(step[3:]).max() / self._limits.turn
+        shares = np.array([*quotients.max(axis=1), jump, turn])  # of each limit, that this tick uses
         self.samples += 1
         self.over += ~(shares <= LIMIT_SLACK)  # NaN is over
         self.worst = np.maximum(self.worst, np.where(np.isfinite(shares), shares, np.inf))
 
-    def _shares(self) -> Array:
-        """How much of each limit the last tick took (5,)."""
-        p = self._last
-        step = p[3] - p[2]
-        quotients = np.abs(np.stack([step, step - (p[2] - p[1]), p[3] - 3 * p[2] + 3 * p[1] - p[0]])) / self._bounds
-        jump, turn = np.linalg.norm(step[:3]) / self._limits.jump, np.abs(step[3:]).max() / self._limits.turn
-        return np.array([*quotients.max(axis=1), jump, turn])
 
-
-POLL_PERIOD = 0.005  # s between looks at the line
-CONDUCTOR_PERIOD = 0.02  # s between looks of whoever conducts the run
+POLL_PERIOD = 0.005  # s between polls of the line
+MAIN_PERIOD = 0.02  # s between the main process's checks of the others
 START_HEIGHT = 3.0  # mm over its first checkpoint, where the nozzle begins
 WATCHED_AFTER_KILL = 1.5  # s that the rest of the world goes on without the motion
-ORDER_PERIOD = 0.3  # s between an operator's words
+ORDER_PERIOD = 0.3  # s between an operator's orders
 FAULT_FREE_S, SECONDS = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedScenario:
-    """What all runs of one scenario share. path: in the surface frame, laid on its shape."""
+    """What all runs of one scenario share."""
 
     scenario: Scenario
     shape: Shape
     truth: Truth
-    path: Path
+    path: Path  # surface frame, draped on the shape
 
 
 def prepare_scenario(file: File) -> PreparedScenario:
@@ -114,30 +106,30 @@ def prepare_scenario(file: File) -> PreparedScenario:
     if scenario.clearance is not None:
         path = drape_path(path, shape, scenario.clearance, scenario.path)
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, shape.surface_from_grid)
-    tracked = TrackingSettings(pictures=False, tracks=True)
+    tracking = TrackingSettings(pictures=False, tracks=True)
     answering = replace(scenario.arm, replies=ReplyMode.STREAM)
-    plain = replace(scenario, tracking=tracked, arm=answering, known_rig=scenario.rig, seconds=SECONDS)
+    plain = replace(scenario, tracking=tracking, arm=answering, known_rig=scenario.rig, seconds=SECONDS)
     return PreparedScenario(plain, shape, truth, path)
 
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What was known at one instant."""
+    """What was reported at one instant."""
 
     stamp: float  # s
-    said: str  # a reservation, a hold's reason, or why the arm does not move; "" if all is well
+    text: str  # a pose's reservation, a hold's reason, or why the arm does not move; "" if all is well
     moving: bool  # whether a move was sent
     own: bool  # whether the link moves the arm by itself
-    seen: float  # s, stamp of the newest pose, -inf before any; of what no pose told, `stamp`
+    pose_stamp: float  # s, of the newest pose, -inf before any; `stamp` where the report is not about a pose
     hold: LinkCode | None = None  # why the link sends nothing
 
 
 @dataclass(slots=True, eq=False)
 class FaultRunRecord:
-    """What one run came to."""
+    """What happened in one run."""
 
-    words: list[Statement] = field(default_factory=list)  # a tick each
-    missed: list[Statement] = field(default_factory=list)  # what the conducting process said of one that was silent
+    statements: list[Statement] = field(default_factory=list)  # a tick each
+    timeouts: list[Statement] = field(default_factory=list)  # the main process's, of a process that was silent
     log: NozzleLog | None = None  # of nozzle and target
     over: int = 0  # ticks of commands beyond a limit
     ended: float = 0.0  # s
@@ -145,57 +137,71 @@ class FaultRunRecord:
 
 
 class _KilledError(Exception):
-    """The motion process is no more."""
+    """The motion process has ended."""
+
+
+def _ignore(*data: object, **named: object) -> None:
+    pass
+
+
+class _NoSink:
+    """Takes what cameras and tracker produce, and does nothing with it."""
+
+    picture = head = pose = event = staticmethod(_ignore)
 
 
 class FaultRun:
     """One run with faults, from the first frame until the path is printed, the motion is killed, or `SECONDS`."""
 
     def __init__(self, on: PreparedScenario, faults: Sequence[Fault], seed: int) -> None:
-        self._agenda, self._clock = EventQueue(), SimClock()
+        self._events, self._clock = EventQueue(), SimClock()
         scenario = replace(on.scenario, faults=tuple(faults), seed=seed)
         fold = fold_deformation("faults", on.truth.deformation, faults)
         deformation, strain = (on.truth.deformation, on.truth.strain) if fold is None else fold
         motion = disturbed_motion(on.truth.motion, faults)
         self._truth = replace(on.truth, motion=motion, deformation=deformation, strain=strain)
-        taken: Exposures = {}
+        shots: Exposures = {}
 
         def shot(camera: int, stamp: float) -> Shot:
-            return taken[camera, stamp]
+            return shots[camera, stamp]
 
         step = LandmarkTracker(scenario.rig, scenario.known_rig, self._truth, on.shape, shot, seed)
-        self._sight = CameraPipeline(scenario, self._agenda, step, taken, self, SimClock(), self._know)
-        self._profile = arm_near_path(scenario.profile, self._truth, on.path)
-        home = self._profile.arm.home
+        self._cameras = CameraPipeline(scenario, self._events, step, shots, _NoSink(), SimClock(), self._receive_pose)
+        # home is over the first checkpoint: the way there is not what is judged
+        over = on.path.surface_from_nozzle[:1].copy()
+        over[:, :3, 3] += START_HEIGHT * over[:, :3, 2]
+        arm = scenario.profile.arm
+        home = axes_from_nozzle(arm, self._truth.base_from_surface(np.zeros(1)) @ over)[0]
+        self._profile = replace(scenario.profile, arm=replace(arm, home=home))
         self._virtual = VirtualArm(scenario.arm, self._profile.dialect, home, faults, self._profile.baud)
         self._device = VirtualDevice(self._virtual, self._clock, self._profile.baud)
         self._arm = Arm(self._device, self._profile, 0.0, LinkSettings(poll=POLL_PERIOD))
         self._motion = MotionStep(on.path, self._profile)
-        self._ledger = TruthLog(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
+        self._truth_log = TruthLog(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
         self._hangs = faults_striking(faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
-        self._asked, self._stands = -np.inf, False
+        self._order_at, self._stands = -np.inf, False
         self._interval = scenario.cameras.period
-        self._ticked = self._heard = np.inf  # when motion and tracking last said something, s
-        self._looks = 0.0  # when the conducting process looks next, s
-        self._judge, self._sent = AxesOracle(home, self._profile.limits, self._profile.tick), -np.inf
-        self._ran = FaultRunRecord()
+        self._ticked = self._posed = np.inf  # s, the last tick of the motion and pose of the tracking
+        self._main_check = 0.0  # s, the main process's next check
+        self._oracle, self._sent_at = AxesOracle(home, self._profile.limits, self._profile.tick), -np.inf
+        self._record = FaultRunRecord()
 
     def __call__(self) -> FaultRunRecord:
-        """Let it happen."""
-        self._sight.begin()
-        loop = MotionLoop(self._motion, self._arm, self, self._newest, self._orders, self._tell)
+        """Run it."""
+        self._cameras.begin()
+        loop = MotionLoop(self._motion, self._arm, self, lambda: self._pose, self._orders, self._note)
         try:
             loop.run(SECONDS)
         except _KilledError:
             self._device.faults = PortFaults(away=[(self._clock.now(), np.inf)])
             self._advance(self._clock.now() + WATCHED_AFTER_KILL)
-        ran = self._ran
-        ran.ended = self._clock.now()
-        self._virtual.advance(ran.ended)
-        ran.log = self._ledger.rows(row_instants(0.0, ran.ended), self._virtual.axes_at)
-        ran.over = int(self._judge.over.sum())
-        return ran
+        record = self._record
+        record.ended = self._clock.now()
+        self._virtual.advance(record.ended)
+        record.log = self._truth_log.rows(row_instants(0.0, record.ended), self._virtual.axes_at)
+        record.over = int(self._oracle.over.sum())
+        return record
 
     # -- the clock of the motion: while it waits, the rest of the world goes on
 
@@ -204,7 +210,7 @@ class FaultRun:
         return self._clock.now()
 
     def wait_until(self, instant: float) -> None:
-        """Let the world go on until `instant`, s, or for as long as the motion stands still."""
+        """Let the world go on until `instant`, s, or for as long as the motion hangs."""
         self._advance(instant)
         for fault in self._hangs:
             if fault.covers(self._clock.now()):
@@ -215,30 +221,24 @@ class FaultRun:
             raise _KilledError
 
     def _advance(self, instant: float) -> None:
-        while self._looks <= instant:
-            self._pass(self._looks)
-            self._conduct(self._looks)
-            self._looks += CONDUCTOR_PERIOD
+        while self._main_check <= instant:
+            self._pass(self._main_check)
+            # what a live run's main process notices of the others
+            motion = silence_text("motion", self._ticked, self._profile.tick, self._main_check)
+            if text := motion or silence_text("tracking", self._posed, self._interval, self._main_check):
+                self._record.timeouts.append(Statement(self._main_check, text, False, False, self._main_check))
+            self._main_check += MAIN_PERIOD
         self._pass(instant)
 
     def _pass(self, instant: float) -> None:
-        for _ in self._agenda.run(lambda: instant):
+        for _ in self._events.run(lambda: instant):
             pass
         self._clock.wait_until(instant)
 
-    def _conduct(self, now: float) -> None:
-        """What a live run's conducting process sees of the others, and says."""
-        motion = silence_text("motion", self._ticked, self._profile.tick, now)
-        if said := motion or silence_text("tracking", self._heard, self._interval, now):
-            self._ran.missed.append(Statement(now, said, False, False, now))
+    # -- what the motion is given, and what it does
 
-    # -- what the motion is given, and what becomes of it
-
-    def _newest(self) -> SurfacePose | None:
-        return self._pose
-
-    def _know(self, pose: SurfacePose, frames: FrameSet, seen: object) -> None:
-        self._pose, self._heard = pose, self._clock.now()
+    def _receive_pose(self, pose: SurfacePose, frames: FrameSet, report: object) -> None:
+        self._pose, self._posed = pose, self._clock.now()
 
     def _orders(self) -> list[Order]:
         """An operator's: the arm stands at home, is armed once there is a pose, and again where it was stopped."""
@@ -246,78 +246,37 @@ class FaultRun:
         if not self._stands:
             self._stands = True
             return [Order.AT_HOME]
-        if self._pose is None or self._pose.state is not TrackState.TRACKING or now < self._asked + ORDER_PERIOD:
+        if self._pose is None or self._pose.state is not TrackState.TRACKING or now < self._order_at + ORDER_PERIOD:
             return []
-        self._asked = now
+        self._order_at = now
         return [Order.ARM] if self._arm.state in (ArmState.STOPPED, ArmState.DISARMED) else []
 
-    def _tell(self, tick: Tick) -> None:
-        ran, pose, status = self._ran, self._pose, tick.status
+    def _note(self, tick: Tick) -> None:
+        record, pose = self._record, self._pose
         self._ticked = self._clock.now()
-        said = tick.command.reason or reservation(pose)
-        if status.state is ArmState.STOPPED and (not ran.stopped or stopped_anew(ran, tick.stamp)):
-            ran.stopped.append(tick.stamp)
-        self._ledger.write(tick.command, self._motion.progress)
-        if tick.stamp - self._sent > 1.5 * self._profile.tick or self._arm.travels:
-            self._judge.rest()  # a tick that sends nothing, just after one that did, is no rest yet
+        anew = bool(record.statements) and record.statements[-1].hold is not LinkCode.STOPPED
+        if tick.status.state is ArmState.STOPPED and (not record.stopped or (anew and tick.stamp > record.stopped[-1])):
+            record.stopped.append(tick.stamp)
+        self._truth_log.write(tick.command, self._motion.progress)
+        if tick.stamp - self._sent_at > 1.5 * self._profile.tick or self._arm.travels:
+            self._oracle.rest()  # a tick that sends nothing, just after one that did, is no rest yet
         if tick.recalled is not None:
-            self._judge.stands(tick.recalled.stands)
+            self._oracle.stands(tick.recalled.stands)
         axes = tick.command.axes if isinstance(tick.command, Move) else None
         if axes is not None or tick.frame:
-            self._judge(axes)
-            self._sent = tick.stamp
-        own = self._arm.travels or tick.hold is LinkCode.RECALLED
-        seen = -np.inf if pose is None else pose.stamp
-        ran.words.append(Statement(tick.stamp, said, isinstance(tick.command, Move), own, seen, tick.hold))
-
-    # -- nobody looks at pictures
-
-    def picture(self, shot: Shot, kind: str, data: bytes) -> None:
-        """Nobody looks."""
-
-    def head(self, stamp: float, head: PrintHead) -> None:
-        """Nobody looks."""
-
-    def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
-        """It is heard of once it is known."""
-
-    def event(self, stamp: float, text: str, level: int = WARNING) -> None:
-        """Nobody listens."""
-
-
-def reservation(pose: SurfacePose | None) -> str:
-    """What is to be said of a pose, "" of one without a reservation."""
-    if pose is None:
-        return "no pose"
-    return pose.reason or ("" if pose.state is TrackState.TRACKING else pose.state.value)
-
-
-def stopped_anew(ran: FaultRunRecord, stamp: float) -> bool:
-    """Whether the arm is stopped anew: the tick before, it was not."""
-    return bool(ran.words) and ran.words[-1].hold is not LinkCode.STOPPED and stamp > ran.stopped[-1]
-
-
-def arm_near_path(profile: ArmProfile, truth: Truth, path: Path) -> ArmProfile:
-    """The arm with its home over the first checkpoint: the way there is not what is looked at."""
-    over = path.surface_from_nozzle[:1].copy()
-    over[:, :3, 3] += START_HEIGHT * over[:, :3, 2]
-    place = truth.base_from_surface(np.zeros(1)) @ over
-    return replace(profile, arm=replace(profile.arm, home=axes_from_nozzle(profile.arm, place)[0]))
-
-
-RowFlags = NDArray[np.bool_]
-
-
-def nozzle_speeds(log: NozzleLog) -> Array:
-    """Of the nozzle (N,), mm/s, executed, over 10 ms."""
-    places = log.base_from_nozzle[:, :3, 3]
-    way = np.zeros(len(log))
-    way[10:] = np.linalg.norm(places[10:] - places[:-10], axis=1) / np.maximum(log.stamps[10:] - log.stamps[:-10], 1e-9)
-    return way
+            self._oracle(axes)
+            self._sent_at = tick.stamp
+        reservation, pose_stamp = "no pose", -np.inf
+        if pose is not None:
+            reservation = pose.reason or ("" if pose.state is TrackState.TRACKING else pose.state.value)
+            pose_stamp = pose.stamp
+        text, own = tick.command.reason or reservation, self._arm.travels or tick.hold is LinkCode.RECALLED
+        moving = isinstance(tick.command, Move)
+        record.statements.append(Statement(tick.stamp, text, moving, own, pose_stamp, tick.hold))
 
 
 FAULT_SPACING, FAULTS_A_RUN = 2.6, 7  # s from one fault to the next, and faults of a run
-MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to be seen, short enough to be over before the next
+MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to have an effect, short enough to be over before the next
 AMOUNTS = {  # of what has one, uniform in the logarithm
     (FaultPart.CAMERA, FaultKind.SLOW): (0.03, 0.3),  # s
     (FaultPart.CAMERA, FaultKind.BUMP): (2.0, 10.0),  # mm: what is less is no harm to three cameras
@@ -328,9 +287,7 @@ AMOUNTS = {  # of what has one, uniform in the logarithm
     (FaultPart.SURFACE, FaultKind.FOLD): (0.5, 5.0),  # mm
 }
 CAMPAIGN_KINDS = [key for key, spec in FAULT_SPECS.items() if FaultRunner.SIMULATE in spec.runners]
-ENDING_KINDS = [
-    (part, kind) for part, kind in CAMPAIGN_KINDS if kind is FaultKind.KILL
-]  # after which a run has nothing to go on with
+ENDING_KINDS = [key for key in CAMPAIGN_KINDS if key[1] is FaultKind.KILL]  # after which a run cannot go on
 PASSING_KINDS = [key for key in CAMPAIGN_KINDS if key not in ENDING_KINDS]
 
 
@@ -344,9 +301,12 @@ def draw_faults(seed: int, number: int) -> list[Fault]:
 
 
 def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generator) -> Fault:
+    def draw(low: float, high: float) -> float:
+        return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))), 3)
+
     start = round(slot + float(rng.uniform(0.0, 0.4)), 3)
-    duration = round(_between(rng, MIN_DURATION, MAX_DURATION), 3)
-    amount = round(_between(rng, *AMOUNTS[key]), 3) if key in AMOUNTS else 0.0
+    duration = draw(MIN_DURATION, MAX_DURATION)
+    amount = draw(*AMOUNTS[key]) if key in AMOUNTS else 0.0
     if key == (FaultPart.CLOCK, FaultKind.JUMP):
         amount *= float(rng.choice([-1.0, 1.0]))
     if key[1] is FaultKind.KILL:
@@ -355,7 +315,3 @@ def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generat
         duration = 0.0
     number = int(rng.integers(3)) if key[0] is FaultPart.CAMERA else 0
     return Fault(*key, start, duration, amount, number, int(rng.integers(10**6)))
-
-
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

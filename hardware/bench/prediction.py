@@ -1,17 +1,16 @@
 """Subjects `prediction` and `loop`: where a breathing chest will be, and what knowing it is worth at the nozzle.
 
 `prediction`: error of surface points beside hold, constant velocity and a plain ensemble. Over recorded chests where
-there are some, else over the breathing of the simulator's scenarios, seen with the recordings' own noise; what is
-asked as a part of hold's error is asked of the recordings alone. The ensemble is eight autoregressions by recursive
-least squares (four reaches of the lags, two forgetting factors), hold and constant velocity, each coordinate by itself:
-increments since each lag are regressed on the increment ahead, directly for each horizon. The ten are weighted by the
-exponential of their delayed squared errors over the last seconds, relative to the best one's.
+there are some, else over the breathing of the simulator's scenarios with the recordings' own noise; targets relative to
+hold's error are for the recordings alone. The ensemble is eight autoregressions by recursive least squares (four ranges
+of lags, two forgetting factors), hold and constant velocity, for each coordinate alone: increments since each lag are
+regressed on the increment ahead, directly for each horizon. The ten are weighted by the exponential of their delayed
+squared errors over the last seconds, relative to the best one's.
 
-`loop`: each print is one of a scenario in virtual time: exposure, way, pairing, the estimator on tracks, the motion of
-a live run and the virtual arm, whose nozzle is compared with its true checkpoint every millisecond. What differs is
-only what the motion is told of the surface: where it was at the first pose (a bed that stands still), where it was last
-seen, that and its velocity, or the pose as it is. The first three claim to know it exactly: nothing but what they ask
-of the arm keeps them from printing.
+`loop`: each print is one of a scenario in virtual time: exposure, transport, pairing, the estimator on tracks, the
+motion of a live run and the virtual arm, whose nozzle is compared with its true checkpoint every millisecond. Only the
+pose that the motion is given differs: the first one for ever, the last one at rest, the last one with its velocity, or
+the pose as it is. The first three state no error: only the arm's limits keep them from printing.
 """
 
 from __future__ import annotations
@@ -36,6 +35,7 @@ from hardware.bench.figures import (
     Target,
     at_least,
     at_most,
+    columns,
     percentile,
     require_positive,
     with_progress,
@@ -50,31 +50,25 @@ from hardware.simulator.scenario import read_scenario
 from perception.frames import FrameSet
 from perception.package_data import shipped_file
 
-LAG_REACHES = (0.5, 1.0, 2.0, 4.0)  # s
+LONGEST_LAGS = (0.5, 1.0, 2.0, 4.0)  # s
 FORGETTING_FACTORS = (0.995, 0.9995)  # a sample
 MAX_LAGS = 12
 RIDGE = 1.0  # mm^2
-ERROR_MEMORY, WEIGHT_SHARPNESS = (
-    50.0,
-    2.0,
-)  # samples over which errors count; 2 times the best one's error weighs exp(-2)
+ERROR_MEMORY = 50.0  # samples over which errors count
+WEIGHT_SHARPNESS = 2.0  # twice the best expert's squared error weighs exp(-2)
 
 
 def plain_forecasts(values: Array, step: float, ahead: tuple[int, ...]) -> Array:
     """Increments (H, T, C) expected of values (T, C), mm, `step` s apart, over each of H numbers of samples ahead."""
-    experts = [autoregression(values, lags, keep, ahead) for lags in _lags(step) for keep in FORGETTING_FACTORS]
+    longest = [max(2, round(lag / step)) for lag in LONGEST_LAGS]
+    lags = [sorted({round(x) for x in np.geomspace(1, lag, min(lag, MAX_LAGS))}) for lag in longest]  # in samples
+    experts = [_autoregression(values, some, keep, ahead) for some in lags for keep in FORGETTING_FACTORS]
     velocity = np.concatenate([np.zeros_like(values[:1]), np.diff(values, axis=0)])
     steady = np.asarray(ahead)[:, None, None] * velocity
-    return weighted(values, np.stack([*experts, np.zeros_like(steady), steady]), ahead)
+    return _weighted(values, np.stack([*experts, np.zeros_like(steady), steady]), ahead)
 
 
-def _lags(step: float) -> list[list[int]]:
-    """Four sets of lags in samples: every one up to half a second, sparser from there."""
-    reaches = [max(2, round(reach / step)) for reach in LAG_REACHES]
-    return [sorted({round(x) for x in np.geomspace(1, reach, min(reach, MAX_LAGS))}) for reach in reaches]
-
-
-def autoregression(values: Array, lags: list[int], keep: float, ahead: tuple[int, ...]) -> Array:
+def _autoregression(values: Array, lags: list[int], keep: float, ahead: tuple[int, ...]) -> Array:
     """Increments (H, T, C) that one autoregression per coordinate expects, trained on what is known at each time."""
     count, width = values.shape
     first, delay = max(lags), max(ahead)
@@ -83,7 +77,7 @@ def autoregression(values: Array, lags: list[int], keep: float, ahead: tuple[int
         inputs[lag:, :, i] = values[lag:] - values[:-lag]
     gain = np.tile(np.eye(len(lags)) / RIDGE, (width, 1, 1))
     slopes = np.zeros((width, len(lags), len(ahead)))
-    out = np.zeros((len(ahead), count, width))
+    increments = np.zeros((len(ahead), count, width))
     for t in range(first, count):
         if t - delay >= first:
             then = t - delay
@@ -92,13 +86,13 @@ def autoregression(values: Array, lags: list[int], keep: float, ahead: tuple[int
             share = pull / (keep + (x * pull).sum(1))[:, None]
             slopes += share[..., None] * (truth - (x[:, None] @ slopes)[:, 0])[:, None]
             gain = (gain - share[..., None] * pull[:, None]) / keep
-        out[:, t] = (inputs[t][:, None] @ slopes)[:, 0].T
-    return out
+        increments[:, t] = (inputs[t][:, None] @ slopes)[:, 0].T
+    return increments
 
 
-def weighted(values: Array, experts: Array, ahead: tuple[int, ...]) -> Array:
+def _weighted(values: Array, experts: Array, ahead: tuple[int, ...]) -> Array:
     """Experts' increments (E, H, T, C) combined (H, T, C) by exponential weights of their errors so far."""
-    out = np.zeros(experts.shape[1:])
+    combined = np.zeros(experts.shape[1:])
     for k, h in enumerate(ahead):
         square = np.zeros((len(experts), values.shape[1]))
         for t in range(values.shape[0]):
@@ -106,41 +100,41 @@ def weighted(values: Array, experts: Array, ahead: tuple[int, ...]) -> Array:
                 square += ((experts[:, k, t - h] - (values[t] - values[t - h])) ** 2 - square) / ERROR_MEMORY
             best = square.min(0)
             weights = np.exp(-WEIGHT_SHARPNESS * (square - best) / np.maximum(best, 1e-9))
-            out[k, t] = (weights / weights.sum(0) * experts[:, k, t]).sum(0)
-    return out
+            combined[k, t] = (weights / weights.sum(0) * experts[:, k, t]).sum(0)
+    return combined
 
 
 AHEAD = (0.1, 0.2, 0.3, 0.5)  # s
-HOLD_SHARES = (0.42, 0.42, 0.44, 0.47)  # of hold's error, asked for on recorded chests
+HOLD_SHARES = (0.42, 0.42, 0.44, 0.47)  # of hold's error: targets for recorded chests
 SIMULATED = (None,) * 4
-ENSEMBLE_TARGET = 0.92  # of the plain ensemble's error, asked for
+ENSEMBLE_TARGET = 0.92  # of the plain ensemble's error
 COVERED_TARGET = Target(0.88, 0.92)
-TRACE_VARIANCE = 1e-9  # rad^2 and mm^2: what the trace's own pose is claimed to be known to
+TRACE_VARIANCE = 1e-9  # rad^2 and mm^2: stated covariance of the trace's poses
 POINT_SPREAD = 60.0  # mm
-POINTS_AROUND = POINT_SPREAD * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])  # where no markers are told
+POINTS_AROUND = POINT_SPREAD * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])  # where there are no markers
 CHEST_RATE, CHEST_NOISE = 10.0, 0.1  # Hz, and mm: of the recorded chests
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TraceErrors:
-    """What one trace came to. hold, steady, plain, ours: (H,) RMSE, mm, mean over points. covered: (H,). ms: (T,)."""
+    """Errors of each method over one trace, at H times ahead: RMSE, mm, mean over points."""
 
     name: str
-    hold: Array
-    steady: Array
-    plain: Array
-    ours: Array
-    covered: Array
-    ms: Array
+    hold: Array  # (H,)
+    steady: Array  # (H,)
+    plain: Array  # (H,)
+    ours: Array  # (H,)
+    covered: Array  # (H,) share of errors within the 90 % radius
+    ms: Array  # (T,) time of a step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chest:
-    """One motion. seen: poses as they are told, of points (P, 3) mm on the surface."""
+    """One motion."""
 
     name: str
-    seen: Trajectory
-    points: Array
+    observed: Trajectory  # with the noise of observation
+    points: Array  # (P, 3) mm, on the surface
 
 
 def run_prediction(options: argparse.Namespace) -> list[Figure]:
@@ -159,13 +153,14 @@ def run_prediction(options: argparse.Namespace) -> list[Figure]:
 def recorded(file: Path, warm_up: float) -> Chest:
     """A trace as it was recorded, long enough to be judged."""
     trace = read_tum(file, exact=True)
-    if trace.stamps[-1] - trace.stamps[0] < warm_up + 1 + max(AHEAD):
-        raise InputError(file, "duration", f"{trace.stamps[-1] - trace.stamps[0]:g} s", f"more than {warm_up + 2:g} s")
-    return Chest(file.stem, trace, marker_points(file, trace))
+    duration = trace.stamps[-1] - trace.stamps[0]
+    if duration < warm_up + 1 + max(AHEAD):
+        raise InputError(file, "duration", f"{duration:g} s", f"more than {warm_up + 2:g} s")
+    return Chest(file.stem, trace, _marker_points(file, trace))
 
 
 def simulated(name: str, seconds: float) -> Chest:
-    """A scenario's motion, as a camera would tell it that trembles by the recordings' noise."""
+    """A scenario's motion, observed with the recordings' noise."""
     scenario = read_scenario(shipped_file("scenarios", f"{name}.toml"))
     stamps, rng = np.arange(0.0, seconds, 1 / CHEST_RATE), np.random.default_rng([scenario.seed, 83])
     noise = rng.normal(size=(len(stamps), 6)) * np.repeat([CHEST_NOISE / POINT_SPREAD, CHEST_NOISE], 3)
@@ -175,40 +170,37 @@ def simulated(name: str, seconds: float) -> Chest:
 
 def errors_of(chest: Chest, warm_up: float) -> TraceErrors:
     """Run every method over one trace, once through."""
-    trace, points = chest.seen, chest.points
+    trace, points = chest.observed, chest.points
     step = float(np.median(np.diff(trace.stamps)))
     first, ahead = int(np.searchsorted(trace.stamps, trace.stamps[0] + warm_up)), tuple(round(a / step) for a in AHEAD)
     places = se3.transform_points(trace.base_from_surface, points)  # (T, P, 3)
     flat = places.reshape(len(places), -1)
     plain = places + plain_forecasts(flat, step, ahead).reshape(len(ahead), *places.shape)
     steady = np.concatenate([np.zeros_like(places[:1]), np.diff(places, axis=0)])
-    expected, radii, ms = followed(trace, points)
-    out = np.zeros((5, len(ahead)))
+    expected, radii, ms = _predicted(trace, points)
+    errors = np.zeros((5, len(ahead)))
     for k, h in enumerate(ahead):
         truth, now = places[first + h :], slice(first, len(places) - h)
         guesses = (places[now], places[now] + h * steady[now], plain[k, now], expected[k, now])
         lengths = [np.linalg.norm(truth - guess, axis=-1) for guess in guesses]
-        out[:4, k] = [np.sqrt((length**2).mean(0)).mean() for length in lengths]
-        out[4, k] = (lengths[3] <= radii[k, now]).mean()
-    hold, steadily, simply, ours, covered = out
-    return TraceErrors(chest.name, hold, steadily, simply, ours, covered, ms)
+        errors[:4, k] = [np.sqrt((length**2).mean(0)).mean() for length in lengths]
+        errors[4, k] = (lengths[3] <= radii[k, now]).mean()
+    return TraceErrors(chest.name, *errors, ms)
 
 
-def followed(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:
+def _predicted(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:
     """Places (H, T, P, 3) and 90 % radii (H, T, P) that our prediction gives, mm, and its time per pose (T,), ms."""
     count, clock, predictor = len(trace.stamps), CpuClock(), Predictor(points)
     twists = np.zeros((count, 6))
     moves = se3.log(se3.inverse(trace.base_from_surface[:-1]) @ trace.base_from_surface[1:])
     twists[1:] = moves / np.diff(trace.stamps)[:, None]
     places, radii = np.zeros((len(AHEAD), count, len(points), 3)), np.zeros((len(AHEAD), count, len(points)))
-    ms = np.zeros(count)
+    ms, covariance = np.zeros(count), TRACE_VARIANCE * np.eye(6)
     for i, stamp in enumerate(trace.stamps.tolist()):
-        begun = clock.now()
-        pose = SurfacePose(
-            stamp, trace.base_from_surface[i], TRACE_VARIANCE * np.eye(6), twists[i], TrackState.TRACKING
-        )
+        start = clock.now()
+        pose = SurfacePose(stamp, trace.base_from_surface[i], covariance, twists[i], TrackState.TRACKING)
         pose = replace(pose, forecast=predictor.add(pose))
-        ms[i] = 1000 * (clock.now() - begun)
+        ms[i] = 1000 * (clock.now() - start)
         for k, ahead in enumerate(AHEAD):
             later = pose.predict(stamp + ahead)
             places[k, i] = se3.transform_points(later.base_from_surface, points)
@@ -216,7 +208,7 @@ def followed(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:
     return places, radii, ms
 
 
-def marker_points(file: Path, trace: Trajectory) -> Array:
+def _marker_points(file: Path, trace: Trajectory) -> Array:
     """Where the markers beside a trace (NAME_markers.csv) sit on the surface (P, 3), mm; else points about it."""
     beside = file.with_name(f"{file.stem}_markers.csv")
     if not beside.is_file():
@@ -227,65 +219,55 @@ def marker_points(file: Path, trace: Trajectory) -> Array:
     markers = np.array([[[float(row[f"{n}_{a}_mm"]) for a in "xyz"] for n in names] for row in rows])
     if len(markers) != len(trace.stamps):
         raise InputError(beside, "rows", len(markers), f"{len(trace.stamps)}, as many as poses")
-    placed = markers - markers.mean((0, 1))
     inverse = se3.inverse(trace.base_from_surface)
-    return np.asarray(se3.transform_points(inverse, placed).mean(0))
+    return np.asarray(se3.transform_points(inverse, markers - markers.mean((0, 1))).mean(0))
 
 
 def figures(traces: list[TraceErrors], shares: Sequence[float | None] = HOLD_SHARES) -> list[Figure]:
-    """The figures of traces, each method's mean error as a part of hold's. shares: what is asked, if anything."""
-    mean = {name: np.mean([getattr(t, name) for t in traces], axis=0) for name in ("hold", "steady", "plain", "ours")}
-    out = []
-    for k, (ahead, asked) in enumerate(zip(AHEAD, shares, strict=True)):
-        hold, steady, plain, ours = (float(mean[n][k]) for n in ("hold", "steady", "plain", "ours"))
-        beside = f"constant velocity {steady / hold:.3f}, plain ensemble {plain / hold:.3f}"
-        name = f"{1000 * ahead:.0f} ms"
-        target = None if asked is None else at_most(asked)
-        out.append(Figure(f"{name}: error by hold's", ours / hold, "", target, beside, f"hold {hold:.3f} mm"))
-        out.append(Figure(f"{name}: error by the plain ensemble's", ours / plain, "", at_most(ENSEMBLE_TARGET)))
+    """The figures of traces, each method's mean error relative to hold's. shares: targets, if there are any."""
+    methods = [np.mean(errors, axis=0).tolist() for errors in columns(traces, "hold", "steady", "plain", "ours")]
+    rows = []
+    for ahead, share, hold, steady, plain, ours in zip(AHEAD, shares, *methods, strict=True):
+        others = f"constant velocity {steady / hold:.3f}, plain ensemble {plain / hold:.3f}"
+        name, target = f"{1000 * ahead:.0f} ms", None if share is None else at_most(share)
+        rows.append(Figure(f"{name}: error by hold's", ours / hold, "", target, others, f"hold {hold:.3f} mm"))
+        rows.append(Figure(f"{name}: error by the plain ensemble's", ours / plain, "", at_most(ENSEMBLE_TARGET)))
     for trace in traces:
         for k, ahead in enumerate(AHEAD):
-            share = f"error by hold's {trace.ours[k] / trace.hold[k]:.3f}"
+            note = f"error by hold's {trace.ours[k] / trace.hold[k]:.3f}"
             name = f"{trace.name}, {1000 * ahead:.0f} ms: inside 90 %"
-            out.append(Figure(name, float(trace.covered[k]), "", COVERED_TARGET, "", share))
+            rows.append(Figure(name, float(trace.covered[k]), "", COVERED_TARGET, "", note))
     ms = np.concatenate([t.ms for t in traces])
-    out.append(Figure("time a step: median", percentile(ms, 50), "ms", at_most(0.5), "", "CPU, learning included"))
-    out.append(Figure("time a step: p99", percentile(ms, 99), "ms", None, "", "CPU"))
-    return out
+    rows.append(Figure("time a step: median", percentile(ms, 50), "ms", at_most(0.5), "", "CPU, learning included"))
+    return [*rows, Figure("time a step: p99", percentile(ms, 99), "ms", None, "", "CPU")]
 
 
-MIN_DRAWN_MM = 0.01  # mm, where the logarithmic axis begins
-NOZZLE_ERROR_95, MAX_NOZZLE_ERROR, MIN_DUTY = 0.5, 1.0, 0.8  # mm, mm, part of the time: asked of a live run
+MIN_DRAWN_MM = 0.01  # where the logarithmic axis begins
+NOZZLE_ERROR_95, MAX_NOZZLE_ERROR, MIN_DUTY = 0.5, 1.0, 0.8  # mm, mm, share of the time: targets of a live run
 
-Told = Callable[[SurfacePose], SurfacePose]  # what the motion is told in the place of a pose
+PoseChange = Callable[[SurfacePose], SurfacePose]  # what the motion is given in place of a pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Print:
-    """One print. stamps: (N,) s. error: (N,) mm at the nozzle, NaN where nothing leaves it."""
+    """One print."""
 
-    stamps: Array
-    error: Array
+    stamps: Array  # (N,) s
+    error: Array  # (N,) mm at the nozzle, NaN where nothing leaves it
 
-    @property
-    def p95(self) -> float:
-        """mm, while extruding."""
-        return percentile(self.error[np.isfinite(self.error)], 95)
-
-    @property
-    def largest(self) -> float:
-        """mm, while extruding."""
-        return percentile(self.error[np.isfinite(self.error)], 100)
+    def percentile(self, share: float) -> float:
+        """Of the error, mm, while extruding."""
+        return percentile(self.error[np.isfinite(self.error)], share)
 
     @property
     def duty(self) -> float:
-        """Part of the time from the first material to the last in which it flows."""
+        """Share of the time from the first material to the last in which it flows."""
         flows = np.flatnonzero(np.isfinite(self.error))
         return len(flows) / (flows[-1] - flows[0] + 1) if len(flows) else 0.0
 
 
 class StillBed:
-    """The surface is said to be where it was first seen, for ever."""
+    """The surface stays for ever where it was first measured."""
 
     def __init__(self) -> None:
         self._first: SurfacePose | None = None
@@ -294,44 +276,38 @@ class StillBed:
         """The first measured pose, under every stamp."""
         if self._first is None and pose.state.measured:
             self._first = pose
-        where = pose if self._first is None else self._first
-        return replace(last_seen(pose), base_from_surface=where.base_from_surface)
+        return replace(at_rest(pose), base_from_surface=(self._first or pose).base_from_surface)
 
 
-def last_seen(pose: SurfacePose) -> SurfacePose:
-    """The surface is said to stay where it was seen."""
+def at_rest(pose: SurfacePose) -> SurfacePose:
+    """The surface stays where it was last measured."""
     return replace(steady(pose), twist=np.zeros(6))
 
 
 def steady(pose: SurfacePose) -> SurfacePose:
-    """The surface is said to keep its velocity."""
+    """The surface keeps its velocity."""
     nothing = np.zeros((6, 6))
     return replace(pose, covariance=nothing, twist_covariance=nothing, acceleration_psd=np.zeros(6), forecast=None)
 
 
-def as_it_is(pose: SurfacePose) -> SurfacePose:
-    """What the estimator says, forecast and claim included."""
-    return pose
-
-
-MOTION_INPUTS: dict[str, Callable[[], Told]] = {
+FORECAST_INPUT = "forecast"  # the pose as the estimator reports it
+MOTION_INPUTS: dict[str, Callable[[], PoseChange]] = {
     "a bed that stands still": StillBed,
-    "where it was last seen": lambda: last_seen,
+    "where it was last seen": lambda: at_rest,
     "constant velocity": lambda: steady,
-    "forecast": lambda: as_it_is,
+    FORECAST_INPUT: lambda: lambda pose: pose,
 }
-FORECAST_INPUT = "forecast"
 
 
 class LoopRun(FaultRun):
-    """A print in which nothing goes wrong, and the motion is told something else than the pose."""
+    """A print without faults in which the motion is given changed poses."""
 
-    def __init__(self, on: PreparedScenario, told: Told, seed: int) -> None:
+    def __init__(self, on: PreparedScenario, change: PoseChange, seed: int) -> None:
         super().__init__(on, (), seed)
-        self._told = told
+        self._change = change
 
-    def _know(self, pose: SurfacePose, frames: FrameSet, seen: object) -> None:
-        super()._know(self._told(pose), frames, seen)
+    def _receive_pose(self, pose: SurfacePose, frames: FrameSet, report: object) -> None:
+        super()._receive_pose(self._change(pose), frames, report)
 
 
 def run_loop(options: argparse.Namespace) -> list[Figure]:
@@ -339,11 +315,10 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
     if options.seed < 0:
         raise InputError("command line", "--seed", options.seed, ">= 0")
     require_positive(options, "jobs")
-    asked = [(name, way) for name in options.scenario for way in MOTION_INPUTS]
+    cases = [(name, way) for name in options.scenario for way in MOTION_INPUTS]
     with workers(options.jobs) as pool:
-        prints = pool.map(partial(_print_case, options.seed), *zip(*asked, strict=True))
-        done = list(with_progress("loop", "prints", prints, len(asked)))
-    by_case = dict(zip(asked, done, strict=True))
+        prints = pool.map(partial(_print_case, options.seed), *zip(*cases, strict=True))
+        by_case = dict(zip(cases, with_progress("loop", "prints", prints, len(cases)), strict=True))
     write_page(options.out, "loop.html", lambda: loop_page(by_case), "picture")
     return [figure for name in options.scenario for figure in _figures(name, by_case)]
 
@@ -359,41 +334,31 @@ def _print_case(seed: int, scenario: str, way: str) -> Print:
 def _figures(scenario: str, prints: dict[tuple[str, str], Print]) -> list[Figure]:
     ours = prints[scenario, FORECAST_INPUT]
     rest = [(way, one) for (name, way), one in prints.items() if name == scenario and way != FORECAST_INPUT]
-    others = ", ".join(f"{way} {one.p95:.2f}" for way, one in rest)
+    others = ", ".join(f"{way} {one.percentile(95):.2f}" for way, one in rest)
+    error, note = f"{scenario}: error at the nozzle, 95 %", "the arm holds where the forecast is not sure"
     return [
-        Figure(
-            f"{scenario}: error at the nozzle, 95 %",
-            ours.p95,
-            "mm",
-            at_most(NOZZLE_ERROR_95),
-            others,
-            "while extruding",
-        ),
-        Figure(f"{scenario}: largest error", ours.largest, "mm", at_most(MAX_NOZZLE_ERROR)),
-        Figure(
-            f"{scenario}: duty", ours.duty, "", at_least(MIN_DUTY), "", "the arm holds where the forecast is not sure"
-        ),
+        Figure(error, ours.percentile(95), "mm", at_most(NOZZLE_ERROR_95), others, "while extruding"),
+        Figure(f"{scenario}: largest error", ours.percentile(100), "mm", at_most(MAX_NOZZLE_ERROR)),
+        Figure(f"{scenario}: duty", ours.duty, "", at_least(MIN_DUTY), "", note),
     ]
 
 
 def loop_page(prints: dict[tuple[str, str], Print]) -> str:
     """The error at the nozzle over time, a plot for each way, one scale for all of a scenario."""
-    body = [_one(name, prints) for name in dict.fromkeys(name for name, _ in prints)]
+    body = []
+    keys = legend([line_key("estimate", "error while extruding, mm"), line_key("limit", f"{MAX_NOZZLE_ERROR:g} mm")])
+    for scenario in dict.fromkeys(name for name, _ in prints):
+        ways = {way: one for (name, way), one in prints.items() if name == scenario}
+        largest = [one.percentile(100) for one in ways.values() if np.isfinite(one.error).any()]
+        top, span = 1.3 * max(MAX_NOZZLE_ERROR, *largest), (0.0, max(float(one.stamps[-1]) for one in ways.values()))
+        plots = []
+        for way, one in ways.items():
+            label = f"{way}: 95 % {one.percentile(95):.2f}, at most {one.percentile(100):.2f} mm"
+            plot = Plot(900, 150, span, (MIN_DRAWN_MM, top), log_y=True, label=label)
+            plot.level(MAX_NOZZLE_ERROR, "", "limit")
+            plot.line(one.stamps, np.maximum(one.error, MIN_DRAWN_MM), "estimate")
+            plots.append(plot.svg())
+        body.append(section(scenario, "Over time, s; a gap: nothing leaves the nozzle.", keys + "".join(plots)))
     lead = "The same print, by what the motion is told of where the surface will be."
     footer = "Virtual time, the virtual arm; the true error, every millisecond."
     return document("bench", "closed loop", lead, body, footer)
-
-
-def _one(scenario: str, prints: dict[tuple[str, str], Print]) -> str:
-    ways = {way: one for (name, way), one in prints.items() if name == scenario}
-    top = 1.3 * max(MAX_NOZZLE_ERROR, *(one.largest for one in ways.values() if np.isfinite(one.error).any()))
-    span = 0.0, max(float(one.stamps[-1]) for one in ways.values())
-    plots = []
-    for way, one in ways.items():
-        label = f"{way}: 95 % {one.p95:.2f}, at most {one.largest:.2f} mm"
-        plot = Plot(900, 150, span, (MIN_DRAWN_MM, top), log_y=True, label=label)
-        plot.level(MAX_NOZZLE_ERROR, "", "limit")
-        plot.line(one.stamps, np.maximum(one.error, MIN_DRAWN_MM), "estimate")
-        plots.append(plot.svg())
-    keys = legend([line_key("estimate", "error while extruding, mm"), line_key("limit", f"{MAX_NOZZLE_ERROR:g} mm")])
-    return section(scenario, "Over time, s; a gap: nothing leaves the nozzle.", keys + "".join(plots))

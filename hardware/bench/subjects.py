@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hardware.bench.figures import Figure
 
 BREATHING = ("breathing_calm", "breathing_deep", "breathing_irregular")  # scenarios
+BREATHING_HELP = f"of {', '.join(BREATHING)} (default: all)"
 MOVEMENTS = ("still", "breathing", "irregular", "steps", "turns", "sway", "lively")  # of synthetic worlds
 RENDERED = (
     *("still", *BREATHING, "shaking_table_0_5_hz", "steps_300um"),
@@ -59,12 +60,18 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 
-def _subject(function: str, summary: str, *options: _Option) -> Subject:
-    def add(parser: argparse.ArgumentParser) -> None:
-        for names, settings in options:
-            parser.add_argument(*names, **settings)
+def _subject(name: str, module: str, summary: str) -> Callable[..., tuple[str, Subject]]:
+    """Called with its options, the named subject that `run_NAME` of a module of this folder measures."""
+    function = f"hardware.bench.{module}:run_{name.replace('-', '_')}"
 
-    return Subject(function, add, summary)
+    def with_options(*options: _Option) -> tuple[str, Subject]:
+        def add(parser: argparse.ArgumentParser) -> None:
+            for names, settings in options:
+                parser.add_argument(*names, **settings)
+
+        return name, Subject(function, add, summary)
+
+    return with_options
 
 
 def _option(*names: str, **settings: Any) -> _Option:
@@ -85,43 +92,30 @@ def _positive(text: str) -> int:
 SEED = _option("--seed", type=int, default=0)
 SESSIONS = _option("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions to show instead")
 
-SUBJECTS: Subjects = {
-    "arm-calibration": _subject(
-        "hardware.bench.calibration:run_arm_calibration",
-        "the arm's place, tool and latency from what cameras see of its tip",
+_SUBJECTS = (
+    _subject("arm-calibration", "calibration", "the arm's place, tool and latency from what cameras see of its tip")(
         _number("--rendered", 1, "N", "arms before rendered cameras; default 1"),
         _number("--runs", 50, "N", "arms on drawn tips; default 50"),
         _number("--seed", 0, None, "of the first arm; default 0"),
     ),
-    "bumps": _subject(
-        "hardware.bench.detection:run_bumps",
-        "cameras knocked and lenses turned by little: found, named, false alarms",
+    _subject("bumps", "detection", "cameras knocked and lenses turned by little: found, named, false alarms")(
         _number("--count", 9, "N", "of each knock; default 9"),
         _number("--minutes", 10.0, "M", "of calm; default 10"),
         _number("--seed", 0, None, "of motions and noise; default 0"),
     ),
-    "calibration": _subject(
-        "hardware.bench.calibration:run_calibration",
-        "cameras calibrated from rendered boards, beside the exact rig",
+    _subject("calibration", "calibration", "cameras calibrated from rendered boards, beside the exact rig")(
         _number("--instants", 60, "N", "frame sets that are rendered; default 60"),
         _number("--runs", 50, "N", "runs without pictures; default 50"),
     ),
-    "cameras": _subject(
-        "hardware.bench.detection:run_cameras",
-        "frames of live cameras put into sets: complete, wrong, waited for",
-        _number("--minutes", 10.0, None, "of three cameras at 30 fps; default 10"),
-        SEED,
+    _subject("cameras", "detection", "frames of live cameras put into sets: complete, wrong, waited for")(
+        _number("--minutes", 10.0, None, "of three cameras at 30 fps; default 10"), SEED
     ),
-    "consistency": _subject(
-        "hardware.bench.estimator:run_consistency",
-        "poses from pictures: are errors as large as is claimed?",
+    _subject("consistency", "estimator", "poses from pictures: are errors as large as is claimed?")(
         _number("--scenes", 2, "N", "rendered first, some 10 s each; default 2"),
         _number("--seed", 300, None, "of the first scene (default: 300)"),
         _number("--seconds", 5.0, "S", "of each scene; default 5"),
     ),
-    "estimator": _subject(
-        "hardware.bench.estimator:run_estimator",
-        "the estimator on synthetic tracks: accuracy, honesty, time",
+    _subject("estimator", "estimator", "the estimator on synthetic tracks: accuracy, honesty, time")(
         _option("--only", default="*", metavar="PATTERN", help="scenes by name, e.g. 'breathing, c*'"),
         _option("--maps", nargs="+", choices=MAPS, default=MAPS, help="whose map"),
         _number("--seeds", 3, "N", "worlds of each scene"),
@@ -130,18 +124,14 @@ SUBJECTS: Subjects = {
         _number("--noise", 0.25, "PX", "white, where a scene has no own"),
         _option("--soak", type=float, metavar="HOURS", help="instead: one long run of breathing"),
     ),
-    "faults": _subject(
-        "hardware.bench.campaigns.faults:run_faults",
-        "prints in which everything goes wrong: said, harmless, back soon?",
+    _subject("faults", "campaigns.faults", "prints in which everything goes wrong: said, harmless, back soon?")(
         _number("--count", 60, None, "faults, of all kinds in turn (default: 60)"),
         _number("--seed", 1, None, "of all that chance decides (default: 1)"),
         _number("--jobs", 1, None, "processes that share the runs (default: 1)"),
         _option("--log", type=Path, metavar="X.csv", help="what came of each fault; runs in it are not repeated"),
         _option("--scenarios", type=Path, metavar="FOLDER", help="where the scenarios are (default: the shipped)"),
     ),
-    "fill": _subject(
-        "hardware.bench.fill:run_fill",
-        "beads laid into contours and random wounds: coverage and time",
+    _subject("fill", "fill", "beads laid into contours and random wounds: coverage and time")(
         _option("contours", nargs="*", type=Path, metavar="CSV", help="x_mm,y_mm; two own without"),
         _option("--kind", choices=PATTERN_KINDS, default="best", help="pattern; default best"),
         _number("--contour-width", 0.8, "MM", "bead in contours; default 0.8"),
@@ -150,36 +140,25 @@ SUBJECTS: Subjects = {
         SEED,
         _option("--picture", type=Path, metavar="SVG", help="also draw all patterns side by side"),
     ),
-    "fuzz": _subject(
-        "hardware.bench.campaigns.fuzz:run_fuzz",
-        "every reader of what comes from outside, given what is nearly valid",
+    _subject("fuzz", "campaigns.fuzz", "every reader of what comes from outside, given what is nearly valid")(
         _number("--count", 20_000, None, "inputs, of all readers in equal shares (default: 20000)"),
         _number("--seed", 1, None, "of what is made wrong (default: 1)"),
         _option("--only", metavar="READER", help="one reader; see the table for their names"),
         _number("--jobs", 1, None, "readers at a time, a process each (default: 1)"),
         _option(
-            "--log",
-            type=Path,
-            metavar="X.csv",
-            help="how far each reader is, and what went wrong; goes on from there",
+            "--log", type=Path, metavar="X.csv", help="how far each reader is, and what went wrong; goes on from there"
         ),
     ),
-    "growth": _subject(
-        "hardware.bench.recordings:run_growth",
-        "how cost grows: with tracks, cameras, pixels, checkpoints, minutes",
+    _subject("growth", "recordings", "how cost grows: with tracks, cameras, pixels, checkpoints, minutes")(
         _number("--seconds", 4.0, "S", "of each world; default 4"),
         _option("--no-pictures", action="store_true", help="leave out resolution, which has to be rendered"),
     ),
-    "latency": _subject(
-        "hardware.bench.recordings:run_latency",
-        "from three decoded frames to the pose, by wall clock and processor",
+    _subject("latency", "recordings", "from three decoded frames to the pose, by wall clock and processor")(
         SESSIONS,
         _number("--seconds", 5.0, "S", "of each made recording; default 5"),
         _option("--scene", nargs="+", choices=MADE, default=[MADE[-1]], metavar="NAME", help="; ".join(MADE)),
     ),
-    "link": _subject(
-        "hardware.bench.campaigns.link:run_link",
-        "the arm's line with everything going wrong; stops, jitter, the guard",
+    _subject("link", "campaigns.link", "the arm's line with everything going wrong; stops, jitter, the guard")(
         _number("--hours", 1.0, "H", "of virtual time; default 1"),
         _number("--minutes", 0.0, "M", "of real time on a pty; default none"),
         _number("--commands", 100_000, "N", "random ones before the guard"),
@@ -189,61 +168,38 @@ SUBJECTS: Subjects = {
         _number("--busy", 1, "N", "processes that saturate a core each; default 1"),
         _option("--ordinary", action="store_true", help="do not ask for real-time priority"),
     ),
-    "live": _subject(
-        "hardware.bench.live:run_live",
-        "whole runs in real time: frames to wire, stops, nozzle, kills",
+    _subject("live", "live", "whole runs in real time: frames to wire, stops, nozzle, kills")(
         _number("--minutes", 1.0, "M", "of printing; 0: none; default 1"),
         _number("--stops", 3, "N", "in a run of their own; default 3"),
         _number("--kills", 0, "N", "of random processes; default none"),
         _number("--seed", 0, None, "of what is killed when"),
         _option("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other"),
         _option(
-            "--scenario",
-            type=Path,
-            default=Path("data/live/calm.toml"),
-            metavar="SCENARIO.toml",
-            help="which world",
+            "--scenario", type=Path, default=Path("data/live/calm.toml"), metavar="SCENARIO.toml", help="which world"
         ),
     ),
-    "loop": _subject(
-        "hardware.bench.prediction:run_loop",
-        "the closed loop at the nozzle, with and without prediction",
+    _subject("loop", "prediction", "the closed loop at the nozzle, with and without prediction")(
         _option(
-            "--scenario",
-            nargs="+",
-            default=list(BREATHING),
-            choices=BREATHING,
-            metavar="NAME",
-            help=f"of {', '.join(BREATHING)} (default: all)",
+            "--scenario", nargs="+", default=list(BREATHING), choices=BREATHING, metavar="NAME", help=BREATHING_HELP
         ),
         _number("--seed", 1, None, "of the tracks' noise (default: 1)"),
         _number("--jobs", 1, None, "processes that share the prints (default: 1)"),
     ),
-    "map": _subject(
-        "hardware.bench.mapping:run_map",
-        "landmarks off the true surface beside their claim, and the map's growth",
-        _number("--seconds", 3.0, "S", "of each still standing; default 3"),
+    _subject("map", "mapping", "landmarks off the true surface beside their claim, and the map's growth")(
+        _number("--seconds", 3.0, "S", "of each still standing; default 3")
     ),
-    "outages": _subject(
-        "hardware.bench.campaigns.outages:run_outages",
-        "cameras covered, dead, frozen, swapped, bumped: lost in silence?",
+    _subject("outages", "campaigns.outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?")(
         _option("--count", type=_positive, default=66, help="outages, of all kinds in turn (default: 66)"),
         _number("--seed", 0, None, "of scenes, motions and outages (default: 0)"),
         _option("--processes", type=_positive, default=2, help="that share the scenes (default: 2)"),
     ),
-    "plan": _subject(
-        "hardware.bench.fill:run_plan",
-        "a whole plan of a large wound: time, memory, coverage, ink",
-        _option("--body", choices=("forearm", "chest", "foot"), default="forearm", help="default forearm"),
+    _subject("plan", "fill", "a whole plan of a large wound: time, memory, coverage, ink")(
+        _option("--body", choices=("forearm", "chest", "foot"), default="forearm", help="default forearm")
     ),
-    "registration": _subject(
-        "hardware.bench.mapping:run_registration",
-        "a scan laid into the first pictures: error and verdict",
-        _number("--seeds", 2, "N", "bodies of each kind; default 2"),
+    _subject("registration", "mapping", "a scan laid into the first pictures: error and verdict")(
+        _number("--seeds", 2, "N", "bodies of each kind; default 2")
     ),
-    "prediction": _subject(
-        "hardware.bench.prediction:run_prediction",
-        "where a breathing chest will be, 100 to 500 ms ahead",
+    _subject("prediction", "prediction", "where a breathing chest will be, 100 to 500 ms ahead")(
         _option(
             "--traces",
             type=Path,
@@ -254,25 +210,19 @@ SUBJECTS: Subjects = {
         _number("--warm-up", 60.0, "S", "beginning that is not judged"),
         _number("--seconds", 240.0, "S", "of the simulator's; default 240"),
     ),
-    "planner": _subject(
-        "hardware.bench.planner:run_planner",
-        "random poses into planner and guard: limits kept, cost of a step",
+    _subject("planner", "planner", "random poses into planner and guard: limits kept, cost of a step")(
         _number("--updates", 10_000, "N", "in all; default 10000"),
         _option("--arm", type=Path, metavar="ARM.toml", help="instead of the default arm"),
         _number("--seed", 0, None, "of the streams; runs with other seeds may go side by side"),
     ),
-    "segmentation": _subject(
-        "hardware.bench.pictures:run_segmentation",
-        "finding the wound: Dice, silence, a half covered one, time",
+    _subject("segmentation", "pictures", "finding the wound: Dice, silence, a half covered one, time")(
         _option("dataset", type=Path, nargs="?", metavar="DATASET", help="folder with images/ and labels/"),
         _option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
         _number("--rendered", 60, "N", "rendered pictures of each kind"),
         _option("--sheet", type=Path, metavar="X.jpg", help="also draw best, median and worst, 8 of each"),
         _number("--seed", 1, "N", "of pieces, covers and sizes drawn"),
     ),
-    "smoothing": _subject(
-        "hardware.bench.smoothing:run_smoothing",
-        "smoothed poses beside causal ones, clocks, time by length",
+    _subject("smoothing", "smoothing", "smoothed poses beside causal ones, clocks, time by length")(
         _option("--movements", nargs="*", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds; none: no worlds"),
         _option("--scenarios", nargs="*", choices=RENDERED, default=RENDERED, help="rendered, tracked and smoothed"),
         _number("--rendered", 8.0, "S", "of each scenario; kept rendered; default 8"),
@@ -286,28 +236,20 @@ SUBJECTS: Subjects = {
         _number("--adjusted", 4.0, "S", "of the bundle adjustment beside Ceres's; default 4, 0: none"),
         _number("--sessions", 40, "N", "smoothed by one and by two workers; default 40, 0: none"),
     ),
-    "steps": _subject(
-        "hardware.bench.detection:run_steps",
-        "movements of 300 um and 0.1 degree: how soon flagged, how often falsely",
+    _subject("steps", "detection", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely")(
         _number("--steps", 2000, None, "of each kind (default: %(default)s)"),
         _number("--hours", 1.0, None, "at rest (default: %(default)s)"),
         _number("--noise", 0.1, None, "px of a track in a frame (default: %(default)s)"),
         SEED,
     ),
-    "tracks": _subject(
-        "hardware.bench.mapping:run_tracks",
-        "scatter and creep of tracks before a surface that stands still",
+    _subject("tracks", "mapping", "scatter and creep of tracks before a surface that stands still")(
         _number("--minutes", 10.0, "M", "that are stood for; default 10"),
         _number("--pictures", 240, "N", "evenly over them; default 240"),
     ),
-    "views": _subject(
-        "hardware.bench.pictures:run_views",
-        "skin that deforms, grazing views with glare, a cube's edges",
-        _number("--seconds", 8.0, "S", "of each sequence; default 8"),
+    _subject("views", "pictures", "skin that deforms, grazing views with glare, a cube's edges")(
+        _number("--seconds", 8.0, "S", "of each sequence; default 8")
     ),
-    "thesis": _subject(
-        "hardware.bench.recordings:run_thesis",
-        "the thesis's estimator beside ours, on the same frame sets",
+    _subject("thesis", "recordings", "the thesis's estimator beside ours, on the same frame sets")(
         SESSIONS,
         _number("--seconds", 4.0, "S", "of each made recording; default 4"),
         _option(
@@ -317,4 +259,5 @@ SUBJECTS: Subjects = {
             help="which of the thesis's ways",
         ),
     ),
-}
+)
+SUBJECTS: Subjects = dict(_SUBJECTS)

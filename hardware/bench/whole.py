@@ -1,12 +1,13 @@
-"""Commands in processes of their own: all subjects in one go, and a live run as an operator would run it.
+"""Commands in processes of their own: all subjects one after the other, and a live run as an operator would run it.
 
-All subjects come to one table, a page to look at and Markdown for the documents, and what has become worse since a
-saved table. A live run has a terminal, keys, a look at its memory, and an end.
+All subjects give one table as JSON, an HTML page, Markdown for the documents, and a list of what is worse than in a
+saved table. A live run gets a terminal and keys; its memory is measured.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import pty
 import signal
@@ -14,10 +15,10 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from estimation.errors import InputError, StillbedError
 from hardware.bench.figures import Figure, Machine, Target, read_figures, table_text, this_machine, whole_text
@@ -28,8 +29,9 @@ from hardware.report.page import document, row_of_tiles, section, tile
 from hardware.report.summary import figure as digits
 
 Parts = Mapping[str, Sequence[Figure]]  # by the name of the part
-MAX_MISSES_NAMED = 3  # figures of a part that are named where they miss their target; of more, the count is
+MAX_MISSES_NAMED = 3  # figures of a part that are named where they miss their target; the others are counted
 PART_HEADER = ("figure", "value", "target", "", "reference", "note")
+COLOURS = {"met": ' class="met"', "MISSED": ' class="missed"'}  # by verdict
 
 
 def whole_page(parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, str], machine: Machine) -> str:
@@ -62,18 +64,17 @@ def measured_on(machine: Machine) -> str:
 
 
 def _overview(parts: Parts, troubles: Mapping[str, str]) -> str:
-    """A line for each part: how its figures fare, and which of them miss their target; its name leads to its card."""
+    """A line for each part: how many targets it meets, and which it misses; its name leads to its card."""
     rows = []
     for name, figures in parts.items():
         judged, missed, plain = counted({name: figures})
         what = [escape(figure.what) for figure in figures if figure.verdict == "MISSED"]
-        told = "; ".join(what[:MAX_MISSES_NAMED]) + (
-            f"; and {len(what) - MAX_MISSES_NAMED} more" if len(what) > MAX_MISSES_NAMED else ""
-        )
+        more = [f"and {len(what) - MAX_MISSES_NAMED} more"] if len(what) > MAX_MISSES_NAMED else []
+        misses = "; ".join([*what[:MAX_MISSES_NAMED], *more])
         link = f'<td><a href="#{escape(_place(name))}">{escape(name)}</a></td>'
         alarm = f'<span class="missed">{missed}</span>' if missed else "0"
         counts = f"<td>{judged - missed}</td><td>{alarm}</td><td>{plain}</td>"
-        rows.append(f'<tr>{link}{counts}<td class="words">{escape(troubles.get(name, "")) or told}</td></tr>')
+        rows.append(f'<tr>{link}{counts}<td class="words">{escape(troubles.get(name, "")) or misses}</td></tr>')
     head = '<th>part</th><th>met</th><th>missed</th><th>without a target</th><th class="words">which miss it</th>'
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     return section("Overview", "How many figures of each part meet their target.", table)
@@ -88,19 +89,14 @@ def _body(name: str, figures: Sequence[Figure], pages: Mapping[str, str]) -> str
     if not figures:
         return ""
     link = f'<p class="note"><a href="{escape(pages[name])}">the pictures</a></p>' if name in pages else ""
-    head = "".join(
-        f'<th class="words">{cell}</th>' if i > 3 else f"<th>{cell}</th>" for i, cell in enumerate(PART_HEADER)
-    )
-    rows = "".join(f"<tr>{_cells(figure)}</tr>" for figure in figures)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{link}"
-
-
-def _cells(figure: Figure) -> str:
-    what, value, target, verdict, *words = map(escape, _row(figure))
-    colour = {"met": ' class="met"', "MISSED": ' class="missed"'}.get(verdict, "")
-    numbers = "".join(f'<td class="whole">{cell}</td>' for cell in (value, target))
-    said = "".join(f'<td class="words">{cell}</td>' for cell in words)
-    return f"<td>{what}</td>{numbers}<td{colour}>{verdict}</td>{said}"
+    words = ' class="words"'
+    head = "".join(f"<th{words if i > 3 else ''}>{cell}</th>" for i, cell in enumerate(PART_HEADER))
+    rows = []
+    for what, value, target, verdict, reference, note in (map(escape, _row(figure)) for figure in figures):
+        numbers = f'<td class="whole">{value}</td><td class="whole">{target}</td>'
+        cells = f"<td>{what}</td>{numbers}<td{COLOURS.get(verdict, '')}>{verdict}</td>"
+        rows.append(f"<tr>{cells}<td{words}>{reference}</td><td{words}>{note}</td></tr>")
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>{link}"
 
 
 def _row(figure: Figure) -> tuple[str, ...]:
@@ -177,41 +173,36 @@ class MeasuredPart:
 
 
 def measure_all(out: Path, quick: bool, parts: Sequence[BenchPart] = BENCH_PARTS) -> list[MeasuredPart]:
-    """Measure every subject into a folder each of `out`; what stands there of the same commit and options is kept.
+    """Measure every subject into a folder each of `out`; figures there of the same commit and options are reused.
 
-    The table is written after each, so that one that is interrupted shows what it came to.
+    The table is written after each, so that an interrupted run leaves what it has measured.
     """
-    clock, machine, done = WallClock(), this_machine(), []
-    wanted = [(part, part.quick if quick else part.options) for part in parts]
-    chosen = [(part.subject, part.name or part.subject, options) for part, options in wanted if options is not None]
+    clock, machine, done = WallClock(), this_machine(), list[MeasuredPart]()
+    candidates = [(part, part.quick if quick else part.options) for part in parts]
+    chosen = [(part.subject, part.name or part.subject, options) for part, options in candidates if options is not None]
     for number, (subject, name, options) in enumerate(chosen, 1):
-        begun = clock.now()
-        one = _kept(out / name, options, machine) or _measured(out / name, subject, options)
-        taken = duration_text(clock.now() - begun)
-        print(f"{number} of {len(chosen)}: {subject} {' '.join(options)}, {taken}\n", flush=True)
-        print(one.trouble or table_text(one.figures), end="\n\n", flush=True)
-        done.append(one)
-        _save(out, done, machine)
+        start = clock.now()
+        part = _earlier(out / name, options, machine) or _measured(out / name, subject, options)
+        duration = duration_text(clock.now() - start)
+        print(f"{number} of {len(chosen)}: {subject} {' '.join(options)}, {duration}\n", flush=True)
+        print(part.trouble or table_text(part.figures), end="\n\n", flush=True)
+        done.append(part)
+        figures = {part.subject: part.figures for part in done}
+        troubles = {part.subject: part.trouble for part in done if part.trouble}
+        drawn = {part.subject: sorted((out / part.subject).glob("*.html")) for part in done}
+        pages = {name: files[0].relative_to(out).as_posix() for name, files in drawn.items() if files}
+        (out / FIGURES_FILE).write_text(whole_text(figures, machine), encoding="utf-8")
+        (out / PAGE_FILE).write_text(whole_page(figures, troubles, pages, machine), encoding="utf-8")
+        (out / TABLE_FILE).write_text(whole_markdown(figures, machine), encoding="utf-8")
     return done
 
 
-def _save(out: Path, done: Sequence[MeasuredPart], machine: Machine) -> None:
-    """The table so far: to read back, to look at, and for a document."""
-    parts = {one.subject: one.figures for one in done}
-    troubles = {one.subject: one.trouble for one in done if one.trouble}
-    drawn = {one.subject: sorted((out / one.subject).glob("*.html")) for one in done}
-    pages = {name: files[0].relative_to(out).as_posix() for name, files in drawn.items() if files}
-    (out / FIGURES_FILE).write_text(whole_text(parts, machine), encoding="utf-8")
-    (out / PAGE_FILE).write_text(whole_page(parts, troubles, pages, machine), encoding="utf-8")
-    (out / TABLE_FILE).write_text(whole_markdown(parts, machine), encoding="utf-8")
-
-
-def _kept(folder: Path, options: Sequence[str], machine: Machine) -> MeasuredPart | None:
-    """What an earlier run left, if it was of this very code, with these options."""
-    asked = folder / "options.json"
-    if not asked.is_file() or not (folder / FIGURES_FILE).is_file() or machine.commit.endswith("+"):
+def _earlier(folder: Path, options: Sequence[str], machine: Machine) -> MeasuredPart | None:
+    """The figures of an earlier run, if it was of this very code, with these options."""
+    file = folder / "options.json"
+    if not file.is_file() or not (folder / FIGURES_FILE).is_file() or machine.commit.endswith("+"):
         return None
-    if json.loads(asked.read_text(encoding="utf-8")) != [machine.commit, *options]:
+    if json.loads(file.read_text(encoding="utf-8")) != [machine.commit, *options]:
         return None
     return MeasuredPart(folder.name, tuple(read_figures(folder / FIGURES_FILE)))
 
@@ -228,35 +219,31 @@ def _measured(folder: Path, subject: str, options: Sequence[str]) -> MeasuredPar
 
 def summary(done: Sequence[MeasuredPart]) -> str:
     """How many targets were met, and the missed ones by name."""
-    judged = [(one.subject, f) for one in done for f in one.figures if f.target is not None]
+    judged = [(part.subject, f) for part in done for f in part.figures if f.target is not None]
     missed = [f"{subject}: {f.what} {f.value:.4g} {f.unit} ({f.target})" for subject, f in judged if f.verdict != "met"]
-    failed = [f"{one.subject}: {one.trouble}" for one in done if one.trouble]
+    failed = [f"{part.subject}: {part.trouble}" for part in done if part.trouble]
     return "\n  ".join([f"{len(judged) - len(missed)} of {len(judged)} targets met", *missed, *failed])
 
 
 def regressions(done: Sequence[MeasuredPart], file: Path) -> str:
     """What is worse than in a saved table: a target met no more, or a figure WORSE_FACTOR times farther from good."""
-    before = read_whole(file)
-    rows = []
-    for one in done:
-        for figure in one.figures:
-            then = before.get((one.subject, figure.what))
-            if then is not None and _worse(figure, then):
-                rows.append(f"{one.subject}: {figure.what} {then:.4g} -> {figure.value:.4g} {figure.unit}")
+    before, rows = read_whole(file), []
+    for name, figure in ((part.subject, figure) for part in done for figure in part.figures):
+        then = before.get((name, figure.what))
+        if then is not None and _worse(figure, then):
+            rows.append(f"{name}: {figure.what} {then:.4g} -> {figure.value:.4g} {figure.unit}")
     return "\n  ".join([f"worse than in {file}: {len(rows)}", *rows])
 
 
 def read_whole(file: Path) -> dict[tuple[str, str], float]:
     """The values of a saved table, by subject and figure; InputError where it is none."""
     try:
-        table: Any = json.loads(file.read_text(encoding="utf-8"))
-        subjects = table["subjects"]
+        subjects = json.loads(file.read_text(encoding="utf-8"))["subjects"]
         rows = ((name, row["what"], row["value"]) for name, part in subjects.items() for row in part)
         return {(name, what): float(value) for name, what, value in rows if value is not None}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            file, "table", error_text(error), "figures.json as `stillbed bench --all` writes it"
-        ) from error
+        allowed = "figures.json as `stillbed bench --all` writes it"
+        raise InputError(file, "table", error_text(error), allowed) from error
 
 
 def _worse(figure: Figure, before: float) -> bool:
@@ -268,18 +255,17 @@ def _worse(figure: Figure, before: float) -> bool:
 
 def _badness(target: Target, value: float) -> float:
     """How far from good, 1 at the limit: value by limit from above, limit by value from below."""
-    if target.high < float("inf") and target.low > -float("inf"):
-        middle, half = (target.high + target.low) / 2, (target.high - target.low) / 2
-        return abs(value - middle) / half if half else 0.0
-    if target.high < float("inf"):
-        return value / target.high if target.high else 0.0
-    return target.low / value if value else 0.0
+    low, high = target.low, target.high
+    part, whole = (low, value) if math.isinf(high) else (value, high)
+    if not math.isinf(low) and not math.isinf(high):
+        part, whole = abs(value - (high + low) / 2), (high - low) / 2
+    return part / whole if whole else 0.0
 
 
 def run_whole(out: Path, quick: bool, against: Path | None) -> None:
     """Measure, print, save and compare."""
     if against is not None:
-        read_whole(against)  # a wrong file is told before an hour of measuring
+        read_whole(against)  # a wrong file is reported before an hour of measuring
     out.mkdir(parents=True, exist_ok=True)
     machine = this_machine()
     print(f"{machine.cpu}, {machine.cores} cores, commit {machine.commit or 'unknown'}\n", flush=True)
@@ -288,21 +274,25 @@ def run_whole(out: Path, quick: bool, against: Path | None) -> None:
     if against is not None:
         print(regressions(done, against))
     print(f"\nthe whole table: {out / PAGE_FILE}, {out / TABLE_FILE} and {out / FIGURES_FILE}")
-    if any(one.trouble for one in done):
+    if any(part.trouble for part in done):
         raise StillbedError("not everything could be measured; what could is kept")
 
 
-PROCESS_PREFIX = "(sb-"  # of the processes of a run, as the system tells it
-MAP_PROCESS = "map"  # the processes of the tracking's own
-START_PATIENCE = 300.0  # s in which a run must have begun to print, on a busy machine
-LOOK_PERIOD = 0.005  # s
+PROCESS_PREFIX = "(sb-"  # of the names of a run's processes in /proc
+MAP_PROCESS = "map"  # what the tracking's own processes are called
+START_TIMEOUT = 300.0  # s in which a run must have begun to print, on a busy machine
+POLL_INTERVAL = 0.005  # s
 
 
 class LiveSession:
-    """A run in a process of its own. said: what it told so far. memory: s, and MB by process."""
+    """A run in a process of its own.
+
+    output: what it has printed so far.
+    memory: of each measurement, instant, s, and MB by process.
+    """
 
     def __init__(self, arguments: list[str]) -> None:
-        self.said = ""
+        self.output = ""
         self.memory: list[tuple[float, dict[str, float]]] = []
         self._clock = WallClock()
         self.keys, theirs = pty.openpty()
@@ -313,21 +303,21 @@ class LiveSession:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    def wait_for(self, words: str, after: int = 0, patience: float = START_PATIENCE) -> int:
-        """Wait until it said so beyond the first `after` characters; where that ended, -1 where it never did."""
-        until = self._clock.now() + patience
+    def wait_for(self, text: str, after: int = 0, timeout: float = START_TIMEOUT) -> int:
+        """Wait for a text beyond the first `after` characters of the output; where the text ends, -1: it never came."""
+        until = self._clock.now() + timeout
         while self._clock.now() < until:
-            if (place := self.said.find(words, after)) >= 0:
-                return place + len(words)
-            if self.process.poll() is not None and not self._reader.is_alive() and self.said.find(words, after) < 0:
+            if (place := self.output.find(text, after)) >= 0:
+                return place + len(text)
+            if self.process.poll() is not None and not self._reader.is_alive() and self.output.find(text, after) < 0:
                 return -1
-            self._clock.wait_until(self._clock.now() + LOOK_PERIOD)
+            self._clock.wait_until(self._clock.now() + POLL_INTERVAL)
         return -1
 
     @property
-    def last_words(self) -> str:
-        """The last two lines that it said, and how it ended."""
-        lines = [line for line in self.said.splitlines() if line.strip()]
+    def last_lines(self) -> str:
+        """The last two lines of the output, and how the run ended."""
+        lines = [line for line in self.output.splitlines() if line.strip()]
         code = self.process.poll()
         return f"{' / '.join(lines[-2:]) or 'nothing said'} ({'still runs' if code is None else f'exit code {code}'})"
 
@@ -340,21 +330,21 @@ class LiveSession:
         named = ((name, pid) for pid, name in _children(self.process.pid) if name.startswith(PROCESS_PREFIX))
         return {name.removeprefix(PROCESS_PREFIX): pid for name, pid in named}
 
-    def weigh(self) -> None:
-        """Note how much memory each of its processes but the virtual arm holds that no other has, MB."""
-        held: dict[str, float] = {}
-        own = {name: pid for name, pid in self.children().items() if name != "arm"}  # which keeps all that it ever did
+    def measure_memory(self) -> None:
+        """Note the unshared memory, MB, of each of its processes but the virtual arm, which stores all that it did."""
+        private: dict[str, float] = {}
+        own = {name: pid for name, pid in self.children().items() if name != "arm"}
         of_map = [(MAP_PROCESS, pid) for pid, _ in _children(own.get("tracking", -1))]
         for name, pid in [("run", self.process.pid), *own.items(), *of_map]:
             try:
                 resident, shared = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1:3]
             except (OSError, ValueError):
                 continue
-            held[name] = held.get(name, 0.0) + (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE") / 1e6
-        self.memory.append((self._clock.now(), held))
+            private[name] = private.get(name, 0.0) + (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        self.memory.append((self._clock.now(), private))
 
     def kill(self, name: str) -> float:
-        """Kill one of its processes, "run" for the one that conducts; the instant, s, NaN where there is none."""
+        """Kill one of its processes, "run" for the main process; the instant, s, NaN where there is none."""
         pid = self.process.pid if name == "run" else self.children().get(name)
         if pid is None:
             return float("nan")
@@ -362,15 +352,13 @@ class LiveSession:
         os.kill(pid, signal.SIGKILL)
         return now
 
-    def end(self, patience: float = START_PATIENCE) -> int | None:
-        """Wait for its end; its exit code."""
-        try:
-            return self.process.wait(patience)
-        except subprocess.TimeoutExpired:
-            return None
+    def end(self, timeout: float = START_TIMEOUT) -> None:
+        """Wait for its end."""
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout)
 
     def close(self) -> None:
-        """Leave nothing behind."""
+        """End what still runs."""
         if self.process.poll() is None:
             self.process.terminate()
             self.end(30.0)
@@ -381,12 +369,12 @@ class LiveSession:
     def _read(self) -> None:
         assert self.process.stderr is not None
         for line in self.process.stderr:
-            self.said += line
+            self.output += line
 
 
 def _children(parent: int) -> list[tuple[int, str]]:
-    """The processes that a process has started: each its number and name, which begins with a bracket."""
-    found = []
+    """Number and name, which begins with a bracket, of the processes that a process has started."""
+    children = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             text = (folder / "stat").read_text()
@@ -394,5 +382,5 @@ def _children(parent: int) -> list[tuple[int, str]]:
             continue
         name, rest = text[text.find("(") : text.rfind(")")], text[text.rfind(")") + 2 :].split()
         if int(rest[1]) == parent:
-            found.append((int(folder.name), name))
-    return found
+            children.append((int(folder.name), name))
+    return children

@@ -1,9 +1,9 @@
-"""Random commands before the guard, on and beside all its limits, judged by an oracle of its own.
+"""Random commands for the guard, on and beside all its limits, judged by an independent oracle.
 
-The oracle is written from the limits alone, it shares no arithmetic with the guard. It looks at all commands of a run
-at once, afterwards, and takes another way to each number: the surface's speed and the spread of a place by moving the
-place a little, the joints by where they bring the nozzle. A verdict is 1 where a limit is kept, -1 where it is broken
-and 0 within rounding of it.
+The oracle is written from the limits alone and shares no arithmetic with the guard. It judges all commands of a run at
+once, afterwards, and computes each number in another way: the surface's speed and a point's standard deviation by small
+steps of the point, the joints by forward kinematics. A verdict is 1 where a limit is kept, -1 where it is broken and 0
+within rounding of it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.bench.figures import Figure, at_most
+from hardware.bench.figures import Figure, at_most, columns
 from perception.package_data import shipped_file
 from planning.command import Command, Hold, Move
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
@@ -27,72 +27,68 @@ Flags = NDArray[np.bool_]
 Verdicts = NDArray[np.int_]
 
 ROUNDING_SHARE = 1e-12  # of a limit
-DIFFERENCE_ERROR = 1e-5  # of one whose number is differentiated by steps
+DIFFERENCE_ERROR = 1e-5  # of a limit whose number is differentiated by steps
 DIFFERENCE_STEP = 1e-5  # rad and mm, or s, of these steps
-ZONE_THIRDS = 40  # thirds: 1e-7 of a way
+ZONE_THIRDS = 40  # ternary search steps: 1e-7 of a segment
 ZONE_MARGIN = 1e-6  # mm, of a zone's surface
-REACH_TOLERANCE = 1e-6  # mm and rad: joints that bring the nozzle where it shall be
+REACH_TOLERANCE = 1e-6  # mm and rad, of the nozzle by forward kinematics
 
 
 @dataclass(slots=True)
 class GuardLog:
-    """What a guard was asked and let pass, in order, a row each; N rows.
+    """The commands a guard was given, in order, N rows."""
 
-    stamps, nows: (N,) s. axes: (N, 6). feeds: (N,). extrude, holds: (N,) bool, whether it was a hold. poses: N of them.
-    passed: (N,) bool.
-    """
-
-    stamps: Array
-    nows: Array
-    axes: Array
-    feeds: Array
-    extrude: Flags
-    holds: Flags
-    poses: list[SurfacePose | None]
-    passed: Flags
+    stamps: Array  # (N,) s, as the command states it
+    nows: Array  # (N,) s, when the guard was asked
+    axes: Array  # (N, 6)
+    feeds: Array  # (N,)
+    extrude: Flags  # (N,)
+    holds: Flags  # (N,) whether it was a Hold
+    poses: list[SurfacePose | None]  # N
+    passed: Flags  # (N,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GuardRules:
-    """What the guard was told. zone: (2, 3) mm. tick, lag: s."""
+    """The parameters of a guard."""
 
     arm: SimpleArm
     limits: MotionLimits
-    zone: Array
-    tick: float
-    lag: float
+    zone: Array  # (2, 3) mm
+    tick: float  # s
+    lag: float  # s
 
 
 def judge_guard(log: GuardLog, rules: GuardRules) -> NDArray[np.int_]:
-    """(4,) counts: asked, passed, passed though a limit is broken, refused though all are kept."""
+    """(4,) counts: all commands, passed, passed though a limit is broken, refused though all are kept."""
     before = _last(np.where((log.passed & ~log.holds)[:, None], log.axes, np.nan), rules.arm.home)
-    order, worth = _order(log), _worth(log, before, rules)
-    stopping = _stopping(log, order, worth, before, rules.limits)
-    trust = np.where(worth > 0, 1, np.where((worth == 0) & (stopping < 0), 0, stopping))
+    after = _last(np.where(log.passed, log.nows, np.nan), -np.inf)
+    order = _exactly(np.isfinite(log.nows) & (log.stamps == log.nows) & (log.nows > after))
+    pose = _pose_verdicts(log, before, rules)
+    # moves that follow no trusted pose: no ink, and soon and near at rest
+    sure, perhaps = (
+        _since_trusted(log, before, (order > 0) & trusted, rules.limits) for trusted in (pose > 0, pose >= 0)
+    )
+    stopping = np.where(log.extrude, -1, np.where(sure == perhaps, sure, 0))
+    trust = np.where(pose > 0, 1, np.where((pose == 0) & (stopping < 0), 0, stopping))
     parts = [_reach(log, rules), _motion(log, before, rules), _joints(log, before, rules), _zones(log, before, rules)]
-    moves = np.minimum.reduce([*parts, trust])
-    verdict = np.minimum(order, np.where(log.holds, 1, moves))
+    verdict = np.minimum(order, np.where(log.holds, 1, np.minimum.reduce([*parts, trust])))
     wrong = log.passed & (verdict < 0), ~log.passed & (verdict > 0)
     return np.array([len(verdict), log.passed.sum(), wrong[0].sum(), wrong[1].sum()])
 
 
 def _within(values: Array, limit: float | Array, rounding: float = ROUNDING_SHARE) -> Verdicts:
-    """Verdicts on values that must not exceed a limit; what is not a number does."""
-    kept, near = values <= limit * (1 - rounding), values <= limit * (1 + rounding)
-    return np.where(kept, 1, np.where(near, 0, -1))
+    """Verdicts on values that must not exceed a limit; NaN does."""
+    inside, near = values <= limit * (1 - rounding), values <= limit * (1 + rounding)
+    return np.where(inside, 1, np.where(near, 0, -1))
 
 
-def _exactly(kept: Flags) -> Verdicts:
-    return np.where(kept, 1, -1)
-
-
-def _every(flags: Flags) -> Flags:
-    """Whether all of a row are so (N,)."""
-    return np.asarray(flags.all(axis=1), bool)
+def _exactly(flags: Flags) -> Verdicts:
+    return np.where(flags, 1, -1)
 
 
 def _last(rows: Array, first: Array | float) -> Array:
-    """The row before each one that is not NaN, `first` where there is none yet."""
+    """The last row before each one that is not NaN, `first` where there is none yet."""
     known = ~np.isnan(rows.reshape(len(rows), -1)).any(axis=1)
     index = np.maximum.accumulate(np.where(known, np.arange(len(rows)), -1))
     index = np.concatenate([[-1], index[:-1]])
@@ -101,15 +97,9 @@ def _last(rows: Array, first: Array | float) -> Array:
     return filled
 
 
-def _order(log: GuardLog) -> Verdicts:
-    after = _last(np.where(log.passed, log.nows, np.nan), -np.inf)
-    return _exactly(np.isfinite(log.nows) & (log.stamps == log.nows) & (log.nows > after))
-
-
 def _reach(log: GuardLog, rules: GuardRules) -> Verdicts:
-    inside = _every((log.axes >= rules.limits.low) & (log.axes <= rules.limits.high))
-    feed: Flags = (log.feeds > 0) & (log.feeds <= rules.limits.feed)
-    return _exactly(_every(np.isfinite(log.axes)) & inside & feed)
+    inside = np.isfinite(log.axes) & (log.axes >= rules.limits.low) & (log.axes <= rules.limits.high)
+    return _exactly(inside.all(axis=1) & (log.feeds > 0) & (log.feeds <= rules.limits.feed))
 
 
 def _motion(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
@@ -125,20 +115,21 @@ def _joints(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     model = rules.arm.jointed
     if model is None:
         return np.ones(len(log.axes), int)
-    axes = np.where(_every(np.isfinite(log.axes))[:, None], log.axes, rules.arm.home)  # judged by _reach
+    finite = np.isfinite(log.axes).all(axis=1)
+    axes = np.where(finite[:, None], log.axes, rules.arm.home)  # judged by _reach
     after, start = joints_from_axes(model, axes), joints_from_axes(model, before)
-    known = _every(np.isfinite(after))
+    known = np.isfinite(after).all(axis=1)
     after = np.where(known[:, None], after, 0.0)
-    off = np.abs(nozzle_from_joints(model, after)[:, :3, 3] - axes[:, :3]).max(axis=1)
-    off = np.maximum(off, np.abs(after[:, 3:] - axes[:, 3:]).max(axis=1))
-    inside = _exactly(_every((after >= model.low) & (after <= model.high)))
+    error = np.abs(nozzle_from_joints(model, after)[:, :3, 3] - axes[:, :3]).max(axis=1)
+    error = np.maximum(error, np.abs(after[:, 3:] - axes[:, 3:]).max(axis=1))
+    inside = _exactly(((after >= model.low) & (after <= model.high)).all(axis=1))
     speed = _within(np.abs(after - start), model.speed * rules.tick).min(axis=1)
-    return np.where(known & (off < REACH_TOLERANCE), np.minimum(inside, speed), -1)
+    return np.where(known & (error < REACH_TOLERANCE), np.minimum(inside, speed), -1)
 
 
 def _zones(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
-    """Verdicts on the tip's straight ways: how far outside is convex along each, so thirds close in on its least."""
-    finite = _every(np.isfinite(log.axes))
+    """Verdicts on the tip's straight segments: ternary search for the least distance outside, convex along each."""
+    finite = np.isfinite(log.axes).all(axis=1)
     start, end = (
         np.linalg.solve(rules.arm.arm_from_base, np.column_stack([axes[:, :3], np.ones(len(axes))]).T)[:3].T
         for axes in (before, np.where(finite[:, None], log.axes, before))
@@ -148,20 +139,17 @@ def _zones(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
         low, high = np.zeros(len(start)), np.ones(len(start))
         for _ in range(ZONE_THIRDS):
             left, right = low + (high - low) / 3, high - (high - low) / 3
-            nearer = _outside(zone, _between(start, end, left)) < _outside(zone, _between(start, end, right))
+            nearer = _outside(zone, start, end, left) < _outside(zone, start, end, right)
             low, high = np.where(nearer, low, left), np.where(nearer, right, high)
         shares = (np.zeros(len(start)), (low + high) / 2, np.ones(len(start)))
-        least = np.min([_outside(zone, _between(start, end, share)) for share in shares], axis=0)
+        least = np.min([_outside(zone, start, end, share) for share in shares], axis=0)
         verdict = np.minimum(verdict, np.where(least > ZONE_MARGIN, 1, np.where(least > -ZONE_MARGIN, 0, -1)))
     return np.where(finite, verdict, -1)
 
 
-def _between(start: Array, end: Array, share: Array) -> Array:
-    return start + share[:, None] * (end - start)
-
-
-def _outside(zone: NoGo, places: Array) -> Array:
-    """How far outside a zone places (N, 3) are, mm, along its farthest face; negative inside."""
+def _outside(zone: NoGo, start: Array, end: Array, share: Array) -> Array:
+    """Distance (N,), mm, outside a zone by its farthest face, negative inside, at a share (N,) of segments (N, 3)."""
+    places = start + share[:, None] * (end - start)
     faces = (places[:, None] * zone.normals).sum(axis=2) - zone.offsets
     along = places - zone.axis[0]
     axis = zone.axis[1] - zone.axis[0]
@@ -169,25 +157,20 @@ def _outside(zone: NoGo, places: Array) -> Array:
     return np.asarray(np.maximum(faces.max(axis=1), np.sqrt((off**2).sum(axis=1)) - zone.radius))
 
 
-def _stopping(log: GuardLog, order: Verdicts, worth: Verdicts, before: Array, limits: MotionLimits) -> Verdicts:
-    """Verdicts on moves that follow no pose worth it: no ink, and soon and near at rest."""
-    sure, perhaps = (_since(log, before, (order > 0) & trusted, limits) for trusted in (worth > 0, worth >= 0))
-    either = np.where(sure == perhaps, sure, 0)
-    return np.where(log.extrude, -1, either)
-
-
-def _since(log: GuardLog, before: Array, trusted: Flags, limits: MotionLimits) -> Verdicts:
+def _since_trusted(log: GuardLog, before: Array, trusted: Flags, limits: MotionLimits) -> Verdicts:
+    """Verdicts on time and way since the last command with a trusted pose."""
     at = _last(np.where(trusted, log.nows, np.nan), -np.inf)
     place = _last(np.where(trusted[:, None], before, np.nan), np.nan)
     way = np.sqrt(((log.axes - place)[:, :3] ** 2).sum(axis=1))
     return np.minimum(_within(log.nows - at, limits.stop_time), _within(way, limits.stop_distance))
 
 
-def _worth(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
-    """Verdicts on the poses."""
+def _pose_verdicts(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
+    """Verdicts on the poses; a pose that is not there is replaced by a LOST one, and refused."""
+    none = np.eye(4), np.zeros((6, 6)), np.zeros(6), TrackState.LOST
     there = np.array([pose is not None for pose in log.poses])
-    poses = [_standing(now) if pose is None else pose for pose, now in zip(log.poses, log.nows, strict=True)]
-    numbers = [np.array([getattr(pose, name) for pose in poses]) for name in _POSE_NUMBERS]
+    poses = [pose or SurfacePose(now, *none) for pose, now in zip(log.poses, log.nows, strict=True)]
+    numbers = columns(poses, *_POSE_NUMBERS)
     stamps, base, covariance, twist, drift, psd = numbers
     finite = np.all([np.isfinite(n.reshape(len(n), -1)).all(axis=1) for n in numbers], axis=0)
     measured = np.array([pose.state in (TrackState.TRACKING, TrackState.DEGRADED) for pose in poses])
@@ -195,15 +178,22 @@ def _worth(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     ahead = (age + rules.tick + rules.lag)[:, None, None]
     spread = covariance + ahead**2 * drift + ahead**3 / 3 * (psd[:, :, None] * np.eye(6))
     usable = finite[:, None, None]
-    place = _place(np.where(usable, base, np.eye(4)), before, rules)
-    error, speed = _error(place, np.where(usable, spread, 0.0)), _speed(place, np.where(finite[:, None], twist, 0.0))
+    # the point of the print zone, surface frame, where the nozzle is or to which it is nearest; the tip is at X Y Z
+    arm_from_surface = rules.arm.arm_from_base @ np.where(usable, base, np.eye(4))
+    tip = np.column_stack([before[:, :3], np.ones(len(before))])
+    place = np.clip(np.linalg.solve(arm_from_surface, tip[:, :, None])[:, :3, 0], *rules.zone)
+    velocity = _differentiated(place, np.where(finite[:, None], twist, 0.0))
+    jacobian = np.stack([_differentiated(place, axis[None]) for axis in np.eye(6)], axis=-1)
+    # standard deviation along the worst direction
+    position_covariance = jacobian @ np.where(usable, spread, 0.0) @ np.swapaxes(jacobian, 1, 2)
+    error = np.sqrt(np.linalg.norm(position_covariance, 2, axis=(1, 2)))
     limits = rules.limits
     verdicts = [
         _exactly(there & finite & measured),
         _exactly(age >= 0),
         _within(age, limits.pose_age),
         _within(error, limits.pose_error, DIFFERENCE_ERROR),
-        _within(speed, limits.surface_speed, DIFFERENCE_ERROR),
+        _within(np.linalg.norm(velocity, axis=1), limits.surface_speed, DIFFERENCE_ERROR),
         _within(np.sqrt((twist[:, :3] ** 2).sum(axis=1)), limits.surface_turn),
     ]
     return np.asarray(np.minimum.reduce(verdicts))
@@ -212,59 +202,33 @@ def _worth(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
 _POSE_NUMBERS = ("stamp", "base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd")
 
 
-def _standing(stamp: float) -> SurfacePose:
-    """Stands in for a pose that is not there."""
-    return SurfacePose(stamp, np.eye(4), np.zeros((6, 6)), np.zeros(6), TrackState.LOST)
+def _differentiated(place: Array, twist: Array) -> Array:
+    """Velocity (N, 3) of places (N, 3) of the surface, in its own frame, under a twist (..., 6), by differences."""
+    points = np.concatenate([place, np.ones((len(place), 1))], 1)[:, :, None]
+    there, back = ((se3.exp(step * twist) @ points)[:, :3, 0] for step in (DIFFERENCE_STEP, -DIFFERENCE_STEP))
+    return np.asarray((there - back) / (2 * DIFFERENCE_STEP))
 
 
-def _place(base_from_surface: Array, axes: Array, rules: GuardRules) -> Array:
-    """Where in the zone the nozzle is, or is nearest to (N, 3), in the surface frame. The tip is at X Y Z."""
-    tip = np.column_stack([axes[:, :3], np.ones(len(axes))])
-    arm_from_surface = rules.arm.arm_from_base @ base_from_surface
-    return np.clip(np.linalg.solve(arm_from_surface, tip[:, :, None])[:, :3, 0], *rules.zone)
-
-
-def _moved(place: Array, by: Array) -> Array:
-    """Places (N, 3) after small motions (..., 6) of the surface under them, in its own frame."""
-    return np.asarray((se3.exp(by) @ np.concatenate([place, np.ones((len(place), 1))], 1)[:, :, None])[:, :3, 0])
-
-
-def _speed(place: Array, twist: Array) -> Array:
-    return np.asarray(
-        np.linalg.norm(_moved(place, DIFFERENCE_STEP * twist) - _moved(place, -DIFFERENCE_STEP * twist), axis=1)
-        / (2 * DIFFERENCE_STEP)
-    )
-
-
-def _error(place: Array, spread: Array) -> Array:
-    """Standard deviation (N,), mm, of places (N, 3) along the worst direction, for covariances (N, 6, 6)."""
-    steps = DIFFERENCE_STEP * np.eye(6)
-    columns = [_moved(place, step[None]) - _moved(place, -step[None]) for step in steps]
-    jacobian = np.stack(columns, axis=-1) / (2 * DIFFERENCE_STEP)
-    variance = np.linalg.norm(jacobian @ spread @ np.swapaxes(jacobian, 1, 2), 2, axis=(1, 2))
-    return np.asarray(np.sqrt(variance))
-
-
-COMMANDS_A_RUN = 10_000  # commands of one run
+COMMANDS_A_RUN = 10_000
 PRINT_ZONE = np.array([[-20.0, -20, -1], [20, 20, 5]])
 SURFACE_REST = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # base_from_surface
 TICK_S, ARM_LAG = 0.02, 0.024  # s
 AXES_BOX = np.array([12.0, 12, 12, 0.15, 0.15, 0.15])  # mm and rad about home
-POSE_OUTAGE = 0.01, 0.8  # share of the poses at which the surface is lost, and s for which at most
+OUTAGE_SHARE, MAX_OUTAGE_S = 0.01, 0.8  # share of the poses at which the surface is lost, and for how long at most
 TRACK_STATES = list(TrackState)
 
 
 def guard_figures(commands: int, seed: int) -> list[Figure]:
-    """How many random commands passed that break a limit, and the other way round."""
+    """How many random commands passed though they break a limit, and were refused though they keep all."""
     arms = simple_rules(), simple_rules(), simple_rules(), jointed_rules()
     counts = np.zeros(4, int)
     for k in range(max(1, round(commands / COMMANDS_A_RUN))):
         rules = arms[k % len(arms)]
         counts += judge_guard(random_log(seed + k, min(COMMANDS_A_RUN, commands), rules), rules)
-    asked, passed, broken, refused = counts.tolist()
+    count, passed, broken, refused = counts.tolist()
     what = "guard: random commands"
     return [
-        Figure(what, asked, "", note=f"{passed} passed; one in four runs with an arm that is sent its joints"),
+        Figure(what, count, "", note=f"{passed} passed; one in four runs with an arm that is sent its joints"),
         Figure(f"{what} that break a limit and passed", broken, "", at_most(0), "", "by an independent oracle"),
         Figure(f"{what} that keep all and were refused", refused, "", at_most(0)),
     ]
@@ -284,18 +248,15 @@ def jointed_rules() -> GuardRules:
 
 
 def boxed_limits(limits: MotionLimits) -> MotionLimits:
-    """The limits with bounds so near home that random steps meet them."""
+    """The limits with bounds, and a zone of each kind, so near home that random steps meet them."""
     home = SimpleArm().home
-    return replace(limits, low=home - AXES_BOX, high=home + AXES_BOX, zones=zones_about(home[:3]))
-
-
-def zones_about(home: Array) -> tuple[NoGo, ...]:
-    """One zone of each kind about a place (3,), mm, that steps there meet: a bed below, a block and a post."""
-    return (
-        half_space("bed", np.array([0.1, 0, 1.0]), home - [0, 0, 9]),
-        box("block", home + [5, 4, 2], home + [9, 8, 9]),
-        cylinder("post", home - [7, 6, 20], home - [7, 6, -20], 1.5),
+    tip = home[:3]
+    zones = (
+        half_space("bed", np.array([0.1, 0, 1.0]), tip - [0, 0, 9]),
+        box("block", tip + [5, 4, 2], tip + [9, 8, 9]),
+        cylinder("post", tip - [7, 6, 20], tip - [7, 6, -20], 1.5),
     )
+    return replace(limits, low=home - AXES_BOX, high=home + AXES_BOX, zones=zones)
 
 
 def random_log(seed: int, count: int, rules: GuardRules, guard: Guard | None = None) -> GuardLog:
@@ -307,8 +268,8 @@ def random_log(seed: int, count: int, rules: GuardRules, guard: Guard | None = N
     for _ in range(count):
         now += draw.choice([TICK_S, 0.1, 0.0, -TICK_S], p=[0.9, 0.06, 0.02, 0.02])
         stamp = now if draw.random() < 0.98 else now + draw.choice([1e-9, -TICK_S, np.nan])
-        if draw.random() < POSE_OUTAGE[0]:
-            lost_until = now + draw.uniform(0, POSE_OUTAGE[1])
+        if draw.random() < OUTAGE_SHARE:
+            lost_until = now + draw.uniform(0, MAX_OUTAGE_S)
         pose = None if now < lost_until else random_pose(draw, now, rules)
         axes, feed = random_move(draw, guard.axes, rules)
         hold, extrude = draw.random() < 0.05, draw.random() < 0.5
@@ -327,10 +288,8 @@ def random_move(draw: np.random.Generator, before: Array, rules: GuardRules) -> 
     near = draw.choice([0.2, 0.5, 1.0, 1 + 1e-9, 1 - 1e-9, 1.5], p=[0.5, 0.38, 0.03, 0.03, 0.03, 0.03])
     near = near * draw.choice([1.0, 0.05])
     way = draw.normal(size=6) * limits.speed + draw.choice([0.0, 0.0, 3.0]) * (rules.arm.home - before)
-    share = max(
-        np.abs(way / limits.speed).max(), float(np.linalg.norm(way[:3])) * TICK_S / limits.jump
-    )  # of the limits
-    axes = before + near * TICK_S * way / share
+    of_limits = max(np.abs(way / limits.speed).max(), float(np.linalg.norm(way[:3])) * TICK_S / limits.jump)
+    axes = before + near * TICK_S * way / of_limits
     if draw.random() < 0.03:
         axis = draw.integers(6)
         low, high = limits.low[axis], limits.high[axis]
@@ -355,8 +314,6 @@ def random_pose(draw: np.random.Generator, now: float, rules: GuardRules) -> Sur
     if draw.random() < 0.01:
         twist[draw.integers(6)] = np.nan
     base = SURFACE_REST @ se3.exp(draw.normal(size=6) * [0.05, 0.05, 0.05, 3, 3, 3])
-    drift, psd = (
-        np.diag([0, 0, 0, 1.0, 1, 1]) * draw.choice([0.0, 1.0]),
-        np.array([0, 0, 0, 1.0, 1, 1]) * draw.choice([0, 5]),
-    )
+    shifts = np.array([0, 0, 0, 1.0, 1, 1])
+    drift, psd = np.diag(shifts) * draw.choice([0.0, 1.0]), shifts * draw.choice([0, 5])
     return SurfacePose(now - age, base, covariance, twist, state, drift, psd)

@@ -1,8 +1,8 @@
-"""The motion process on a pty in real time: jitter, stops, and what arrives, beside processes that saturate the cores.
+"""The motion process on a pty in real time: jitter, stops, and what arrives, while other processes saturate the cores.
 
 Three processes as in a live run: a virtual arm that serves a pty, the motion process, and this one, which gives poses
-and orders; and some that only burn. The motion process is halted now and then, as a busy machine would; the device goes
-and comes back; the controller stalls and the wire loses frames.
+and orders; and some that only use up processor time. The motion process is halted now and then, as by a busy machine;
+the device goes and comes back; the controller stalls and the wire loses frames.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.bench.figures import Figure, at_least, at_most
+from hardware.bench.figures import Figure, at_least, at_most, milliseconds
 from hardware.motion.loop import Order
 from hardware.motion.step import MotionPlan, MotionReport, motion_process
 from hardware.process.clock import WallClock
@@ -38,58 +38,53 @@ from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.path import Path as Toolpath
 
 DEVICE_SPAN = 40.0  # s with one device, where it goes and comes back
-POSE_RATE = 30.0  # poses a second
-ORDER_STOP_PERIOD = 3.0  # s between the operator's stops
+POSE_RATE = 30.0  # Hz
+STOP_PERIOD = 3.0  # s between the operator's stops
 HALT_PERIOD, MAX_HALT = 6.0, 0.6  # s between halts of the motion process, and of the longest
-READY_PATIENCE = 60.0  # s in which a process must have started, on a busy machine
+START_TIMEOUT = 60.0  # s in which a process must have started, on a busy machine
 NOT_MEASURED = float("nan")
-CALM_PART, HALTED_PART, ROUGH_PART = (
-    "calm",
-    "halted",
-    "rough",
-)  # what goes wrong: nothing, host and port, the arm and its wire
-LIVE_PARTS = (CALM_PART, HALTED_PART, ROUGH_PART)
+# what goes wrong: nothing; host and port; the arm and its wire
+CALM_PART, HALTED_PART, ROUGH_PART = LIVE_PARTS = "calm", "halted", "rough"
 
 
 @dataclass(frozen=True, slots=True)
 class ArmReport:
-    """What a virtual arm found."""
+    """What a virtual arm counted."""
 
     frames: int
     ignored: int
     refused: int
     garbage: int  # bytes
-    deepest: float  # s that its queue was ever ahead
-    left: float  # s of it at its end
+    deepest: float  # s, the most that was ever queued
+    left: float  # s, queued at its end
 
 
 @dataclass(slots=True)
 class LivePart:
-    """What came of one part. Times in s."""
+    """The measurements of one part. Times in s."""
 
     arms: list[ArmReport] = field(default_factory=list)
-    flight: float = 0.0
-    stops: list[float] = field(default_factory=list)  # decided to on the wire
-    orders: list[float] = field(default_factory=list)  # ordered to on the wire
+    flight: float = 0.0  # most under way, by the link's model
+    stops: list[float] = field(default_factory=list)  # from the decision to the wire
+    orders: list[float] = field(default_factory=list)  # from the order to the wire
     load: list[float] = field(default_factory=list)
     halts: int = 0
     report: MotionReport | None = None
-    rate: float = NOT_MEASURED
+    rate: float = NOT_MEASURED  # ticks a second
 
 
 def live_figures(seconds: float, seed: int, busy: int, real_time: bool) -> list[Figure]:
     """Three parts of equal length: a calm one, whose jitter counts, one with halts and returns, one with a bad arm."""
-    calm, halted, rough = parts = [
-        run_part(seconds / 3, seed + k, busy, real_time, part) for k, part in enumerate(LIVE_PARTS)
-    ]
+    parts = [run_part(seconds / 3, seed + k, busy, real_time, part) for k, part in enumerate(LIVE_PARTS)]
+    calm, halted, rough = parts
     name = f"real time {seconds / 60:.3g} min"
     arms = [arm for part in parts for arm in part.arms]
     obeying = calm.arms + halted.arms
     load, report = np.mean([*calm.load, *halted.load, *rough.load] or [NOT_MEASURED]), calm.report
-    granted, late, skipped = (
-        ("", (NOT_MEASURED,) * 3, 0) if report is None else (report.priority, report.late, report.skipped)
-    )
-    machine = f"{granted}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
+    priority, late, skipped = "", (NOT_MEASURED,) * 3, 0
+    if report is not None:
+        priority, late, skipped = report.priority, report.late, report.skipped
+    machine = f"{priority}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
     stops, orders = calm.stops + halted.stops + rough.stops, calm.orders + rough.orders
     note = f"{halted.halts} halts up to 600 ms, {len(halted.arms) - 1} returns of the device"
     decided, moving = f"{name}: stop on the wire after its decision, 99 %", sum(p.arms[-1].left > 0 for p in parts[:2])
@@ -98,8 +93,9 @@ def live_figures(seconds: float, seed: int, busy: int, real_time: bool) -> list[
         Figure(f"{name}: tick late, median", 1000 * late[0], "ms"),
         Figure(f"{name}: tick late, 99 %", 1000 * late[1], "ms", at_most(3), "8 in a process, 72 in a thread"),
         Figure(f"{name}: tick late, largest", 1000 * late[2], "ms", note=f"{skipped} ticks were skipped"),
-        Figure(decided, _most(stops), "ms", at_most(10), note=f"{len(stops)} stops"),
-        Figure(f"{name}: stop on the wire after the order, 99 %", _most(orders), "ms", note="from another process"),
+        Figure(decided, milliseconds(stops, 99), "ms", at_most(10), note=f"{len(stops)} stops"),
+        Figure(f"{name}: stop on the wire after the order, 99 %", milliseconds(orders, 99), "ms",
+               note="from another process"),
         Figure(f"{name}: most under way, by the model", 1000 * max(p.flight for p in parts), "ms", at_most(50)),
         Figure(f"{name}: most queued in the arm", _queued(obeying), "ms", at_most(50), "", note),
         Figure(f"{name}: most queued, the arm stalls and loses frames", _queued(rough.arms), "ms"),
@@ -108,11 +104,7 @@ def live_figures(seconds: float, seed: int, busy: int, real_time: bool) -> list[
         Figure(f"{name}: frames that the arm refused", sum(a.refused for a in obeying), "", at_most(0)),
         Figure(f"{name}: arms not at rest once the motion has ended", moving, "", at_most(0), "", "of 2"),
         Figure(f"{name}: frames taken", sum(a.frames for a in arms)),
-    ]
-
-
-def _most(seconds: list[float]) -> float:
-    return 1000 * float(np.percentile(seconds, 99)) if seconds else NOT_MEASURED
+    ]  # fmt: skip
 
 
 def _queued(arms: list[ArmReport]) -> float:
@@ -124,7 +116,8 @@ def run_part(seconds: float, seed: int, busy: int, real_time: bool, part: str) -
     context, clock = multiprocessing.get_context("spawn"), WallClock()
     poses, reports = SharedLatest[SurfacePose](), SharedLatest[MotionReport]()
     orders, theirs = context.Pipe()
-    with tempfile.TemporaryDirectory() as folder, _burning(busy):
+    burning = [context.Process(target=_burn, daemon=True) for _ in range(busy)]
+    with tempfile.TemporaryDirectory() as folder, _running(*burning):
         link = Path(folder) / "arm"
         arm = _VirtualArm(link, seed, part == ROUGH_PART)
         plan = MotionPlan(_toolpath(), ArmProfile(), str(link), real_time=real_time)
@@ -138,18 +131,16 @@ def run_part(seconds: float, seed: int, busy: int, real_time: bool, part: str) -
             begun = device = clock.now()
             while (now := clock.now()) < begun + seconds:
                 poses.put(_pose(now))
-                operator.look(reports.get(), now)
+                operator.act(reports.get(), now)
                 if part == HALTED_PART and now > device + DEVICE_SPAN:
-                    operator.seen.arms.append(arm.end())
+                    operator.measured.arms.append(arm.end())
                     arm, device = _VirtualArm(link, seed, False), clock.now()
                 clock.wait_until(now + 1 / POSE_RATE)
             operator.end(reports.get())
-            operator.seen.arms.append(arm.end())
+            operator.measured.arms.append(arm.end())
         finally:
-            motion.kill()
-            motion.join()
-            arm.kill()
-    return operator.seen
+            _kill(motion, arm.process)
+    return operator.measured
 
 
 class _VirtualArm:
@@ -157,34 +148,27 @@ class _VirtualArm:
 
     def __init__(self, link: Path, seed: int, bad: bool) -> None:
         context = multiprocessing.get_context("spawn")
-        self._found, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(link, seed, bad, theirs))
-        self._process.start()
+        self._reports, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(link, seed, bad, theirs))
+        self.process.start()
         _wait(link.is_symlink)
 
     def end(self) -> ArmReport:
-        """Have it end; what it found."""
-        pid = self._process.pid
-        assert pid is not None
-        os.kill(pid, signal.SIGTERM)
-        assert self._found.poll(READY_PATIENCE)
-        found: ArmReport = self._found.recv()
-        self._process.join()
-        return found
-
-    def kill(self) -> None:
-        """End it whatever it does."""
-        self._process.kill()
-        self._process.join()
+        """Have it end; its report."""
+        self.process.terminate()
+        assert self._reports.poll(START_TIMEOUT)
+        report: ArmReport = self._reports.recv()
+        self.process.join()
+        return report
 
 
-def _serve(link: Path, seed: int, bad: bool, found: Connection) -> None:
+def _serve(link: Path, seed: int, bad: bool, reports: Connection) -> None:
     ask_for_real_time()  # a real controller shares no core with us
     settings = ArmSettings(replies=ReplyMode.STREAM, seed=seed)
     with redirect_stdout(StringIO()):
         arm = run_virtual_arm(settings, faults=_faults(seed) if bad else (), link=link)
     garbage = sum(len(data) for _, data in arm.garbage)
-    found.send(ArmReport(arm.frames, len(arm.ignored), len(arm.refused), garbage, arm.deepest, arm.in_flight))
+    reports.send(ArmReport(arm.frames, len(arm.ignored), len(arm.refused), garbage, arm.deepest, arm.in_flight))
 
 
 def _faults(seed: int) -> list[Fault]:
@@ -202,69 +186,70 @@ WIRE_FAULTS = (FaultKind.STALL, FaultKind.STALL, FaultKind.DROP, FaultKind.UNPLU
 
 
 class _Operator:
-    """Arms, stops and arms again, halts the motion process, and keeps what it reports."""
+    """Arms, stops and arms again, halts the motion process, and collects what it reports."""
 
     def __init__(self, orders: Connection, motion: BaseProcess, rng: np.random.Generator, halts: bool) -> None:
-        self.seen = LivePart()
+        self.measured = LivePart()
         self._orders, self._motion, self._rng, self._halts = orders, motion, rng, halts
-        self._stop = self._halt = self._ask = 0.0
-        self._ordered: float | None = None
+        self._stop = self._halt = self._arm = 0.0  # s, when each is due
+        self._stop_sent: float | None = None
         self._first: MotionReport | None = None
         self._clock = WallClock()
 
-    def look(self, report: MotionReport | None, now: float) -> None:
+    def act(self, report: MotionReport | None, now: float) -> None:
         """Read a report, and do what is due at `now`, s."""
         assert report is not None
         self._first = self._first or report
-        status, seen = report.tick.status, self.seen
-        seen.flight = max(seen.flight, status.in_flight)
-        if report.stop is not None and self._ordered is not None and report.stop[0] > self._ordered:
-            seen.stops.append(report.stop[1] - report.stop[0])
-            seen.orders.append(report.stop[1] - self._ordered)
-            self._ordered = None
+        status, measured = report.tick.status, self.measured
+        measured.flight = max(measured.flight, status.in_flight)
+        if report.stop is not None and self._stop_sent is not None and report.stop[0] > self._stop_sent:
+            measured.stops.append(report.stop[1] - report.stop[0])
+            measured.orders.append(report.stop[1] - self._stop_sent)
+            self._stop_sent = None
         if status.state is ArmState.ARMED:
             self._disturb(now)
-        elif now > self._ask:
+        elif now > self._arm:
             self._orders.send(Order.HOME if report.tick.answer.code is LinkCode.FAR_FROM_PATH else Order.ARM)
-            self._ask = now + 0.5
+            self._arm = now + 0.5
             self._stop = max(self._stop, now + 1.0)
 
     def _disturb(self, now: float) -> None:
-        if now > self._stop and self._ordered is None:
-            self.seen.load.append(os.getloadavg()[0])
-            self._ordered = self._clock.now()
+        if now > self._stop and self._stop_sent is None:
+            self.measured.load.append(os.getloadavg()[0])
+            self._stop_sent = self._clock.now()
             self._orders.send(Order.STOP)
-            self._stop = now + ORDER_STOP_PERIOD * self._rng.uniform(0.8, 1.2)
+            self._stop = now + STOP_PERIOD * self._rng.uniform(0.8, 1.2)
         elif self._halts and now > self._halt and self._motion.pid is not None:
             self._halt = now + HALT_PERIOD * self._rng.uniform(0.5, 1.5)
             os.kill(self._motion.pid, signal.SIGSTOP)
             self._clock.wait_until(now + self._rng.uniform(0.02, MAX_HALT))
             os.kill(self._motion.pid, signal.SIGCONT)
-            self.seen.halts += 1
+            self.measured.halts += 1
 
     def end(self, report: MotionReport | None) -> None:
-        """Have the motion end, and keep its last report."""
+        """Have the motion end, after its last report."""
         self._orders.send(Order.QUIT)
-        self._motion.join(READY_PATIENCE)
-        self.seen.report = report
+        self._motion.join(START_TIMEOUT)
+        self.measured.report = report
         if report is not None and self._first is not None:
-            spent = report.tick.stamp - self._first.tick.stamp
-            self.seen.rate = (report.ticks - self._first.ticks) / spent
+            seconds = report.tick.stamp - self._first.tick.stamp
+            self.measured.rate = (report.ticks - self._first.ticks) / seconds
 
 
 @contextmanager
-def _burning(count: int) -> Iterator[None]:
-    """So many processes that only burn."""
-    context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=_burn, daemon=True) for _ in range(count)]
+def _running(*processes: BaseProcess) -> Iterator[None]:
     for process in processes:
         process.start()
     try:
         yield
     finally:
-        for process in processes:
-            process.kill()
-            process.join()
+        _kill(*processes)
+
+
+def _kill(*processes: BaseProcess) -> None:
+    for process in processes:
+        process.kill()
+        process.join()
 
 
 def _burn() -> None:
@@ -276,7 +261,7 @@ def _burn() -> None:
 
 def _wait(ready: Callable[[], bool]) -> None:
     clock = WallClock()
-    until = clock.now() + READY_PATIENCE
+    until = clock.now() + START_TIMEOUT
     while not ready():
         assert clock.now() < until, "a process did not start"
         clock.wait_until(clock.now() + 0.02)
@@ -286,9 +271,8 @@ def _toolpath() -> Toolpath:
     """Lines of 20 mm that take a quarter of an hour to print."""
     across = np.linspace(-10, 10, 240)
     xy = np.array([[x, y] for i, y in enumerate(across) for x in np.array([-10.0, 10.0]) * (-1) ** i])
-    count = len(xy)
+    count, ones = len(xy), np.ones(len(xy), np.int64)
     places = se3.make(np.eye(3), np.column_stack([xy, np.zeros(count)]))
-    ones = np.ones(count, np.int64)
     return Toolpath(places, np.full(count, 5.0), ones, np.full(count, 20.0), 0 * ones, np.ones(count, bool))
 
 
@@ -300,7 +284,5 @@ def _pose(now: float) -> SurfacePose:
 
 
 def _base(now: float) -> Array:
-    phase = np.pi / 2 * now  # 15 a minute
-    return np.asarray(
-        ARM_FROM_BENCH @ se3.exp(np.array([0.03 * np.sin(phase), 0.02 * np.cos(phase), 0, 0, 0, 5 * np.sin(phase)]))
-    )
+    sine, cosine = np.sin(np.pi / 2 * now), np.cos(np.pi / 2 * now)  # 15 breaths a minute
+    return np.asarray(ARM_FROM_BENCH @ se3.exp(np.array([0.03 * sine, 0.02 * cosine, 0, 0, 0, 5 * sine])))
