@@ -24,7 +24,7 @@ from hardware.bench.smoothing import (
     MovementErrors,
     RenderedErrors,
     ceres_figures,
-    many_figures,
+    cluster_figures,
     pair_figures,
     rendered_figure,
     rendered_figures,
@@ -131,7 +131,7 @@ def test_that_pycolmap_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.slow  # three clusters; tests/test_smooth_many.py has the same of one
 def test_two_workers_and_one_that_is_killed_finish_all_sessions() -> None:
     pytest.importorskip("distributed")
-    faster, killed = many_figures(3)
+    faster, killed = cluster_figures(3)
     assert faster.value > 0 and faster.unit == ""
     assert killed.value == 3 and killed.verdict == "met"
 

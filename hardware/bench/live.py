@@ -1,4 +1,4 @@
-"""Subject `live`: whole runs in real time before pre-rendered cameras with the virtual arm, all processes in it.
+"""Subject `live`: whole runs in real time with pre-rendered cameras, the virtual arm, and all processes.
 
 Rendering takes ten times as long as the pictures last, so they are rendered once and shown by a process of their own.
 Kills: random processes of a run end at random instants. Is the arm at rest? Does the next run go on where it was?
@@ -37,39 +37,38 @@ from hardware.recording.session_reader import open_session
 from planning.path import Path as Toolpath
 from planning.path import way_lengths
 
-WATCHED_PROCESSES = ("tracking", "motion", "recorder")  # by the process that conducts; the feed's end is the cameras'
+WATCHED_PROCESSES = ("tracking", "motion", "recorder")  # by the main process; the cameras notice the feed's end
 VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
 PRINTED_TEXT = "the path is printed"
 MAX_PRINTING = 3.0  # s of printing before a kill
-# s after a kill in which the arm must have come to rest: noticed in 0.1, queued for 0.05, its servo
-MAX_REST_DELAY = 0.5
-MIN_REST = 0.05  # s of rest that are looked at
+MAX_REST_DELAY = 0.5  # s from a kill until the arm must rest: 0.1 until it is noticed, 0.05 queued, its servo
+MIN_REST = 0.05  # s of rest that are checked
 REST_RADIUS = 0.05  # mm from where it ended
-END_PATIENCE = 60.0  # s in which the others must have ended
-EXECUTED_PATIENCE = 30.0  # s in which the virtual arm has written what it did
+END_TIMEOUT = 60.0  # s in which the others must have ended
+EXECUTED_TIMEOUT = 30.0  # s in which the virtual arm has written what it did
 
 
 @dataclass(slots=True)
 class Kills:
-    """What came of them."""
+    """Measurements of all kills."""
 
-    out: Path | None = None  # for a table, and for what is left of runs whose arm moved on; None: nothing is kept
+    out: Path | None = None  # for a table, and for the files of runs whose arm moved on; None: nothing is saved
     count: int = 0
     rests: list[float] = field(default_factory=list)  # s after each kill until the arm rested
-    stuck: list[str] = field(default_factory=list)  # last words of the runs that did not print
+    stuck: list[str] = field(default_factory=list)  # last lines of the runs that did not print
     lost: list[float] = field(default_factory=list)  # checkpoints, of each resumed run
     doubled: list[float] = field(default_factory=list)  # likewise
     unread: list[float] = field(default_factory=list)  # s before the kill from which the recording cannot be read
-    noticed: list[float] = field(default_factory=list)  # s until the conducting process said so
+    noticed: list[float] = field(default_factory=list)  # s until the main process reported it
 
-    def keep(self, record: Path, victim: str, place: float) -> None:
-        """Add the last kill to the table; where the arm moved on, keep all that the run has left."""
+    def save(self, record: Path, victim: str, place: float) -> None:
+        """Add the last kill to the table; where the arm moved on, copy the run's files."""
         if self.out is None:
             return
         row = (record.name, victim, f"{self.rests[-1]:.3f}", f"{place:.3f}")
         append_rows(self.out / "kills.csv", ("record", "killed", "rests_s", "place"), [row])
-        for left in record.parent.glob(f"{record.stem}.*") if self.rests[-1] > MAX_REST_DELAY else ():
-            shutil.copy(left, self.out)
+        for file in record.parent.glob(f"{record.stem}.*") if self.rests[-1] > MAX_REST_DELAY else ():
+            shutil.copy(file, self.out)
 
 
 def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int, out: Path | None) -> list[Figure]:
@@ -78,19 +77,16 @@ def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int
     record: Path | None = None
     place = math.nan
     for number in with_progress("kills", "kills", range(count), count):
-        fresh = record is None
         if record is None:
-            record, place = folder / f"kill{number}.mcap", math.nan
-            arguments = ["--simulated", str(scenario), "--path", str(path), "--record", str(record)]
+            record = folder / f"kill{number}.mcap"
+            place = _kill(LiveSession(_arguments(scenario, record, path)), record, kills, rng, None)
         else:
-            arguments = ["--resume", str(record)]
+            arguments = ["--resume", str(record), "--no-page", "--yes"]
             record = RunFiles(record).next().record
-        run = LiveSession([*arguments, "--no-page", "--yes"])
-        place = _kill(run, record, kills, rng, None if fresh else place)
+            place = _kill(LiveSession(arguments), record, kills, rng, place)
         record = record if np.isfinite(place) else None
-    name = f"{kills.count} kills"
+    name, most_noticed = f"{kills.count} kills", 1000 * max(kills.noticed, default=np.nan)
     late = sum(s > MAX_REST_DELAY for s in kills.rests)
-    most_noticed = 1000 * max(kills.noticed, default=np.nan)
     return [
         Figure(f"{name}: arms not at rest after {MAX_REST_DELAY:g} s", late, "", at_most(0)),
         Figure(f"{name}: arm at rest after, median", 1000 * float(np.median(kills.rests or np.nan)), "ms"),
@@ -109,21 +105,26 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
     clock = WallClock()
     try:
         if run.wait_for("\nprint\n") < 0:
-            if PRINTED_TEXT not in run.said:  # nothing is left where the run before was killed on its way home
-                kills.stuck.append(run.last_words)
+            if PRINTED_TEXT not in run.output:  # nothing is left where the run before was killed on its way home
+                kills.stuck.append(run.last_lines)
             return math.nan
         clock.wait_until(clock.now() + rng.uniform(0, MAX_PRINTING))
         victim = str(rng.choice(VICTIMS))
         now = run.kill(victim)
-        if victim in WATCHED_PROCESSES and run.wait_for("was killed", patience=END_PATIENCE) >= 0:
+        if victim in WATCHED_PROCESSES and run.wait_for("was killed", timeout=END_TIMEOUT) >= 0:
             kills.noticed.append(clock.now() - now)
-        run.end(END_PATIENCE)
+        run.end(END_TIMEOUT)
     finally:
         run.close()
-    if not np.isfinite(now) or PRINTED_TEXT in run.said:
+    if not np.isfinite(now) or PRINTED_TEXT in run.output:
         return math.nan
     kills.count += 1
-    kills.rests.append(_rest(record, now))
+    file, until = RunFiles(record).executed, clock.now() + EXECUTED_TIMEOUT
+    while not file.exists() and clock.now() < until:
+        clock.wait_until(clock.now() + 0.1)
+    clock.wait_until(clock.now() + 0.3)
+    with np.load(file) as executed:
+        kills.rests.append(rest_delay(executed["stamps"], executed["axes"], now))
     first, last = printed_range(record)
     if before is not None and np.isfinite(first):
         kills.lost.append(max(first - before, 0.0))
@@ -132,22 +133,10 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         kills.unread.append(max(now - open_session(record).sets[-1][0].stamp, 0.0))
     except InputError:
         kills.unread.append(math.inf)
-    if victim == "recorder":  # its recording ends before the arm did: what is kept of the place is all that is known
+    if victim == "recorder":  # its recording ends before the arm did: only the progress file has the place
         last = float(read_toml(RunFiles(record).progress)["fraction"])
-    kills.keep(record, victim, last)
+    kills.save(record, victim, last)
     return last if np.isfinite(last) else before if before is not None else math.nan
-
-
-def _rest(record: Path, killed: float) -> float:
-    """How long, s, after the kill the virtual arm came to where it ended; inf where it ended in motion."""
-    clock, file = WallClock(), RunFiles(record).executed
-    until = clock.now() + EXECUTED_PATIENCE
-    while not file.exists() and clock.now() < until:
-        clock.wait_until(clock.now() + 0.1)
-    clock.wait_until(clock.now() + 0.3)
-    with np.load(file) as executed:
-        stamps, axes = executed["stamps"], executed["axes"]
-    return rest_delay(stamps, axes, killed)
 
 
 def rest_delay(stamps: Array, axes: Array, since: float) -> float:
@@ -162,10 +151,10 @@ def rest_delay(stamps: Array, axes: Array, since: float) -> float:
     return max(last - since, 0.0) if last < stamps[-1] - MIN_REST else math.inf
 
 
-STOP_PERIOD = 8.0  # s between stops of the run that is stopped again and again
-PROBE_PIECES = 20000  # of work that the machine is given before a run: ten seconds
-MEMORY_PERIOD = 2.0  # s between looks at the memory
-WARM_UP_SHARE = 0.3  # share of a run after which its memory counts: key frames are full then
+STOP_PERIOD = 8.0  # s between stops of the run that is stopped repeatedly
+PROBE_PIECES = 20000  # of work that measure the machine before a run: ten seconds
+MEMORY_PERIOD = 2.0  # s between measurements of the memory
+WARM_UP_SHARE = 0.3  # of a run, after which its memory counts: key frames are full then
 HOMING_TEXT = "\nhoming\n"  # what a run says once its path is printed
 KILLED_PATH_S = 90.0  # s of a path that is printed by runs which are killed after some seconds each
 SHOWN_STAGES = "frames wait for the tracker", "tracking", "frames handed over to pose"
@@ -173,24 +162,23 @@ STOP_STAGE = "stop decided to on the wire"
 
 
 def run_live(options: argparse.Namespace) -> list[Figure]:
-    """The figures of all runs that were asked for."""
+    """The figures of all runs that the options choose."""
     rendered = prerender(options.scenario, cache_folder())
     with tempfile.TemporaryDirectory(prefix="stillbed-live-") as name:
         folder, figures = Path(name), list[Figure]()
-        long = folder / "long.csv"
-        write_path(long, to_and_fro(read_path(rendered.path), 60 * (options.minutes or 1.0)))
+        long, killed = folder / "long.csv", folder / "killed.csv"
+        write_path(long, _repeated(read_path(rendered.path), 60 * (options.minutes or 1.0)))
         if options.minutes:
-            figures = _printing(options, folder, long, rendered.arm)
+            figures = _print_figures(options, folder, long, rendered.arm)
         if options.stops:
-            figures += _stopping(options, folder, long)
+            figures += _stop_figures(options, folder, long)
         if options.kills:
-            killed = folder / "killed.csv"
-            write_path(killed, to_and_fro(read_path(rendered.path), KILLED_PATH_S))
+            write_path(killed, _repeated(read_path(rendered.path), KILLED_PATH_S))
             figures += kill_figures(options.scenario, folder, killed, options.kills, options.seed, options.out)
     return figures
 
 
-def to_and_fro(path: Toolpath, seconds: float) -> Toolpath:
+def _repeated(path: Toolpath, seconds: float) -> Toolpath:
     """The path printed again and again, there and back, for so long."""
     once = float(np.sum(way_lengths(path.surface_from_nozzle) / path.speed[1:]))
     count, there = len(path), np.arange(len(path))
@@ -198,45 +186,41 @@ def to_and_fro(path: Toolpath, seconds: float) -> Toolpath:
     while len(order) < seconds / once * count:
         order += list(there[-2::-1] if order[-1] == count - 1 else there[1:])
     index = np.array(order[: max(int(seconds / once * count), 2)])
-    return replace(
-        path,
-        surface_from_nozzle=path.surface_from_nozzle[index],
-        speed=path.speed[index],
-        material=path.material[index],
-        temperature=path.temperature[index],
-        layer=path.layer[index],
-        extrude=path.extrude[np.maximum(index, 1)],
-        extra={},
-    )
+    names = "surface_from_nozzle", "speed", "material", "temperature", "layer"
+    rows: dict[str, Any] = {name: getattr(path, name)[index] for name in names}
+    return replace(path, **rows, extrude=path.extrude[np.maximum(index, 1)], extra={})
 
 
-def _printing(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
+def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
     record, clock = folder / "print.mcap", WallClock()
-    told, alone = _arguments(options.scenario, record, path), measure_evenness(clock, PROBE_PIECES)
-    run = LiveSession([*([str(_pinned(folder))] if options.pinned else []), *told])
+    arguments, alone = _arguments(options.scenario, record, path), measure_evenness(clock, PROBE_PIECES)
+    if options.pinned:  # a session.toml that gives each loop a core of its own
+        one, other = available_cores()[:1], available_cores()[1:2]
+        settings = settings_text(LiveSettings(cores_tracking=one, cores_motion=other, cores_recorder=other))
+        (folder / "session.toml").write_text(settings)
+        arguments.insert(0, str(folder / "session.toml"))
+    run = LiveSession(arguments)
     load = []
     try:
-        begun = run.wait_for("\nprint\n")
-        while begun >= 0 and run.process.poll() is None and run.said.find(HOMING_TEXT, begun) < 0:
-            run.weigh()
+        printing = run.wait_for("\nprint\n")
+        while printing >= 0 and run.process.poll() is None and run.output.find(HOMING_TEXT, printing) < 0:
+            run.measure_memory()
             load.append(os.getloadavg()[0])
             clock.wait_until(clock.now() + MEMORY_PERIOD)
         run.end()
     finally:
         run.close()
-    found: dict[str, Any] = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))
+    summary: dict[str, Any] = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))
     error = nozzle_errors(record, path, arm)
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
-    figures = [*_latencies(name, found, note), *_machine(name, alone)]
-    return [*figures, *_errors(name, found, error), *_burden(name, found, run.memory)]
+    figures = [*_latencies(name, summary["latency_ms"], note), *_machine(name, alone)]
+    return [*figures, *_errors(name, summary, error), *_load(name, summary, run.memory)]
 
 
-def _latencies(name: str, found: dict[str, Any], note: str) -> list[Figure]:
-    times = found["latency_ms"]
-    wire, exposure, late = (
-        times.get(stage, {}) for stage in (FRAMES_TO_WIRE_STAGE, EXPOSURE_TO_WIRE_STAGE, LATE_TICK_STAGE)
-    )
+def _latencies(name: str, times: dict[str, Any], note: str) -> list[Figure]:
+    stages = FRAMES_TO_WIRE_STAGE, EXPOSURE_TO_WIRE_STAGE, LATE_TICK_STAGE
+    wire, exposure, late = (times.get(stage, {}) for stage in stages)
     return [
         Figure(f"{name}: frames to wire, median", _of(wire, "p50"), "ms", at_most(20), "thesis: 180 ms", note),
         Figure(f"{name}: frames to wire, 99 %", _of(wire, "p99"), "ms", at_most(35)),
@@ -255,15 +239,15 @@ def _machine(name: str, alone: Evenness) -> list[Figure]:
     ]
 
 
-def _errors(name: str, found: dict[str, Any], error: NozzleErrors) -> list[Figure]:
-    done = f"ended: {found['ended']}"
+def _errors(name: str, summary: dict[str, Any], error: NozzleErrors) -> list[Figure]:
+    done, sets = f"ended: {summary['ended']}", f"of {summary['frame_sets']}"
     return [
         Figure(f"{name}: nozzle error, 95 %", error.figure(95), "mm", at_most(0.5), "", done),
         Figure(f"{name}: nozzle error, largest", error.figure(100), "mm", at_most(1.0)),
         Figure(f"{name}: duty", 100 * error.duty, "%", at_least(80)),
         Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50)),
         Figure(f"{name}: virtual arm held up by the machine, longest", 1000 * error.held_up, "ms"),
-        Figure(f"{name}: frame sets left out", found["frame_sets_dropped"], "", None, "", f"of {found['frame_sets']}"),
+        Figure(f"{name}: frame sets left out", summary["frame_sets_dropped"], "", None, "", sets),
     ]
 
 
@@ -271,29 +255,28 @@ def memory_growth(memory: Sequence[tuple[float, dict[str, float]]]) -> dict[str,
     """By process, from s and MB each: MB an hour by which it grows once it has settled, and MB in the end."""
     settled = memory[int(WARM_UP_SHARE * len(memory)) :]
     stamps = np.array([stamp for stamp, _ in settled])
-    found = {}
+    growth = {}
     for name in settled[-1][1] if len(settled) > 5 else ():
         held = np.array([each.get(name, np.nan) for _, each in settled])
         there = np.isfinite(held)
         slope = np.polyfit(stamps[there] - stamps[0], held[there], 1)[0] if there.sum() > 5 else np.nan
-        found[name] = float(3600 * slope), float(held[-1])
-    return found
+        growth[name] = float(3600 * slope), float(held[-1])
+    return growth
 
 
-def _burden(name: str, found: dict[str, Any], memory: Sequence[tuple[float, dict[str, float]]]) -> list[Figure]:
-    share, grown = found["recorder_share_of_core"], memory_growth(memory)
-    slope, size = (sum(each[k] for each in grown.values()) if grown else np.nan for k in (0, 1))
-    told = ", ".join(f"{process} {by:+.0f}" for process, (by, _) in grown.items())
-    recorder = 100 * (share or np.nan) / 2
+def _load(name: str, summary: dict[str, Any], memory: Sequence[tuple[float, dict[str, float]]]) -> list[Figure]:
+    growth, recorder = memory_growth(memory), 100 * (summary["recorder_share_of_core"] or np.nan) / 2
+    slope, size = (sum(each[k] for each in growth.values()) if growth else np.nan for k in (0, 1))
+    slopes = ", ".join(f"{process} {by:+.0f}" for process, (by, _) in growth.items())
     return [
         Figure(f"{name}: recorder", recorder, "%", at_most(3), "", "of two cores, its start included"),
-        Figure(f"{name}: not recorded", found["unrecorded"], "", at_most(0)),
-        Figure(f"{name}: memory grows", slope, "MB/h", at_most(5), "", f"{told}; a short run tells little"),
+        Figure(f"{name}: not recorded", summary["unrecorded"], "", at_most(0)),
+        Figure(f"{name}: memory grows", slope, "MB/h", at_most(5), "", f"{slopes}; a short run tells little"),
         Figure(f"{name}: memory", size, "MB"),
     ]
 
 
-def _stopping(options: argparse.Namespace, folder: Path, path: Path) -> list[Figure]:
+def _stop_figures(options: argparse.Namespace, folder: Path, path: Path) -> list[Figure]:
     record, clock = folder / "stop.mcap", WallClock()
     run = LiveSession(_arguments(options.scenario, record, path)[:-1])  # attended
     try:
@@ -312,20 +295,12 @@ def _stopping(options: argparse.Namespace, folder: Path, path: Path) -> list[Fig
         run.end()
     finally:
         run.close()
-    found = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))["latency_ms"].get(STOP_STAGE, {})
-    note = f"{found.get('count', 0)} stops by the terminal"
+    delay = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))["latency_ms"].get(STOP_STAGE, {})
+    note = f"{delay.get('count', 0)} stops by the terminal"
     return [
-        Figure("stop decided to on the wire, 99 %", _of(found, "p99"), "ms", at_most(10), "", note),
-        Figure("stop decided to on the wire, largest", _of(found, "max"), "ms"),
+        Figure("stop decided to on the wire, 99 %", _of(delay, "p99"), "ms", at_most(10), "", note),
+        Figure("stop decided to on the wire, largest", _of(delay, "max"), "ms"),
     ]
-
-
-def _pinned(folder: Path) -> Path:
-    """A session.toml that gives each loop a core of its own."""
-    file = folder / "session.toml"
-    one, other = available_cores()[:1], available_cores()[1:2]
-    file.write_text(settings_text(LiveSettings(cores_tracking=one, cores_motion=other, cores_recorder=other)))
-    return file
 
 
 def _arguments(scenario: Path, record: Path, path: Path) -> list[str]:

@@ -1,16 +1,16 @@
-"""`stillbed bench planner`: random poses into planner and guard, judged tick by tick by an oracle; what a step costs.
+"""`stillbed bench planner`: random poses into planner and guard, judged tick by tick by an oracle; cost of a step.
 
-Each stream is a print of its own: a random path over a moving surface, seen through poses that are noisy, late,
-jumping, spoilt or missing, by a caller that stalls now and then. A stream is cut in two: a second planner goes on where
-the first one's record says. Time is virtual; the cost of a step is the thread's own processor time.
+Each stream is a print of its own: a random path over a moving surface, whose poses are noisy, late, jumping, invalid or
+missing, with a caller that stalls now and then. A stream is cut in two: a second planner resumes from the first one's
+progress. Time is virtual; the cost of a step is the thread's own processor time.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from estimation.se3 import Array
 from estimation.surface_map import Warp
 from hardware.arm.profile import ArmProfile
 from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
-from hardware.bench.figures import Figure, at_most, percentile, with_progress
+from hardware.bench.figures import Figure, at_most, milliseconds, percentile, with_progress
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import CpuClock
 from planning.command import Hold, Move
@@ -34,18 +34,19 @@ Draw = np.random.Generator
 Tick = tuple[float, SurfacePose | None]  # now, s, and the newest pose
 
 SWING_REST = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # base_from_surface: under the default arm's home
-TICK_S = 0.02  # s
-FIRST_TICK = 10.0  # s, of the first tick
+TICK_S = 0.02
+FIRST_TICK = 10.0  # s, its instant
 MAX_POSE_DELAY = 0.1  # s from a pose's stamp until it is known
 SWINGS = ((0.0, 0.0), (5.0, 0.05), (12.0, 0.2), (40.0, 0.6))  # mm and rad of the surface's swing
 SWING_RATES = 0.1, 0.3, 0.8  # Hz
 POSE_NOISES = 0.0, 0.0, 0.05, 0.3, 10.0  # mm, and a hundredth of it in rad
-SPOILT_SHARES = 0.0, 0.005, 0.02, 0.3  # share of poses that are spoilt
-DOUBT_SHARES = 0.0, 0.01, 0.1  # share of poses that claim a large error
-STALL_SHARE = 0.002  # share of ticks before which the caller stalls
+INVALID_SHARES = 0.0, 0.005, 0.02, 0.3  # of the poses
+UNCERTAIN_SHARES = 0.0, 0.01, 0.1  # of poses with a large covariance
+FRAME_RATES = 6, 30, 60  # Hz
+STALL_SHARE = 0.002  # of ticks before which the caller stalls
 JUMP_SIZES = np.array([0.01] * 3 + [5.0] * 3)  # rad and mm of a jump
-OUT_OF_REACH = np.array([0.0, 0, 0, 800.0, 0, 0])  # mm: out of any reach
-FORECAST_HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s, of a forecast
+OUT_OF_REACH = np.array([0.0, 0, 0, 800.0, 0, 0])  # mm
+FORECAST_HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,70 +65,50 @@ class SwingingSurface:
         return np.asarray(SWING_REST @ se3.exp(np.stack([*turn, none, none, self.height * sine], -1)))
 
 
-def random_run(seed: tuple[int, int], ticks: int) -> tuple[Path, Iterator[Tick]]:
-    """A path, and `ticks` ticks of poses; the same seed gives the same ones."""
-    draw = np.random.default_rng(seed)
-    return random_path(draw), _ticks(draw, ticks)
-
-
 def random_path(draw: Draw) -> Path:
     """Checkpoints far apart or close together, straight, curved, tilted or turned on the spot; all may be printed."""
-    points = [_scattered, _curved, _raster][draw.integers(3)](draw)
+    match int(draw.integers(3)):
+        case 0:  # scattered
+            points = np.asarray(draw.uniform(-8, 8, (int(draw.integers(2, 12)), 3)) * [1, 1, 0.2])
+        case 1:  # curved, 0.05 to 0.5 mm apart, as a dense planner gives them
+            angle = np.linspace(0, draw.uniform(1, 12), int(draw.integers(40, 400)))
+            radius = draw.uniform(2, 15) * (1 - 0.05 * angle)
+            height = draw.uniform(-1, 1) * np.sin(angle)
+            points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
+        case _:  # raster
+            across = np.arange(-4, 4, draw.uniform(0.3, 2.0))
+            points = np.array([[x, y, 0] for i, y in enumerate(across) for x in np.array([-6.0, 6.0]) * (-1) ** i])
     turns = np.cumsum(draw.normal(size=points.shape), axis=0) * draw.choice([0.0, 0.005, 0.05])
     poses = se3.make(se3.exp_rotation(np.clip(turns, -0.3, 0.3)), points)
     poses = poses[np.concatenate([[True], way_lengths(poses) >= 2 * MIN_SPACING])]
     count = len(poses)
-    return Path(
-        poses,
-        draw.uniform(1.0, draw.choice([5.0, 40.0, 120.0]), count),
-        np.ones(count, np.int64),
-        np.full(count, 20.0),
-        np.zeros(count, np.int64),
-        draw.random(count) < 0.9,
-    )
-
-
-def _scattered(draw: Draw) -> Array:
-    return np.asarray(draw.uniform(-8, 8, (int(draw.integers(2, 12)), 3)) * [1, 1, 0.2])
-
-
-def _curved(draw: Draw) -> Array:
-    """Checkpoints 0.05 to 0.5 mm apart, as a dense planner gives them."""
-    angle = np.linspace(0, draw.uniform(1, 12), int(draw.integers(40, 400)))
-    radius = draw.uniform(2, 15) * (1 - 0.05 * angle)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), draw.uniform(-1, 1) * np.sin(angle)], -1)
-
-
-def _raster(draw: Draw) -> Array:
-    across = np.arange(-4, 4, draw.uniform(0.3, 2.0))
-    ends = [[x, y, 0.0] for i, y in enumerate(across) for x in np.array([-6.0, 6.0]) * (-1) ** i]
-    return np.array(ends)
+    speed, layer = draw.uniform(1.0, draw.choice([5.0, 40.0, 120.0]), count), np.zeros(count, np.int64)
+    return Path(poses, speed, np.ones(count, np.int64), np.full(count, 20.0), layer, draw.random(count) < 0.9)
 
 
 def _ticks(draw: Draw, ticks: int) -> Iterator[Tick]:
     swing = SwingingSurface(*SWINGS[draw.integers(4)], float(draw.choice(SWING_RATES)))
-    noise, trouble, doubt, fps = (
-        draw.choice(kinds) for kinds in (POSE_NOISES, SPOILT_SHARES, DOUBT_SHARES, [6, 30, 60])
-    )
-    foreseen, warped = draw.random() < 0.3, draw.random() < 0.2
-    now, taken, pose, jump = FIRST_TICK, -1, None, np.eye(4)
+    kinds = POSE_NOISES, INVALID_SHARES, UNCERTAIN_SHARES, FRAME_RATES
+    noise, invalid, uncertain, fps = (draw.choice(of_kind) for of_kind in kinds)
+    forecast, warped = draw.random() < 0.3, draw.random() < 0.2
+    now, last_frame, newest, jump = FIRST_TICK, -1, None, np.eye(4)
     for _ in range(ticks):
-        if (frame := int((now - FIRST_TICK) * fps)) > taken:
-            taken = frame
-            if draw.random() < trouble / 5:
+        if (frame := int((now - FIRST_TICK) * fps)) > last_frame:
+            last_frame = frame
+            if draw.random() < invalid / 5:
                 jump = jump @ se3.exp(draw.normal(size=6) * JUMP_SIZES)
-            made = _pose(swing, now - draw.uniform(0, MAX_POSE_DELAY), draw, foreseen)
-            if draw.random() < doubt:
-                made = replace(made, covariance=made.covariance * draw.choice([30.0, 200.0]) ** 2)
-            wrong = jump @ se3.exp(draw.normal(size=6) * noise * np.array([0.01] * 3 + [1.0] * 3))
-            made = replace(made, base_from_surface=made.base_from_surface @ wrong)
-            made = replace(made, warp=_warp(draw)) if warped else made
-            pose = _spoilt(made, draw) if draw.random() < trouble else made
-        yield now, pose
+            pose = _pose(swing, now - draw.uniform(0, MAX_POSE_DELAY), draw, forecast)
+            if draw.random() < uncertain:
+                pose = replace(pose, covariance=pose.covariance * draw.choice([30.0, 200.0]) ** 2)
+            error = jump @ se3.exp(draw.normal(size=6) * noise * np.array([0.01] * 3 + [1.0] * 3))
+            pose = replace(pose, base_from_surface=pose.base_from_surface @ error)
+            pose = replace(pose, warp=_warp(draw)) if warped else pose
+            newest = _invalid(pose, draw) if draw.random() < invalid else pose
+        yield now, newest
         now += TICK_S * (1 if draw.random() > STALL_SHARE else int(draw.integers(4, 60)))
 
 
-def _pose(swing: SwingingSurface, stamp: float, draw: Draw, foreseen: bool) -> SurfacePose:
+def _pose(swing: SwingingSurface, stamp: float, draw: Draw, with_forecast: bool) -> SurfacePose:
     """The exact pose and twist at `stamp`, s."""
     step = 1e-4
     before, here, after = swing.at(stamp + np.array([-step, 0, step]))
@@ -135,11 +116,10 @@ def _pose(swing: SwingingSurface, stamp: float, draw: Draw, foreseen: bool) -> S
     covariance = np.diag([1e-6] * 3 + [1e-4] * 3)
     state = TrackState.DEGRADED if draw.random() < 0.1 else TrackState.TRACKING
     forecast = None
-    if foreseen:
+    if with_forecast:
         increments = se3.log(se3.inverse(here) @ swing.at(stamp + FORECAST_HORIZONS)) * draw.normal(1.0, 0.05)
-        forecast = Forecast(
-            FORECAST_HORIZONS, increments, covariance + FORECAST_HORIZONS[:, None, None] * 0.01 * np.eye(6)
-        )
+        covariances = covariance + FORECAST_HORIZONS[:, None, None] * 0.01 * np.eye(6)
+        forecast = Forecast(FORECAST_HORIZONS, increments, covariances)
     return SurfacePose(stamp, here, covariance, twist, state, forecast=forecast)
 
 
@@ -148,45 +128,35 @@ def _warp(draw: Draw) -> Warp:
     return Warp(control, draw.normal(size=(6, 3)) * 0.2, 1e-4 * np.eye(18), np.zeros((18, 18)), 8.0, 0.2, 0.01)
 
 
-def _spoilt(pose: SurfacePose, draw: Draw) -> SurfacePose | None:
-    """The pose with one thing wrong: not there, not measured, not finite, too fast, too far, older or newer."""
-    put = partial(replace, pose)
-    match int(draw.integers(10)):
-        case 0:
-            return None
-        case 1:
-            return put(state=TrackState.COASTING)
-        case 2:
-            return put(base_from_surface=np.full((4, 4), np.nan))
-        case 3:
-            return put(twist=np.array([0, 0, 0, np.inf, 0, 0]))
-        case 4:
-            return put(twist=pose.twist + draw.normal(size=6) * [1, 1, 1, 100, 100, 100])
-        case 5:
-            return put(covariance=np.full((6, 6), np.nan))
-        case 6:
-            return put(stamp=draw.choice([np.nan, -np.inf, 0.0, pose.stamp + 1.0]))
-        case 7:
-            return put(covariance=-pose.covariance)
-        case 8:
-            return put(base_from_surface=pose.base_from_surface @ se3.exp([*draw.normal(size=3), 0, 0, 0]))
-        case _:
-            return put(base_from_surface=pose.base_from_surface @ se3.exp(OUT_OF_REACH))
+def _invalid(pose: SurfacePose, draw: Draw) -> SurfacePose | None:
+    """The pose with one thing wrong: missing, not measured, not finite, too fast, too far, older or newer."""
+    place = pose.base_from_surface
+    changes: tuple[Callable[[], dict[str, Any]], ...] = (
+        lambda: {"state": TrackState.COASTING},
+        lambda: {"base_from_surface": np.full((4, 4), np.nan)},
+        lambda: {"twist": np.array([0, 0, 0, np.inf, 0, 0])},
+        lambda: {"twist": pose.twist + draw.normal(size=6) * [1, 1, 1, 100, 100, 100]},
+        lambda: {"covariance": np.full((6, 6), np.nan)},
+        lambda: {"stamp": draw.choice([np.nan, -np.inf, 0.0, pose.stamp + 1.0])},
+        lambda: {"covariance": -pose.covariance},
+        lambda: {"base_from_surface": place @ se3.exp([*draw.normal(size=3), 0, 0, 0])},
+        lambda: {"base_from_surface": place @ se3.exp(OUT_OF_REACH)},
+    )
+    kind = int(draw.integers(len(changes) + 1))
+    return replace(pose, **changes[kind - 1]()) if kind else None
 
 
-STREAM_UPDATES = 500  # updates of one stream: 10 s
+STREAM_UPDATES = 500  # of one stream: 10 s
 TAKE_OVER_SHARE = 0.6  # of a stream, after which a second planner takes over
-START_ABOVE = se3.make(
-    np.eye(3), [0, 0, 2.0]
-)  # mm: the arm starts so high above the surface, so that prints begin soon
-LONG_PATH = 50_000
+START_ABOVE = se3.make(np.eye(3), [0, 0, 2.0])  # mm, of the arm over the surface: low, so that prints begin soon
+LONG_PATH = 50_000  # checkpoints
 PATH_MOVES = 300
 PLAN_TARGETS = at_most(3.0), at_most(8.0)  # ms, median and 99 %
 
 
 @dataclass
 class StreamTally:
-    """What came of the streams."""
+    """Counts over all streams."""
 
     over: Array = field(default_factory=lambda: np.zeros(len(AXES_LIMITS)))
     worst: Array = field(default_factory=lambda: np.zeros(len(AXES_LIMITS)))
@@ -201,7 +171,7 @@ class StreamTally:
 
 
 def run_planner(options: argparse.Namespace) -> list[Figure]:
-    """Judge the streams, then time the transform of a long path."""
+    """Judge the streams, then time the transform of a long path to another pose."""
     tally, profile = StreamTally(), bench_arm(None if options.arm is None else read_arm(options.arm))
     streams = -(-options.updates // STREAM_UPDATES)
     for stream in with_progress("planner", "streams", range(streams), streams):
@@ -209,7 +179,16 @@ def run_planner(options: argparse.Namespace) -> list[Figure]:
             follow_stream((options.seed, stream), tally, profile)
         except Exception as error:  # every uncaught error is a finding, whatever it is
             tally.errors.append(f"stream {stream}: {type(error).__name__}: {error}")
-    return [*_limits(tally), *_costs(tally), *carry_figures()]
+    transform, axes = carries(LONG_PATH, PATH_MOVES)
+    name, note = f"transform of {LONG_PATH:,} checkpoints", "processor time"
+    return [
+        *_limits(tally),
+        *_costs(tally),
+        Figure(f"{name}, 99 %", milliseconds(transform, 99), "ms", at_most(1), "thesis < 1", note),
+        Figure(f"{name}, median", milliseconds(transform, 50), "ms"),
+        Figure(f"{name}, axes X to C too, 99 %", milliseconds(axes, 99), "ms", note=note),
+        Figure(f"{name}, axes X to C too, median", milliseconds(axes, 50), "ms"),
+    ]
 
 
 def bench_arm(profile: ArmProfile | None = None) -> ArmProfile:
@@ -220,41 +199,37 @@ def bench_arm(profile: ArmProfile | None = None) -> ArmProfile:
 
 def follow_stream(seed: tuple[int, int], tally: StreamTally, profile: ArmProfile, ticks: int = STREAM_UPDATES) -> None:
     """One stream through planner and guard."""
-    path, seen = random_run(seed, ticks)
-    clock = CpuClock()
+    draw, clock = np.random.default_rng(seed), CpuClock()
+    path = random_path(draw)
     settings = profile.limits, profile.arm, TICK_S
     planner, guard = Planner(path, *settings), Guard(*settings, path.zone)
-    judge, before, printed = AxesOracle(profile.arm.home, profile.limits, TICK_S), -np.inf, 0.0
-    for k, (now, pose) in enumerate(seen):
+    oracle, before, printed = AxesOracle(profile.arm.home, profile.limits, TICK_S), -np.inf, 0.0
+    for k, (now, pose) in enumerate(_ticks(draw, ticks)):
         if now - before > STALL_TICKS * TICK_S:
-            judge.rest()
-        if k == int(TAKE_OVER_SHARE * ticks):
-            planner, guard = _taken_over(path, profile, planner, guard)
-            judge.rest()
+            oracle.rest()
+        if k == int(TAKE_OVER_SHARE * ticks):  # by a later run, on an arm that stands where it was left
+            arm = replace(profile.arm, home=guard.axes.copy())
+            fraction = resume_fraction(path, progress_mark(path, planner.progress))
+            planner = Planner(path, profile.limits, arm, TICK_S, start=fraction)
+            guard = Guard(profile.limits, arm, TICK_S, path.zone)
+            oracle.rest()
         before, place, horizons, start = now, planner.progress.place, planner.horizons, clock.now()
-        wanted = planner(pose, now)
+        planned = planner(pose, now)
         tally.seconds.append(clock.now() - start)
         tally.timed.append(planner.horizons > horizons)
-        command = guard(wanted, pose, now)
-        if isinstance(wanted, Move) and isinstance(command, Hold):
+        command = guard(planned, pose, now)
+        if isinstance(planned, Move) and isinstance(command, Hold):
             tally.refused += 1
             planner.refused(guard.axes)
-        judge(command.axes if isinstance(command, Move) else None)
+        oracle(command.axes if isinstance(command, Move) else None)
         if isinstance(command, Move):
             tally.moves += 1
             if command.extrude:
                 tally.printing += 1
                 tally.twice += max(printed - place, 0.0)
                 printed = max(printed, planner.progress.place)
-    tally.samples += judge.samples
-    tally.over, tally.worst = tally.over + judge.over, np.maximum(tally.worst, judge.worst)
-
-
-def _taken_over(path: Path, profile: ArmProfile, planner: Planner, guard: Guard) -> tuple[Planner, Guard]:
-    """A planner and a guard of a later run, on an arm that stands where it was left."""
-    arm = replace(profile.arm, home=guard.axes.copy())
-    start = resume_fraction(path, progress_mark(path, planner.progress))
-    return Planner(path, profile.limits, arm, TICK_S, start=start), Guard(profile.limits, arm, TICK_S, path.zone)
+    tally.samples += oracle.samples
+    tally.over, tally.worst = tally.over + oracle.over, np.maximum(tally.worst, oracle.worst)
 
 
 def _limits(tally: StreamTally) -> list[Figure]:
@@ -262,10 +237,9 @@ def _limits(tally: StreamTally) -> list[Figure]:
     figures = [Figure("samples over a limit by 0.1 %", float(tally.over.sum()), "", none, "ruckig #160", note)]
     for kind, over, worst in zip(AXES_LIMITS, tally.over, tally.worst, strict=True):
         figures.append(Figure(f"{kind}: most of its limit", float(worst), "", at_most(1.001), note=f"{int(over)} over"))
-    told = tally.errors[0] if tally.errors else ""
     return [
         *figures,
-        Figure("uncaught errors", len(tally.errors), "", none, "toppra #150", told),
+        Figure("uncaught errors", len(tally.errors), "", none, "toppra #150", next(iter(tally.errors), "")),
         Figure("moves that the guard refused", tally.refused, "", none),
         Figure("printed twice", tally.twice, "mm", at_most(1e-6), note="over outages, stalls and a second run"),
         Figure("share of updates that print", tally.printing / max(tally.samples, 1)),
@@ -273,28 +247,13 @@ def _limits(tally: StreamTally) -> list[Figure]:
 
 
 def _costs(tally: StreamTally) -> list[Figure]:
-    spent, timed = 1000 * np.array(tally.seconds), np.array(tally.timed)
-    figures = []
-    for name, rows, targets in (
-        ("step that times a horizon", timed, PLAN_TARGETS),
-        ("any step", spent > 0, (None, None)),
-    ):
+    ms, figures = 1000 * np.array(tally.seconds), []
+    kinds = ("step that times a horizon", np.array(tally.timed), PLAN_TARGETS), ("any step", ms > 0, (None, None))
+    for name, rows, targets in kinds:
         note = f"{rows.sum():,} steps, processor time"
         for word, share, target in zip(("median", "99 %"), (50, 99), targets, strict=True):
-            figures.append(Figure(f"{name}, {word}", percentile(spent[rows], share), "ms", target, "", note))
+            figures.append(Figure(f"{name}, {word}", percentile(ms[rows], share), "ms", target, "", note))
     return figures
-
-
-def carry_figures() -> list[Figure]:
-    """What it costs to carry a long path to another pose."""
-    transform, axes = carries(LONG_PATH, PATH_MOVES)
-    name, note = f"transform of {LONG_PATH:,} checkpoints", "processor time"
-    return [
-        Figure(f"{name}, 99 %", 1000 * percentile(transform, 99), "ms", at_most(1), "thesis < 1", note),
-        Figure(f"{name}, median", 1000 * float(np.median(transform)), "ms"),
-        Figure(f"{name}, axes X to C too, 99 %", 1000 * percentile(axes, 99), "ms", note=note),
-        Figure(f"{name}, axes X to C too, median", 1000 * float(np.median(axes)), "ms"),
-    ]
 
 
 def carries(checkpoints: int, count: int) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Subjects `thesis`, `latency` and `growth`: short made recordings, or recorded sessions, before a tracking method.
+"""Subjects `thesis`, `latency` and `growth`: tracking methods on short rendered recordings, or on recorded sessions.
 
 `thesis`: the thesis's estimator and ours, on the same frame sets in the same run.
 `latency`: from three decoded frames to the pose, flow included, by wall clock and by processor.
@@ -24,11 +24,10 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow_steps
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
-from hardware.bench.figures import Figure, Target, at_least, at_most, percentile, with_progress, write_page
+from hardware.bench.figures import Figure, Target, at_least, at_most, milliseconds, with_progress, write_page
 from hardware.bench.planner import carries
 from hardware.files.images import decode, encode
 from hardware.files.pose_file import PoseWriter, read_poses
-from hardware.files.session import Session
 from hardware.offline.track import MAP_METHOD, step_by, tracker
 from hardware.process.checks import Table
 from hardware.process.clock import CpuClock, ProcessorClock, WallClock
@@ -70,31 +69,8 @@ class Recording:
     rig: Rig
     roi: tuple[Roi, ...]  # where the surface is at the start
     truth: Trajectory | None  # None where nothing is known of it
-    source: Session | RenderedFrames
+    frame_sets: Callable[[], Iterator[FrameSet]]  # in order of stamp, the same ones each time
     surface: Path | None = None
-
-    def frame_sets(self) -> Iterator[FrameSet]:
-        """Its frame sets in order of stamp."""
-        return self.source.frame_sets()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RenderedFrames:
-    """Pictures rendered as they are asked for. stamps: (N,) s."""
-
-    scene: Scene
-    rig: Rig
-    truth: Truth
-    stamps: Array
-
-    def frame_sets(self) -> Iterator[FrameSet]:
-        """A frame set a stamp; the same ones each time."""
-        rng, cameras = np.random.default_rng([SCENE_SEED, 31]), self.rig.cameras
-        for stamp in self.stamps.tolist():
-            times = np.array([stamp])
-            instant = WorldState(stamp, 0.0, self.truth.base_from_surface(times)[0], self.truth.twist(times)[0])
-            images = render(self.scene, cameras, [instant] * len(cameras), Sensor(), rng.spawn(len(cameras)))
-            yield FrameSet(stamp, tuple(Frame(c, stamp, image) for c, image in enumerate(images)))
 
 
 def made_recording(name: str, seconds: float, rig: Rig | None = None) -> Recording:
@@ -105,20 +81,33 @@ def made_recording(name: str, seconds: float, rig: Rig | None = None) -> Recordi
         scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=SCENE_SEED)
     else:
         scene = scene_from_table(TABLE_SOURCE, dict(table), Path(), SCENE_SEED)
-    rig, truth = (
-        rig or arc_rig(),
-        Truth(BASE_FROM_REST, motion_from_tables(TABLE_SOURCE, [dict(motion)], Path(), SCENE_SEED)),
-    )
+    rig = rig or arc_rig()
+    cameras = rig.cameras
+    truth = Truth(BASE_FROM_REST, motion_from_tables(TABLE_SOURCE, [dict(motion)], Path(), SCENE_SEED))
     stamps = np.arange(round(seconds * FRAME_RATE)) / FRAME_RATE
     poses = truth.base_from_surface(stamps)
-    exact = Trajectory(stamps, poses, exact=True)
-    return Recording(name, rig, rois(scene, rig, poses[0], 0.0), exact, RenderedFrames(scene, rig, truth, stamps))
+
+    def rendered() -> Iterator[FrameSet]:
+        rng = np.random.default_rng([SCENE_SEED, 31])
+        for stamp in stamps.tolist():
+            times = np.array([stamp])
+            instant = WorldState(stamp, 0.0, truth.base_from_surface(times)[0], truth.twist(times)[0])
+            images = render(scene, cameras, [instant] * len(cameras), Sensor(), rng.spawn(len(cameras)))
+            yield FrameSet(stamp, tuple(Frame(c, stamp, image) for c, image in enumerate(images)))
+
+    return Recording(name, rig, rois(scene, rig, poses[0], 0.0), Trajectory(stamps, poses, exact=True), rendered)
 
 
 def recorded_session(path: Path) -> Recording:
     """A recorded session; InputError says what is wrong with it."""
     session = open_session(path)
-    return Recording(path.name, session.rig, session.roi, session.truth, session, session.surface)
+    return Recording(path.name, session.rig, session.roi, session.truth, session.frame_sets, session.surface)
+
+
+def shown_recordings(options: argparse.Namespace, names: Iterable[str]) -> list[Recording]:
+    """The sessions that the options name, or rendered recordings of these names."""
+    sessions = [recorded_session(path) for path in options.sessions]
+    return sessions or [made_recording(name, options.seconds) for name in names]
 
 
 MIN_ACCURACY_RATIO, MIN_SPEED_RATIO = 10.0, 5.0  # times better than the thesis's, which ours is to be
@@ -128,7 +117,7 @@ REFERENCE_MS = "70, thesis Fig. 4.17"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MethodResult:
-    """What a method made of a recording."""
+    """How well and how fast a method tracks a recording."""
 
     run: Evaluation
     millimetres: float  # RMSE of the measured poses' place from the start; NaN without a truth
@@ -138,28 +127,24 @@ class MethodResult:
 
 def run_thesis(options: argparse.Namespace) -> list[Figure]:
     """Errors and latencies of both on each recording, and how many times ours are smaller."""
-    shown = [recorded_session(path) for path in options.sessions] or [
-        made_recording(name, options.seconds) for name in MADE_RECORDINGS
-    ]
     figures = []
-    for each in shown:
-        ours, theirs = compare_methods(each, (MAP_METHOD, options.method))
-        figures += _figures(each.name, ours, theirs)
+    for recording in shown_recordings(options, MADE_RECORDINGS):
+        figures += _figures(recording.name, *_compare_methods(recording, (MAP_METHOD, options.method)))
     return figures
 
 
-def compare_methods(shown: Recording, methods: tuple[str, ...]) -> list[MethodResult]:
-    """What each method makes of a recording; on each frame set they take turns, so the machine is the same to all."""
+def _compare_methods(recording: Recording, methods: tuple[str, ...]) -> list[MethodResult]:
+    """Track a recording by each method; they take turns on each frame set, so that the machine is the same for all."""
     now, processor = WallClock().now, ProcessorClock().now
-    cameras = [camera.name for camera in shown.rig.cameras]
+    cameras = [camera.name for camera in recording.rig.cameras]
     with TemporaryDirectory() as folder, ExitStack() as stack:
         steps, writers, costs = {}, {}, {}
         for method in methods:
             (Path(folder) / method).mkdir()
-            steps[method] = stack.enter_context(step_by(method, shown.rig, shown.roi, shown.surface, now))
+            steps[method] = stack.enter_context(step_by(method, recording.rig, recording.roi, recording.surface, now))
             writers[method] = stack.enter_context(PoseWriter(Path(folder) / method, cameras, STAGES))
             costs[method] = list[float]()
-        for frames in shown.frame_sets():
+        for frames in recording.frame_sets():
             for method, step in steps.items():
                 start, cost = now(), processor()
                 pose = step(frames)
@@ -167,12 +152,12 @@ def compare_methods(shown: Recording, methods: tuple[str, ...]) -> list[MethodRe
                 spent = now() - start
                 writers[method].write(pose, len(frames.frames), step.last, spent)
                 step.idle()
-        return [_judged(shown, Path(folder) / m / "poses.csv", m, costs[m]) for m in methods]
+        return [_method_result(recording, Path(folder) / m / "poses.csv", m, costs[m]) for m in methods]
 
 
-def _judged(shown: Recording, file: Path, method: str, costs: list[float]) -> MethodResult:
-    since = min((roi.stamp for roi in shown.roi), default=-np.inf)
-    result = evaluate(read_poses(file), shown.truth, shown.name, since, method=method)
+def _method_result(recording: Recording, file: Path, method: str, costs: list[float]) -> MethodResult:
+    since = min((roi.stamp for roi in recording.roi), default=-np.inf)
+    result = evaluate(read_poses(file), recording.truth, recording.name, since, method=method)
     later, place, turn = costs[result.latency.initial_sets :], math.nan, math.nan
     if result.comparison is not None:
         start = result.comparison.start
@@ -181,110 +166,83 @@ def _judged(shown: Recording, file: Path, method: str, costs: list[float]) -> Me
 
 
 def _figures(name: str, ours: MethodResult, theirs: MethodResult) -> list[Figure]:
-    label = theirs.run.method
+    """Ours, the thesis's and how many times ours is smaller, with the least ratio where one is a target."""
+    label, figures = theirs.run.method, list[Figure]()
     shares = f"measured: {label} {percent(measured_share(theirs.run))}, ours {percent(measured_share(ours.run))}"
+    accuracy, speed = at_least(MIN_ACCURACY_RATIO), at_least(MIN_SPEED_RATIO)
     late, their_late = ours.run.latency, theirs.run.latency
-    return [
-        *_pair(
-            f"{name}: error", label, "mm RMSE", (ours.millimetres, theirs.millimetres), REFERENCE_MM, MIN_ACCURACY_RATIO
-        ),
-        *_pair(f"{name}: turn", label, "deg RMSE", (ours.degrees, theirs.degrees), "", MIN_ACCURACY_RATIO, shares),
-        *_pair(
-            f"{name}: pose after",
-            label,
-            "ms, median",
-            (late.p50[-1], their_late.p50[-1]),
-            REFERENCE_MS,
-            MIN_SPEED_RATIO,
-        ),
-        *_pair(f"{name}: pose after, 99 %", label, "ms", (late.p99[-1], their_late.p99[-1])),
-        *_pair(f"{name}: processor", label, "ms, median", (ours.processor, theirs.processor)),
-    ]
-
-
-def _pair(
-    what: str, label: str, unit: str, values: tuple[float, float], reference: str = "", times: float | None = None,
-    note: str = "",
-) -> list[Figure]:  # fmt: skip
-    """Ours, the thesis's and how many times ours is smaller, which should be at least `times`."""
-    ours, theirs = map(float, values)
-    target, ratio = None if times is None else at_least(times), theirs / ours if ours > 0 else math.nan
-    return [
-        Figure(f"{what}, ours", ours, unit, note=note),
-        Figure(f"{what}, {label}", theirs, unit, reference=reference),
-        Figure(f"{what}, {label} / ours", ratio, "times", target),
-    ]
+    for what, unit, own, other, reference, target, note in (
+        ("error", "mm RMSE", ours.millimetres, theirs.millimetres, REFERENCE_MM, accuracy, ""),
+        ("turn", "deg RMSE", ours.degrees, theirs.degrees, "", accuracy, shares),
+        ("pose after", "ms, median", late.p50[-1], their_late.p50[-1], REFERENCE_MS, speed, ""),
+        ("pose after, 99 %", "ms", late.p99[-1], their_late.p99[-1], "", None, ""),
+        ("processor", "ms, median", ours.processor, theirs.processor, "", None, ""),
+    ):
+        ratio = float(other) / float(own) if own > 0 else math.nan
+        figures += [
+            Figure(f"{name}: {what}, ours", float(own), unit, note=note),
+            Figure(f"{name}: {what}, {label}", float(other), unit, reference=reference),
+            Figure(f"{name}: {what}, {label} / ours", ratio, "times", target),
+        ]
+    return figures
 
 
 LATENCY_REFERENCE = "thesis 70"
 LATENCY_TARGETS = ("median", 50, at_most(8)), ("99 %", 99, at_most(16)), ("largest", 100, at_most(33))
 TRACK_TARGETS = ("median", 50, at_most(5)), ("99 %", 99, at_most(10))  # 120 a camera
 ESTIMATION_TARGET = at_most(4)  # ms, 99 %
-JPEG_QUALITY = 95  # of JPEG: what is held in memory until it is shown
+JPEG_QUALITY = 95  # of the pictures that wait in memory
 WARM_UP_STEPS = 10  # frame sets after the first map that only fill caches and the window
 
 
 def run_latency(options: argparse.Namespace) -> list[Figure]:
     """Latencies on each recording."""
-    shown = [recorded_session(path) for path in options.sessions]
-    shown = shown or [made_recording(name, options.seconds) for name in options.scene]
-    return [figure for each in shown for figure in latency_figures(each.name, *time_steps(each))]
+    recordings = shown_recordings(options, options.scene)
+    return [figure for each in recordings for figure in latency_figures(each.name, *_time_steps(each))]
 
 
-def time_steps(shown: Recording) -> tuple[Array, Array]:
+def _time_steps(recording: Recording) -> tuple[Array, Array]:
     """Wall time (N, 1 + len(STAGES)) s, in all and by stage, and processor time (N,), s, of each tracked frame set."""
     now, processor = WallClock().now, ProcessorClock().now
-    rows, costs, known = [], [], 0
-    with tracker(shown.rig, shown.roi, shown.surface, now) as step:
-        for frames in _held(shown.frame_sets()):
+    rows, costs, initialised = [], [], 0
+    # all are rendered before the first is tracked
+    packed = [
+        (frames.stamp, [(f.camera, f.stamp, encode(f.image, JPEG_QUALITY)[1]) for f in frames.frames])
+        for frames in recording.frame_sets()
+    ]
+    with tracker(recording.rig, recording.roi, recording.surface, now) as step:
+        for stamp, pictures in packed:
+            frames = tuple(Frame(c, t, decode(data, "bench", "picture")) for c, t, data in pictures)
             start, cost = now(), processor()
-            pose = step(frames)
+            pose = step(FrameSet(stamp, frames))
             cost, spent = processor() - cost, now() - start
             step.idle()
-            known += pose.state is not TrackState.INITIALISING
-            if known > WARM_UP_STEPS:
+            initialised += pose.state is not TrackState.INITIALISING
+            if initialised > WARM_UP_STEPS:
                 rows.append([spent, *step.last.seconds])
                 costs.append(cost)
     return np.array(rows).reshape(-1, 1 + len(STAGES)), np.array(costs)
-
-
-def _held(frame_sets: Iterable[FrameSet]) -> Iterator[FrameSet]:
-    """All frame sets, made before the first is given out: whatever renders them is done by then."""
-    packed = [
-        (frames.stamp, [(f.camera, f.stamp, encode(f.image, JPEG_QUALITY)[1]) for f in frames.frames])
-        for frames in frame_sets
-    ]
-    for stamp, frames in packed:
-        yield FrameSet(stamp, tuple(Frame(c, t, decode(data, "bench", "picture")) for c, t, data in frames))
 
 
 def latency_figures(name: str, wall: Array, processor: Array) -> list[Figure]:
     """Figures in ms of wall times (N, 1 + len(STAGES)) s and processor times (N,) s."""
     if not len(wall):
         return [Figure(f"{name}: pose after", math.nan, "ms", note="no surface was followed for long enough")]
+
+    def figure(what: str, seconds: Array, word: str, share: float, target: Target | None = None, *words: str) -> Figure:
+        return Figure(f"{name}: {what}, {word}", milliseconds(seconds, share), "ms", target, *words)
+
     note = f"{len(wall)} frame sets; the machine's load was {os.getloadavg()[0]:.1f}"
-    what = f"{name}: pose after"
-    figures = [_figure(what, wall[:, 0], *target, LATENCY_REFERENCE, note) for target in LATENCY_TARGETS]
-    figures.append(_figure(f"{name}: processor", processor, "median", 50, note="all threads"))
-    columns = dict(zip(STAGES, wall[:, 1:].T, strict=True))
-    figures += [_figure(f"{name}: {stage}", column, "median", 50) for stage, column in columns.items()]
-    tracking = columns["flow"] + columns["align"]
-    figures += [_figure(f"{name}: tracks of all cameras", tracking, *target) for target in TRACK_TARGETS]
-    figures.append(_figure(f"{name}: estimation alone", columns["pose"], "99 %", 99, ESTIMATION_TARGET))
-    asked = float(np.mean(columns["flow"] > 0))
-    return [*figures, Figure(f"{name}: frame sets that asked for flow", 100 * asked, "%")]
-
-
-def _figure(
-    what: str,
-    seconds: Array,
-    word: str,
-    share: float,
-    target: Target | None = None,
-    reference: str = "",
-    note: str = "",
-) -> Figure:
-    return Figure(f"{what}, {word}", 1000 * percentile(seconds, share), "ms", target, reference, note)
+    stages = dict(zip(STAGES, wall[:, 1:].T, strict=True))
+    tracking, flow = stages["flow"] + stages["align"], float(np.mean(stages["flow"] > 0))
+    return [
+        *(figure("pose after", wall[:, 0], *target, LATENCY_REFERENCE, note) for target in LATENCY_TARGETS),
+        figure("processor", processor, "median", 50, None, "", "all threads"),
+        *(figure(stage, seconds, "median", 50) for stage, seconds in stages.items()),
+        *(figure("tracks of all cameras", tracking, *target) for target in TRACK_TARGETS),
+        figure("estimation alone", stages["pose"], "99 %", 99, ESTIMATION_TARGET),
+        Figure(f"{name}: frame sets that asked for flow", 100 * flow, "%"),
+    ]
 
 
 ANGLES_DEG = (0.0, 36.0, 84.0, -36.0, 60.0, -60.0)  # the thesis's three cameras, and three more on the same arc
@@ -328,19 +286,17 @@ def axes_for(seconds: float) -> tuple[CostAxis, ...]:
     def moved(checkpoints: float) -> tuple[float, float]:
         return _two(carries(round(checkpoints), MOVED_PATHS)[0])
 
+    def late(minutes: float) -> tuple[float, float]:
+        end = round(60 * minutes * FRAME_RATE)
+        return _two(_spent(60 * WORLD_MINUTES[-1])[end - round(seconds * FRAME_RATE) : end])
+
     return (
         CostAxis("tracks", "landmarks", pose, (25, 50, 100, 200, 400), lambda n: tracked(count=round(n))),
         CostAxis("cameras", "cameras", pose, (2, 3, 4, 6), lambda n: tracked(cameras=round(n))),
-        CostAxis("minutes", "min behind", pose, WORLD_MINUTES, lambda n: _behind(n, seconds)),
+        CostAxis("minutes", "min behind", pose, WORLD_MINUTES, late),
         CostAxis("checkpoints", "checkpoints", path, (1e3, 1e4, 5e4, 2e5), moved),
         CostAxis("pixels", "Mpx a camera", frames, (0.23, 0.52, 0.92, 2.07), lambda n: _pictures(n, seconds)),
     )
-
-
-def _behind(minutes: float, last: float) -> tuple[float, float]:
-    """ms a step in the `last` s before so many minutes of a breathing world have passed."""
-    end = round(60 * minutes * FRAME_RATE)
-    return _two(_spent(60 * WORLD_MINUTES[-1])[end - round(last * FRAME_RATE) : end])
 
 
 @lru_cache(maxsize=1)
@@ -353,12 +309,12 @@ def _spent(seconds: float, count: int = 100, cameras: int = 3) -> Array:
 def _pictures(megapixels: float, seconds: float) -> tuple[float, float]:
     scale = (megapixels * 1e6 / (PICTURE_SIZE[0] * PICTURE_SIZE[1])) ** 0.5
     size = (8 * round(scale * PICTURE_SIZE[0] / 8), 8 * round(scale * PICTURE_SIZE[1] / 8))
-    wall, _ = time_steps(made_recording(GROWTH_RECORDING, seconds, arc_rig(size=size, focal=scale * PICTURE_FOCAL)))
+    wall, _ = _time_steps(made_recording(GROWTH_RECORDING, seconds, arc_rig(size=size, focal=scale * PICTURE_FOCAL)))
     return _two(wall[:, 0])
 
 
 def _two(seconds: Array) -> tuple[float, float]:
-    return 1000 * percentile(seconds, 50), 1000 * percentile(seconds, 99)
+    return milliseconds(seconds, 50), milliseconds(seconds, 99)
 
 
 def growth_figures(axis: CostAxis, costs: Array) -> list[Figure]:
@@ -381,19 +337,13 @@ def slope(values: Sequence[float], costs: Array) -> float:
 
 def growth_page(measured: Sequence[tuple[CostAxis, Array]]) -> str:
     """All curves on one page."""
-    keys = legend([line_key("estimate", "median"), line_key("truth", "99 %")])
-    parts = [
-        section(axis.name.capitalize(), f"{axis.what}, ms, over {axis.unit}.", _plot(axis, costs) + keys)
-        for axis, costs in measured
-    ]
+    parts, keys = [], legend([line_key("estimate", "median"), line_key("truth", "99 %")])
+    for axis, costs in measured:
+        x = np.array(axis.values, float)
+        plot = Plot(1000, 220, spanning([x]), (0.0, 1.1 * float(np.nanmax(costs))), label=f"ms over {axis.unit}")
+        for column, style in ((1, "truth"), (0, "estimate")):
+            plot.line(x, costs[:, column], style)
+            plot.dots(x, costs[:, column], style, 3)
+        parts.append(section(axis.name.capitalize(), f"{axis.what}, ms, over {axis.unit}.", plot.svg() + keys))
     lead = "Each curve is one thing that grows while all else stays what it usually is."
     return document("Bench", "How cost grows", lead, parts, "Made by stillbed bench growth.")
-
-
-def _plot(axis: CostAxis, costs: Array) -> str:
-    x = np.array(axis.values, float)
-    plot = Plot(1000, 220, spanning([x]), (0.0, 1.1 * float(np.nanmax(costs))), label=f"ms over {axis.unit}")
-    for column, style in ((1, "truth"), (0, "estimate")):
-        plot.line(x, costs[:, column], style)
-        plot.dots(x, costs[:, column], style, 3)
-    return plot.svg()

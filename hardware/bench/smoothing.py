@@ -1,11 +1,11 @@
 """Subject `smoothing`: smoothed poses beside causal ones, from tracks and from pictures; clocks, Ceres, time.
 
 Pictures: the simulator's scenarios, rendered and tracked as a live run would, and smoothed.
-Many small sessions: smoothed by one worker and by two, and by two of which one is killed on the way.
-Ceres, by pycolmap, solves what the smoother's elimination can be given too: a rig's bundle adjustment. pycolmap has no
-motion prior and no clocks, so ours are taken away: what is left are the squared pixels of all landmarks in all frame
-sets, cameras known, the first pose held (pycolmap's RigReprojErrorCost). Both begin at the same poses and landmarks, on
-one core, and stop where a step lowers the cost by less than a millionth of a per cent.
+Many small sessions: smoothed by one worker and by two, and by two of which one is killed.
+Ceres, by pycolmap, and the smoother's elimination solve the same bundle adjustment of a rig. pycolmap has no motion
+prior and no clocks, so ours are switched off: squared reprojection errors of all landmarks in all frame sets, cameras
+known, the first pose fixed (pycolmap's RigReprojErrorCost). Both begin at the same poses and landmarks, on one core,
+and stop where a step lowers the cost by less than a millionth of a per cent.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow
-from estimation.synthetic.world import World, synthetic_world
-from hardware.bench.figures import CONSISTENT_NEES, Figure, at_least, at_most, rms
+from estimation.synthetic.world import synthetic_world
+from hardware.bench.figures import CONSISTENT_NEES, Figure, at_least, at_most, columns, rms
 from hardware.files.session import Session
 from hardware.live.prerender import prerender
 from hardware.offline.smooth import Cluster, SmoothOptions, local_cluster, run_smooth, session_hash
@@ -55,17 +55,26 @@ SESSION_SETTINGS = 5.0, 30.0, 60  # s, Hz, landmarks
 MIN_SPEED_UP = 1.8
 
 
-def many_figures(count: int) -> list[Figure]:
-    """The gain of a second worker, and how many sessions are smoothed where one is killed."""
+def cluster_figures(count: int) -> list[Figure]:
+    """The gain of a second worker, and how many of so many equal sessions are smoothed where one worker is killed."""
     names = f"{count} sessions: two workers by one", f"{count} sessions, a worker killed: smoothed"
     with tempfile.TemporaryDirectory() as folder:
         sessions = Path(folder) / "sessions"
-        _write_sessions(sessions, count)
+        sessions.mkdir()
+        world = synthetic_world("breathing", *SESSION_SETTINGS)
+        blank = np.full((720, 1280), 90, np.uint8)
+        with Recorder(sessions / "s000.mcap", world.rig) as recorder:
+            for k, tracks in enumerate(world):
+                for camera in range(3 if k == 0 else 1):
+                    recorder.frame(Frame(camera, tracks.stamp, blank))
+                recorder.write(tracks)
+        for k in range(1, count):
+            shutil.copy(sessions / "s000.mcap", sessions / f"s{k:03}.mcap")
         try:
-            spent = [_smoothed(sessions, Path(folder) / f"by{workers}", workers)[0] for workers in (1, 2)]
+            spent = [_smooth_all(sessions, Path(folder) / f"by{workers}", workers)[0] for workers in (1, 2)]
         except InputError as missing:
             return [Figure(name, math.nan, "", None, "", str(missing)) for name in names]
-        _, done = _smoothed(sessions, Path(folder) / "killed", 2, kill=True)
+        _, done = _smooth_all(sessions, Path(folder) / "killed", 2, kill=True)
     note = f"{spent[0]:.1f} s and {spent[1]:.1f} s by the clock, at a load of {os.getloadavg()[0]:.1f}"
     return [
         Figure(names[0], spent[0] / spent[1], "", at_least(MIN_SPEED_UP), "", note),
@@ -73,22 +82,8 @@ def many_figures(count: int) -> list[Figure]:
     ]
 
 
-def _write_sessions(folder: Path, count: int) -> None:
-    """So many recordings with tracks, all alike."""
-    folder.mkdir()
-    world = synthetic_world("breathing", *SESSION_SETTINGS)
-    blank = np.full((720, 1280), 90, np.uint8)
-    with Recorder(folder / "s000.mcap", world.rig) as recorder:
-        for k, seen in enumerate(world):
-            for camera in range(3 if k == 0 else 1):
-                recorder.frame(Frame(camera, seen.stamp, blank))
-            recorder.write(seen)
-    for k in range(1, count):
-        shutil.copy(folder / "s000.mcap", folder / f"s{k:03}.mcap")
-
-
-def _smoothed(sessions: Path, out: Path, workers: int, kill: bool = False) -> tuple[float, int]:
-    """Seconds by the clock, once the workers stand, and sessions done. kill: one worker, after the first session."""
+def _smooth_all(sessions: Path, out: Path, workers: int, kill: bool = False) -> tuple[float, int]:
+    """Seconds by the clock, once the workers run, and sessions done. kill: one worker, after the first session."""
     clock, done = WallClock(), 0
     with local_cluster(workers) as cluster:
         start = clock.now()
@@ -106,8 +101,8 @@ class RenderedErrors:
 
     causal: float
     tracked: float  # smoothed by the run's own tracks
-    smoothed: float  # smoothed by what was found besides, too
-    found: ReobservedTracks
+    smoothed: float  # smoothed by reobserved tracks, too
+    reobserved: ReobservedTracks
 
 
 def rendered_figures(names: Sequence[str], seconds: float) -> list[Figure]:
@@ -123,15 +118,15 @@ def rendered_figures(names: Sequence[str], seconds: float) -> list[Figure]:
     return figures
 
 
-def rendered_figure(name: str, found: RenderedErrors) -> Figure:
+def rendered_figure(name: str, errors: RenderedErrors) -> Figure:
     """Smoothed by causal error of one scenario."""
-    tracks = found.found
+    tracks, tracked = errors.reobserved, 1000 * errors.tracked
     note = (
-        f"{1000 * found.smoothed:.1f} against {1000 * found.causal:.1f} um RMS, aligned; {1000 * found.tracked:.1f} um "
+        f"{1000 * errors.smoothed:.1f} against {1000 * errors.causal:.1f} um RMS, aligned; {tracked:.1f} um "
         f"without {tracks.looks} looks found besides, {tracks.early} of them before their landmarks joined"
     )
     what = f"pictures, {name}: error by the causal one's"
-    return Figure(what, found.smoothed / found.causal, "", at_most(0.6), "", note)
+    return Figure(what, errors.smoothed / errors.causal, "", at_most(0.6), "", note)
 
 
 def smooth_rendered(path: Path) -> RenderedErrors:
@@ -141,10 +136,10 @@ def smooth_rendered(path: Path) -> RenderedErrors:
         contents, out = session_hash(path), Path(folder)
         tracks = tracks_of(session, out, contents)
         before = smooth(session.rig, tracks.observations, start=tracks.start)
-        found = reobserve(session, tracks, before, out, contents)
-    after = smooth(session.rig, found.tracks.observations, start=tracks.start) if found.looks else before
+        again = reobserve(session, tracks, before, out, contents)
+    after = smooth(session.rig, again.tracks.observations, start=tracks.start) if again.looks else before
     (tracked, causal), (smoothed, _) = (_errors(session, result, tracks) for result in (before, after))
-    return RenderedErrors(causal, tracked, smoothed, found)
+    return RenderedErrors(causal, tracked, smoothed, again)
 
 
 def _errors(session: Session, result: Smoothed, tracks: SessionTracks) -> tuple[float, float]:
@@ -156,25 +151,23 @@ def _errors(session: Session, result: Smoothed, tracks: SessionTracks) -> tuple[
 
 
 UNGATED = 1e4  # times the gate: no residual is that large, and all count by their squares
-NO_MOTION_PRIOR = np.array(
-    [1e10] * 3 + [1e15] * 3
-)  # rad^2/s^5, mm^2/s^5: neighbouring poses know nothing of each other
+NO_MOTION_PRIOR = np.array([1e10] * 3 + [1e15] * 3)  # rad^2/s^5, mm^2/s^5: neighbouring poses are independent
 NO_JITTER = 1e-7, 1e-5  # s, px: exposures and images without a jitter
-COST_TOLERANCE, MAX_STEPS = 1e-8, 50  # of the cost, and steps
+COST_TOLERANCE, MAX_STEPS = 1e-8, 50  # of the cost; solver steps
 MISSING = "pycolmap is not installed (the extra [bench]): not compared"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedBundle:
-    """What a solver made of it."""
+    """The result of one solver."""
 
     rms: float  # px, of all residuals
     spent: float  # s of one core
-    steps: int  # how many it took
+    steps: int
 
 
 def ceres_figures(seconds: float, count: int) -> list[Figure]:
-    """Cost and time of ours by Ceres's; where pycolmap is not installed, that it is not."""
+    """Cost and time of ours by Ceres's; a note where pycolmap is not installed."""
     name = f"bundle adjustment, {seconds:g} s and {count} landmarks"
     try:
         import pycolmap
@@ -184,8 +177,8 @@ def ceres_figures(seconds: float, count: int) -> list[Figure]:
     world = synthetic_world("breathing", seconds, count=count)
     data = pack_tracks(list(world), len(world.rig))
     poses, points = rough_start(world.rig, data, None, None)
-    told = np.isfinite(points[:, 0])
-    data, points = data.landmarks(told), points[told]
+    known = np.isfinite(points[:, 0])
+    data, points = data.landmarks(known), points[known]
     own, theirs = adjust_ours(world.rig, data, poses, points), adjust_by_ceres(pycolmap, world.rig, data, poses, points)
     costs = f"residuals of {own.rms:.6f} against {theirs.rms:.6f} px RMS"
     times = f"{own.spent:.2f} s in {own.steps} steps against {theirs.spent:.2f} s in {theirs.steps}, of one core"
@@ -200,9 +193,9 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
     clock = ProcessorClock()
     start = clock.now()
     cameras, rest = smoothed.cameras_of(rig), np.zeros((len(poses), 6))
-    none = smoothed.correction_sigmas(smoothed.CalibrationPrior(clock=0.0), len(rig))
+    sigmas = smoothed.correction_sigmas(smoothed.CalibrationPrior(clock=0.0), len(rig))
     known = Priors(
-        cameras, smoothed.prior_information(none, len(rig)), points, np.eye(points.size) / FREE_LANDMARK_MM**2,
+        cameras, smoothed.prior_information(sigmas, len(rig)), points, np.eye(points.size) / FREE_LANDMARK_MM**2,
         poses[0], 0, HELD_POSE_SIGMA, np.tile(NO_MOTION_PRIOR, (len(poses) - 1, 1)),
     )  # fmt: skip
     problem = BatchProblem(data, np.zeros(0, np.int64))
@@ -221,22 +214,41 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
 
 
 def adjust_by_ceres(pycolmap: Any, rig: Rig, data: TrackArrays, poses: Array, points: Array) -> AdjustedBundle:
-    """By pycolmap, whose world is the surface, whose rig stands in its first camera."""
+    """By pycolmap, whose world frame is the surface, and whose rig frame is the first camera."""
+
+    def rigid(transform: Array) -> Any:
+        return pycolmap.Rigid3d(np.ascontiguousarray(transform[:3]))
+
     whole, first = pycolmap.Reconstruction(), rig.cameras[0].base_from_camera
     model = pycolmap.Rig(rig_id=1)
     for c, camera in enumerate(rig.cameras):
         m, (width, height) = camera.matrix, camera.size
         lens = [m[0, 0], m[1, 1], m[0, 2], m[1, 2]]
-        eye = pycolmap.Camera(camera_id=c + 1, model="PINHOLE", width=width, height=height, params=lens)
-        whole.add_camera(eye)
+        pinhole = pycolmap.Camera(camera_id=c + 1, model="PINHOLE", width=width, height=height, params=lens)
+        whole.add_camera(pinhole)
         if c == 0:
-            model.add_ref_sensor(eye.sensor_id)
+            model.add_ref_sensor(pinhole.sensor_id)
         else:
-            model.add_sensor(eye.sensor_id, _rigid(pycolmap, se3.inverse(camera.base_from_camera) @ first))
+            model.add_sensor(pinhole.sensor_id, rigid(se3.inverse(camera.base_from_camera) @ first))
     whole.add_rig(model)
-    elements: list[list[Any]] = [[] for _ in points]
+    elements: list[list[Any]] = [[] for _ in points]  # the images of each landmark
     for k, pose in enumerate(poses):
-        _add_frame(pycolmap, whole, rig, data, k, se3.inverse(first) @ pose, elements)
+        frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
+        part, images = slice(data.starts[k], data.starts[k + 1]), []
+        for c in range(len(rig)):
+            rows = np.flatnonzero(data.camera[part] == c) + data.starts[k]
+            number = k * len(rig) + c + 1
+            for i, row in enumerate(rows):
+                elements[data.landmark[row]].append(pycolmap.TrackElement(number, i))
+            image = pycolmap.Image(name=str(number), keypoints=data.pixels[rows], camera_id=c + 1, image_id=number)
+            image.frame_id = k + 1
+            frame.add_data_id(image.data_id)
+            images.append(image)
+        frame.rig_from_world = rigid(se3.inverse(first) @ pose)
+        whole.add_frame(frame)
+        for image in images:
+            whole.add_image(image)
+        whole.register_frame(k + 1)
     for place, track in zip(points, elements, strict=True):
         whole.add_point3D(place, pycolmap.Track(elements=track))
     options = pycolmap.BundleAdjustmentOptions()
@@ -254,48 +266,21 @@ def adjust_by_ceres(pycolmap: Any, rig: Rig, data: TrackArrays, poses: Array, po
     summary = pycolmap.create_default_ceres_bundle_adjuster(options, config, whole).solve()
     spent = clock.now() - start
     matrices = np.stack([whole.frame(k + 1).rig_from_world.matrix() for k in range(len(poses))])
-    found = first @ se3.make(matrices[:, :, :3], matrices[:, :, 3])
+    adjusted = first @ se3.make(matrices[:, :, :3], matrices[:, :, 3])
     places = np.stack([whole.point3D(n + 1).xyz for n in range(len(points))])
-    steps = summary.ceres_summary.num_successful_steps - 1  # the beginning counts as one
-    return AdjustedBundle(residual_rms(rig, data, found, places), spent, int(steps))
-
-
-def _add_frame(
-    pycolmap: Any, whole: Any, rig: Rig, data: TrackArrays, k: int, pose: Array, elements: list[Any]
-) -> None:
-    """Frame set k with its images; what each landmark is seen in goes to its `elements`."""
-    frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
-    part, images = slice(data.starts[k], data.starts[k + 1]), []
-    for c in range(len(rig)):
-        rows = np.flatnonzero(data.camera[part] == c) + data.starts[k]
-        number = k * len(rig) + c + 1
-        for i, row in enumerate(rows):
-            elements[data.landmark[row]].append(pycolmap.TrackElement(number, i))
-        image = pycolmap.Image(name=str(number), keypoints=data.pixels[rows], camera_id=c + 1, image_id=number)
-        image.frame_id = k + 1
-        frame.add_data_id(image.data_id)
-        images.append(image)
-    frame.rig_from_world = _rigid(pycolmap, pose)
-    whole.add_frame(frame)
-    for image in images:
-        whole.add_image(image)
-    whole.register_frame(k + 1)
+    steps = summary.ceres_summary.num_successful_steps - 1  # the initial evaluation counts as one
+    return AdjustedBundle(residual_rms(rig, data, adjusted, places), spent, int(steps))
 
 
 def residual_rms(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> float:
-    """Px, of all residuals: the cost that both lower, by arithmetic of neither."""
+    """Reprojection error, px RMS, by arithmetic of neither solver."""
     frame = np.repeat(np.arange(len(poses)), np.diff(data.starts))
     camera_from_base = se3.inverse(np.stack([camera.base_from_camera for camera in rig.cameras]))
-    there = (
-        camera_from_base[data.camera] @ poses[frame] @ np.insert(points, 3, 1.0, axis=1)[data.landmark][..., None]
-    )[:, :3, 0]
+    landmarks = np.insert(points, 3, 1.0, axis=1)[data.landmark][..., None]
+    in_camera = (camera_from_base[data.camera] @ poses[frame] @ landmarks)[:, :3, 0]
     matrices = np.stack([camera.matrix for camera in rig.cameras])[data.camera]
-    seen = (matrices @ (there / there[:, 2:])[..., None])[:, :2, 0]
-    return float(np.sqrt(((seen - data.pixels) ** 2).mean()))
-
-
-def _rigid(pycolmap: Any, transform: Array) -> Any:
-    return pycolmap.Rigid3d(np.ascontiguousarray(transform[:3]))
+    pixels = (matrices @ (in_camera / in_camera[:, 2:])[..., None])[:, :2, 0]
+    return float(np.sqrt(((pixels - data.pixels) ** 2).mean()))
 
 
 CAMERA_OFFSETS = (0.016, 0.0, -0.016)  # s
@@ -315,64 +300,59 @@ def run_smoothing(options: argparse.Namespace) -> list[Figure]:
     """All figures."""
     figures: list[Figure] = []
     for movement in options.movements:
-        pairs = [_pair(movement, seed, options) for seed in range(options.seeds)]
-        found = pair_figures(movement, pairs)
-        print(f"{movement}: {found[0].value:.2f} of the causal error", file=sys.stderr, flush=True)
-        figures += found
+        of_movement = pair_figures(movement, [_movement_errors(movement, k, options) for k in range(options.seeds)])
+        print(f"{movement}: {of_movement[0].value:.2f} of the causal error", file=sys.stderr, flush=True)
+        figures += of_movement
     if options.movements:
-        figures += _late_figures(options)
+        figures += _offset_figures(options)
     figures += rendered_figures(options.scenarios, options.rendered)
     if options.adjusted:
         figures += ceres_figures(options.adjusted, options.count)
     if options.sessions:
-        figures += many_figures(options.sessions)
+        figures += cluster_figures(options.sessions)
     figures += [figure for minutes in options.minutes for figure in _timed(minutes, options.count)]
     return figures + [_timed(1.0, count)[0] for count in options.landmarks]  # less memory than the longest run took
 
 
 def pair_figures(movement: str, pairs: list[MovementErrors]) -> list[Figure]:
     """The figures of one movement, over all its worlds."""
-    ours, causal = (1000 * float(np.sqrt(np.mean([getattr(p, n) for p in pairs]))) for n in ("smoothed", "causal"))
-    nees = float(np.mean([p.nees for p in pairs]))
-    note = f"{ours:.1f} against {causal:.1f} um RMS, aligned"
+    smoothed, causal, nees = (float(values.mean()) for values in columns(pairs, "smoothed", "causal", "nees"))
+    ours, theirs = (1000 * float(np.sqrt(square)) for square in (smoothed, causal))
+    note = f"{ours:.1f} against {theirs:.1f} um RMS, aligned"
     return [
-        Figure(f"{movement}: error by the causal one's", ours / causal, "", at_most(0.6), "", note),
+        Figure(f"{movement}: error by the causal one's", ours / theirs, "", at_most(0.6), "", note),
         Figure(f"{movement}: NEES/6", nees, "", CONSISTENT_NEES, "", "from the first pose"),
     ]
 
 
-def _pair(movement: str, seed: int, options: argparse.Namespace) -> MovementErrors:
+def _movement_errors(movement: str, seed: int, options: argparse.Namespace) -> MovementErrors:
     world = synthetic_world(movement, options.seconds, count=options.count, seed=seed)
     result = smooth(world.rig, list(world))
     causal = [pose for pose in follow(world, "seen").poses if pose.state.measured]
     rows = np.searchsorted(world.stamps, [pose.stamp - 1e-6 for pose in causal])
-    truth = world.truth.base_from_surface
-    poses = result.states.poses
+    poses, truth = result.states.poses, world.truth.base_from_surface
     theirs = np.stack([pose.base_from_surface for pose in causal])
-    return MovementErrors(_off(poses[rows], truth[rows]), _off(theirs, truth[rows]), _nees(result, truth))
+    # the first pose is aligned with the truth, as smoothing aligns its frame
+    error = se3.log(se3.inverse(poses) @ truth @ se3.inverse(truth[0]) @ poses[0])[1:]
+    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(result.covariance[1:, :6, :6]), error)
+    smoothed, nees = _squared_error(poses[rows], truth[rows]), float(squares.mean() / 6)
+    return MovementErrors(smoothed, _squared_error(theirs, truth[rows]), nees)
 
 
-def _off(poses: Array, truth: Array) -> float:
+def _squared_error(poses: Array, truth: Array) -> float:
     """Mean squared distance, mm^2, of the origin after the constant that fits best."""
     constant = best_constant(se3.inverse(truth) @ poses)
     return float(((poses[:, :3, 3] - (truth @ constant)[:, :3, 3]) ** 2).sum(1).mean())
 
 
-def _nees(result: Smoothed, truth: Array) -> float:
-    """NEES / 6 where the first pose is laid upon the truth, as smoothing lays its frame."""
-    poses = result.states.poses
-    off = se3.log(se3.inverse(poses) @ truth @ se3.inverse(truth[0]) @ poses[0])[1:]
-    return float(np.einsum("ni,nij,nj->n", off, np.linalg.inv(result.covariance[1:, :6, :6]), off).mean() / 6)
-
-
-def _late_figures(options: argparse.Namespace) -> list[Figure]:
-    """With late cameras and an imperfect calibration, which the recording corrects."""
+def _offset_figures(options: argparse.Namespace) -> list[Figure]:
+    """With exposure offsets and an imperfect calibration, which the recording corrects."""
     errors, offsets = [], []
     for seed in range(options.seeds):
         conditions: dict[str, Any] = {"seed": seed, "offsets": CAMERA_OFFSETS, "calibration": 0.3}
         world = synthetic_world("lively", options.seconds, count=options.count, **conditions)
         result = smooth(world.rig, list(world), prior=smoothed.REFINED_PRIOR)
-        errors.append(_off(result.states.poses, world.truth.base_from_surface))
+        errors.append(_squared_error(result.states.poses, world.truth.base_from_surface))
         offsets.append(result.offsets - np.array(CAMERA_OFFSETS))
     name = "lively, cameras 16 ms apart, calibrated to 0.3 px"
     return [
@@ -382,7 +362,7 @@ def _late_figures(options: argparse.Namespace) -> list[Figure]:
 
 
 def _timed(minutes: float, count: int) -> list[Figure]:
-    world: World = synthetic_world("breathing", 60 * minutes, count=count)
+    world = synthetic_world("breathing", 60 * minutes, count=count)
     tracks, clock = list(world), CpuClock()
     start = clock.now()
     smooth(world.rig, tracks)
