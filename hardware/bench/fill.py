@@ -1,9 +1,9 @@
 """Subjects `fill` and `plan`: beads in contours and random wounds, and a whole plan of a large wound.
 
-`fill`: contours beside what other planners lay into them, random wounds, the time it takes; a picture of all patterns.
-`plan`: from a damaged mesh in memory to the path: time, memory, fit. Each plan is made in a process of its own, whose
-peak memory is its own too. The time is of the processor, from the mesh's arrays to the path: the scan's making and the
-writing of files are not in it, and imports are told beside it.
+`fill`: coverage and time of contours, beside other planners', and of random wounds; a picture of all patterns.
+`plan`: from a damaged mesh in memory to the path: time, memory, fit. Each plan is made in a process of its own, to have
+its own peak memory. The time is of the processor, from the mesh's arrays to the path: without making the scan and
+writing files; the time of imports is given beside it.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -24,9 +22,9 @@ from shapely import affinity
 from shapely.geometry import LineString, MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from estimation.errors import InputError, StillbedError
-from estimation.se3 import Array, Index
-from hardware.bench.figures import Figure, at_least, at_most, with_progress
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress
 from hardware.process.clock import CpuClock, ProcessorClock
 from planning.fill import PATTERN_KINDS, PatternKind
 from planning.fill.bead import Bead, Pattern, PrintPace, print_cost
@@ -35,7 +33,7 @@ from planning.fill.region import FillCoverage, Region, areas, fill_coverage, onl
 
 Rng = np.random.Generator
 MAX_ROUGHNESS = 0.2  # mm: noise of the points of a contour, as segmentation leaves it
-MIN_AREA = 4.0  # mm2: smaller parts and holes are noise of the segmentation, not wound
+MIN_AREA = 4.0  # mm2: smaller parts and holes are noise of the segmentation
 
 
 def random_wound(rng: Rng) -> tuple[str, Region]:
@@ -44,7 +42,10 @@ def random_wound(rng: Rng) -> tuple[str, Region]:
     region = affinity.rotate(MAKERS[name](rng), rng.uniform(0, 360), origin=(0, 0))
     if rng.random() < 0.5:
         region = _rough(region, rng)
-    return name, _without_specks(affinity.translate(region, *rng.uniform(-50, 50, 2)))
+    region = affinity.translate(region, *rng.uniform(-50, 50, 2))
+    parts = [p for p in areas(only_areas(shapely.make_valid(region, method="structure"))) if p.area > MIN_AREA]
+    holes = [[h for h in p.interiors if Polygon(h).area > MIN_AREA] for p in parts]
+    return name, MultiPolygon([Polygon(p.exterior, h) for p, h in zip(parts, holes, strict=True)])
 
 
 def outline(name: str) -> Polygon:
@@ -54,13 +55,17 @@ def outline(name: str) -> Polygon:
         r = 14 * (1 + 0.12 * np.cos(2 * t + 0.4) + 0.07 * np.cos(3 * t + 2) + 0.03 * np.cos(5 * t))
         return Polygon(_polar(r, t))
     t = np.linspace(-1.3, 1.3, 60)
-    half = 2.8 + 0.7 * np.sin(3 * t + 1)
-    sides = [_polar(16 + way * half, t) for way in (1, -1)]
-    return Polygon(np.concatenate([sides[0], sides[1][::-1]]))
+    return _band(16, 2.8 + 0.7 * np.sin(3 * t + 1), t)
 
 
 def _polar(radius: Array, angle: Array) -> Array:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def _band(radius: float, half: Array, angle: Array) -> Polygon:
+    """A band along an arc; half: of its width (N,)."""
+    outer, inner = (_polar(radius + side * half, angle) for side in (1, -1))
+    return Polygon(np.concatenate([outer, inner[::-1]]))
 
 
 def _round(rng: Rng, radius: tuple[float, float] = (6.0, 18.0), strength: float = 0.25) -> Polygon:
@@ -86,8 +91,7 @@ def _bent(rng: Rng) -> Region:
     turn, radius = rng.uniform(0.5, 4.5) * (t - 0.5), rng.uniform(10, 25)
     half = rng.uniform(1.5, 4) * (1 + 0.3 * np.sin(rng.uniform(2, 9) * t + rng.uniform(0, 6)))
     half *= np.sqrt(np.maximum(1 - (2 * t - 1) ** 2, 0.05)) if rng.random() < 0.5 else 1.0
-    sides = [_polar(radius + s * half, turn) for s in (1, -1)]
-    return Polygon(np.concatenate([sides[0], sides[1][::-1]]))
+    return _band(radius, half, turn)
 
 
 def _slit(rng: Rng) -> Polygon:
@@ -132,37 +136,32 @@ def _rough(region: Region, rng: Rng) -> Region:
     return only_areas(shapely.union_all([shapely.make_valid(p, method="structure") for p in parts]))
 
 
-def _without_specks(region: Region) -> Region:
-    kept = [p for p in areas(only_areas(shapely.make_valid(region, method="structure"))) if p.area > MIN_AREA]
-    return MultiPolygon([Polygon(p.exterior, [h for h in p.interiors if Polygon(h).area > MIN_AREA]) for p in kept])
-
-
 MAKERS: dict[str, Callable[[Rng], Region]] = {
     **{"round": _round, "star": lambda rng: _round(rng, (10.0, 18.0), 0.6), "angular": _angular, "bent": _bent},
     **{"slit": _slit, "necked": _necked, "holed": _holed, "parted": _parted},
 }
 
-PX_A_MM, DRAWING_MARGIN, CAPTION_HEIGHT = 9.0, 12.0, 34.0  # px a mm; px around each drawing; px for two lines under it
+PX_PER_MM, DRAWING_MARGIN, CAPTION_HEIGHT = 9.0, 12.0, 34.0  # px around each drawing; px for two lines under it
 DRAWING_COLUMNS = 3
 DRAWN_WIDTH = 0.8  # mm, of the beads drawn
-WIDTH_STEP = 0.05  # mm: steps in which widths are drawn
+WIDTH_STEP = 0.05  # mm, to which widths are rounded
 
 
 def picture() -> str:
     """An SVG of all patterns in one outline with a hole."""
     region = outline("oval").difference(outline("oval").buffer(-10.5))
     left, low, right, high = region.bounds
-    wide, tall = PX_A_MM * np.array([right - left, high - low]) + 2 * DRAWING_MARGIN + [0.0, CAPTION_HEIGHT]
+    wide, tall = PX_PER_MM * np.array([right - left, high - low]) + 2 * DRAWING_MARGIN + [0.0, CAPTION_HEIGHT]
     parts = []
     for i, kind in enumerate(PATTERN_KINDS):
         beads = fill(region, Pattern(kind, DRAWN_WIDTH), PrintPace())
-        found, cost = fill_coverage(beads, region), print_cost(beads, PrintPace())
+        coverage, cost = fill_coverage(beads, region), print_cost(beads, PrintPace())
         x, y = wide * (i % DRAWING_COLUMNS), tall * (i // DRAWING_COLUMNS)
-        told = f"{100 * found.covered:.1f} % covered, {100 * found.double:.1f} % twice, {cost.seconds:.1f} s"
+        text = f"{100 * coverage.covered:.1f} % covered, {100 * coverage.double:.1f} % twice, {cost.seconds:.1f} s"
         parts.append(
             f'<g transform="translate({x + DRAWING_MARGIN:.0f} {y + DRAWING_MARGIN:.0f})">{_drawn(beads, left, high)}'
             f'<text y="{tall - CAPTION_HEIGHT:.0f}" font-weight="bold">{kind}</text>'
-            f'<text y="{tall - CAPTION_HEIGHT + 15:.0f}">{told}</text></g>'
+            f'<text y="{tall - CAPTION_HEIGHT + 15:.0f}">{text}</text></g>'
         )
     width, height = DRAWING_COLUMNS * wide, -(-len(PATTERN_KINDS) // DRAWING_COLUMNS) * tall
     return (
@@ -173,14 +172,15 @@ def picture() -> str:
 
 def _drawn(beads: Sequence[Bead], left: float, high: float) -> str:
     def path(points: Array) -> str:
-        x, y = PX_A_MM * (points[:, 0] - left), PX_A_MM * (high - points[:, 1])
+        x, y = PX_PER_MM * (points[:, 0] - left), PX_PER_MM * (high - points[:, 1])
         return "M" + " ".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
 
-    laid = "".join(
-        f'<path d="{path(points)}" stroke-width="{PX_A_MM * width:.1f}"/>'
-        for bead in beads
-        for points, width in _even(bead)
-    )
+    laid = ""
+    for bead in beads:  # in stretches of about one width each
+        width = np.round((bead.width[1:] + bead.width[:-1]) / 2 / WIDTH_STEP) * WIDTH_STEP
+        ends = [0, *(np.flatnonzero(np.diff(width)) + 1).tolist(), len(width)]
+        for a, b in pairwise(ends):
+            laid += f'<path d="{path(bead.points[a : b + 1])}" stroke-width="{PX_PER_MM * float(width[a]):.1f}"/>'
     middles = "".join(f'<path d="{path(bead.points)}"/>' for bead in beads)
     hops = "".join(f'<path d="{path(np.stack([a.points[-1], b.points[0]]))}"/>' for a, b in pairwise(beads))
     return (
@@ -190,14 +190,7 @@ def _drawn(beads: Sequence[Bead], left: float, high: float) -> str:
     )
 
 
-def _even(bead: Bead) -> list[tuple[Array, float]]:
-    """A bead as stretches (N, 2) of about one width each, mm."""
-    width = np.round((bead.width[1:] + bead.width[:-1]) / 2 / WIDTH_STEP) * WIDTH_STEP
-    ends = [0, *(np.flatnonzero(np.diff(width)) + 1).tolist(), len(width)]
-    return [(bead.points[a : b + 1], float(width[a])) for a, b in pairwise(ends)]
-
-
-RETRY_ANGLE = 0.7  # rad: by which each tenth wound is laid again, at no multiple of anything
+RETRY_ANGLE = 0.7  # rad: by which each tenth wound is turned and filled again, a multiple of no pattern's angle
 THESIS_CONTOUR = 3995.5, 3.0  # px2 and px: the largest contour of thesis 5.3, and its lines' spacing
 PEERS = {  # what other planners reach at PEER_WIDTH and Pace(): covered %, s
     "blob": "contour-parallel by shapely 99.40 % in 48.3 s, PrusaSlicer concentric 98.82 % in 48.6 s",
@@ -212,11 +205,10 @@ def run_fill(options: argparse.Namespace) -> list[Figure]:
     regions = regions or {name: outline(name) for name in ("oval", "bow")}
     if options.picture is not None:
         options.picture.write_text(picture(), encoding="utf-8")
-    figures = []
-    for name, region in regions.items():
-        figures += _of_contour(name, region, Pattern(options.kind, options.contour_width))
+    pattern = Pattern(options.kind, options.contour_width)
+    figures = [figure for name, region in regions.items() for figure in _contour_figures(name, region, pattern)]
     if options.count:
-        figures += _of_wounds(Pattern(options.kind, options.width), options.count, options.seed)
+        figures += _wound_figures(Pattern(options.kind, options.width), options.count, options.seed)
     return figures + _times(options.kind)
 
 
@@ -229,38 +221,41 @@ def _contour(path: Path) -> Region:
     return region_of(points, path)
 
 
-def _of_contour(name: str, region: Region, pattern: Pattern) -> list[Figure]:
-    pace = PrintPace()
-    beads = fill(region, pattern, pace)
-    found, cost = fill_coverage(beads, region), print_cost(beads, pace)
-    wanted = CONTOUR_TARGETS.get(name)
-    least, most = (at_least(wanted[0]), at_most(wanted[1])) if wanted else (None, None)
-    laid = f"{cost.printed:.0f} mm printed, {cost.travelled:.0f} mm travelled, {cost.turns} turns, {len(beads)} beads"
+def _contour_figures(name: str, region: Region, pattern: Pattern) -> list[Figure]:
+    beads = fill(region, pattern, PrintPace())
+    coverage, cost = fill_coverage(beads, region), print_cost(beads, PrintPace())
+    targets = CONTOUR_TARGETS.get(name)
+    covered, seconds = (at_least(targets[0]), at_most(targets[1])) if targets else (None, None)
+    note = f"{cost.printed:.0f} mm printed, {cost.travelled:.0f} mm travelled, {cost.turns} turns, {len(beads)} beads"
     peers = PEERS.get(name, "")
     return [
-        Figure(f"{name}: covered", 100 * found.covered, "%", least, peers),
-        Figure(f"{name}: over", 100 * found.over, "%", at_most(0.05)),
-        Figure(f"{name}: double", 100 * found.double, "%", at_most(3.0)),
-        Figure(f"{name}: time", cost.seconds, "s", most, peers, laid),
+        Figure(f"{name}: covered", 100 * coverage.covered, "%", covered, peers),
+        Figure(f"{name}: over", 100 * coverage.over, "%", at_most(0.05)),
+        Figure(f"{name}: double", 100 * coverage.double, "%", at_most(3.0)),
+        Figure(f"{name}: time", cost.seconds, "s", seconds, peers, note),
     ]
 
 
-def _of_wounds(pattern: Pattern, count: int, seed: int) -> list[Figure]:
-    found: list[FillCoverage] = []
+def _wound_figures(pattern: Pattern, count: int, seed: int) -> list[Figure]:
+    coverages: list[FillCoverage] = []
     crashes, turned, worst = 0, 0.0, ""
+    cosine, sine = np.cos(RETRY_ANGLE), np.sin(RETRY_ANGLE)
+    rotation = np.array([[cosine, sine], [-sine, cosine]])
     for i in with_progress("random wounds", "wounds", range(count), count):
         kind, region = random_wound(np.random.default_rng([seed, i]))
         try:
-            one = fill_coverage(fill(region, pattern, PrintPace()), region)
+            coverage = fill_coverage(fill(region, pattern, PrintPace()), region)
             if i % 10 == 0:
-                turned = max(turned, abs(one.covered - _turned_coverage(region, pattern).covered))
+                again = shapely.transform(region, lambda points: points @ rotation)
+                change = coverage.covered - fill_coverage(fill(again, pattern, PrintPace()), again).covered
+                turned = max(turned, abs(change))
         except Exception:  # whatever it is, it is counted
             crashes += 1
             continue
-        if not found or one.covered < min(f.covered for f in found):
+        if not coverages or coverage.covered < min(f.covered for f in coverages):
             worst = f"worst: number {i}, {kind}"
-        found.append(one)
-    covered, double = (100 * np.array([getattr(f, name) for f in found]) for name in ("covered", "double"))
+        coverages.append(coverage)
+    covered, double, over = (100 * values for values in columns(coverages, "covered", "double", "over"))
     note = f"{count} of seed {seed}, bead {pattern.width:g} mm"
     return [
         Figure("wounds: crashes", crashes, "", at_most(0), "", note),
@@ -268,15 +263,9 @@ def _of_wounds(pattern: Pattern, count: int, seed: int) -> list[Figure]:
         Figure("wounds: covered, median", float(np.median(covered)), "%"),
         Figure("wounds: covered below 99 %", float(np.mean(covered < 99) * 100), "%", None, "", "share of the wounds"),
         Figure("wounds: double, most", float(double.max()), "%", at_most(5.0), "none published"),
-        Figure("wounds: over, most", 100 * max(f.over for f in found), "%"),
+        Figure("wounds: over, most", float(over.max()), "%"),
         Figure("wounds: covered when turned, change", 100 * turned, "%", at_most(0.2), "", "each tenth, by 40 degrees"),
     ]
-
-
-def _turned_coverage(region: Region, pattern: Pattern) -> FillCoverage:
-    c, s = np.cos(RETRY_ANGLE), np.sin(RETRY_ANGLE)
-    turned = shapely.transform(region, lambda points: points @ np.array([[c, s], [-s, c]]))
-    return fill_coverage(fill(turned, pattern, PrintPace()), turned)
 
 
 def _times(kind: PatternKind) -> list[Figure]:
@@ -294,12 +283,12 @@ def _times(kind: PatternKind) -> list[Figure]:
 
 
 def _median_ms(work: Callable[[], object], count: int) -> float:
-    clock, taken = CpuClock(), []
+    clock, times = CpuClock(), []
     for _ in range(count):
-        begun = clock.now()
+        start = clock.now()
         work()
-        taken.append(1e3 * (clock.now() - begun))
-    return float(np.median(taken))
+        times.append(1e3 * (clock.now() - start))
+    return float(np.median(times))
 
 
 PLAN_WOUND_SIZE, PLAN_WOUND_DEPTH = (60.0, 40.0), 4.0  # mm; with the bed's unevenness 6 mm deep at the deepest
@@ -313,9 +302,9 @@ import sys
 import numpy
 from hardware.process.clock import ProcessorClock
 clock = ProcessorClock()
-begun = clock.now()
+start = clock.now()
 import planning.fill.bead, planning.layers.plan, planning.layers.repair, planning.layers.slicing, planning.layers.wound
-imports = clock.now() - begun
+imports = clock.now() - start
 from hardware.bench.fill import measure_plan
 measure_plan(imports, *sys.argv[1:])
 """
@@ -323,7 +312,7 @@ measure_plan(imports, *sys.argv[1:])
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPlan:
-    """What one process told."""
+    """The measurements of one process."""
 
     imports: float  # s of the processor
     seconds: float  # of the processor
@@ -343,8 +332,12 @@ def run_plan(options: argparse.Namespace) -> list[Figure]:
 
 
 def _plan_figures(kind: str, pattern: str, mode: str) -> list[Figure]:
-    name = f"{pattern}, layers {mode}"
-    m = _measured_apart(kind, pattern, mode)
+    # in a process of its own, where the imports of planning are measured before anything else is loaded
+    command = [sys.executable, "-c", PLAN_PROCESS, kind, pattern, mode]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise StillbedError(f"planning ended with {done.returncode}: {done.stderr.strip()[-300:]}")
+    m, name = MeasuredPlan(**json.loads(done.stdout)), f"{pattern}, layers {mode}"
     note = f"{m.layers} layers, {m.checkpoints} checkpoints, {m.depth:.1f} mm deep; imports {m.imports:.2f} s apart"
     return [
         Figure(f"{name}: time", m.seconds, "s", at_most(2.0), "none", note),
@@ -355,24 +348,19 @@ def _plan_figures(kind: str, pattern: str, mode: str) -> list[Figure]:
     ]
 
 
-def _measured_apart(kind: str, pattern: str, mode: str) -> MeasuredPlan:
-    """What a process of its own measures. What planning takes to be imported is measured before anything else loads."""
-    command = [sys.executable, "-c", PLAN_PROCESS, kind, pattern, mode]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise StillbedError(f"planning ended with {done.returncode}: {done.stderr.strip()[-300:]}")
-    return MeasuredPlan(**json.loads(done.stdout))
-
-
 def measure_plan(imports: float, kind: str, pattern: str, mode: str) -> None:
-    """Plan once, in this process, and print what came of it. imports: s, that planning took to be imported."""
+    """Plan once, in this process, and print the measurements. imports: s, that the imports of planning took."""
+    from hardware.simulator.scene.shape import Wound, body
     from planning.layers.plan import PlanOrder, figures_of, make_plan, total_of
     from planning.layers.repair import repair_mesh
     from planning.layers.slicing import Tissue
     from planning.layers.wound import find_wound
 
     clock = ProcessorClock()
-    vertices, triangles = _scan(kind)
+    vertices, triangles = body(kind, Wound(PLAN_WOUND_SIZE, PLAN_WOUND_DEPTH), 1).mesh(SCAN_SPACING)
+    chance = np.random.default_rng(1).random(len(triangles))  # some triangles are turned over, some are missing
+    triangles = np.where((chance < DAMAGED_SHARE)[:, None], triangles[:, ::-1], triangles)
+    triangles = triangles[chance < 1 - DAMAGED_SHARE]
     layers = ("hypodermis", None), ("dermis", 1.6), ("epidermis", 0.4)
     tissues = tuple(Tissue(name, thickness, name) for name, thickness in layers)
     order = PlanOrder(tissues, Pattern(pattern, PLAN_BEAD), mode)  # type: ignore[arg-type]
@@ -381,19 +369,6 @@ def measure_plan(imports: float, kind: str, pattern: str, mode: str) -> None:
     plan = make_plan(find_wound(scan, 0.6 * PLAN_BEAD, "scan"), order)
     seconds = clock.now() - start
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    total, found = total_of(figures_of(plan)), plan.wound.findings
-    measured = MeasuredPlan(
-        imports, seconds, memory, len(plan.path), len(plan.layers), found.depth,
-        float(plan.points.volume.sum()) / found.volume, total.covered, total.double,
-    )  # fmt: skip
-    print(json.dumps(asdict(measured)))
-
-
-def _scan(kind: str) -> tuple[Array, Index]:
-    """A damaged scan: vertices (V, 3) mm, triangles (T, 3)."""
-    from hardware.simulator.scene.shape import Wound, body
-
-    vertices, triangles = body(kind, Wound(PLAN_WOUND_SIZE, PLAN_WOUND_DEPTH), 1).mesh(SCAN_SPACING)
-    chance = np.random.default_rng(1).random(len(triangles))
-    triangles = np.where((chance < DAMAGED_SHARE)[:, None], triangles[:, ::-1], triangles)
-    return vertices, triangles[chance < 1 - DAMAGED_SHARE]
+    total, wound = total_of(figures_of(plan)), plan.wound.findings
+    filled, sizes = float(plan.points.volume.sum()) / wound.volume, (len(plan.path), len(plan.layers), wound.depth)
+    print(json.dumps(asdict(MeasuredPlan(imports, seconds, memory, *sizes, filled, total.covered, total.double))))

@@ -1,7 +1,7 @@
-"""A stretch of tracking with one camera outage after the other, and what the tracker said and did in each frame set.
+"""Tracking with one camera outage after the other, and the tracker's pose, state and reason in each frame set.
 
-Outages are laid over the images of one instant: each is a kind, the cameras it strikes, when, and how hard; all chance
-is drawn once, when the outage is.
+Outages change the images of one instant: each has a kind, the cameras it strikes, a time and a strength; everything
+random is drawn once, with the outage.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ RAY_SPACING = 8  # px between the rays that are traced for a bumped camera
 
 
 class OutageKind(Enum):
-    """What goes wrong. The last five may leave a camera of some use."""
+    """What goes wrong. The last five may leave a camera partly usable."""
 
     OCCLUDED = "occluded"  # something lies over the whole wound, from one frame to the next
     DEAD = "dead"  # no picture comes
@@ -54,7 +54,7 @@ class OutageKind(Enum):
 
     @property
     def blinds(self) -> bool:
-        """Whether a camera struck by it is of no use at all."""
+        """Whether a struck camera is of no use at all."""
         return self in tuple(OutageKind)[:6]
 
 
@@ -81,20 +81,17 @@ def draw_outage(
         OutageKind.FLASH: FLASH,
     }.get(kind, (MIN_OCCLUSION, 2.0))
     length = min(float(np.exp(rng.uniform(np.log(low), np.log(high)))), longest)
-    most = {OutageKind.SWAPPED: (2,), OutageKind.BUMPED: (1,)}.get(kind, (1, 1, 2, 3))
-    count = min(int(rng.choice(most)), len(rig))
+    counts = {OutageKind.SWAPPED: (2,), OutageKind.BUMPED: (1,)}.get(kind, (1, 1, 2, 3))
+    count = min(int(rng.choice(counts)), len(rig))
     cameras = tuple(sorted(rng.choice(len(rig), count, replace=False).tolist()))
-    across = np.array([*_unit(rng), 0.3 * rng.normal()])  # pan and tilt show, roll hardly
-    shift = np.array([*_unit(rng), 0.3 * rng.normal()])
-    hard = rng.uniform(1.0, 2.0)
-    turn = bool(rng.integers(2))
-    xi = np.concatenate([across * BUMP_TURN * hard * turn, shift * BUMP_SHIFT * hard * (not turn)])
+
+    def across() -> Array:  # pan and tilt show, roll hardly
+        angle = rng.uniform(0, 2 * np.pi)
+        return np.array([np.cos(angle), np.sin(angle), 0.3 * rng.normal()])
+
+    axis, shift, size, turn = across(), across(), rng.uniform(1.0, 2.0), bool(rng.integers(2))
+    xi = np.concatenate([axis * BUMP_TURN * size * turn, shift * BUMP_SHIFT * size * (not turn)])
     return Outage(kind, cameras, start, start + length, float(rng.random()), se3.exp(xi), int(rng.integers(2**31)))
-
-
-def _unit(rng: np.random.Generator) -> Array:
-    angle = rng.uniform(0, 2 * np.pi)
-    return np.array([np.cos(angle), np.sin(angle)])
 
 
 class Spoiler:
@@ -110,51 +107,49 @@ class Spoiler:
     ) -> list[Image | None]:
         """What the cameras deliver at `stamp` instead of `images` (grey); last: what they did before the outage."""
         spoilt: list[Image | None] = list(images)
+        points = se3.transform_points(base_from_surface, self._extent)
         for c in outage.cameras:
-            spoilt[c] = self._one(outage, stamp, c, images, last, base_from_surface)
+            camera = self.rig.cameras[c]
+            if outage.kind is OutageKind.FROZEN:
+                spoilt[c] = last[c]
+            elif outage.kind is OutageKind.SWAPPED:
+                spoilt[c] = images[outage.cameras[1 - outage.cameras.index(c)]]
+            elif outage.kind is OutageKind.BUMPED:
+                # the surface's tangent plane in the bumped camera; what is nearer or farther shifts by far less
+                if self._maps is None or self._maps[0] is not outage:
+                    self._maps = outage, _bump_maps(camera, outage.bump, base_from_surface)
+                moved = cv2.remap(images[c], *self._maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+                spoilt[c] = np.asarray(moved, np.uint8)
+            else:
+                pixels, _ = pixels_from_points(camera, points)
+                draw = np.random.default_rng([outage.seed, c])
+                spoilt[c] = _spoilt(outage, stamp, images[c], (pixels.min(0), pixels.max(0)), draw)
         return spoilt
 
-    def _one(
-        self, outage: Outage, stamp: float, c: int, images: list[Image], last: list[Image], base_from_surface: Array
-    ) -> Image | None:
-        image, hard = images[c], outage.strength
-        draw = np.random.default_rng([outage.seed, c])
-        match outage.kind:
-            case OutageKind.DEAD:
-                return None
-            case OutageKind.BLACK:
-                return np.full_like(image, 2)
-            case OutageKind.FROZEN:
-                return last[c]
-            case OutageKind.SWAPPED:
-                return images[outage.cameras[1 - outage.cameras.index(c)]]
-            case OutageKind.BUMPED:
-                return self._bumped(outage, c, image, base_from_surface)
-            case OutageKind.FLASH:
-                return _relit(image, 3.0 + 5.0 * hard, 30.0)
-            case OutageKind.EXPOSURE:
-                return _relit(image, 0.35 + 0.35 * hard if hard < 0.5 else 0.9 + 1.4 * hard, 0.0)
-            case OutageKind.BLUR:
-                return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.5 + 6.0 * hard), np.uint8)
-            case OutageKind.GLARE:
-                return draw_glare(image, self._box(c, base_from_surface), 0.25 + 0.5 * hard, draw)
-            case OutageKind.OCCLUDED:
-                return draw_cover(image, self._box(c, base_from_surface), 0.0, draw)
-            case OutageKind.HAND:
-                away = min(stamp - outage.start, outage.end - stamp) / HAND_SLIDE
-                reach = 0.6 if hard < 0.4 else 0.0  # two in five leave more than half of the wound free
-                return draw_cover(image, self._box(c, base_from_surface), max(reach, 1.0 - away), draw)
 
-    def _box(self, camera: int, base_from_surface: Array) -> tuple[Array, Array]:
-        """Low and high corner (2,) px of the wound in a camera's image."""
-        pixels, _ = pixels_from_points(self.rig.cameras[camera], se3.transform_points(base_from_surface, self._extent))
-        return pixels.min(0), pixels.max(0)
-
-    def _bumped(self, outage: Outage, camera: int, image: Image, base_from_surface: Array) -> Image:
-        """As the bumped camera sees the surface's tangent plane; what is nearer or farther shifts by far less."""
-        if self._maps is None or self._maps[0] is not outage:
-            self._maps = outage, _bump_maps(self.rig.cameras[camera], outage.bump, base_from_surface)
-        return np.asarray(cv2.remap(image, *self._maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+def _spoilt(
+    outage: Outage, stamp: float, image: Image, box: tuple[Array, Array], draw: np.random.Generator
+) -> Image | None:
+    """One image in an outage that needs no other. box: low and high corner (2,) px of the wound in it."""
+    strength = outage.strength
+    match outage.kind:
+        case OutageKind.BLACK:
+            return np.full_like(image, 2)
+        case OutageKind.FLASH:
+            return _relit(image, 3.0 + 5.0 * strength, 30.0)
+        case OutageKind.EXPOSURE:
+            return _relit(image, 0.35 + 0.35 * strength if strength < 0.5 else 0.9 + 1.4 * strength, 0.0)
+        case OutageKind.BLUR:
+            return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.5 + 6.0 * strength), np.uint8)
+        case OutageKind.GLARE:
+            return draw_glare(image, box, 0.25 + 0.5 * strength, draw)
+        case OutageKind.OCCLUDED:
+            return draw_cover(image, box, 0.0, draw)
+        case OutageKind.HAND:
+            away = min(stamp - outage.start, outage.end - stamp) / HAND_SLIDE
+            reach = 0.6 if strength < 0.4 else 0.0  # two in five leave more than half of the wound free
+            return draw_cover(image, box, max(reach, 1.0 - away), draw)
+    return None
 
 
 def _relit(image: Image, gain: float, offset: float) -> Image:
@@ -172,11 +167,9 @@ def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Arr
     rays = np.c_[tangents, np.ones(len(tangents))] @ base_from_bumped[:3, :3].T
     centre, plane = base_from_bumped[:3, 3], base_from_surface[:3, 2]
     reach = (base_from_surface[:3, 3] - centre) @ plane / (rays @ plane)
-    source = pixels_from_points(camera, centre + reach[:, None] * rays)[0].reshape(grid.shape)
-    x, y = np.meshgrid((np.arange(w) / RAY_SPACING + 1), (np.arange(h) / RAY_SPACING + 1))
-    fine: Map = np.asarray(
-        cv2.remap(source.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR), np.float32
-    )
+    source = pixels_from_points(camera, centre + reach[:, None] * rays)[0].reshape(grid.shape).astype(np.float32)
+    x, y = np.meshgrid(*((np.arange(n) / RAY_SPACING + 1).astype(np.float32) for n in (w, h)))
+    fine: Map = np.asarray(cv2.remap(source, x, y, cv2.INTER_LINEAR), np.float32)
     return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
 
 
@@ -184,23 +177,22 @@ FPS = 30.0
 MOTION_SETS = 96  # frame sets of the motion's loop: a breath of 3.2 s
 LOOP_WOUND = Wound((40.0, 28.0))
 WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 0.0, 24.0) for y in (-17.0, 0.0, 17.0)])  # mm, around the wound
-JUDGED_POINTS = np.array(
-    [[0, 0, 0], [15.0, 0, 0], [-15.0, 0, 0], [0, 10.0, 0], [0, -10.0, 0]]
-)  # mm: where prints are laid
+JUDGED_POINTS = np.array([[0, 0, 0], [15.0, 0, 0], [-15.0, 0, 0], [0, 10.0, 0], [0, -10.0, 0]])  # mm: of the print
 SPACE_95 = 2.8  # 95 % of a normal error in space lie within so many standard deviations
 START_S, CALM_S, REST_S = 1.5, 0.5, 0.7  # s before the first outage, before each, and watched after each
-JUMP_SHARE = 0.3  # of the outages in which nobody sees the surface it goes elsewhere meanwhile
+HIDING_KINDS = OutageKind.OCCLUDED, OutageKind.DEAD, OutageKind.BLACK  # where they strike all cameras
+JUMP_SHARE = 0.3  # of the outages that hide the surface, in which it moves elsewhere meanwhile
 ELSEWHERE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePictures:
-    """What all stretches of one scene look at."""
+    """The pictures of one scene for all stretches."""
 
     rig: Rig
     scene: Scene
-    near: PictureLoop  # of the motion at one place, and at another
-    far: PictureLoop
+    near: PictureLoop  # of the motion at one place
+    far: PictureLoop  # and at another
 
 
 def make_pictures(
@@ -219,9 +211,7 @@ def picture_loop(
     rig = arc_rig(size=size, focal=focal)
     shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), LOOP_WOUND, seed)
     scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=seed)
-    poses = closed_motion(
-        period, BASE_FROM_REST, rng, lively=period / MOTION_SETS
-    )  # at one speed, however short the loop
+    poses = closed_motion(period, BASE_FROM_REST, rng, lively=period / MOTION_SETS)  # of one speed for any period
     return rig, scene, PictureLoop(scene, rig, poses, seed)
 
 
@@ -232,7 +222,7 @@ class WatchedOutage:
     outage: Outage
     stamps: Array  # (K,) s
     error: Array  # (K,) mm, the largest of the judged points
-    radius: Array  # (K,) mm, within which 95 % of the errors there are claimed to lie
+    radius: Array  # (K,) mm, within which 95 % of the errors there lie by the covariance
     states: tuple[TrackState, ...]  # K
     reasons: tuple[str, ...]  # K
     used: NDArray[np.int64]  # (K, C) tracks that carry the pose
@@ -257,7 +247,7 @@ class TrackedStretch:
         self._rows: list[tuple[float, float, float, TrackState, str, NDArray[np.int64]]] = []
 
     def begin(self) -> bool:
-        """Start up; whether the tracker then tracks. What stands between the two surface frames is taken here."""
+        """Start up; whether the tracker then tracks. The transform between the two surface frames is measured here."""
         offsets = []
         for _ in range(round(START_S * FPS)):
             truth, pose = self._frame(None)
@@ -276,15 +266,12 @@ class TrackedStretch:
         for _ in range(round(CALM_S * FPS)):
             self._frame(None)
         outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng, longest)
-        hidden = len(outage.cameras) == len(self._pictures.rig) and kind in (
-            OutageKind.OCCLUDED,
-            OutageKind.DEAD,
-            OutageKind.BLACK,
-        )
+        hidden = len(outage.cameras) == len(self._pictures.rig) and kind in HIDING_KINDS
         before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMP_SHARE
+        near, far = self._pictures.near, self._pictures.far
         while self._count / FPS < outage.end - 1e-9:
             if jumps and self._count / FPS > outage.start + 0.5:
-                jumps, self._loop = False, self._other()
+                jumps, self._loop = False, far if self._loop is near else near
             self._frame(outage)
         for _ in range(round(REST_S * FPS)):
             self._frame(None)
@@ -292,31 +279,24 @@ class TrackedStretch:
         numbers, jumped = (np.array(stamps), np.array(error), np.array(radius)), self._loop is not before
         return WatchedOutage(outage, *numbers, states, reasons, np.stack(used), jumped)
 
-    def _other(self) -> PictureLoop:
-        return self._pictures.far if self._loop is self._pictures.near else self._pictures.near
-
     def _frame(self, outage: Outage | None) -> tuple[Array, SurfacePose]:
         """One frame set through the tracker; the true pose and the tracker's."""
         stamp, truth = self._count / FPS, self._loop.poses[self._at % len(self._loop)]
         images: list[Image | None] = list(self._loop.images(self._at))
-        kept = list(self._last)
+        last = list(self._last)
         if outage is not None:
-            images = self._spoiler(outage, stamp, self._loop.images(self._at), kept, truth)
+            images = self._spoiler(outage, stamp, self._loop.images(self._at), last, truth)
         frames = []
         for c, image in enumerate(images):
             if image is not None:
-                same = bool(kept) and image is kept[c]
+                same = bool(last) and image is last[c]
                 noisy = image if same else self._loop.noisy(image)
                 frames.append(Frame(c, stamp, noisy))
                 if outage is None:
                     self._last = [*self._last[:c], noisy, *self._last[c + 1 :]]
         pose = self._step(FrameSet(stamp, tuple(frames)))
         self._step.idle()
-        self._note(truth, pose)
         self._count, self._at = self._count + 1, self._at + 1
-        return truth, pose
-
-    def _note(self, truth: Array, pose: SurfacePose) -> None:
         error = radius = np.nan
         if self._constant is not None:
             expected = truth @ self._constant
@@ -325,16 +305,14 @@ class TrackedStretch:
             error = float(np.linalg.norm(gap, axis=1).max())
             radius = SPACE_95 * float(pose.error_at(points).max())
         self._rows.append((pose.stamp, error, radius, pose.state, pose.reason, self._step.last.used.copy()))
-
-
-def may_go_on(watched: WatchedOutage, good: float) -> bool:
-    """Whether the stretch may go on: the last frame sets are TRACKING and within `good` mm."""
-    last = slice(-5, None)
-    return all(s is TrackState.TRACKING for s in watched.states[last]) and float(watched.error[last].max()) < good
+        return truth, pose
 
 
 def run_stretch(pictures: ScenePictures, kinds: Sequence[OutageKind], seed: int, good: float) -> list[WatchedOutage]:
-    """Outages of these kinds in this order; where one is not recovered from, the tracker starts anew for the next."""
+    """Outages of these kinds in this order. The tracker starts anew after one from which it has not recovered.
+
+    good: mm, the largest error of the last five frame sets, which must be TRACKING, after a recovery.
+    """
     done: list[WatchedOutage] = []
     stretch: TrackedStretch | None = None
     for k, kind in enumerate(kinds):
@@ -342,7 +320,7 @@ def run_stretch(pictures: ScenePictures, kinds: Sequence[OutageKind], seed: int,
             stretch = TrackedStretch(pictures, seed + 1000 * k)
             if not stretch.begin():
                 raise RuntimeError(f"no start in scene of seed {seed}")
-        done.append(stretch.outage(kind))
-        if not may_go_on(done[-1], good):
+        done.append(watched := stretch.outage(kind))
+        if any(s is not TrackState.TRACKING for s in watched.states[-5:]) or not float(watched.error[-5:].max()) < good:
             stretch = None
     return done

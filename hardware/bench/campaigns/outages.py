@@ -1,6 +1,6 @@
 """`stillbed bench outages`: cameras fail in every way before a moving wound; is the tracker ever lost in silence?
 
-Each outage is laid over the pictures of a surface with exact truth, and what the tracking step says is held against it.
+Each outage is laid over the pictures of a surface with exact truth, with which the tracking step's poses are compared.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from numpy.typing import NDArray
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
-from hardware.bench.figures import Figure, aligned, at_most, with_progress, workers, write_page
+from hardware.bench.figures import Figure, aligned, at_most, columns, with_progress, workers, write_page
 from hardware.bench.outage_run import OutageKind, WatchedOutage, make_pictures, run_stretch
 from hardware.report.page import Plot, area_key, document, legend, line_key, ribbon, section
 
 HARMFUL_ERROR = 0.5  # mm: an error below is of no harm to a print with a nozzle of 0.4 mm
-CLAIM_FACTOR = 3.0  # times the radius claimed for 95 %: of normal errors not one in a million lies there
-RECOVERED_ERROR = 0.2  # mm, within which a pose is back
-MIN_TRACK_SHARE = 0.25  # of its tracks: a camera that keeps more still sees the surface
+RADIUS_FACTOR = 3.0  # times the 95 % radius: of normal errors not one in a million lies beyond
+RECOVERED_ERROR = 0.2  # mm, within which a pose has recovered
+MIN_TRACK_SHARE = 0.25  # of its tracks: a camera with more still sees the surface
 
 
 @dataclass(frozen=True, slots=True)
 class OutageVerdict:
-    """What came of one outage."""
+    """How the tracker got through one outage."""
 
     silent: bool  # TRACKING while wrong
-    beyond: bool  # off by more than it claims in any state but LOST
+    beyond: bool  # off by more than its covariance allows in any state but LOST
     worst: float  # mm, the largest error while TRACKING or DEGRADED
-    flagged: float  # s from the first affected frame set until state or reason says so; nan: nothing had to be said
+    flagged: float  # s from the first affected frame set until state or reason show it; nan: nothing had to be flagged
     back: float  # s from the view's return to TRACKING without a reservation, inf if never
     after: float  # mm, the error then, or worse afterwards
 
@@ -42,11 +42,9 @@ def judge_outage(watched: WatchedOutage) -> OutageVerdict:
     stamps, outage = watched.stamps, watched.outage
     during = stamps >= outage.start - 1e-9
     after = stamps >= outage.end - 1e-9
-    wrong = (watched.error > np.maximum(HARMFUL_ERROR, CLAIM_FACTOR * watched.radius)) & during
-    tracking, lost = (
-        np.array([s is state for s in watched.states]) for state in (TrackState.TRACKING, TrackState.LOST)
-    )
-    measured = np.array([s.measured for s in watched.states])
+    wrong = (watched.error > np.maximum(HARMFUL_ERROR, RADIUS_FACTOR * watched.radius)) & during
+    tracking = np.array([s is TrackState.TRACKING for s in watched.states])
+    lost, measured = np.array([(s is TrackState.LOST, s.measured) for s in watched.states]).T
     plain = tracking & np.array([not r for r in watched.reasons])
     back = np.flatnonzero(after & plain)
     return OutageVerdict(
@@ -60,31 +58,28 @@ def judge_outage(watched: WatchedOutage) -> OutageVerdict:
 
 
 def _flagged(watched: WatchedOutage, during: NDArray[np.bool_], plain: NDArray[np.bool_]) -> float:
-    """s from the first affected frame set to the first that says so; nan where the view is back before it must."""
-    affected = np.flatnonzero(during & _affected(watched, during))
-    if not len(affected):
+    """s from the first affected frame set to the first that is flagged; nan where the view is back before it must be.
+
+    A frame set is affected if a struck camera is blind, has lost three quarters of its tracks, or the pose is off.
+    """
+    affected, stamps = during, watched.stamps
+    if not watched.outage.kind.blinds:
+        before: Array = np.median(watched.used[stamps < watched.outage.start], axis=0)
+        struck = list(watched.outage.cameras)
+        fewer = (watched.used[:, struck] < MIN_TRACK_SHARE * before[struck]).any(1)
+        affected = during & (fewer | (watched.error > RECOVERED_ERROR))
+    if not affected.any():
         return np.nan
-    first, last = int(affected[0]), int(np.flatnonzero(during)[-1])
-    said = np.flatnonzero(~plain[first : last + 1])
-    if len(said):
-        return float(watched.stamps[first + said[0]] - watched.stamps[first])
-    span = float(watched.stamps[last] - watched.stamps[first])
-    return np.nan if span < 0.1 else np.inf
-
-
-def _affected(watched: WatchedOutage, during: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Frame sets (K,) in which a struck camera is blind, has lost three quarters of its tracks, or the pose is off."""
-    if watched.outage.kind.blinds:
-        return np.ones(len(watched.stamps), bool)
-    before: Array = np.median(watched.used[watched.stamps < watched.outage.start], axis=0)
-    struck = list(watched.outage.cameras)
-    fewer = (watched.used[:, struck] < MIN_TRACK_SHARE * before[struck]).any(1)
-    return np.asarray(fewer | (watched.error > RECOVERED_ERROR))
+    first, last = int(np.argmax(affected)), int(np.flatnonzero(during)[-1])
+    flags = np.flatnonzero(~plain[first : last + 1])
+    if len(flags):
+        return float(stamps[first + flags[0]] - stamps[first])
+    return np.nan if float(stamps[last] - stamps[first]) < 0.1 else np.inf
 
 
 PLOT_WIDTH, MIN_DRAWN_MM = 900, 1e-3  # px; mm, where the logarithmic axis begins
-MAX_REASONS = 3  # reasons that are shown of each
-WORST_SHOWN = 12  # outages that went worst are shown after one of each kind
+MAX_REASONS = 3  # that are shown of each outage
+WORST_SHOWN = 12  # that are shown after one of each kind
 
 
 def outage_page(judged: Sequence[tuple[WatchedOutage, OutageVerdict]]) -> str:
@@ -118,9 +113,9 @@ def _one(watched: WatchedOutage, verdict: OutageVerdict) -> str:
         f"{1000 * verdict.back:.0f} ms at {verdict.after:.3f} mm; time in s from its beginning"
     )
     # of reasons that differ in their figures only, the first
-    reasons = {re.sub(r"(?<!_)\d", "", reason): reason for reason in reversed(watched.reasons) if reason}
-    said = " / ".join(list(reversed(reasons.values()))[:MAX_REASONS]) or "nothing"
-    return section(outage.kind.value, f"{text}. Said: {said}", keys + strip + plot.svg())
+    by_text = {re.sub(r"(?<!_)\d", "", reason): reason for reason in reversed(watched.reasons) if reason}
+    reasons = " / ".join(list(reversed(by_text.values()))[:MAX_REASONS]) or "nothing"
+    return section(outage.kind.value, f"{text}. Said: {reasons}", keys + strip + plot.svg())
 
 
 OUTAGES_A_SCENE = 64  # outages before one scene, whose pictures take as long to render as ten of them to track
@@ -130,7 +125,7 @@ Judged = tuple[WatchedOutage, OutageVerdict]
 
 
 def run_outages(options: argparse.Namespace) -> list[Figure]:
-    """Run the campaign, print what came of each kind, and give the figures of all."""
+    """Run the campaign, print the table of all kinds, and give the figures of all."""
     jobs, pairs = scene_jobs(options.count, options.processes, options.seed), list[Judged]()
     with workers(options.processes) as pool:
         for part in with_progress("outages", "scenes", pool.map(_scene, jobs), len(jobs)):
@@ -168,21 +163,11 @@ def outage_table(judged: Sequence[tuple[OutageKind, OutageVerdict]]) -> str:
 
 
 def _row(name: str, verdicts: Sequence[OutageVerdict]) -> tuple[str, ...]:
-    flagged, back, after, worst = (
-        np.array([getattr(v, n) for v in verdicts]) for n in ("flagged", "back", "after", "worst")
-    )
-    return (
-        name,
-        str(len(verdicts)),
-        str(sum(v.silent for v in verdicts)),
-        str(sum(v.beyond for v in verdicts)),
-        str(int(np.isinf(flagged).sum())),
-        *_times(flagged),
-        *_times(back),
-        f"{np.median(after):.3f}",
-        f"{after.max():.3f}",
-        f"{worst.max():.2f}",
-    )
+    flagged, back, after, worst = columns(verdicts, "flagged", "back", "after", "worst")
+    silent, beyond = (str(sum(getattr(v, field) for v in verdicts)) for field in ("silent", "beyond"))
+    counts = (name, str(len(verdicts)), silent, beyond, str(int(np.isinf(flagged).sum())))
+    errors = (f"{np.median(after):.3f}", f"{after.max():.3f}", f"{worst.max():.2f}")
+    return (*counts, *_times(flagged), *_times(back), *errors)
 
 
 def _times(seconds: Array) -> tuple[str, ...]:
@@ -193,8 +178,8 @@ def _times(seconds: Array) -> tuple[str, ...]:
 
 def outage_figures(verdicts: Sequence[OutageVerdict]) -> list[Figure]:
     """The campaign's figures beside their targets."""
-    flagged, back, after = (np.array([getattr(v, name) for v in verdicts]) for name in ("flagged", "back", "after"))
-    needed, note = flagged[~np.isnan(flagged)], f"of {len(verdicts)} outages"
+    flagged, back, after = columns(verdicts, "flagged", "back", "after")
+    needed, note, points = flagged[~np.isnan(flagged)], f"of {len(verdicts)} outages", "of five points of the wound"
     late, slow = int((needed > 0.1 + 1e-9).sum()), int((back > 0.2 + 1e-9).sum())
     return [
         Figure("silent losses", sum(v.silent for v in verdicts), "", at_most(0), SILENT_LOSS_REFERENCE, note),
@@ -206,12 +191,5 @@ def outage_figures(verdicts: Sequence[OutageVerdict]) -> list[Figure]:
         Figure("time back, median", 1000 * float(np.median(back)), "ms", None, "", "from the view's return"),
         Figure("time back, largest", 1000 * float(back.max()), "ms", at_most(200), "", "from the view's return"),
         Figure("error once back, median", float(np.median(after)), "mm"),
-        Figure(
-            "error once back, largest",
-            float(after.max()),
-            "mm",
-            at_most(RECOVERED_ERROR),
-            "",
-            "of five points of the wound",
-        ),
+        Figure("error once back, largest", float(after.max()), "mm", at_most(RECOVERED_ERROR), "", points),
     ]
