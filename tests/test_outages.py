@@ -191,7 +191,7 @@ def test_draws_are_the_same_again_and_within_their_limits() -> None:
 
 @pytest.fixture(scope="module")
 def stretch() -> TrackedStretch:
-    begun = TrackedStretch(make_pictures(3, period=24, size=(480, 270), focal=420.0), 3)
+    begun = TrackedStretch(make_pictures(3, 24, arc_rig(size=(480, 270), focal=420.0)), 3)
     assert begun.begin()
     return begun
 

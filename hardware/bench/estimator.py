@@ -28,18 +28,8 @@ from estimation.rig import Camera
 from estimation.se3 import Array
 from estimation.synthetic.follow import FollowResult, Mapping, follow, follow_steps
 from estimation.synthetic.world import World, synthetic_world
-from hardware.bench.figures import (
-    CONSISTENT_NEES,
-    INSIDE_95,
-    Figure,
-    Target,
-    at_least,
-    at_most,
-    percentile,
-    rms,
-    with_progress,
-)
-from hardware.bench.outage_run import FPS, picture_loop
+from hardware.bench.figures import CONSISTENT_NEES, INSIDE_95, Figure, Target, at_least, at_most, rms, with_progress
+from hardware.bench.outage_run import FPS, make_pictures
 from hardware.process.clock import CpuClock
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet
@@ -293,14 +283,13 @@ def _work_figures(mapping: Mapping, runs: Sequence[FollowResult]) -> list[Figure
     if not runs:
         return []
     ms, name, note = 1000 * np.concatenate([run.seconds for run in runs]), MAP_NAMES[mapping], "CPU, tracks given"
-    twice = [follow(synthetic_world(seconds=3.0, offsets=(0.0, 0.01, 0.0)), mapping) for _ in range(2)]
-    bits = [
-        [p.base_from_surface.tobytes() + p.covariance.tobytes() + p.twist.tobytes() for p in r.poses] for r in twice
-    ]
+    p50, p99 = np.percentile(ms, [50, 99]).tolist()
+    twice = [follow(synthetic_world(seconds=3.0, offsets=(0.0, 0.01, 0.0)), mapping).poses for _ in range(2)]
+    bits = [[b"".join(map(bytes, (p.base_from_surface, p.covariance, p.twist))) for p in poses] for poses in twice]
     differing = float(sum(first != second for first, second in zip(*bits, strict=True)))
     return [
-        Figure(f"time, {name}: median", percentile(ms, 50), "ms", None, "thesis 70 ms with flow", note),
-        Figure(f"time, {name}: p99", percentile(ms, 99), "ms", at_most(4.0), "", note),
+        Figure(f"time, {name}: median", p50, "ms", None, "thesis 70 ms with flow", note),
+        Figure(f"time, {name}: p99", p99, "ms", at_most(4.0), "", note),
         Figure(f"poses that differ run twice, {name}", differing, "", at_most(0), "open_vins #553"),
     ]
 
@@ -323,8 +312,9 @@ def run_consistency(options: argparse.Namespace) -> list[Figure]:
     """Figures over all scenes, and each scene's own."""
     runs, count = {}, round(options.seconds * FPS)
     for seed in range(options.seed, options.seed + options.scenes):
-        rig, scene, loop = picture_loop(seed, LOOP_SETS)
-        step = TrackingStep(rig, rois(scene, rig, loop.poses[0], 0.0))
+        pictures = make_pictures(seed, LOOP_SETS)
+        loop = pictures.near
+        step = TrackingStep(pictures.rig, rois(pictures.scene, pictures.rig, loop.poses[0], 0.0))
         poses = []
         for number in range(count):
             stamp = number / FPS

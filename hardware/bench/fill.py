@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -22,7 +24,7 @@ from shapely import affinity
 from shapely.geometry import LineString, MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress
 from hardware.process.clock import CpuClock, ProcessorClock

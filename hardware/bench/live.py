@@ -32,7 +32,7 @@ from hardware.live.settings import LiveSettings, available_cores, settings_text
 from hardware.process.checks import read_toml
 from hardware.process.clock import WallClock
 from hardware.process.progress import cache_folder
-from hardware.process.ticks import Evenness, measure_evenness
+from hardware.process.ticks import measure_evenness
 from hardware.recording.session_reader import open_session
 from planning.path import Path as Toolpath
 from planning.path import way_lengths
@@ -214,8 +214,14 @@ def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: P
     error = nozzle_errors(record, path, arm)
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
-    figures = [*_latencies(name, summary["latency_ms"], note), *_machine(name, alone)]
-    return [*figures, *_errors(name, summary, error), *_load(name, summary, run.memory)]
+    even = f"{1000 * alone.usual:.1f} ms usually; before the run, nothing else of it running: no run can be more even"
+    return [
+        *_latencies(name, summary["latency_ms"], note),
+        Figure(f"{name}: the machine alone, a piece of work at the worst", 1000 * alone.largest, "ms", note=even),
+        Figure(f"{name}: the machine alone, time in which work is slow", 100 * alone.slow, "%", note="three times"),
+        *_errors(name, summary, error),
+        *_load(name, summary, run.memory),
+    ]
 
 
 def _latencies(name: str, times: dict[str, Any], note: str) -> list[Figure]:
@@ -228,14 +234,6 @@ def _latencies(name: str, times: dict[str, Any], note: str) -> list[Figure]:
         Figure(f"{name}: exposure to wire, median", _of(exposure, "p50"), "ms"),
         *(Figure(f"{name}: {stage}, median", _of(times.get(stage, {}), "p50"), "ms") for stage in SHOWN_STAGES),
         Figure(f"{name}: tick late, 99 %", _of(late, "p99"), "ms", at_most(3)),
-    ]
-
-
-def _machine(name: str, alone: Evenness) -> list[Figure]:
-    note = f"{1000 * alone.usual:.1f} ms usually; before the run, nothing else of it running: no run can be more even"
-    return [
-        Figure(f"{name}: the machine alone, a piece of work at the worst", 1000 * alone.largest, "ms", note=note),
-        Figure(f"{name}: the machine alone, time in which work is slow", 100 * alone.slow, "%", note="three times"),
     ]
 
 

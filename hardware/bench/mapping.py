@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
 from estimation.scans.scan import scan_from_triangles
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
@@ -156,19 +157,13 @@ def run_map(options: argparse.Namespace) -> list[Figure]:
 
 
 def track_shape(
-    shape: Shape,
-    look: Appearance,
-    size: tuple[int, int],
-    focal: float,
-    poses: Array,
-    stamps: Array,
-    alone: int | None = None,
+    shape: Shape, look: Appearance, rig: Rig, poses: Array, stamps: Array, alone: int | None = None
 ) -> TrackedShape:
     """The tracking step on pictures of a shape at base_from_surface poses (N, 4, 4).
 
     alone: the one camera that is not covered in COVERED_SPAN, s.
     """
-    rig, scene, rng = arc_rig(size=size, focal=focal), Scene(shape, look, seed=1), np.random.default_rng(41)
+    scene, rng = Scene(shape, look, seed=1), np.random.default_rng(41)
     step = TrackingStep(rig, rois(scene, rig, poses[0], 0.0))
     tracked, maps = [], []
     for stamp, pose in zip(stamps.tolist(), poses, strict=True):
@@ -197,7 +192,7 @@ def heights(shape: Shape, surface_map: SurfaceMap, true_from_estimated: Array) -
 def _map_errors(name: str, shape: Shape, stamps: Array) -> list[Figure]:
     up = 2 * (1 - np.cos(2 * np.pi * 0.25 * stamps))
     poses = BASE_FROM_REST @ se3.exp(up[:, None] * np.array([0.015, 0.01, 0.0, 0.2, 0.3, 1.0]))
-    result = track_shape(shape, Appearance(), (1280, 720), FOCAL_PX, poses, stamps)
+    result = track_shape(shape, Appearance(), arc_rig(focal=FOCAL_PX), poses, stamps)
     figures = []
     for when, number in (("confirmed", 1), ("refined", -1)):
         change = se3.inverse(poses[number]) @ result.poses[number].base_from_surface
@@ -236,11 +231,9 @@ def _growth() -> list[Figure]:
     moves[:, 5] = 1.5 * np.sin(2 * stamps)
     patch, passing = with_wound(flat((320.0, 60.0)), Wound((310.0, 56.0)), 1), BASE_FROM_REST @ se3.exp(moves)
     turning, figures = _turned(0.65 * (1 - np.cos(0.8 * stamps)) - 0.65), list[Figure]()
-    for name, shape, size, poses in (
-        ("passing by", patch, (320, 240), passing),
-        ("turning", _limb(), (480, 360), turning),
-    ):
-        result = track_shape(shape, PLAIN_LOOK, size, 560.0, poses, stamps)
+    runs = ("passing by", patch, (320, 240), passing), ("turning", _limb(), (480, 360), turning)
+    for name, shape, size, poses in runs:
+        result = track_shape(shape, PLAIN_LOOK, arc_rig(size=size, focal=560.0), poses, stamps)
         error, measured = _error(result)
         added, note = len(result.maps[-1]) - len(result.maps[0]), f"{len(result.maps[0])} at first"
         figures += [
@@ -258,7 +251,7 @@ def _alone(name: str, camera: int, way: float) -> list[Figure]:
     rates, sizes = np.array([1.0, 1.3, 1.0, 1.0, 2.0, 1.7]), np.array([0.02, 0.01, 0.0, 1.5, 1.0, 1.5])
     turned = _turned(way * 0.375 * (1 - np.cos(2 * np.pi * part)))
     poses = turned @ se3.exp(sizes * np.sin(stamps[:, None] * rates))
-    result = track_shape(_limb(), PLAIN_LOOK, (640, 480), 600.0, poses, stamps, camera)
+    result = track_shape(_limb(), PLAIN_LOOK, arc_rig(size=(640, 480), focal=600.0), poses, stamps, camera)
     error, measured = _error(result)
     note = f"{len(result.maps[-1]) - len(result.maps[0])} landmarks added to {len(result.maps[0])}; 0.67 mm a pixel"
     after = float(error[-5:].max())

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -185,34 +186,29 @@ JUMP_SHARE = 0.3  # of the outages that hide the surface, in which it moves else
 ELSEWHERE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ScenePictures:
     """The pictures of one scene for all stretches."""
 
+    seed: int
     rig: Rig
     scene: Scene
     near: PictureLoop  # of the motion at one place
-    far: PictureLoop  # and at another
+
+    @cached_property
+    def far(self) -> PictureLoop:
+        """And at another, rendered when it is needed first."""
+        return PictureLoop(self.scene, self.rig, self.near.poses @ ELSEWHERE, self.seed + 1)
 
 
-def make_pictures(
-    seed: int, period: int = MOTION_SETS, size: tuple[int, int] = (640, 360), focal: float = 560.0
-) -> ScenePictures:
-    """Render the loops of one scene, some 20 s for the default."""
-    rig, scene, near = picture_loop(seed, period, size, focal)
-    return ScenePictures(rig, scene, near, PictureLoop(scene, rig, near.poses @ ELSEWHERE, seed + 1))
-
-
-def picture_loop(
-    seed: int, period: int = MOTION_SETS, size: tuple[int, int] = (640, 360), focal: float = 560.0
-) -> tuple[Rig, Scene, PictureLoop]:
-    """Cameras, a scene, and the loop of its pictures at the nearer place: `period` frame sets."""
+def make_pictures(seed: int, period: int = MOTION_SETS, rig: Rig | None = None) -> ScenePictures:
+    """Render the loop of one scene, `period` frame sets, some 10 s for the default."""
     rng = np.random.default_rng([seed, 61])
-    rig = arc_rig(size=size, focal=focal)
+    rig = arc_rig(size=(640, 360), focal=560.0) if rig is None else rig
     shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), LOOP_WOUND, seed)
     scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=seed)
     poses = closed_motion(period, BASE_FROM_REST, rng, lively=period / MOTION_SETS)  # of one speed for any period
-    return rig, scene, PictureLoop(scene, rig, poses, seed)
+    return ScenePictures(seed, rig, scene, PictureLoop(scene, rig, poses, seed))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,10 +264,10 @@ class TrackedStretch:
         outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng, longest)
         hidden = len(outage.cameras) == len(self._pictures.rig) and kind in HIDING_KINDS
         before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMP_SHARE
-        near, far = self._pictures.near, self._pictures.far
         while self._count / FPS < outage.end - 1e-9:
             if jumps and self._count / FPS > outage.start + 0.5:
-                jumps, self._loop = False, far if self._loop is near else near
+                near = self._pictures.near
+                jumps, self._loop = False, self._pictures.far if self._loop is near else near
             self._frame(outage)
         for _ in range(round(REST_S * FPS)):
             self._frame(None)

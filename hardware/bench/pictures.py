@@ -181,11 +181,18 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
         images = [(bgr(each.picture), each.wound) for each in pictures or wounds]
         judged = [JudgedPicture(image, segmenter(image), wound) for image, wound in images]
         options.sheet.write_bytes(encode(contact_sheet(judged), SHEET_QUALITY)[1])
-    figures = [
-        *_dice(segmenter, pictures),
-        *_others(pictures, rng),
-        *_silence(segmenter, healthy_pieces(pictures, rng, HEALTHY_PIECES), healthy, wounds),
-        *_covered(segmenter, pictures, rng),
+    figures = [*_dice(segmenter, pictures), *_others(pictures, rng)]
+    pieces = healthy_pieces(pictures, rng, HEALTHY_PIECES)
+    real, rendered = silent_share(segmenter, pieces), silent_share(segmenter, [each.picture for each in healthy])
+    silent, note = at_least(0.95), f"{len(wounds)} pictures"
+    mean = _mean([_dice_of(segmenter, each) for each in wounds])
+    before, after = dice_before_and_after_cover(segmenter, pictures, rng)
+    covered = "half covered: fall of Dice on the open part"
+    figures += [
+        Figure("silent on healthy skin, real", real, "", silent, "", f"{len(pieces)} pieces"),
+        Figure("silent on healthy skin, rendered", rendered, "", silent, "", note),
+        Figure("Dice on rendered wounds, mean", mean, "", None, "", note),
+        Figure(covered, before - after, "", at_most(0.05), "thesis by eye", f"from {before:.3f} to {after:.3f}"),
         *_time(network, pictures or wounds),
     ]
     if pictures:
@@ -253,29 +260,6 @@ def _dice_of(segmenter: ShapeSegmenter | NetworkSegmenter, labelled: Labelled) -
 
 def _mean(values: Sequence[float] | Array) -> float:
     return float(np.mean(values)) if len(values) else math.nan
-
-
-def _silence(
-    segmenter: NetworkSegmenter,
-    pieces: Sequence[NDArray[np.uint8]],
-    healthy: Sequence[Labelled],
-    wounds: Sequence[Labelled],
-) -> list[Figure]:
-    mean = _mean([_dice_of(segmenter, each) for each in wounds])
-    real, rendered = silent_share(segmenter, pieces), silent_share(segmenter, [each.picture for each in healthy])
-    target, note = at_least(0.95), f"{len(wounds)} pictures"
-    return [
-        Figure("silent on healthy skin, real", real, "", target, "", f"{len(pieces)} pieces"),
-        Figure("silent on healthy skin, rendered", rendered, "", target, "", note),
-        Figure("Dice on rendered wounds, mean", mean, "", None, "", note),
-    ]
-
-
-def _covered(segmenter: NetworkSegmenter, pictures: Sequence[Labelled], rng: np.random.Generator) -> list[Figure]:
-    before, after = dice_before_and_after_cover(segmenter, pictures, rng)
-    note = f"from {before:.3f} to {after:.3f}"
-    what = "half covered: fall of Dice on the open part"
-    return [Figure(what, before - after, "", at_most(0.05), "thesis by eye", note)]
 
 
 def _rendered(number: int, wounded: bool) -> Labelled:

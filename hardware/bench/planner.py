@@ -102,7 +102,10 @@ def _ticks(draw: Draw, ticks: int) -> Iterator[Tick]:
                 pose = replace(pose, covariance=pose.covariance * draw.choice([30.0, 200.0]) ** 2)
             error = jump @ se3.exp(draw.normal(size=6) * noise * np.array([0.01] * 3 + [1.0] * 3))
             pose = replace(pose, base_from_surface=pose.base_from_surface @ error)
-            pose = replace(pose, warp=_warp(draw)) if warped else pose
+            if warped:
+                control, shifts = draw.uniform(-8, 8, (6, 3)) * [1, 1, 0], draw.normal(size=(6, 3)) * 0.2
+                warp = Warp(control, shifts, 1e-4 * np.eye(18), np.zeros((18, 18)), 8.0, 0.2, 0.01)
+                pose = replace(pose, warp=warp)
             newest = _invalid(pose, draw) if draw.random() < invalid else pose
         yield now, newest
         now += TICK_S * (1 if draw.random() > STALL_SHARE else int(draw.integers(4, 60)))
@@ -121,11 +124,6 @@ def _pose(swing: SwingingSurface, stamp: float, draw: Draw, with_forecast: bool)
         covariances = covariance + FORECAST_HORIZONS[:, None, None] * 0.01 * np.eye(6)
         forecast = Forecast(FORECAST_HORIZONS, increments, covariances)
     return SurfacePose(stamp, here, covariance, twist, state, forecast=forecast)
-
-
-def _warp(draw: Draw) -> Warp:
-    control = draw.uniform(-8, 8, (6, 3)) * [1, 1, 0]
-    return Warp(control, draw.normal(size=(6, 3)) * 0.2, 1e-4 * np.eye(18), np.zeros((18, 18)), 8.0, 0.2, 0.01)
 
 
 def _invalid(pose: SurfacePose, draw: Draw) -> SurfacePose | None:

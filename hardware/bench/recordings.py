@@ -286,6 +286,12 @@ def axes_for(seconds: float) -> tuple[CostAxis, ...]:
     def moved(checkpoints: float) -> tuple[float, float]:
         return _two(carries(round(checkpoints), MOVED_PATHS)[0])
 
+    def pictures(megapixels: float) -> tuple[float, float]:
+        scale = (megapixels * 1e6 / (PICTURE_SIZE[0] * PICTURE_SIZE[1])) ** 0.5
+        width, height = (8 * round(scale * n / 8) for n in PICTURE_SIZE)
+        rig = arc_rig(size=(width, height), focal=scale * PICTURE_FOCAL)
+        return _two(_time_steps(made_recording(GROWTH_RECORDING, seconds, rig))[0][:, 0])
+
     def late(minutes: float) -> tuple[float, float]:
         end = round(60 * minutes * FRAME_RATE)
         return _two(_spent(60 * WORLD_MINUTES[-1])[end - round(seconds * FRAME_RATE) : end])
@@ -295,7 +301,7 @@ def axes_for(seconds: float) -> tuple[CostAxis, ...]:
         CostAxis("cameras", "cameras", pose, (2, 3, 4, 6), lambda n: tracked(cameras=round(n))),
         CostAxis("minutes", "min behind", pose, WORLD_MINUTES, late),
         CostAxis("checkpoints", "checkpoints", path, (1e3, 1e4, 5e4, 2e5), moved),
-        CostAxis("pixels", "Mpx a camera", frames, (0.23, 0.52, 0.92, 2.07), lambda n: _pictures(n, seconds)),
+        CostAxis("pixels", "Mpx a camera", frames, (0.23, 0.52, 0.92, 2.07), pictures),
     )
 
 
@@ -304,13 +310,6 @@ def _spent(seconds: float, count: int = 100, cameras: int = 3) -> Array:
     """s of processor time of each step (N,) in a breathing world."""
     world = synthetic_world(seconds=seconds, rate=FRAME_RATE, count=count, rig=arc_rig(ANGLES_DEG[:cameras]))
     return np.array([step.seconds for step in follow_steps(world, "told", CpuClock().now)])
-
-
-def _pictures(megapixels: float, seconds: float) -> tuple[float, float]:
-    scale = (megapixels * 1e6 / (PICTURE_SIZE[0] * PICTURE_SIZE[1])) ** 0.5
-    size = (8 * round(scale * PICTURE_SIZE[0] / 8), 8 * round(scale * PICTURE_SIZE[1] / 8))
-    wall, _ = _time_steps(made_recording(GROWTH_RECORDING, seconds, arc_rig(size=size, focal=scale * PICTURE_FOCAL)))
-    return _two(wall[:, 0])
 
 
 def _two(seconds: Array) -> tuple[float, float]:

@@ -66,9 +66,8 @@ def judge_guard(log: GuardLog, rules: GuardRules) -> NDArray[np.int_]:
     order = _exactly(np.isfinite(log.nows) & (log.stamps == log.nows) & (log.nows > after))
     pose = _pose_verdicts(log, before, rules)
     # moves that follow no trusted pose: no ink, and soon and near at rest
-    sure, perhaps = (
-        _since_trusted(log, before, (order > 0) & trusted, rules.limits) for trusted in (pose > 0, pose >= 0)
-    )
+    trusted = ((order > 0) & flags for flags in (pose > 0, pose >= 0))
+    sure, perhaps = (_since_trusted(log, before, flags, rules.limits) for flags in trusted)
     stopping = np.where(log.extrude, -1, np.where(sure == perhaps, sure, 0))
     trust = np.where(pose > 0, 1, np.where((pose == 0) & (stopping < 0), 0, stopping))
     parts = [_reach(log, rules), _motion(log, before, rules), _joints(log, before, rules), _zones(log, before, rules)]

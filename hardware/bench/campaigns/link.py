@@ -280,11 +280,8 @@ def _queued(name: str, counts: LinkCounts) -> list[Figure]:
         figures.append(Figure(f"{name}: most queued, {kind}", 1000 * most, "ms", target, FIFO_REFERENCE, note))
     for kind, most in sorted(counts.after.items()):
         target = at_most(50) if kind.endswith("answering") else None
-        what, note = (
-            f"{name}: most queued at the end of a stall, {kind}",
-            f"of {1000 * DETECTABLE_STALL:.0f} ms or more",
-        )
-        figures.append(Figure(what, 1000 * most, "ms", target, "", note))
+        what = f"{name}: most queued at the end of a stall, {kind}"
+        figures.append(Figure(what, 1000 * most, "ms", target, "", f"of {1000 * DETECTABLE_STALL:.0f} ms or more"))
     return figures
 
 
