@@ -18,7 +18,16 @@ from estimation.synthetic.world import arc_rig
 from hardware.arm.protocol import G1, encode
 from hardware.bench.campaigns import link as link_run
 from hardware.bench.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
-from hardware.bench.prediction import AHEAD, POINTS_AROUND, SIMULATED, Chest, errors_of, figures, recorded, simulated
+from hardware.bench.prediction import (
+    AHEAD,
+    POINTS_AROUND,
+    SIMULATED,
+    Chest,
+    errors_of,
+    prediction_figures,
+    recorded,
+    simulated,
+)
 from hardware.bench.smoothing import (
     MISSING,
     MovementErrors,
@@ -61,7 +70,7 @@ def test_hold_is_off_by_the_way_and_constant_velocity_by_nothing_on_a_steady_gli
 def test_breathing_of_the_simulator_is_foretold_better_than_it_is_held() -> None:
     errors = errors_of(simulated("breathing_deep", SECONDS), WARM)
     assert (errors.ours[1:] < 0.8 * errors.hold[1:]).all()
-    rows = {figure.what: figure for figure in figures([errors], SIMULATED)}
+    rows = {figure.what: figure for figure in prediction_figures([errors], SIMULATED)}
     assert rows["200 ms: error by hold's"].target is None
     assert rows["200 ms: error by hold's"].value == pytest.approx(errors.ours[1] / errors.hold[1])
 

@@ -29,19 +29,9 @@ from estimation.errors import InputError
 from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
+from hardware.bench import figures
 from hardware.bench.fault_run import FaultRun, PreparedScenario, prepare_scenario
-from hardware.bench.figures import (
-    Figure,
-    Target,
-    at_least,
-    at_most,
-    columns,
-    percentile,
-    require_positive,
-    with_progress,
-    workers,
-    write_page,
-)
+from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
 from hardware.bench.subjects import BREATHING
 from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock
@@ -143,11 +133,13 @@ def run_prediction(options: argparse.Namespace) -> list[Figure]:
         if options.seconds < options.warm_up + 2:
             raise InputError("command line", "--seconds", options.seconds, f"at least {options.warm_up + 2:g}")
         chests = [simulated(name, options.seconds) for name in BREATHING]
-        return figures([errors_of(chest, options.warm_up) for chest in chests], SIMULATED)
+        return prediction_figures([errors_of(chest, options.warm_up) for chest in chests], SIMULATED)
     files = sorted(options.traces.glob(options.pattern))
     if not files:
         raise InputError(options.traces, "traces", "none", f"at least one {options.pattern}")
-    return figures([errors_of(recorded(file, options.warm_up), options.warm_up) for file in files], HOLD_SHARES)
+    return prediction_figures(
+        [errors_of(recorded(file, options.warm_up), options.warm_up) for file in files], HOLD_SHARES
+    )
 
 
 def recorded(file: Path, warm_up: float) -> Chest:
@@ -223,7 +215,7 @@ def _marker_points(file: Path, trace: Trajectory) -> Array:
     return np.asarray(se3.transform_points(inverse, markers - markers.mean((0, 1))).mean(0))
 
 
-def figures(traces: list[TraceErrors], shares: Sequence[float | None] = HOLD_SHARES) -> list[Figure]:
+def prediction_figures(traces: list[TraceErrors], shares: Sequence[float | None] = HOLD_SHARES) -> list[Figure]:
     """The figures of traces, each method's mean error relative to hold's. shares: targets, if there are any."""
     methods = [np.mean(errors, axis=0).tolist() for errors in columns(traces, "hold", "steady", "plain", "ours")]
     rows = []
@@ -238,8 +230,10 @@ def figures(traces: list[TraceErrors], shares: Sequence[float | None] = HOLD_SHA
             name = f"{trace.name}, {1000 * ahead:.0f} ms: inside 90 %"
             rows.append(Figure(name, float(trace.covered[k]), "", COVERED_TARGET, "", note))
     ms = np.concatenate([t.ms for t in traces])
-    rows.append(Figure("time a step: median", percentile(ms, 50), "ms", at_most(0.5), "", "CPU, learning included"))
-    return [*rows, Figure("time a step: p99", percentile(ms, 99), "ms", None, "", "CPU")]
+    rows.append(
+        Figure("time a step: median", figures.percentile(ms, 50), "ms", at_most(0.5), "", "CPU, learning included")
+    )
+    return [*rows, Figure("time a step: p99", figures.percentile(ms, 99), "ms", None, "", "CPU")]
 
 
 MIN_DRAWN_MM = 0.01  # where the logarithmic axis begins
@@ -257,7 +251,7 @@ class Print:
 
     def percentile(self, share: float) -> float:
         """Of the error, mm, while extruding."""
-        return percentile(self.error[np.isfinite(self.error)], share)
+        return figures.percentile(self.error[np.isfinite(self.error)], share)
 
     @property
     def duty(self) -> float:
@@ -314,12 +308,12 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
     """Print every scenario in every way; with an output folder, the errors over time as a page."""
     if options.seed < 0:
         raise InputError("command line", "--seed", options.seed, ">= 0")
-    require_positive(options, "jobs")
+    figures.require_positive(options, "jobs")
     cases = [(name, way) for name in options.scenario for way in MOTION_INPUTS]
     with workers(options.jobs) as pool:
         prints = pool.map(partial(_print_case, options.seed), *zip(*cases, strict=True))
         by_case = dict(zip(cases, with_progress("loop", "prints", prints, len(cases)), strict=True))
-    write_page(options.out, "loop.html", lambda: loop_page(by_case), "picture")
+    figures.write_page(options.out, "loop.html", lambda: loop_page(by_case), "picture")
     return [figure for name in options.scenario for figure in _figures(name, by_case)]
 
 

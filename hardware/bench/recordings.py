@@ -98,16 +98,11 @@ def made_recording(name: str, seconds: float, rig: Rig | None = None) -> Recordi
     return Recording(name, rig, rois(scene, rig, poses[0], 0.0), Trajectory(stamps, poses, exact=True), rendered)
 
 
-def recorded_session(path: Path) -> Recording:
-    """A recorded session; InputError says what is wrong with it."""
-    session = open_session(path)
-    return Recording(path.name, session.rig, session.roi, session.truth, session.frame_sets, session.surface)
-
-
-def shown_recordings(options: argparse.Namespace, names: Iterable[str]) -> list[Recording]:
-    """The sessions that the options name, or rendered recordings of these names."""
-    sessions = [recorded_session(path) for path in options.sessions]
-    return sessions or [made_recording(name, options.seconds) for name in names]
+def chosen_recordings(options: argparse.Namespace, names: Iterable[str]) -> list[Recording]:
+    """The recorded sessions that the options name, or rendered recordings of these names."""
+    sessions = [(path.name, open_session(path)) for path in options.sessions]
+    recordings = [Recording(name, s.rig, s.roi, s.truth, s.frame_sets, s.surface) for name, s in sessions]
+    return recordings or [made_recording(name, options.seconds) for name in names]
 
 
 MIN_ACCURACY_RATIO, MIN_SPEED_RATIO = 10.0, 5.0  # times better than the thesis's, which ours is to be
@@ -128,7 +123,7 @@ class MethodResult:
 def run_thesis(options: argparse.Namespace) -> list[Figure]:
     """Errors and latencies of both on each recording, and how many times ours are smaller."""
     figures = []
-    for recording in shown_recordings(options, MADE_RECORDINGS):
+    for recording in chosen_recordings(options, MADE_RECORDINGS):
         figures += _figures(recording.name, *_compare_methods(recording, (MAP_METHOD, options.method)))
     return figures
 
@@ -197,7 +192,7 @@ WARM_UP_STEPS = 10  # frame sets after the first map that only fill caches and t
 
 def run_latency(options: argparse.Namespace) -> list[Figure]:
     """Latencies on each recording."""
-    recordings = shown_recordings(options, options.scene)
+    recordings = chosen_recordings(options, options.scene)
     return [figure for each in recordings for figure in latency_figures(each.name, *_time_steps(each))]
 
 

@@ -22,20 +22,9 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
+from hardware.bench import figures
 from hardware.bench.fault_run import FAULT_FREE_S, FAULTS_A_RUN, FaultRun, FaultRunRecord, draw_faults, prepare_scenario
-from hardware.bench.figures import (
-    Figure,
-    aligned,
-    append_rows,
-    at_least,
-    at_most,
-    columns,
-    log_rows,
-    require_positive,
-    with_progress,
-    workers,
-    write_page,
-)
+from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress, workers
 from hardware.process.clock import ProcessorClock
 from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, fault_from_text
 from hardware.report.page import Plot, document, figures_table, section
@@ -146,7 +135,7 @@ def fault_table(verdicts: Sequence[FaultVerdict]) -> str:
 
     said, known: `exposure` and `detected` of the verdicts. late: how many recovered after more than `MAX_RECOVERY`.
     """
-    return aligned([KIND_HEADER, *_rows_by_kind(verdicts)], range(1, len(KIND_HEADER)))
+    return figures.aligned([KIND_HEADER, *_rows_by_kind(verdicts)], range(1, len(KIND_HEADER)))
 
 
 def _rows_by_kind(verdicts: Sequence[FaultVerdict]) -> list[tuple[str, ...]]:
@@ -237,7 +226,7 @@ class FaultRow:
 
 def run_faults(options: argparse.Namespace) -> list[Figure]:
     """Run the campaign, print the table of all kinds, and give the figures of all."""
-    require_positive(options, "count", "jobs")
+    figures.require_positive(options, "count", "jobs")
     folder = options.scenarios or shipped_file("scenarios", f"{SCENARIOS[0]}.toml").parent
     rows = read_log(options.log, options.seed) if options.log is not None and options.log.exists() else []
     done = {row.run for row in rows}
@@ -257,7 +246,7 @@ def run_faults(options: argparse.Namespace) -> list[Figure]:
                 append_log(options.log, of_run)
     verdicts = [row.verdict for row in rows]
     print(fault_table(verdicts) + "\n")
-    write_page(options.out, "faults.html", lambda: fault_page(verdicts), "picture")
+    figures.write_page(options.out, "faults.html", lambda: fault_page(verdicts), "picture")
     return [*fault_figures(rows), Figure("runs that ended in a traceback", broken, "", at_most(0))]
 
 
@@ -280,13 +269,13 @@ def append_log(file: Path, rows: Iterable[FaultRow]) -> None:
         v = row.verdict
         measured = v.detected, v.exposure, v.worst, int(v.silent), int(v.restless), v.recovered, int(v.operator)
         cells.append([row.seed, row.run, row.scenario, row.over, row.spent, v.fault, *measured])
-    append_rows(file, FAULT_LOG_COLUMNS, cells)
+    figures.append_rows(file, FAULT_LOG_COLUMNS, cells)
 
 
 def read_log(file: Path, seed: int) -> list[FaultRow]:
     """The rows of a campaign with this seed; InputError where the file is none of ours."""
     rows = []
-    for number, each in log_rows(file, FAULT_LOG_COLUMNS):
+    for number, each in figures.log_rows(file, FAULT_LOG_COLUMNS):
         try:
             numbers = [float(each[name]) for name in FAULT_LOG_COLUMNS if name not in ("scenario", "fault")]
         except (TypeError, ValueError):
