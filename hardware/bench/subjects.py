@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,18 +61,15 @@ class Subject:
 Subjects = Mapping[str, Subject]
 
 
+def _add_options(options: tuple[_Option, ...], parser: argparse.ArgumentParser) -> None:
+    for names, settings in options:
+        parser.add_argument(*names, **settings)
+
+
 def _subject(name: str, module: str, summary: str) -> Callable[..., tuple[str, Subject]]:
-    """Called with its options, the named subject that `run_NAME` of a module of this folder measures."""
+    """The subject that `run_NAME` of a module of this folder measures; call the result with its options."""
     function = f"hardware.bench.{module}:run_{name.replace('-', '_')}"
-
-    def with_options(*options: _Option) -> tuple[str, Subject]:
-        def add(parser: argparse.ArgumentParser) -> None:
-            for names, settings in options:
-                parser.add_argument(*names, **settings)
-
-        return name, Subject(function, add, summary)
-
-    return with_options
+    return lambda *options: (name, Subject(function, partial(_add_options, options), summary))
 
 
 def _option(*names: str, **settings: Any) -> _Option:

@@ -44,7 +44,8 @@ HALT_PERIOD, MAX_HALT = 6.0, 0.6  # s between halts of the motion process, and o
 START_TIMEOUT = 60.0  # s in which a process must have started, on a busy machine
 NOT_MEASURED = float("nan")
 # what goes wrong: nothing; host and port; the arm and its wire
-LIVE_PARTS = _, HALTED_PART, ROUGH_PART = "calm", "halted", "rough"
+LIVE_PARTS = "calm", "halted", "rough"
+HALTED_PART, ROUGH_PART = LIVE_PARTS[1:]
 
 
 @dataclass(frozen=True, slots=True)
