@@ -49,40 +49,26 @@ class TrackScene:
     rigid: bool = False  # whether all is as the model assumes, so that the error has to be near the bound
     surface: str = "patch"
 
-    @property
-    def seconds(self) -> float:
-        """Its duration: offsets have to be known after 20 s."""
-        return 24.0 if "offsets" in self.conditions else 10.0
 
-
-DISTURBANCES = tuple(
-    TrackScene(f"breathing, {name}", "breathing", conditions, at_most(limit) if limit else None, rigid)
-    for name, conditions, limit, rigid in (
-        ("noise 0.5 px", {"noise": 0.5}, 0.0, True),
-        ("dropouts 15 %", {"dropouts": 0.15}, 0.03, True),
-        ("churn 5 s", {"churn": 5.0}, 0.03, True),
-        ("outage 0.4 s", {"outages": ((4.0, 4.4),)}, 0.03, True),
-        ("outliers 10 %", {"outliers": 0.1}, 0.03, True),
-        ("coherent 20 %", {"coherent": 0.2}, 0.0, False),
-        ("correlated 0.6 px", {"correlated": 0.6}, 0.0, False),
-        ("offsets 16 ms", {"offsets": (0.0, HALF_PERIOD, -HALF_PERIOD)}, 0.1, False),
-        ("offsets 16, 4, 12 ms", {"offsets": (HALF_PERIOD, -0.004, -0.012)}, 0.1, False),
-        ("offsets 16 ms, lens 0.3 px", {"offsets": (0.0, HALF_PERIOD, -HALF_PERIOD), "calibration": 0.3}, 0.1, False),
-        ("jitter 5 ms", {"jitter": 0.005}, 0.1, False),
-    )
-)
-
+SYNC_ERROR, ASYNC_ERROR = at_most(0.03), at_most(0.1)  # mm, with and without synchronised exposures
+HALF_OFFSETS = {"offsets": (0.0, HALF_PERIOD, -HALF_PERIOD)}
+CLEAN_MOVEMENTS = "still", "breathing", "irregular", "shaker", "steps", "turns", "sway", "lively"
 TRACK_SCENES = (
-    *(
-        TrackScene(f"{movement}, clean", movement, error=at_most(0.03), rigid=True)
-        for movement in ("still", "breathing", "irregular", "shaker", "steps", "turns", "sway", "lively")
-    ),
-    *DISTURBANCES,
-    TrackScene("lively, offsets 16 ms", "lively", {"offsets": (0.0, HALF_PERIOD, -HALF_PERIOD)}, at_most(0.1)),
+    *(TrackScene(f"{movement}, clean", movement, {}, SYNC_ERROR, True) for movement in CLEAN_MOVEMENTS),
+    TrackScene("breathing, noise 0.5 px", "breathing", {"noise": 0.5}, None, True),
+    TrackScene("breathing, dropouts 15 %", "breathing", {"dropouts": 0.15}, SYNC_ERROR, True),
+    TrackScene("breathing, churn 5 s", "breathing", {"churn": 5.0}, SYNC_ERROR, True),
+    TrackScene("breathing, outage 0.4 s", "breathing", {"outages": ((4.0, 4.4),)}, SYNC_ERROR, True),
+    TrackScene("breathing, outliers 10 %", "breathing", {"outliers": 0.1}, SYNC_ERROR, True),
+    TrackScene("breathing, coherent 20 %", "breathing", {"coherent": 0.2}),
+    TrackScene("breathing, correlated 0.6 px", "breathing", {"correlated": 0.6}),
+    TrackScene("breathing, offsets 16 ms", "breathing", HALF_OFFSETS, ASYNC_ERROR),
+    TrackScene("breathing, offsets 16, 4, 12 ms", "breathing", {"offsets": (HALF_PERIOD, -0.004, -0.012)}, ASYNC_ERROR),
+    TrackScene("breathing, offsets 16 ms, lens 0.3 px", "breathing", {**HALF_OFFSETS, "calibration": 0.3}, ASYNC_ERROR),
+    TrackScene("breathing, jitter 5 ms", "breathing", {"jitter": 0.005}, ASYNC_ERROR),
+    TrackScene("lively, offsets 16 ms", "lively", HALF_OFFSETS, ASYNC_ERROR),
     TrackScene("breathing, cube", "breathing", rigid=True, surface="cube"),
 )
-
-
 MIN_PNP_TRACKS = 6  # for a pose
 PNP_GATE_PX = 8.0  # px: OpenCV's own gate of an outlier
 
@@ -237,7 +223,8 @@ def run_estimator(options: argparse.Namespace) -> list[Figure]:
         raise InputError("command line", "--only", options.only, f"a pattern of {names}")
     for scene in scenes:
         conditions = {"count": options.count, "surface": scene.surface, "noise": options.noise, **scene.conditions}
-        seconds = scene.seconds if options.seconds is None else options.seconds
+        usual = 24.0 if "offsets" in scene.conditions else 10.0  # s: offsets have to be known after 20 s
+        seconds = usual if options.seconds is None else options.seconds
         worlds = [synthetic_world(scene.movement, seconds, seed=n, **conditions) for n in range(options.seeds)]
         pnp = best_camera(worlds)
         for mapping in options.maps:

@@ -255,8 +255,7 @@ def soak_figures(counts: LinkCounts) -> list[Figure]:
     """Figures of the virtual runs."""
     name = f"virtual {counts.seconds / 3600:.3g} h"
     noise = f"of {counts.strays} stray bytes; there is no check sum, and one answer alone is not believed"
-    returns = f"the device went {counts.unplugged} times"
-    return [
+    figures = [
         Figure(f"{name}: frames taken", counts.frames, "", note=f"of {counts.ticks} ticks; {counts.held} held"),
         Figure(f"{name}: commands that found the queue full", counts.overflows, "", ZERO),
         Figure(f"{name}: frames taken that nobody sent", counts.foreign, "", ZERO),
@@ -264,15 +263,7 @@ def soak_figures(counts: LinkCounts) -> list[Figure]:
         Figure(f"{name}: frames that the arm refused", counts.refused, "", ZERO),
         Figure(f"{name}: most under way, by the model", 1000 * counts.modelled, "ms", at_most(50), FIFO_REFERENCE),
         Figure(f"{name}: still moving 55 ms after the last frame", counts.restless, "", ZERO, note="an arm that obeys"),
-        *_queued(name, counts),
-        *_stops(name, counts),
-        Figure(f"{name}: underruns", counts.underruns, "", note="each ended at rest"),
-        Figure(f"{name}: stops by the link itself", counts.faults, "", note=returns),
     ]
-
-
-def _queued(name: str, counts: LinkCounts) -> list[Figure]:
-    figures = []
     for kind, most in sorted(counts.queued.items()):
         manner = kind.split(",")[0]
         target = at_most(50) if manner == OBEYING else None
@@ -282,16 +273,16 @@ def _queued(name: str, counts: LinkCounts) -> list[Figure]:
         target = at_most(50) if kind.endswith("answering") else None
         what = f"{name}: most queued at the end of a stall, {kind}"
         figures.append(Figure(what, 1000 * most, "ms", target, "", f"of {1000 * DETECTABLE_STALL:.0f} ms or more"))
-    return figures
-
-
-def _stops(name: str, counts: LinkCounts) -> list[Figure]:
-    what = f"{name}: stop on the wire after its decision"
-    if not counts.stops:
-        return [Figure(what, float("nan"), "ms", at_most(10))]
+    what, returns = f"{name}: stop on the wire after its decision", f"the device went {counts.unplugged} times"
     note = f"{len(counts.stops)} stops, and {len(counts.blocked_stops)} before a port that took no bytes"
-    return [
+    stops = [
         Figure(f"{what}, median", milliseconds(counts.stops, 50), "ms"),
         Figure(f"{what}, 99 %", milliseconds(counts.stops, 99), "ms", at_most(10)),
-        Figure(f"{what}, largest", 1000 * max(counts.stops), "ms", note=note),
+        Figure(f"{what}, largest", 1000 * max(counts.stops, default=np.nan), "ms", note=note),
+    ]
+    return [
+        *figures,
+        *(stops if counts.stops else [Figure(what, float("nan"), "ms", at_most(10))]),
+        Figure(f"{name}: underruns", counts.underruns, "", note="each ended at rest"),
+        Figure(f"{name}: stops by the link itself", counts.faults, "", note=returns),
     ]
