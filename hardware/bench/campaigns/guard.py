@@ -114,21 +114,21 @@ def _joints(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     model = rules.arm.jointed
     if model is None:
         return np.ones(len(log.axes), int)
-    finite = np.isfinite(log.axes).all(axis=1)
+    finite = np.all(np.isfinite(log.axes), axis=1)
     axes = np.where(finite[:, None], log.axes, rules.arm.home)  # judged by _reach
     after, start = joints_from_axes(model, axes), joints_from_axes(model, before)
-    known = np.isfinite(after).all(axis=1)
+    known = np.all(np.isfinite(after), axis=1)
     after = np.where(known[:, None], after, 0.0)
     error = np.abs(nozzle_from_joints(model, after)[:, :3, 3] - axes[:, :3]).max(axis=1)
     error = np.maximum(error, np.abs(after[:, 3:] - axes[:, 3:]).max(axis=1))
-    inside = _exactly(((after >= model.low) & (after <= model.high)).all(axis=1))
+    inside = _exactly(np.all((after >= model.low) & (after <= model.high), axis=1))
     speed = _within(np.abs(after - start), model.speed * rules.tick).min(axis=1)
     return np.where(known & (error < REACH_TOLERANCE), np.minimum(inside, speed), -1)
 
 
 def _zones(log: GuardLog, before: Array, rules: GuardRules) -> Verdicts:
     """Verdicts on the tip's straight segments: ternary search for the least distance outside, convex along each."""
-    finite = np.isfinite(log.axes).all(axis=1)
+    finite = np.all(np.isfinite(log.axes), axis=1)
     start, end = (
         np.linalg.solve(rules.arm.arm_from_base, np.column_stack([axes[:, :3], np.ones(len(axes))]).T)[:3].T
         for axes in (before, np.where(finite[:, None], log.axes, before))
