@@ -177,7 +177,8 @@ def errors_of(chest: Chest, warm_up: float) -> TraceErrors:
         lengths = [np.linalg.norm(truth - guess, axis=-1) for guess in guesses]
         errors[:4, k] = [np.sqrt((length**2).mean(0)).mean() for length in lengths]
         errors[4, k] = (lengths[3] <= radii[k, now]).mean()
-    return TraceErrors(chest.name, *errors, ms=ms)
+    hold, velocity, ensemble, forecast, covered = errors
+    return TraceErrors(chest.name, hold, velocity, ensemble, forecast, covered, ms)
 
 
 def _predicted(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:

@@ -16,8 +16,8 @@ from estimation.online.estimator import Estimator
 from estimation.online.fit import FrameFit
 from estimation.pose import SurfacePose
 from estimation.scans.registration import Registration
-from estimation.scans.scan import Index, Scan
-from estimation.se3 import Array
+from estimation.scans.scan import Scan
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
