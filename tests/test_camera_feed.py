@@ -128,11 +128,6 @@ def test_a_camera_that_went_is_opened_again_with_a_back_off_and_named_meanwhile(
     assert len(out) == 10 and state.reopened == 1 and state.since < MAX_BACK_OFF
 
 
-def test_a_camera_that_never_came_is_named() -> None:
-    feed, _ = fed(*[None] * 6)
-    assert feed.state().phase is CameraPhase.OPENING and "cam cannot be opened since" in feed.state().trouble
-
-
 def test_a_camera_that_only_sends_damage_is_opened_anew() -> None:
     broken = [Shot(s.arrival, s.position, None) for s in shots(MAX_DAMAGED_FRAMES)]
     feed, out = fed(broken, shots(5, 60.0))
@@ -158,11 +153,10 @@ def test_the_loop_finds_the_beat_behind_jitter_and_skips(seed: int, jitter: floa
     beats = [loop(float(instant)) for instant in instants]
     steady = np.array([beat.steady for beat in beats])
     assert (np.diff(steady) >= 0).all()
-    settled = slice(PLL_BEATS + PERIOD_INSTANTS, None)
-    assert np.abs(steady - 5 - kept * PERIOD)[settled].max() <= max(0.75 * jitter * PERIOD, 1e-9)
-    assert [beat.count for beat in beats[PLL_BEATS + PERIOD_INSTANTS :]] == np.diff(kept)[
-        PLL_BEATS + PERIOD_INSTANTS - 1 :
-    ].tolist()
+    first = PLL_BEATS + PERIOD_INSTANTS
+    assert np.abs(steady - 5 - kept * PERIOD)[first:].max() <= max(0.75 * jitter * PERIOD, 1e-9)
+    first = PLL_BEATS + PERIOD_INSTANTS
+    assert [beat.count for beat in beats[first:]] == np.diff(kept)[first - 1 :].tolist()
 
 
 def test_the_loop_takes_a_new_rate_over() -> None:
@@ -310,7 +304,8 @@ def test_a_camera_that_never_comes_is_named_and_one_of_another_size_too(cameras:
     cameras[1].picture_of = lambda n: np.repeat(picture(n), 2, axis=0)
     with LiveCameras(rig_of(2), [c.source for c in cameras], CLOCK) as live:
         assert not list(sets_until(live, lambda h: len(h.trouble.split("; ")) == 2 and h.cameras[1].age > 0.6))
-        assert "cam0 cannot be opened since" in live.health().trouble
+        health = live.health()
+        assert health.cameras[0].phase is CameraPhase.OPENING and "cam0 cannot be opened since" in health.trouble
         assert "cam1 sends pictures of another size" in live.health().trouble
 
 

@@ -329,11 +329,8 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     run = _packages([*project["dependencies"], *extras["bench"], *extras["cluster"], *extras["train"]])
     imported = set().union(*(module.roots for module in ours().modules.values()))
     assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run - INDIRECT
-    tests = {
-        name.split(".")[0].lstrip("_")
-        for path in TESTS
-        for name in _imported(ast.parse(path.read_text("utf-8")), path.name)
-    }
+    names = [name for path in TESTS for name in _imported(ast.parse(path.read_text("utf-8")), path.name)]
+    tests = {name.split(".")[0].lstrip("_") for name in names}
     develop = _packages(extras["dev"])
     assert tests - {*FLOORS, *sys.stdlib_module_names, "tests", "future__"} <= run | develop
     assert develop - TOOLS <= tests | imported

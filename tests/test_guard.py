@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
@@ -227,39 +225,13 @@ def test_a_hold_passes_and_moves_nothing() -> None:
     assert guard(hold, None, 1.0) is hold and np.array_equal(guard.axes, np.zeros(6))
 
 
-@given(st.integers(0, 100_000))
-def test_nothing_that_breaks_a_limit_passes(seed: int) -> None:
-    """Random commands against an oracle that was written from the limits alone."""
-    draw = np.random.default_rng(seed)
-    guard, limits = Guard(MotionLimits(), SimpleArm(), 0.02), MotionLimits()
-    before, stamp = SimpleArm().home, 0.0
-    for _ in range(40):
-        stamp += draw.choice([0.02, 0.02, 0.02, 0.0, -0.02])
-        target = before + draw.normal(size=6) * limits.speed * 0.02 * draw.choice([0.2, 0.5, 1.0])
-        target[draw.integers(6)] *= draw.choice([1.0, 1.0, 1.0, np.nan, 5.0])
-        seen = pose(stamp - draw.choice([0.0, 0.1, 0.4]), state=draw.choice([TrackState.TRACKING, TrackState.LOST]))
-        wanted = move(target, stamp, feed=draw.choice([5.0, 100.0, 251.0]), extrude=True)
-        if isinstance(guard(wanted, seen, stamp), Move):
-            step = np.abs(target - before)
-            assert (target >= limits.low).all() and (target <= limits.high).all()
-            assert (step <= limits.speed * 0.02 * (1 + 1e-12)).all()
-            assert np.linalg.norm(step[:3]) <= limits.jump * (1 + 1e-12) and wanted.feed <= limits.feed
-            assert seen.state is TrackState.TRACKING and stamp - seen.stamp <= limits.pose_age
-            before = target
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("speed", np.zeros(6)),
-        ("jerk", np.full(6, np.nan)),
-        ("acceleration", np.ones(5)),
-        ("jump", -1.0),
-        ("pose_age", np.inf),
-        ("low", np.full(6, 900.0)),
-        ("high", np.array([650.0, 650, 500, 1, 1.6, 1])),
+        ("speed", np.zeros(6)), ("jerk", np.full(6, np.nan)), ("acceleration", np.ones(5)), ("jump", -1.0),
+        ("pose_age", np.inf), ("low", np.full(6, 900.0)), ("high", np.array([650.0, 650, 500, 1, 1.6, 1])),
     ],
-)
+)  # fmt: skip
 def test_limits_are_checked(name: str, value: object) -> None:
     with pytest.raises(InputError, match="limits"):
         replace(MotionLimits(), **{name: value})  # type: ignore[arg-type]
@@ -285,6 +257,7 @@ def test_a_warp_adds_its_own_doubt_and_what_grows_of_it() -> None:
     assert refused(judged(move(axes(0.5)), warped(np.nan, 0.0)), "not finite")
 
 
+PRINT = move(axes(0.5), extrude=True)
 REFUSED: list[tuple[RefusalCode, Move, SurfacePose | None, float, float]] = [
     (RefusalCode.ORDER, move(axes(0.5), 0.5), pose(1.0), 0.5, 1.0),
     (RefusalCode.NOT_FINITE, move(axes(np.nan)), pose(1.0), np.nan, np.nan),
@@ -293,19 +266,13 @@ REFUSED: list[tuple[RefusalCode, Move, SurfacePose | None, float, float]] = [
     (RefusalCode.JUMP, move(axes(65)), pose(1.0), 65.0, 64.0),
     (RefusalCode.TURN, move(axes(0, 0, 0, 1.25)), pose(1.0), 1.25, 1.0),
     (RefusalCode.AXIS_SPEED, move(axes(3)), pose(1.0), 192.0, 128.0),
-    (RefusalCode.NO_POSE, move(axes(0.5), extrude=True), None, np.nan, np.nan),
-    (RefusalCode.POSE_NOT_FINITE, move(axes(0.5), extrude=True), pose(1.0, twist=np.full(6, np.inf)), np.nan, np.nan),
-    (RefusalCode.TRACK_STATE, move(axes(0.5), extrude=True), pose(1.0, state=TrackState.LOST), np.nan, np.nan),
-    (RefusalCode.POSE_AGE, move(axes(0.5), extrude=True), pose(0.5), 0.5, 0.25),
-    (RefusalCode.SURFACE_SPEED, move(axes(0.5), extrude=True), pose(1.0, twist=axes(0, 0, 0, 51)), 51.0, 50.0),
-    (RefusalCode.SURFACE_TURN, move(axes(0.5), extrude=True), pose(1.0, twist=axes(1.5)), 1.5, 0.75),
-    (
-        RefusalCode.POSE_ERROR,
-        move(axes(0.5), extrude=True),
-        pose(1.0, covariance=np.diag([0.0, 0, 0, 1, 0, 0])),
-        1.0,
-        0.5,
-    ),
+    (RefusalCode.NO_POSE, PRINT, None, np.nan, np.nan),
+    (RefusalCode.POSE_NOT_FINITE, PRINT, pose(1.0, twist=np.full(6, np.inf)), np.nan, np.nan),
+    (RefusalCode.TRACK_STATE, PRINT, pose(1.0, state=TrackState.LOST), np.nan, np.nan),
+    (RefusalCode.POSE_AGE, PRINT, pose(0.5), 0.5, 0.25),
+    (RefusalCode.SURFACE_SPEED, PRINT, pose(1.0, twist=axes(0, 0, 0, 51)), 51.0, 50.0),
+    (RefusalCode.SURFACE_TURN, PRINT, pose(1.0, twist=axes(1.5)), 1.5, 0.75),
+    (RefusalCode.POSE_ERROR, PRINT, pose(1.0, covariance=np.diag([0.0, 0, 0, 1, 0, 0])), 1.0, 0.5),
     (RefusalCode.STOP_DISTANCE, move(axes(5), 1.25), None, 5.0, 4.0),
     (RefusalCode.WATCHDOG, move(axes(0.5), 1.75), None, 0.75, 0.5),
 ]
@@ -337,9 +304,7 @@ HAIR = 1e-12  # rad, rad/s: the joints are solved anew under each limit, which m
 
 @pytest.mark.parametrize("seed", [0, *slowly(1, 2, 3)])
 @pytest.mark.parametrize("rules", [simple_rules, jointed_rules])
-def test_no_random_command_that_breaks_a_limit_passes_and_none_that_keeps_all_is_refused(
-    rules: Callable[[], GuardRules], seed: int
-) -> None:
+def test_a_random_command_passes_exactly_if_it_keeps_all_limits(rules: Callable[[], GuardRules], seed: int) -> None:
     asked, passed, broken, refused = judge_guard(random_log(seed, COUNT, rules()), rules())
     assert (asked, broken, refused) == (COUNT, 0, 0)
     assert 0.3 * COUNT < passed < 0.9 * COUNT  # both sides are tried

@@ -47,9 +47,6 @@ def judged(log: NozzleLog, path: Path) -> tuple[RowErrors, NozzleFigures]:
     return errors, nozzle_figures(log, line, errors)
 
 
-# -- error
-
-
 def test_a_perfect_run_has_no_error_and_full_duty() -> None:
     path = raster()
     _, figures = judged(nozzle_log(path, breathing), path)
@@ -141,9 +138,6 @@ def test_the_lag_is_not_measured_across_a_gap() -> None:
     assert np.isnan(nozzle_lag(without_target(part(log, slice(0, 900)), slice(450, 451))).seconds)
 
 
-# -- the printed line
-
-
 @FEW
 @given(st.integers(0, 10_000))
 def test_the_distance_to_the_line_is_that_of_the_nearest_of_many_points_on_it(seed: int) -> None:
@@ -167,10 +161,18 @@ def test_being_late_is_no_distance_from_the_line() -> None:
     assert figures.path.max < 1e-9
 
 
-def test_a_path_that_prints_nothing_has_no_line() -> None:
-    path = through(np.array([[0.0, 0, 0], [5, 0, 0]]), extrude=np.zeros(2, bool))
-    _, figures = judged(nozzle_log(path), path)
-    assert np.isnan([figures.path.max, figures.duty, figures.position.max, figures.near]).all()
+def test_what_prints_nothing_has_no_figures() -> None:
+    path = straight()
+    log, bare = nozzle_log(path), replace(path, extrude=np.zeros(len(path), bool))
+    none = judged(nozzle_log(bare), bare)[1]
+    assert np.isnan([none.path.max, none.duty, none.position.max, none.near]).all()
+    assert np.isnan(laid(nozzle_log(bare), bare)[1].coverage)
+    empty = judged(part(log, slice(0, 0)), path)[1]
+    assert np.isnan([empty.duty, empty.position.max, empty.lag.seconds]).all()
+    log.extrude[:] = False
+    dry, gap = judged(log, path)[1], laid(log, path)[1]
+    assert dry.duty == 0.0 and np.isnan(dry.position.rmse)
+    assert (gap.coverage, gap.gaps, gap.outside, gap.material) == (0, 1, 0, 0)
 
 
 def test_a_turn_on_the_spot_has_the_direction_of_the_piece_before() -> None:
@@ -186,10 +188,7 @@ def test_a_checkpoint_belongs_to_the_piece_that_leads_to_it() -> None:
     assert line.piece(np.array([-1.0, 0.0, 1e-9, 2.0, 2.0 + 1e-9, 5.0, 9.0])).tolist() == [0, 0, 0, 0, 1, 1, 1]
 
 
-# -- duty
-
-
-def test_a_hold_costs_duty_and_the_end_of_the_path_costs_none() -> None:
+def test_a_hold_costs_duty_to_the_end_of_the_path_or_of_the_run() -> None:
     path = straight(length=20.0, speed=5.0)
     log = nozzle_log(path, breathing, seconds=8.0, reasons=held(1.0, 2.0))
     log.extrude[5000:] = False  # the path is finished after 5 s
@@ -202,10 +201,6 @@ def test_a_hold_costs_duty_and_the_end_of_the_path_costs_none() -> None:
     assert [(h.reason, h.count) for h in figures.holds] == [("surface is LOST", 1)]
     assert figures.holds[0].seconds == pytest.approx(1.0)
     assert figures.holds[0].first == pytest.approx(1.0)
-
-
-def test_a_run_that_never_finishes_pays_until_its_end() -> None:
-    path = straight(length=20.0, speed=5.0)
     _, figures = judged(nozzle_log(path, seconds=4.0, reasons=held(1.0, 99.0)), path)
     assert not figures.finished
     assert figures.duty == pytest.approx(0.25, abs=1e-3)
@@ -232,23 +227,10 @@ def test_a_place_that_is_not_known_is_the_last_one_that_was() -> None:
     assert judged(printing, path)[1].duty == pytest.approx(0.95, abs=1e-3)
 
 
-def test_what_extrudes_nothing_has_no_duty_and_no_error() -> None:
+def test_the_share_near_ends_at_half_a_millimetre_and_where_there_is_no_target() -> None:
     path = straight()
-    log = nozzle_log(path)
-    log.extrude[:] = False
-    _, figures = judged(log, path)
-    assert figures.duty == 0.0
-    assert np.isnan(figures.position.rmse)
-
-
-def test_an_empty_log_has_no_figures() -> None:
-    path = straight()
-    _, figures = judged(part(nozzle_log(path), slice(0, 0)), path)
-    assert np.isnan([figures.duty, figures.position.max, figures.lag.seconds]).all()
-
-
-def test_extruding_without_a_target_is_told_and_not_near() -> None:
-    path = straight()
+    for off, near in ((0.5 - 1e-9, 1.0), (0.5 + 1e-9, 0.0)):
+        assert judged(nozzle_log(path, offset=np.array([0, off, 0])), path)[1].near == near
     log = without_target(nozzle_log(path), slice(1000, 1100))
     _, figures = judged(log, path)
     assert figures.without_target == pytest.approx(0.1)
@@ -256,25 +238,15 @@ def test_extruding_without_a_target_is_told_and_not_near() -> None:
     assert figures.position.max < 1e-9
 
 
-def test_the_share_near_the_target_ends_at_half_a_millimetre() -> None:
-    path = straight()
-    for off, near in ((0.5 - 1e-9, 1.0), (0.5 + 1e-9, 0.0)):
-        assert judged(nozzle_log(path, offset=np.array([0, off, 0])), path)[1].near == near
-
-
-# -- holds
-
-
-def spans_of(reasons: list[str]) -> tuple[list[str], list[float], list[float]]:
+def test_a_reason_whose_numbers_change_is_one_hold_and_a_gap_in_the_stamps_ends_it() -> None:
+    reasons = ["", *["pose is 0.181 s old"] * 2, "pose is 0.201 s old", "", "LOST", "no pose"]
     spans = hold_spans(np.arange(len(reasons)) * 0.001, np.array(reasons), 0.001)
-    return [s.reason for s in spans], [s.start for s in spans], [s.end for s in spans]
-
-
-def test_a_reason_whose_numbers_change_is_one_hold() -> None:
-    reasons, starts, ends = spans_of(["", *["pose is 0.181 s old"] * 2, "pose is 0.201 s old", "", "LOST", "no pose"])
-    assert reasons == ["pose is 0.181 s old", "LOST", "no pose"]
-    assert starts == pytest.approx([0.001, 0.005, 0.006])
-    assert ends == pytest.approx([0.004, 0.006, 0.007])
+    assert [span.reason for span in spans] == ["pose is 0.181 s old", "LOST", "no pose"]
+    assert [span.start for span in spans] == pytest.approx([0.001, 0.005, 0.006])
+    assert [span.end for span in spans] == pytest.approx([0.004, 0.006, 0.007])
+    stamps = np.array([0.0, 0.001, 0.5, 0.501])
+    assert len(hold_spans(stamps, np.array(["a"] * 4), 0.001)) == 2
+    assert hold_spans(stamps[:0], np.array([], "U1"), 0.001) == []
 
 
 def test_holds_of_one_kind_keep_the_numbers_they_share() -> None:
@@ -282,12 +254,6 @@ def test_holds_of_one_kind_keep_the_numbers_they_share() -> None:
     found = group_holds(hold_spans(np.arange(5) * 0.001, np.array(texts), 0.001))
     assert [(h.reason, h.count) for h in found] == [("cam2: … s old, limit 0.18 s", 2), (texts[-1], 1)]
     assert found[0].longest == pytest.approx(0.001)
-
-
-def test_a_gap_in_the_stamps_ends_a_hold() -> None:
-    stamps = np.array([0.0, 0.001, 0.5, 0.501])
-    assert len(hold_spans(stamps, np.array(["a"] * 4), 0.001)) == 2
-    assert hold_spans(stamps[:0], np.array([], "U1"), 0.001) == []
 
 
 BEAD = 0.8
@@ -403,13 +369,3 @@ def test_material_far_away_does_not_make_the_map_endless() -> None:
     found, figures = laid(nozzle_log(path, offset=np.array([0, 5000.0, 0])), path)
     assert found.planned.shape[1] * found.cell < MAP_REACH + 2
     assert (figures.coverage, figures.gaps) == (0, 1)
-
-
-def test_nothing_laid_is_all_gap_and_nothing_planned_has_no_figures() -> None:
-    path = raster()
-    log = nozzle_log(path)
-    log.extrude[:] = False
-    _, figures = laid(log, path)
-    assert (figures.coverage, figures.gaps, figures.outside, figures.material) == (0, 1, 0, 0)
-    empty = replace(path, extrude=np.zeros(len(path), bool))
-    assert np.isnan(laid(nozzle_log(empty), empty)[1].coverage)

@@ -68,9 +68,7 @@ def test_covariance_stays_symmetric_and_positive(seed: int, dt: float) -> None:
 @given(seeds, st.floats(0.001, 1))
 def test_a_resting_surface_is_known_less_the_longer_it_is_not_seen(seed: int, dt: float) -> None:
     p = pose(seed)
-    resting = SurfacePose(
-        p.stamp, p.base_from_surface, p.covariance, np.zeros(6), p.state, p.twist_covariance, p.acceleration_psd
-    )
+    resting = replace(p, twist=np.zeros(6))
     for sign in (1, -1):
         later, much_later = resting.predict(p.stamp + sign * dt), resting.predict(p.stamp + 2 * sign * dt)
         assert np.linalg.eigvalsh(later.covariance - p.covariance).min() > 0

@@ -87,34 +87,23 @@ def recording(request: pytest.FixtureRequest) -> tuple[Recording, Run]:
     return wanted, Run(session, poses)
 
 
-def test_every_frame_set_has_a_pose_and_a_state_that_says_why(recording: tuple[Recording, Run]) -> None:
+def test_every_frame_set_has_a_pose_and_its_state_says_why(recording: tuple[Recording, Run]) -> None:
     _, run = recording
     assert len(run.poses) == len(run.session)
     for p in run.poses:
         assert se3.is_transform(p.base_from_surface) and np.isfinite(p.covariance).all()
         assert (p.reason == "") == (p.state is TrackState.TRACKING)
-
-
-def test_the_surface_is_followed(recording: tuple[Recording, Run]) -> None:
-    assert recording[1].followed().mean() >= FOLLOWED
-
-
-def test_the_median_error_is_what_is_asked(recording: tuple[Recording, Run]) -> None:
-    wanted, run = recording
-    away, _ = run.errors()
-    assert len(away) > 0.9 * run.followed().sum() - 2
-    assert np.median(away) <= wanted.median
-
-
-def test_no_pose_that_is_called_tracking_is_far_off(recording: tuple[Recording, Run]) -> None:
-    away, tracking = recording[1].errors()
-    assert away[tracking].max() <= OFF
-
-
-def test_nothing_is_tracked_before_the_region_is_known(recording: tuple[Recording, Run]) -> None:
-    _, run = recording
     start = max(r.stamp for r in run.session.roi)
     assert all(p.state is TrackState.INITIALISING for p in run.poses if p.stamp < start - 0.1)
+
+
+def test_the_surface_is_followed_as_well_as_is_asked_and_no_tracked_pose_is_far_off(
+    recording: tuple[Recording, Run],
+) -> None:
+    wanted, run = recording
+    away, tracking = run.errors()
+    assert run.followed().mean() >= FOLLOWED and len(away) > 0.9 * run.followed().sum() - 2
+    assert np.median(away) <= wanted.median and away[tracking].max() <= OFF
 
 
 TRACES_DATA = Path(__file__).parent.parent.parent / "shared" / "data" / "motion"
@@ -163,9 +152,7 @@ def test_the_motion_passes_through_the_poses_of_the_file_relative_to_its_first(t
 
 @pytest.mark.parametrize("loop", ["back", "hold"])
 @given(start=st.floats(-3, 90))
-def test_the_twist_is_the_velocity_of_the_pose(
-    tmp_path_factory: pytest.TempPathFactory, loop: str, start: float
-) -> None:
+def test_the_twist_is_the_poses_velocity(tmp_path_factory: pytest.TempPathFactory, loop: str, start: float) -> None:
     path = tmp_path_factory.getbasetemp() / "law.tum"
     if not path.exists():
         write_chest(path, noise=0.1)
@@ -249,9 +236,7 @@ def write_csv(path: Path, header: str, rows: Array) -> None:
         ("frame,tx_m,ty_m,tz_m,rx_deg,ry_deg,rz_deg", (25, 1e-3, 180 / np.pi), 25.0),
     ],
 )
-def test_csv_columns_say_their_units(
-    tmp_path: Path, header: str, factors: tuple[float, float, float], rate: float | None
-) -> None:
+def test_csv_column_units(tmp_path: Path, header: str, factors: tuple[float, float, float], rate: float | None) -> None:
     times = np.arange(0, 9, 0.04)
     rows = chest(times)
     write_csv(
@@ -360,14 +345,10 @@ def test_real_breathing_keeps_its_length_speed_and_cost_of_holding(name: str, se
 
 
 @real
-def test_the_two_forms_of_a_real_trace_are_one_motion() -> None:
+def test_the_other_real_traces_play_and_two_forms_of_one_alike() -> None:
     times = np.linspace(0, 100, 501)
     tum, markers = play(TRACES_DATA / "breathing_seq8.tum"), play(TRACES_DATA / "breathing_seq8_markers.csv")
     assert np.abs(tum(times) - markers(times)).max() < 1e-3
-
-
-@real
-def test_the_other_real_traces_play() -> None:
     patch = play(TRACES_DATA / "chest30" / "patch_01.csv", rate_hz=100)
     assert part(patch).duration == pytest.approx(23.08)
     hand = play(TRACES_DATA / "handheld_1.tum", unit="m")

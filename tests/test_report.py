@@ -72,19 +72,13 @@ def eventful() -> Evaluation:
     return evaluate(table, truth, "monday <1>", since=0.1)
 
 
-def test_the_page_is_well_formed_and_says_what_happened() -> None:
-    text = text_of_page(track_page(eventful()))
+def test_the_page_is_well_formed_needs_nothing_from_outside_and_says_what_happened() -> None:
+    html = track_page(eventful())
+    text = text_of_page(html)
     for words in ("monday <1>", "One pose was off by more than 10 mm", "LOST 1.3 %", "left, median", "row 31", "NEES"):
         assert words in text
-
-
-def test_the_page_needs_nothing_from_outside() -> None:
-    html = track_page(eventful())
     assert not re.search(r"https?:|src=|@import|url\(|<script", html)
-
-
-def test_no_number_on_the_page_is_not_a_number() -> None:
-    assert not re.search(r'[" ML](nan|inf|-inf)\b', track_page(eventful()))
+    assert not re.search(r'[" ML](nan|inf|-inf)\b', html)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 2])
@@ -101,7 +95,7 @@ def test_a_run_without_any_known_pose_has_a_page() -> None:
     assert "INITIALISING 100 %" in text_of_page(track_page(evaluate(table, truth)))
 
 
-def test_the_page_says_when_each_camera_exposes() -> None:
+def test_the_page_says_when_each_camera_exposes_or_that_all_do_together() -> None:
     table, truth = run(40, sigma=SIGMA)
     result = evaluate(table, truth)
     text = text_of_page(track_page(result))
@@ -110,14 +104,9 @@ def test_the_page_says_when_each_camera_exposes() -> None:
     assert "left, at the end +14.3 ± 0.4 ms" in text
     assert at_end in summary_text(result)
     assert as_dict(result)["clocks_ms"]["top"] == pytest.approx({"offset": -9.1, "sigma": 0.4})
-
-
-def test_cameras_that_expose_together_are_said_to() -> None:
-    table, truth = run(40, sigma=SIGMA)
     table.offsets[:] = 0
-    assert "No camera exposes clearly earlier or later than the others (known to 0.4 ms)." in verdict(
-        evaluate(table, truth)
-    )
+    said = verdict(evaluate(table, truth))
+    assert "No camera exposes clearly earlier or later than the others (known to 0.4 ms)." in said
 
 
 @pytest.mark.parametrize("states", [{}, {i: TrackState.INITIALISING for i in range(40)}])
@@ -187,15 +176,6 @@ def test_a_span_is_never_empty() -> None:
         assert low < high
 
 
-def test_identical_trajectories_have_no_error() -> None:
-    comparison = compare(*run())
-    assert comparison is not None
-    for errors in (comparison.start, comparison.aligned):
-        assert errors.translation.max() < 1e-9
-        assert errors.rotation.max() < 1e-9
-    assert len(comparison.rows) == 59  # the first row is still INITIALISING
-
-
 @given(st.integers(0, 10_000))
 def test_another_surface_frame_is_no_error(seed: int) -> None:
     change = se3.exp(np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 50, 50, 50])
@@ -224,8 +204,7 @@ def test_a_wrong_first_pose_is_in_every_error_from_the_start_but_not_aligned() -
     table, truth = run(400)
     table.base_from_surface[1, :3, 3] += [0, 0, 2]
     comparison = compare(table, truth)
-    assert comparison is not None
-    assert np.allclose(comparison.start.translation[1:], 2, atol=0.2)
+    assert comparison is not None and np.allclose(comparison.start.translation[1:], 2, atol=0.2)
     assert comparison.aligned.translation[1:].max() < 0.02
 
 
@@ -246,8 +225,7 @@ def test_no_other_constant_fits_better(seed: int) -> None:
 def test_honest_noise_has_a_nees_of_six_and_is_inside_as_often_as_it_should() -> None:
     table, truth = run(3000, sigma=SIGMA)
     comparison = compare(table, truth)
-    assert comparison is not None
-    assert comparison.aligned.mean_nees / 6 == pytest.approx(1, abs=0.04)
+    assert comparison is not None and comparison.aligned.mean_nees / 6 == pytest.approx(1, abs=0.04)
     assert comparison.aligned.nees_inside == pytest.approx(0.95, abs=0.012)
 
 
@@ -255,16 +233,14 @@ def test_a_covariance_that_claims_half_the_error_has_four_times_the_nees() -> No
     table, truth = run(3000, sigma=SIGMA)
     table.covariance[:] /= 4
     comparison = compare(table, truth)
-    assert comparison is not None
-    assert comparison.aligned.mean_nees / 6 == pytest.approx(4, abs=0.16)
+    assert comparison is not None and comparison.aligned.mean_nees / 6 == pytest.approx(4, abs=0.16)
 
 
 def test_a_pose_without_covariance_does_not_spoil_the_nees() -> None:
     table, truth = run(300, sigma=SIGMA)
     table.covariance[7] = np.inf
     comparison = compare(table, truth)
-    assert comparison is not None
-    assert np.isfinite(comparison.aligned.mean_nees)
+    assert comparison is not None and np.isfinite(comparison.aligned.mean_nees)
     assert np.isnan(comparison.aligned.nees).sum() == 1
 
 
@@ -273,8 +249,7 @@ def test_only_a_pose_that_is_off_while_tracking_is_a_lie() -> None:
     table.base_from_surface[[20, 21, 22], 0, 3] += 10.001
     table.base_from_surface[23, 0, 3] += 9.999
     comparison = compare(table, truth)
-    assert comparison is not None
-    assert comparison.off.tolist() == [22]
+    assert comparison is not None and comparison.off.tolist() == [22]
     assert 21 not in comparison.rows
 
 

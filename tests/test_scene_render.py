@@ -11,7 +11,6 @@ from functools import cache
 from itertools import pairwise
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,7 +27,7 @@ from hardware.simulator.camera_pipeline import PictureRenderer
 from hardware.simulator.cameras import Fate, Shot, TrueCameras
 from hardware.simulator.scene.appearance import Appearance, Sensor, unlit_texture
 from hardware.simulator.scene.render import render
-from hardware.simulator.scene.scene import Scene, WorldState, rois
+from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import (
     BODIES,
     Deformation,
@@ -140,9 +139,8 @@ def test_a_moving_point_is_smeared_about_the_middle_of_the_exposure(twist: tuple
         here = projected(scene, camera, at_rest)
         assert np.linalg.norm(imaged(image, here) - here, axis=1).max() < 0.03
         opened, closed = (BASE_FROM_REST @ se3.exp(np.array(twist) * t) for t in (-exposure / 2, exposure / 2))
-        smear = np.linalg.norm(
-            projected(scene, camera, instant(closed)) - projected(scene, camera, instant(opened)), axis=1
-        )
+        ends = [projected(scene, camera, instant(pose)) for pose in (opened, closed)]
+        smear = np.linalg.norm(ends[1] - ends[0], axis=1)
         assert smear.max() > 1.5
         shape = spread(image, here) - spread(still, here)
         np.testing.assert_allclose(np.sqrt(12 * shape.clip(0)), smear, rtol=0.1, atol=0.1)
@@ -191,16 +189,9 @@ def test_a_scene_built_again_gives_the_same_picture_and_another_seed_another() -
     camera = RIG.cameras[1:2]
     again, other = (Scene(body("forearm", Wound(), s), Appearance(texel=0.3), seed=s) for s in (2, 3))
     first = taken(wounded(), instant(), cameras=camera)[0]
+    taken(again, instant(MOVED), cameras=camera)  # no picture is remembered
     np.testing.assert_array_equal(first, taken(again, instant(), cameras=camera)[0])
     assert np.abs(first.astype(int) - taken(other, instant(), cameras=camera)[0]).mean() > 3
-
-
-@pytest.mark.slow
-def test_a_view_does_not_remember_the_pictures_before() -> None:
-    scene = Scene(body("forearm", Wound(), 2), Appearance(texel=0.3), seed=2)
-    taken(scene, instant(MOVED))
-    for a, b in zip(taken(scene, instant()), taken(wounded(), instant()), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_grain_is_as_strong_as_the_sensor_says_and_differs_from_image_to_image() -> None:
@@ -294,17 +285,6 @@ def test_far_cloth_rests_while_cloth_by_the_wound_moves_with_it() -> None:
     assert np.abs(moved - still)[300:420, 400:880].mean() > 4
 
 
-def test_regions_hold_the_wound_in_every_camera() -> None:
-    regions = rois(wounded(), RIG, MOVED, 1.5)
-    assert [r.camera for r in regions] == [0, 1, 2]
-    middle = se3.transform_points(MOVED, wounded().shape.points([[0.0, 0.0], [15.0, 8.0]]))
-    for roi in regions:
-        pixels, _ = pixels_from_points(RIG.cameras[roi.camera], middle)
-        for x, y in pixels:
-            assert cv2.pointPolygonTest(roi.polygon.astype(np.float32), (float(x), float(y)), False) > 0
-        assert roi.stamp == 1.5
-
-
 def test_a_scan_is_drawn_in_its_own_frame() -> None:
     source = wounded().shape
     surface_from_scanner = se3.make(se3.exp_rotation([0.3, -0.2, 0.1]), [12.0, -7.0, 31.0])
@@ -318,11 +298,6 @@ def test_a_scan_is_drawn_in_its_own_frame() -> None:
     point = se3.transform_points(pose, shape.points([[0.0, 0.0]]))
     x, y = np.rint(pixels_from_points(RIG.cameras[1], point)[0][0]).astype(int)
     assert image[y - 6 : y + 6, x - 6 : x + 6, 2].mean() > 1.5 * image[y - 6 : y + 6, x - 6 : x + 6, 1].mean()
-
-
-def test_a_surface_out_of_view_leaves_the_cloth() -> None:
-    aside = se3.make(np.eye(3), [5000.0, 0, 0]) @ BASE_FROM_REST
-    assert all(image.std() < 40 for image in taken(wounded(), instant(aside)))
 
 
 def test_a_patch_is_built_quickly_enough_for_tests() -> None:
@@ -403,8 +378,7 @@ def test_a_scan_gives_its_surface_back_in_its_own_frame() -> None:
     off = np.einsum("ni,ni->n", again - points, shape.normals(shape.material(points)))
     assert np.abs(off).max() < 0.1  # a mesh of 0.5 mm, taken anew every 0.5 mm: its creases are rounded
     assert np.abs(off).mean() < 0.004
-    assert shape.valid is not None
-    assert shape.valid.mean() > 0.97
+    assert shape.valid is not None and shape.valid.mean() > 0.97
 
 
 def test_holes_of_a_scan_are_no_surface_and_overhangs_hide_what_is_below() -> None:
@@ -429,8 +403,7 @@ def test_holes_of_a_scan_are_no_surface_and_overhangs_hide_what_is_below() -> No
 def test_a_wound_on_a_scan_is_painted_not_carved() -> None:
     source = flat((60.0, 50.0))
     shape = with_wound(source, Wound(), 1)
-    assert shape.inside is not None
-    assert (shape.inside > 0).any()
+    assert shape.inside is not None and (shape.inside > 0).any()
     np.testing.assert_array_equal(shape.heights, source.heights)
 
 
@@ -492,28 +465,21 @@ def test_a_picture_does_not_depend_on_threads_or_on_what_else_waits() -> None:
     assert len(set(together)) == len(ALL)
 
 
-def test_another_seed_is_another_noise() -> None:
-    one, other = (decode(shape_taken(pictures(seed, None), ALL[:1])[0][1], "", "").astype(int) for seed in (3, 4))
-    assert 0 < np.abs(one - other).mean() < 6
+def test_noise_differs_by_seed_and_from_picture_to_picture_of_the_same_thing() -> None:
+    def noisy(seed: int, number: int) -> Image:
+        source = pictures(seed, None)
+        source.expose(shot(0, number), shape_instant(0))
+        return decode(source.take(shot(0, number))[1], "", "").astype(int)
+
+    first, other_seed, later = noisy(3, 0), noisy(4, 0), noisy(3, 1)
+    assert 0 < np.abs(first - other_seed).mean() < 6 and 0 < np.abs(first - later).mean() < 6
 
 
-def test_the_noise_of_two_pictures_of_the_same_thing_differs() -> None:
-    still = shape_instant(0)
-    source = pictures(quality=None)
-    for number in range(2):
-        source.expose(shot(0, number), still)
-    first, second = (decode(source.take(shot(0, number))[1], "", "").astype(int) for number in range(2))
-    assert 0 < np.abs(first - second).mean() < 6
-
-
-def test_a_repeated_frame_is_the_same_picture() -> None:
+def test_a_repeated_frame_is_the_same_and_a_damaged_one_has_the_header_of_the_whole() -> None:
     source = pictures()
     again = replace(shot(1, 1, Fate.DUPLICATED), picture=0, exposed=0.1)
     first, second = shape_taken(source, [shot(1, 0), again])
     assert first == second
-
-
-def test_a_damaged_frame_has_the_header_of_the_whole_one() -> None:
     whole = shape_taken(pictures(), [shot(2, 0)])[0]
     damaged = shape_taken(pictures(), [shot(2, 0, Fate.GARBLED)])[0]
     assert damaged[1] != whole[1]

@@ -105,6 +105,14 @@ def swap(name: str, old: str, new: str) -> Callable[[Path], None]:
     return lambda folder: change(folder / name, old, new)
 
 
+def in_rig(old: str, new: str) -> Callable[[Path], None]:
+    return swap("rig.toml", old, new)
+
+
+def in_frames(old: str, new: str) -> Callable[[Path], None]:
+    return swap("frames.csv", old, new)
+
+
 def remove(name: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).unlink()
 
@@ -148,56 +156,44 @@ FAULTS: list[tuple[str, Callable[[Path], None], str, str, str]] = [
     ("video cut short", cut("top.avi", 0.6), "frames.csv", "number of frames of camera 'top'", "6"),
     ("video shorter", lambda f: write_video(f / "top.avi", 1, 5), "frames.csv", "camera 'top'", "6, allowed 5"),
     ("video longer", lambda f: write_video(f / "top.avi", 1, 7), "frames.csv", "camera 'top'", "6, allowed 7"),
-    ("frame not in video", swap("frames.csv", row("top", 5), row("top", 5) + "top,6,99\n"), "frames.csv", "'top'", "7"),
-    ("frame left out", swap("frames.csv", row("left", 3), ""), "frames.csv", "camera 'left': frame", "4 after 2"),
-    ("stamp back", swap("frames.csv", row("left", 3), "left,3,-5.0\n"), "frames.csv", "stamp_s of frame 3", "-5.0"),
-    (
-        "stamp equal",
-        swap("frames.csv", row("left", 3), f"left,3,{stamps(6)[2]!r}\n"),
-        "frames.csv",
-        "stamp_s of frame 3",
-        "later than",
-    ),
-    ("frame twice", swap("frames.csv", row("left", 3), row("left", 2)), "frames.csv", "line 5", "left,2"),
-    ("stamp nan", swap("frames.csv", row("left", 3), "left,3,nan\n"), "frames.csv", "line 5: stamp_s", "nan"),
-    ("stamp inf", swap("frames.csv", row("left", 3), "left,3,inf\n"), "frames.csv", "line 5: stamp_s", "inf"),
-    ("stamp no number", swap("frames.csv", row("left", 3), "left,3,soon\n"), "frames.csv", "stamp_s", "soon"),
-    ("row short", swap("frames.csv", row("left", 3), "left,3\n"), "frames.csv", "line 5: stamp_s", "''"),
-    ("frame no number", swap("frames.csv", row("left", 3), "left,-3,1\n"), "frames.csv", "line 5: frame", "-3"),
-    ("camera unknown", swap("frames.csv", "left,0", "lefd,0"), "frames.csv", "line 2: camera", "did you mean 'left'"),
-    ("header wrong", swap("frames.csv", "stamp_s", "stamp"), "frames.csv", "header", "camera,frame,stamp_s"),
+    ("frame not in video", in_frames(row("top", 5), row("top", 5) + "top,6,99\n"), "frames.csv", "'top'", "7"),
+    ("frame left out", in_frames(row("left", 3), ""), "frames.csv", "camera 'left': frame", "4 after 2"),
+    ("stamp back", in_frames(row("left", 3), "left,3,-5.0\n"), "frames.csv", "stamp_s of frame 3", "-5.0"),
+    ("stamp equal", in_frames(row("left", 3), f"left,3,{stamps(6)[2]!r}\n"), "frames.csv", "of frame 3", "later than"),
+    ("frame twice", in_frames(row("left", 3), row("left", 2)), "frames.csv", "line 5", "left,2"),
+    ("stamp nan", in_frames(row("left", 3), "left,3,nan\n"), "frames.csv", "line 5: stamp_s", "nan"),
+    ("stamp inf", in_frames(row("left", 3), "left,3,inf\n"), "frames.csv", "line 5: stamp_s", "inf"),
+    ("stamp no number", in_frames(row("left", 3), "left,3,soon\n"), "frames.csv", "stamp_s", "soon"),
+    ("row short", in_frames(row("left", 3), "left,3\n"), "frames.csv", "line 5: stamp_s", "''"),
+    ("frame no number", in_frames(row("left", 3), "left,-3,1\n"), "frames.csv", "line 5: frame", "-3"),
+    ("camera unknown", in_frames("left,0", "lefd,0"), "frames.csv", "line 2: camera", "did you mean 'left'"),
+    ("header wrong", in_frames("stamp_s", "stamp"), "frames.csv", "header", "camera,frame,stamp_s"),
     ("frames.csv empty", put("frames.csv", ""), "frames.csv", "header", "empty"),
     ("frames.csv bare", put("frames.csv", "camera,frame,stamp_s\n"), "frames.csv", "frames", "none"),
     ("frames.csv missing", remove("frames.csv"), "frames.csv", "file", "no such file"),
     ("rig.toml missing", remove("rig.toml"), "rig.toml", "file", "no such file"),
     ("rig.toml empty", put("rig.toml", " \n"), "rig.toml", "file", "empty"),
-    ("rig.toml no TOML", swap("rig.toml", "[[camera]]", "[[camera]"), "rig.toml", "syntax", "line"),
+    ("rig.toml no TOML", in_rig("[[camera]]", "[[camera]"), "rig.toml", "syntax", "line"),
     ("no camera", put("rig.toml", "camera = []"), "rig.toml", "camera", "[]"),
-    ("key missing", swap("rig.toml", "size = [64, 48]\n", ""), "rig.toml", "camera[0].size", "missing"),
-    ("key misspelt", swap("rig.toml", "distortion", "distorsion"), "rig.toml", "distorsion", "did you mean 'distort"),
-    (
-        "top key unknown",
-        swap("rig.toml", "[[camera]]", "sruface = 'a'\n[[camera]]"),
-        "rig.toml",
-        "sruface",
-        "'surface'",
-    ),
-    ("no images named", swap("rig.toml", 'video = "left.avi"\n', ""), "rig.toml", "camera 'left'", "neither"),
-    ("both named", swap("rig.toml", 'video = "left.avi"', 'video = "a"\nimages = "b"'), "rig.toml", "'left'", "one of"),
-    ("name twice", swap("rig.toml", 'name = "top"', 'name = "left"'), "rig.toml", "camera[1].name", "left"),
-    ("name a path", swap("rig.toml", 'name = "top"', 'name = "../top"'), "rig.toml", "camera[1].name", "../top"),
-    ("focal nan", swap("rig.toml", "70.1", "nan"), "rig.toml", "camera 'left': matrix", "nan"),
-    ("focal zero", swap("rig.toml", "70.1", "0.0"), "rig.toml", "camera 'left': matrix fx", "0.0"),
-    ("focal negative", swap("rig.toml", "70.3", "-70.3"), "rig.toml", "camera 'left': matrix fy", "-70.3"),
-    ("focal in mm", swap("rig.toml", "70.1", "3.6"), "rig.toml", "camera 'left': matrix fx", "6.4 px"),
-    ("skew", swap("rig.toml", MATRIX, MATRIX.replace("0.0", "0.5", 1)), "rig.toml", "camera 'left': matrix", "0.5"),
-    ("matrix ragged", swap("rig.toml", MATRIX, "[[1, 2, 3], [4, 5]]"), "rig.toml", "camera 'left': matrix", "3 x 3"),
-    ("matrix of text", swap("rig.toml", "70.1", '"70.1"'), "rig.toml", "camera 'left': matrix", "3 x 3"),
-    ("matrix of flags", swap("rig.toml", "70.1", "true"), "rig.toml", "camera 'left': matrix", "3 x 3"),
-    ("size of one", swap("rig.toml", "[64, 48]", "[64]"), "rig.toml", "camera 'left': size", "width, height"),
-    ("size not whole", swap("rig.toml", "[64, 48]", "[64, 48.5]"), "rig.toml", "camera 'left': size", "48.5"),
-    ("size other", swap("rig.toml", "[64, 48]", "[48, 64]"), "left.avi", "size of frame 0", "64 x 48 px"),
-    ("distortion of 4", swap("rig.toml", "-0.0002, 0.0]", "-0.0002]"), "rig.toml", "distortion", "5 finite"),
+    ("key missing", in_rig("size = [64, 48]\n", ""), "rig.toml", "camera[0].size", "missing"),
+    ("key misspelt", in_rig("distortion", "distorsion"), "rig.toml", "distorsion", "did you mean 'distort"),
+    ("top key unknown", in_rig("[[camera]]", "sruface = 'a'\n[[camera]]"), "rig.toml", "sruface", "'surface'"),
+    ("no images named", in_rig('video = "left.avi"\n', ""), "rig.toml", "camera 'left'", "neither"),
+    ("both named", in_rig('video = "left.avi"', 'video = "a"\nimages = "b"'), "rig.toml", "'left'", "one of"),
+    ("name twice", in_rig('name = "top"', 'name = "left"'), "rig.toml", "camera[1].name", "left"),
+    ("name a path", in_rig('name = "top"', 'name = "../top"'), "rig.toml", "camera[1].name", "../top"),
+    ("focal nan", in_rig("70.1", "nan"), "rig.toml", "camera 'left': matrix", "nan"),
+    ("focal zero", in_rig("70.1", "0.0"), "rig.toml", "camera 'left': matrix fx", "0.0"),
+    ("focal negative", in_rig("70.3", "-70.3"), "rig.toml", "camera 'left': matrix fy", "-70.3"),
+    ("focal in mm", in_rig("70.1", "3.6"), "rig.toml", "camera 'left': matrix fx", "6.4 px"),
+    ("skew", in_rig(MATRIX, MATRIX.replace("0.0", "0.5", 1)), "rig.toml", "camera 'left': matrix", "0.5"),
+    ("matrix ragged", in_rig(MATRIX, "[[1, 2, 3], [4, 5]]"), "rig.toml", "camera 'left': matrix", "3 x 3"),
+    ("matrix of text", in_rig("70.1", '"70.1"'), "rig.toml", "camera 'left': matrix", "3 x 3"),
+    ("matrix of flags", in_rig("70.1", "true"), "rig.toml", "camera 'left': matrix", "3 x 3"),
+    ("size of one", in_rig("[64, 48]", "[64]"), "rig.toml", "camera 'left': size", "width, height"),
+    ("size not whole", in_rig("[64, 48]", "[64, 48.5]"), "rig.toml", "camera 'left': size", "48.5"),
+    ("size other", in_rig("[64, 48]", "[48, 64]"), "left.avi", "size of frame 0", "64 x 48 px"),
+    ("distortion of 4", in_rig("-0.0002, 0.0]", "-0.0002]"), "rig.toml", "distortion", "5 finite"),
     ("in metres", scaled(1e-3), "rig.toml", "base_from_camera of all cameras", "mm, not m"),
     ("in parsecs", scaled(1e200), "rig.toml", "base_from_camera of all cameras", "along each axis"),
     ("roi camera", swap("roi.toml", '"left"', '"lift"'), "roi.toml", "roi[0].camera", "did you mean 'left'"),
@@ -223,14 +219,8 @@ FAULTS: list[tuple[str, Callable[[Path], None], str, str, str]] = [
     ),
     ("roi empty", put("roi.toml", ""), "roi.toml", "file", "empty"),
     ("truth nan", put("truth.tum", "0 1 2 3 0 0 nan 1"), "truth.tum", "line 1", "nan"),
-    (
-        "scan named, missing",
-        swap("rig.toml", "[[camera]]", "surface = 'a.stl'\n[[camera]]"),
-        "rig.toml",
-        "surface",
-        "a.stl",
-    ),
-    ("scan of no kind", swap("rig.toml", "[[camera]]", "surface = 'a.txt'\n[[camera]]"), "rig.toml", "surface", ".ply"),
+    ("scan named, missing", in_rig("[[camera]]", "surface = 'a.stl'\n[[camera]]"), "rig.toml", "surface", "a.stl"),
+    ("scan of no kind", in_rig("[[camera]]", "surface = 'a.txt'\n[[camera]]"), "rig.toml", "surface", ".ply"),
     ("two scans", second_scan, "s", "surface", "surface.ply, surface.stl"),
     ("scan empty", cut("surface.ply", 0.0), "surface.ply", "file", "empty"),
 ]
@@ -310,10 +300,6 @@ def test_a_picture_that_cannot_be_decoded_is_named_when_its_turn_comes(tmp_path:
         next(frames)
     with pytest.raises(InputError, match=r"3\.png: picture"):
         next(frames)
-
-
-def test_a_rig_whose_cameras_stand_60_mm_apart_is_in_millimetres(tmp_path: Path) -> None:
-    assert len(open_session(make_folder(tmp_path / "s")).rig) == 2
 
 
 def test_a_path_that_is_not_there_is_an_error(tmp_path: Path) -> None:

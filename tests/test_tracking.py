@@ -111,11 +111,6 @@ def test_a_pose_uses_nothing_that_came_later(sets: list[FrameSet], plain: list[S
     assert not same(poses[12], plain[12])
 
 
-@pytest.mark.slow
-def test_two_runs_give_the_same_bits(sets: list[FrameSet], plain: list[SurfacePose]) -> None:
-    assert all(same(a, b) for a, b in zip(run(sets), plain, strict=True))
-
-
 def test_poses_do_not_depend_on_where_the_map_is_refined(sets: list[FrameSet], plain: list[SurfacePose]) -> None:
     with ThreadPoolExecutor(1) as executor:
         threaded = run(sets, executor=executor)
@@ -310,10 +305,8 @@ def test_without_a_region_whatever_two_cameras_see_is_the_surface(sets: list[Fra
 @pytest.mark.slow
 def test_a_surface_at_rest_stays_at_rest() -> None:
     poses = run(shot(lambda stamp: BASE_FROM_REST, STAMPS[:20], 5))
-    assert (
-        states(poses[FIRST:]) == {TrackState.TRACKING}
-        and errors(poses, lambda stamp: BASE_FROM_REST)[FIRST:].max() < 0.03
-    )
+    assert states(poses[FIRST:]) == {TrackState.TRACKING}
+    assert errors(poses, lambda stamp: BASE_FROM_REST)[FIRST:].max() < 0.03
     assert max(np.linalg.norm(p.twist[3:]) for p in poses[5:]) < 0.3
 
 
@@ -325,13 +318,9 @@ def test_nothing_is_tracked_before_the_regions_instant(sets: list[FrameSet]) -> 
     assert states(poses[4 + FIRST :]) == {TrackState.TRACKING} and errors(poses)[4 + FIRST :].max() < 0.1
 
 
-def test_a_surface_that_is_not_there_is_not_made_up(sets: list[FrameSet]) -> None:
-    poses = run([blank(s) for s in sets[:3]])
-    assert states(poses) == {TrackState.INITIALISING} and all(p.reason for p in poses)
-
-
-def test_a_first_map_that_is_never_seen_again_is_never_tracked(sets: list[FrameSet]) -> None:
-    poses = run([sets[0], *[gone(s) for s in sets[1:8]]])
+@pytest.mark.parametrize("shown", [0, 1], ids=["never there", "never seen again"])
+def test_a_surface_that_is_not_there_is_not_made_up(sets: list[FrameSet], shown: int) -> None:
+    poses = run([*sets[:shown], *([gone(s) for s in sets[1:8]] if shown else [blank(s) for s in sets[:3]])])
     assert states(poses) == {TrackState.INITIALISING} and all(p.reason for p in poses)
 
 

@@ -273,10 +273,17 @@ def test_the_outline_of_a_scan_is_its_topmost_layers() -> None:
     assert area == pytest.approx(np.pi * 10 * 32, rel=0.05)
 
 
-def test_a_model_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_a_model_that_is_none_or_whose_numbers_are_not_finite_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "shape.toml"
     for text in ("", "colour = 3", "colour = [1.0]\nrank = [1.0]\nrank_usual = [1.0]\ntrust = 0.4\npatterns = []"):
         file.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="shape model"):
+            read_shape_model(file)
+    file.write_text(model_text(), encoding="utf-8")
+    assert len(read_shape_model(file).patterns) == 1
+    wrong = [{key: word} for key in ("trust", "colour", "corner") for word in ("inf", "nan", "9" * 400)]
+    for each in [*wrong, {"corner": "9" * 30}]:
+        file.write_text(model_text(**each), encoding="utf-8")
         with pytest.raises(InputError, match="shape model"):
             read_shape_model(file)
 
@@ -285,17 +292,6 @@ def model_text(trust: str = "0.4", colour: str = "1.0", corner: str = "1") -> st
     rank = ", ".join(["1.0"] * RANK_TERMS)
     lists = f"colour = [{', '.join([colour] * COLOUR_TERMS)}]\nrank = [{rank}]\nrank_usual = [{rank}]\n"
     return f"trust = {trust}\n{lists}patterns = [[[{corner}, 1], [2, 2], [3, 1]]]\n"
-
-
-def test_a_model_with_a_number_that_is_not_finite_or_too_large_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "shape.toml"
-    file.write_text(model_text(), encoding="utf-8")
-    assert len(read_shape_model(file).patterns) == 1
-    wrong = [{key: word} for key in ("trust", "colour", "corner") for word in ("inf", "nan", "9" * 400)]
-    for each in [*wrong, {"corner": "9" * 30}]:
-        file.write_text(model_text(**each), encoding="utf-8")
-        with pytest.raises(InputError, match="shape model"):
-            read_shape_model(file)
 
 
 def test_products_are_all_pairs_and_begin_with_one() -> None:
