@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from tests.browser import Browser
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as the command line does
 settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=60)
@@ -19,6 +24,18 @@ LONGEST = (  # files that take longest, begun first: of two workers neither then
     *("test_estimator_suite", "test_examples", "test_track", "test_operator_page", "test_segment_command"),
     *("test_live_faults", "test_growth", "test_fill_laws", "test_odd_camera", "test_outages", "test_fault_bench"),
 )
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """A real browser; what needs one is skipped where there is none."""
+    from tests.browser import Browser, executable
+
+    if (program := executable()) is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    made = Browser(program)
+    yield made
+    made.close()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

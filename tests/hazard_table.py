@@ -84,9 +84,8 @@ def _row(one: Hazard) -> str:
 
 def versions() -> dict[str, str]:
     """The version of each library that is needed at run time, as it is pinned."""
-    pinned = dict(
-        re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
-    )
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    pinned = dict(re.findall(r"^([\w.-]+)==(\S+)", text, re.MULTILINE))
     by_name = {name.lower().replace("_", "-"): version for name, version in pinned.items()}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = [re.split(r"[<>=\[; ]", line)[0] for line in project["dependencies"]]

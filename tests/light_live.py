@@ -1,8 +1,4 @@
-"""A live run for tests whose tracker needs no pictures: `python -m tests.light_live FOLDER RECORD [FLAG ...]`.
-
-All else is as in any run: its processes, the arm's line, the recording, keys, signals and the page. It begins to print
-within seconds, as nothing is rendered, decoded or tracked.
-"""
+"""A live run for tests that needs no pictures: `python -m tests.light_live FOLDER RECORD [FLAG ...]`."""
 
 from __future__ import annotations
 

@@ -10,7 +10,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from hardware.live.prepared import RunFiles
 from hardware.process.clock import WallClock
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.session_reader import open_session
+from tests.light_live import prepare_files
 
 ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
@@ -210,3 +212,19 @@ def printed_once(*records: Path) -> None:
         spans.append((min(places), max(places)))
     for before, after in pairwise(spans):
         assert after[0] >= before[1] - 1e-9 and after[0] - before[1] <= 1.0 + 1e-9
+
+
+@contextmanager
+def light_runs(folder: Path, *flags: str, **path: float) -> Iterator[Callable[..., Running]]:
+    """A starter of runs without pictures, over a printed `path` (`prepare_files`); none is left behind."""
+    running: list[Running] = []
+    prepare_files(folder, **path)  # type: ignore[arg-type]
+
+    def start(record: Path, *more: str) -> Running:
+        program = "tests.light_live", str(folder), str(record)
+        running.append(Running(*flags, *more, cache=folder, program=program))
+        return running[-1]
+
+    yield start
+    for run in running:
+        run.close()

@@ -116,10 +116,8 @@ def straight(length: float = 20.0, speed: float = 5.0) -> Path:
 
 def through(points: Array, speed: float = 5.0, extrude: Array | None = None, layer: Array | None = None) -> Path:
     """An upright path through points (N, 3), mm."""
-    path = path_through(points, speed)
-    return replace(
-        path, layer=path.layer if layer is None else layer, extrude=path.extrude if extrude is None else extrude
-    )
+    given = {name: row for name, row in (("extrude", extrude), ("layer", layer)) if row is not None}
+    return replace(path_through(points, speed), **given)
 
 
 def part(log: NozzleLog, rows: slice) -> NozzleLog:

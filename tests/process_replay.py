@@ -111,13 +111,8 @@ def _plots(change: Change) -> str:
     unit = "" if change.unit == DECISION else f", {change.unit}"
     known = ", ".join(f"{i} {state.lower()}" for i, state in enumerate(STATES))
     names = f" ({known})" if change.name == "state" else ""
-    both = Plot(
-        HALF_CHART_WIDTH,
-        150,
-        span,
-        spanning([change.before, change.after], 0.12, 1e-6),
-        label=change.name + unit + names,
-    )
+    ends = spanning([change.before, change.after], 0.12, 1e-6)
+    both = Plot(HALF_CHART_WIDTH, 150, span, ends, label=change.name + unit + names)
     both.line(change.stamps, change.before, "truth")
     both.line(change.stamps, change.after, "estimate")
     size = change.size

@@ -1,7 +1,4 @@
-"""`python -m tests.reference_recordings`: makes the reference recordings anew, from seeds; needed once in a long while.
-
-What is kept was made so on one machine; another one's recordings differ in their last bits, and so do their outcomes.
-"""
+"""`python -m tests.reference_recordings` makes the reference recordings anew, from seeds; rarely needed."""
 
 from __future__ import annotations
 

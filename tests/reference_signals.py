@@ -92,10 +92,7 @@ Signals = list[tuple[str, str, Array]]  # name, unit, a value for each row
 
 
 def _pose_signals(arrays: Arrays) -> Signals:
-    poses, covariance = (
-        np.asarray(arrays["pose base_from_surface"], float),
-        np.asarray(arrays["pose covariance"], float),
-    )
+    poses, covariance = (np.asarray(arrays[f"pose {name}"], float) for name in ("base_from_surface", "covariance"))
     placed = components(poses, np.eye(4))
     sigma = np.sqrt(np.maximum(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2), 0))
     names = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
@@ -128,9 +125,8 @@ def _track_changes(before: Arrays, after: Arrays) -> list[Change]:
     keys = [np.rec.fromarrays([a["track stamp"], a["track camera"], a["track id"]]) for a in (before, after)]
     both, old, new = np.intersect1d(*keys, return_indices=True)
     apart = np.linalg.norm(np.asarray(after["track pixels"][new] - before["track pixels"][old], float), axis=1)
-    medians = np.array(
-        [np.median(apart[both["f0"] == stamp]) if (both["f0"] == stamp).any() else np.nan for stamp in stamps]
-    )
+    rows = [apart[both["f0"] == stamp] for stamp in stamps]
+    medians = np.array([np.median(row) if len(row) else np.nan for row in rows])
     return [*found, Change("tracks apart (median)", "px", stamps, np.where(np.isnan(medians), np.nan, 0.0), medians)]
 
 

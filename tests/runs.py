@@ -20,9 +20,8 @@ STAGES = ("prepare", "flow", "total")
 def breathing(stamps: Array) -> Array:
     """base_from_surface (N, 4, 4): 10 mm and 3 degrees of breathing, 400 mm in front of base."""
     phase = 2 * np.pi * 0.25 * stamps
-    xi = np.stack(
-        [0.05 * np.sin(phase), 0.02 * np.cos(phase), 0 * phase, 0.3 * stamps, 0 * phase, 5 * np.sin(phase)], -1
-    )
+    sin, cos, none = np.sin(phase), np.cos(phase), 0 * phase
+    xi = np.stack([0.05 * sin, 0.02 * cos, none, 0.3 * stamps, none, 5 * sin], -1)
     return se3.make(se3.exp_rotation([0.4, -0.2, 1.0]), [30.0, -20.0, 400.0]) @ se3.exp(xi)
 
 

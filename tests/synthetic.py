@@ -66,11 +66,7 @@ def breathing(
 
 
 def pictures(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    base_from_surface: Array,
-    rng: np.random.Generator,
-    sensor: Sensor = NOISY,
+    scene: Scene, cameras: Sequence[Camera], base_from_surface: Array, rng: np.random.Generator, sensor: Sensor = NOISY
 ) -> list[Image]:
     """The cameras' sharp images of one instant, in their order."""
     instant = WorldState(0.0, 0.0, base_from_surface, np.zeros(6))

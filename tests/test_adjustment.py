@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.movements import patch
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from tests.test_estimator import joined
 
 RIG = arc_rig()
 
@@ -44,10 +46,8 @@ def look(
         only[c] = True
         draw = np.random.default_rng([seed, c, round(1000 * stamp)])
         parts.append(observations(RIG, points, swaying(stamp + delay), stamp, draw, noise, visible=only))
-    camera, track, pixels, sigma = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("camera", "track", "pixels", "sigma")
-    )
-    return Observations(stamp, camera, track, pixels, np.maximum(sigma, 0.1))
+    seen = joined(stamp, parts)
+    return replace(seen, sigma=np.maximum(seen.sigma, 0.1))
 
 
 def fitted(seen: Observations, points: Array, start: Array) -> Array:
@@ -122,15 +122,7 @@ def test_a_landmark_that_stays_while_the_rest_moves_is_found() -> None:
     for t in STAMPS:
         moving, resting = look(true, float(t), 2), look(true, 0.0, 2)
         stuck = np.isin(moving.track, still)
-        seen.append(
-            Observations(
-                float(t),
-                moving.camera,
-                moving.track,
-                np.where(stuck[:, None], resting.pixels, moving.pixels),
-                moving.sigma,
-            )
-        )
+        seen.append(replace(moving, pixels=np.where(stuck[:, None], resting.pixels, moving.pixels)))
     adjusted = adjust(RIG, as_map(true), key_frames(seen, true), unsure(0.0))
     assert adjusted is not None and np.flatnonzero(~adjusted.agrees).tolist() == still.tolist()
     rest = np.setdiff1d(np.arange(len(true)), still)
@@ -206,7 +198,7 @@ def test_a_landmark_seen_too_seldom_stays_where_it_was() -> None:
     for i, t in enumerate(STAMPS):
         o = look(true, float(t), 4)
         keep = (o.track != 0) | ((o.camera < 2) & (i == 0))
-        seen.append(Observations(o.stamp, o.camera[keep], o.track[keep], o.pixels[keep], o.sigma[keep]))
+        seen.append(o.only(keep))
     wrong = true.copy()
     wrong[0] += [0.0, 0.0, 5.0]
     adjusted = adjust(RIG, as_map(wrong), key_frames(seen, wrong), unsure(0.0))

@@ -325,9 +325,8 @@ def test_a_file_of_touched_points_makes_an_arm_file(tmp_path: Path, pixels: bool
 def test_a_point_that_was_another_one_is_named(tmp_path: Path) -> None:
     _, axes, points = touched(8, False, 0.05)
     points[4] += [0.0, 4.0, 0.0]
-    outcome = calibrate_touched(
-        *touched_file(tmp_path, axes, points, False), TOLD, tmp_path / "arm.toml", keep_tool=True
-    )
+    file = touched_file(tmp_path, axes, points, False)
+    outcome = calibrate_touched(*file, TOLD, tmp_path / "arm.toml", keep_tool=True)
     assert not outcome.verdict.passed and "touch point 5 again" in outcome.verdict.hints[0]
 
 

@@ -1,6 +1,4 @@
-"""`stillbed arm DEVICE`: it listens, and moves only what an operator has confirmed. `stillbed calibrate arm --device`:
-a virtual arm on a pseudo-terminal, network cameras that show where it is.
-"""
+"""`stillbed arm DEVICE` moves only what an operator confirmed; `calibrate arm --device` with a virtual arm."""
 
 from __future__ import annotations
 
@@ -129,10 +127,8 @@ def test_where_an_arm_stands_is_home_or_six_numbers() -> None:
 def test_what_is_not_known_is_not_said() -> None:
     nan = float("nan")
     status = ArmStatus(0.0, ArmState.DISARMED, "x", None, None, 0.0, nan, nan, 0.0, 0, 0, 0, 0)
-    assert findings(status, ArmProfile()).splitlines() == [
-        "disarmed: x",
-        "it sent nothing that is an answer and 0 stray bytes",
-    ]
+    lines = findings(status, ArmProfile()).splitlines()
+    assert lines == ["disarmed: x", "it sent nothing that is an answer and 0 stray bytes"]
 
 
 def test_the_command_finds_a_virtual_arm_on_its_pty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -193,9 +189,7 @@ def shown(arm: VirtualArm, true: SimpleArm, camera: Camera) -> HttpCamera:
 
 
 @pytest.mark.slow
-def test_an_arm_before_live_cameras_is_moved_recorded_and_calibrated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_arm_before_live_cameras_is_moved_and_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     watched = replace(watched_arm(3), rig=arc_rig(size=SIZE))
     record, out = tmp_path / "moved", tmp_path / "arm.toml"
     told = replace(watched.profile, arm=replace(watched.profile.arm, home=watched.begin))

@@ -1,6 +1,4 @@
-"""Each fault of the virtual arm: it happens, it shows, and the arm comes back. A stop whose frame is lost on the line
-is said again, and not to an arm that rests.
-"""
+"""Each fault of the virtual arm happens, shows, and the arm comes back; a lost stop is sent again."""
 
 from __future__ import annotations
 
@@ -25,8 +23,6 @@ from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.linked import Linked, linked
 from tests.test_motion_loop import Looping
 from tests.virtual_arm import HOME, IDEAL, arm_fault, axes_at, motion, move, virtual_arm
-
-# -- names
 
 
 @pytest.mark.parametrize(
@@ -59,9 +55,6 @@ def test_a_text_names_a_fault(text: str, expected: Fault) -> None:
 def test_what_names_none_is_refused(text: object) -> None:
     with pytest.raises(InputError, match=r"x\.toml: arm\.faults = "):
         arm_fault(text)  # type: ignore[arg-type]
-
-
-# -- stall and slow
 
 
 def test_a_stall_stops_a_move_and_then_it_goes_on() -> None:
@@ -109,18 +102,13 @@ windows = st.lists(
 
 
 @given(windows, st.floats(0, 6), st.floats(0, 5), st.booleans())
-def test_the_work_done_in_all_stretches_is_the_work_there_was(
-    faults: list[Fault], start: float, work: float, moving: bool
-) -> None:
+def test_the_work_of_all_stretches_is_the_whole(faults: list[Fault], start: float, work: float, moving: bool) -> None:
     stretches = WorkRates(faults).stretches(start, work, moving)
     assert stretches[0][0] == start and all(a[1] == b[0] for a, b in pairwise(stretches))
     assert sum((end - begin) * rate for begin, end, rate in stretches) == pytest.approx(work, abs=1e-9)
     slowest = min([f.share for f in faults], default=1.0)
     stalled = sum(f.duration for f in faults)
     assert work - 1e-9 <= stretches[-1][1] - start <= stalled + work / slowest ** len(faults) + 1e-9
-
-
-# -- the line
 
 
 def test_a_dropped_frame_is_as_if_it_had_not_been_sent() -> None:

@@ -1,6 +1,4 @@
-"""Arm files: round trip, defaults, and faults told by key. The table [arm]: what it may say, and what it may not. No-go
-zones: a tip on their surface passes, a hair inside is refused, and no step goes through one.
-"""
+"""Arm files and the table [arm]: round trip, defaults, faults named by key; no-go zones."""
 
 from __future__ import annotations
 
@@ -81,21 +79,13 @@ def test_on_a_slow_line_ticks_and_lag_follow_unless_they_are_given(tmp_path: Pat
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["empty"]),
-        ("baud = ", ["syntax"]),
-        ("boud = 9600", ["boud", "did you mean 'baud'"]),
-        ("baud = 9600\ntick_s = 0.049", ["tick", "0.05"]),
-        ("baud = 4800", ["tick", "0.1"]),
-        ("baud = -1", ["baud", ">= 1"]),
-        ("motion_byte = 2", ["motion_byte", "0 or 1"]),
-        ("origin_scale = 2", ["origin_scale", "1 or 10"]),
-        ("pwm = 7", ["pwm", "1500"]),
-        ('slots = ["J4", "J4", "J6"]', ["slots", "each once"]),
-        ("slots = 3", ["slots"]),
-        ("tick_s = nan", ["tick_s", "finite"]),
-        ("lag_s = -0.01", ["lag", "0 to 1"]),
-        ("lag_s = 1.01", ["lag", "0 to 1"]),
-        ("lag_s = 24", [": lag_s = 24, allowed 0 to 1"]),
+        ("", ["empty"]), ("baud = ", ["syntax"]), ("boud = 9600", ["boud", "did you mean 'baud'"]),
+        ("baud = 9600\ntick_s = 0.049", ["tick", "0.05"]), ("baud = 4800", ["tick", "0.1"]),
+        ("baud = -1", ["baud", ">= 1"]), ("motion_byte = 2", ["motion_byte", "0 or 1"]),
+        ("origin_scale = 2", ["origin_scale", "1 or 10"]), ("pwm = 7", ["pwm", "1500"]),
+        ('slots = ["J4", "J4", "J6"]', ["slots", "each once"]), ("slots = 3", ["slots"]),
+        ("tick_s = nan", ["tick_s", "finite"]), ("lag_s = -0.01", ["lag", "0 to 1"]),
+        ("lag_s = 1.01", ["lag", "0 to 1"]), ("lag_s = 24", [": lag_s = 24, allowed 0 to 1"]),
         ("tick_s = 9", [": tick_s = 9, allowed"]),
         ("home_mm_deg = [0, 0, 9000, 0, 0, 90]", [": home_mm_deg = [0, 0, 9000, 0, 0, 90], allowed", "in degrees"]),
         ("[limits]\nturn = -3", [": limits.turn = -3, allowed > 0"]),
@@ -115,7 +105,7 @@ def test_on_a_slow_line_ticks_and_lag_follow_unless_they_are_given(tmp_path: Pat
         ("[limits]\njump = -1", ["limits", "jump", "> 0"]),
         ("[limits]\nspead = 1", ["limits.spead", "did you mean 'speed'"]),
     ],
-)
+)  # fmt: skip
 def test_faults_are_told_by_file_and_key(tmp_path: Path, text: str, words: list[str]) -> None:
     file = tmp_path / "arm.toml"
     file.write_text(text, encoding="utf-8")
@@ -157,23 +147,12 @@ def test_what_a_table_leaves_out_keeps_its_default() -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("fifo", 0),
-        ("fifo", 1.5),
-        ("seed", -1),
-        ("dead_time_s", -0.001),
-        ("servo_lag_s", "20 ms"),
-        ("servo_lag_s", -1e-9),
-        ("acceleration_mm_s2", 0),
-        ("top_speed_mm_s", 0),
-        ("top_turn_deg_s", -1),
-        ("low_mm_deg", [0] * 5),
-        ("low_mm_deg", [1000, -1, -1, -1, -1, -1]),
-        ("high_mm_deg", [1601, 1, 1, 1, 1, 1]),
-        ("replies", "on"),
-        ("replies", 3),
-        ("reply_period_s", 0),
+        ("fifo", 0), ("fifo", 1.5), ("seed", -1), ("dead_time_s", -0.001), ("servo_lag_s", "20 ms"),
+        ("servo_lag_s", -1e-9), ("acceleration_mm_s2", 0), ("top_speed_mm_s", 0), ("top_turn_deg_s", -1),
+        ("low_mm_deg", [0] * 5), ("low_mm_deg", [1000, -1, -1, -1, -1, -1]), ("high_mm_deg", [1601, 1, 1, 1, 1, 1]),
+        ("replies", "on"), ("replies", 3), ("reply_period_s", 0),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_value_is_refused_by_the_name_it_has_in_the_file(key: str, value: object) -> None:
     with pytest.raises(InputError, match=rf"a\.toml: arm\.{key.replace('high', '(low|high)')} = .*allowed"):
         arm_settings_from_table("a.toml", {key: value})

@@ -1,6 +1,4 @@
-"""The arm on its line: nothing moves unasked, little is ever under way, every fault ends at rest and with a reason. The
-model of the arm's queue: what it says is under way is what the virtual arm has yet to do.
-"""
+"""The arm on its line: nothing moves unasked, every fault ends at rest with a reason; the model of its queue."""
 
 from __future__ import annotations
 
@@ -22,9 +20,6 @@ from tests.linked import circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault, virtual_arm
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
-
-
-# -- who may move it
 
 
 def test_nothing_is_sent_before_an_operator_says_so() -> None:
@@ -102,9 +97,6 @@ def test_a_command_too_long_or_too_fast_stops_the_arm_and_is_not_sent() -> None:
     assert "limit" in linked().arm.send(waiting(exact * (1 + 1e-6)), 0.0)
 
 
-# -- pacing
-
-
 @settings(max_examples=15)
 @given(st.lists(st.floats(0.0, 0.1), min_size=5, max_size=40), st.integers(0, 9))
 def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float], seed: int) -> None:
@@ -152,9 +144,6 @@ def test_a_frame_waits_for_the_one_on_the_wire_so_that_a_stop_waits_for_no_more_
     assert on_wire - decided == pytest.approx(2 / 240)
 
 
-# -- stop
-
-
 def test_a_stop_does_not_wait_for_the_queue() -> None:
     link = linked()
     for k in (1, 2):
@@ -188,13 +177,9 @@ def test_armed_again_it_goes_back_slowly_to_where_the_motion_left_off() -> None:
     assert link.arm.arm(1.0, left_off) == "the arm still moves"
     link.run(0.5)
     assert "limit 10 mm" in link.arm.arm(1.5, left_off + [11, 0, 0, 0, 0, 0])
-    assert link.arm.arm(1.5, left_off) == ""
-    assert link.arm.hold(1.5) == "the arm is on its way"
+    assert link.arm.arm(1.5, left_off) == "" and link.arm.hold(1.5) == "the arm is on its way"
     link.run(0.5)
     assert link.arm.hold(2.0) == "" and link.executed() == pytest.approx(left_off, abs=1e-3)
-
-
-# -- home, origin, jog
 
 
 def test_home_is_reached_slowly_by_way_of_above_and_never_much_is_under_way() -> None:
@@ -230,9 +215,6 @@ def test_a_work_origin_changes_what_is_said_and_not_where_it_goes() -> None:
     assert link.arm.status(link.clock.now()).answered == pytest.approx(link.arm.target, abs=0.06)
     link.send(circle(3.0))
     assert "at rest" in link.arm.set_origin(np.zeros(3), link.clock.now())
-
-
-# -- what it answers
 
 
 def test_answers_give_lag_and_arrival_and_no_doubt_of_an_arm_that_follows() -> None:
@@ -312,8 +294,7 @@ def test_an_arm_that_stays_behind_is_stopped() -> None:
 @pytest.mark.parametrize("begin", [2.0, 2.013, 2.031])
 def test_an_arm_that_moves_too_slowly_is_held_before_it_is_far_behind(share: int, within: float, begin: float) -> None:
     link = linked(ANSWERING, arm_fault(f"slow {share}% at {begin}s for 3s"))
-    assert link.follow(begin) == []
-    assert any("called back" in reason for reason in link.follow(within))
+    assert link.follow(begin) == [] and any("called back" in reason for reason in link.follow(within))
 
 
 def test_an_arm_that_runs_away_is_stopped_at_once() -> None:
@@ -339,8 +320,7 @@ def test_one_wrong_answer_alone_is_not_believed() -> None:
     link.follow(1.0)
     assert link.arm._queue is not None
     link.arm._feedback.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
-    assert link.arm.hold(1.0) == ""
-    assert link.follow(1.0) == []
+    assert link.arm.hold(1.0) == "" and link.follow(1.0) == []
 
 
 @pytest.mark.parametrize("off", [3.0, 14.0])
@@ -382,9 +362,7 @@ def played(script: list[tuple[float, G1 | G4]]) -> tuple[VirtualArm, ArmQueue, f
 
 @settings(max_examples=80)
 @given(scripts, st.floats(0, 0.2))
-def test_what_is_under_way_is_what_the_virtual_arm_has_yet_to_do(
-    script: list[tuple[float, G1 | G4]], after: float
-) -> None:
+def test_what_is_in_flight_is_what_the_virtual_arm_has_to_do(script: list[tuple[float, G1 | G4]], after: float) -> None:
     arm, queue, now, wire = played(script)
     then = max(now + after, wire)
     arm.advance(then)
@@ -437,9 +415,7 @@ def test_bounds_hold_every_set_point_between() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(5.0, 50.0)), min_size=1, max_size=8), st.floats(0, 1))
-def test_when_it_passed_a_place_last_is_when_its_set_point_was_last_there(
-    moves: list[tuple[float, float]], share: float
-) -> None:
+def test_the_last_passage_of_a_place_is_its_set_points(moves: list[tuple[float, float]], share: float) -> None:
     queue, now = ArmQueue(HOME.tolist(), 1 / 240, 0.0), 0.0
     for way, feed in moves:
         queue.add(G1(HOME + [way, 0, 0, 0, 0, 0], feed), now)

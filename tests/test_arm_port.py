@@ -1,6 +1,4 @@
-"""The virtual arm as a device: a serial client writes to it, comes and goes, and finds it as it left it. The lock on a
-port: one writer at a time, whatever became of the last one.
-"""
+"""The virtual arm as a serial device: clients come and go; the lock on a port: one writer at a time."""
 
 from __future__ import annotations
 
@@ -151,9 +149,7 @@ def test_bytes_go_through_a_pty_unchanged_and_at_once() -> None:
 
 
 @given(st.binary(max_size=200), st.floats(0.0, 5.0), st.floats(0.0, 2.0))
-def test_what_came_while_the_machine_held_the_arm_up_is_taken_as_if_it_came_evenly(
-    data: bytes, before: float, late: float
-) -> None:
+def test_what_came_while_the_machine_was_held_up_is_spread_evenly(data: bytes, before: float, late: float) -> None:
     parts = list(_arrivals(data, before, before + late))
     assert b"".join(part for part, _ in parts) == data
     instants = np.array([before, *(instant for _, instant in parts)])

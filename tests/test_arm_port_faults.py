@@ -23,9 +23,6 @@ from tests.virtual_arm import HOME, arm_fault
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 
 
-# -- the port
-
-
 def test_partial_writes_change_nothing_that_arrives() -> None:
     link = linked(port=PortFaults(partial=0.5))
     link.follow(3.0)
@@ -53,14 +50,15 @@ def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_comple
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3) and link.virtual.deepest <= 0.05
 
 
+def gone(data: bytes) -> int:
+    raise UnpluggedError("the device is gone")
+
+
 def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
     link = linked(ANSWERING)
     link.run(0.5)
     line = link.arm._line
     assert line is not None
-
-    def gone(data: bytes) -> int:
-        raise UnpluggedError("the device is gone")
 
     monkeypatch.setattr(line.port, "write", gone)
     monkeypatch.setattr(line, "receive", lambda: ([Reply(ReplyKind.ORIGIN, np.array([5.0, 0, 0]))], b""))
@@ -68,16 +66,11 @@ def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(mo
     assert link.arm.state is ArmState.UNPLUGGED and "gone" in link.arm.reason
 
 
-def test_a_port_that_goes_while_an_arm_is_asked_whether_it_obeys_is_an_arm_unplugged(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_port_that_goes_while_an_arm_is_asked_to_obey_is_an_arm_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
     link = linked(ANSWERING, arm_fault("drop at 1s for 900ms"))
     link.follow(1.4)
     line, frames = link.arm._line, link.arm.frames
     assert line is not None
-
-    def gone(data: bytes) -> int:
-        raise UnpluggedError("the device is gone")
 
     monkeypatch.setattr(line.port, "write", gone)
     link.run(0.2)
@@ -86,9 +79,7 @@ def test_a_port_that_goes_while_an_arm_is_asked_whether_it_obeys_is_an_arm_unplu
 
 @settings(max_examples=40)
 @given(blocked=st.floats(0.84, 0.98), stalls=st.floats(0.80, 0.96))
-def test_a_step_home_that_waited_in_the_port_as_it_was_called_back_is_made_after_all(
-    blocked: float, stalls: float
-) -> None:
+def test_a_step_home_that_waited_in_the_port_when_called_back_is_made_after_all(blocked: float, stalls: float) -> None:
     port = PortFaults(blocked=[(blocked, blocked + 0.15)])
     link = linked(ANSWERING, arm_fault(f"stall 200ms at {stalls}s"), port=port)
     goal = HOME + [8, 0, 0, 0, 0, 0]
@@ -207,10 +198,7 @@ def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:
 def test_an_origin_that_is_not_the_one_it_was_told_stops_it() -> None:
     link = linked()
     port = link.arm._line.port  # type: ignore[union-attr]
-    answers = [
-        encode_reply(Reply(ReplyKind.ORIGIN, np.array([0.1, 0, 0]))),
-        encode_reply(Reply(ReplyKind.ORIGIN, HOME[:3])),
-    ]
+    answers = [encode_reply(Reply(ReplyKind.ORIGIN, place)) for place in (np.array([0.1, 0, 0]), HOME[:3])]
     port.read = lambda: answers.pop(0) if answers else b""  # type: ignore[method-assign]
     link.arm.poll(0.0)
     assert link.arm.state is ArmState.ARMED  # a count of rounding

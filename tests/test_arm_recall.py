@@ -48,15 +48,6 @@ def recalled_by(link: Linked, seconds: float) -> list[float]:
     return sent
 
 
-def taking_note(link: Linked, seconds: float) -> None:
-    """Let time pass as a motion does that takes note of recalls and has nothing to send."""
-
-    def each(now: float) -> None:
-        link.arm.take_up()
-
-    link.run(seconds, each)
-
-
 @settings(max_examples=12)
 @given(
     fault=st.sampled_from(["stall", "drop", "garble", "unplug", "slow 40%"]),
@@ -77,7 +68,7 @@ def test_an_arm_that_has_begun_its_step_is_not_called_back_for_the_time_it_did_n
     for seconds in np.arange(0.5, 0.6, 0.007):  # answers come from all over the step
         link = linked(ANSWERING, arm_fault(f"stall {seconds:.3f}s at 1.1s"))
         recalled_by(link, 1.3)
-        taking_note(link, 1.2)
+        link.run(1.2, lambda now, arm=link.arm: arm.take_up() and None)
         assert sum("called back" in event.text for event in link.arm.events()) == 1, seconds
         assert link.arm.arrived(link.clock.now())
 
@@ -219,9 +210,7 @@ COUNT = np.array([*[0.1] * 3, *[np.deg2rad(0.01)] * 3])  # of answers, mm and ra
 
 
 @given(place=SIX, beside=SIX, far=st.booleans())
-def test_where_it_rests_is_what_was_known_as_far_as_its_answer_allows(
-    place: np.ndarray, beside: np.ndarray, far: bool
-) -> None:
+def test_where_it_rests_is_as_known_as_its_answer_allows(place: np.ndarray, beside: np.ndarray, far: bool) -> None:
     true = HOME + 100 * COUNT * place
     known = true + (20 if far else 1) * COUNT * beside
     answered, echo = np.round(true / COUNT) * COUNT, ArmFeedback(LinkSettings(), 0.02)

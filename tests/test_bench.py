@@ -1,6 +1,4 @@
-"""The bench: every figure stands beside its target, on the screen and in the files, with what it was measured on. All
-subjects in one go: figures come back as they were saved, what failed is told, what became worse is named.
-"""
+"""The bench: each figure beside its target, on screen and in files; all subjects in one go, compared with before."""
 
 from __future__ import annotations
 
@@ -74,15 +72,10 @@ def test_targets_say_their_direction() -> None:
 
 
 def test_the_table_marks_what_is_met_and_what_is_missed() -> None:
-    text = table_text(
-        [Figure("a", 1.0, "mm", at_most(1.0)), Figure("longer", 20.0, "", at_least(30.0)), Figure("c", 3)]
-    )
-    lines = text.splitlines()
-    assert [("met" in line.split(), "MISSED" in line) for line in lines[1:4]] == [
-        (True, False),
-        (False, True),
-        (False, False),
-    ]
+    figures = [Figure("a", 1.0, "mm", at_most(1.0)), Figure("longer", 20.0, "", at_least(30.0)), Figure("c", 3)]
+    lines = table_text(figures).splitlines()
+    assert ["met" in line.split() for line in lines[1:4]] == [True, False, False]
+    assert ["MISSED" in line for line in lines[1:4]] == [False, True, False]
     assert lines[-1] == "1 of 2 targets met"
     ends = {line.index(value) + len(value) for line, value in zip(lines[1:4], ("1.00", "20.0", "3.00"), strict=True)}
     assert len(ends) == 1  # numbers stand under each other
@@ -254,9 +247,7 @@ def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize(("line", "quick"), [(["--all"], False), (["--quick"], True), (["--all", "--quick"], True)])
-def test_the_whole_is_asked_for_by_either_word(
-    line: list[str], quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_either_word_means_all(line: list[str], quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = list[tuple[Path, bool]]()
     monkeypatch.setattr(whole, "measure_all", lambda out, quick: asked.append((out, quick)) or [])
     assert main(["bench", *line, "-o", str(tmp_path)]) == 0 and asked == [(tmp_path, quick)]

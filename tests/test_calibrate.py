@@ -100,11 +100,8 @@ def test_board_files_come_back_and_wrong_ones_are_named(tmp_path: Path) -> None:
         ('kind = "charuco"\nsquares = [30, 30]\nsquare_mm = 5', "dictionary"),
         ('kind = "chessboard"\nsquares = [8, 8]\nsquare_mm = 5', "squares"),
     ):
-        lines = (
-            text
-            if "square_mm" in text
-            else text + ("" if "squares" in text else "\nsquares = [4, 5]") + "\nsquare_mm = 5"
-        )
+        lines = text if "squares" in text else text + "\nsquares = [4, 5]"
+        lines = lines if "square_mm" in text else lines + "\nsquare_mm = 5"
         path.write_text(lines)
         with pytest.raises(InputError, match=named):
             read_board(path)
@@ -186,9 +183,7 @@ def test_the_command_ends_with_the_verdict(session: Path, board_file: Path, caps
     assert said.startswith("FAIL") and "hold the board in its picture's" in said
 
 
-def test_corners_are_looked_for_once_and_a_damaged_file_again(
-    session: Path, outcome: CalibrationResult, tmp_path: Path
-) -> None:
+def test_corners_are_searched_once_and_damage_again(session: Path, outcome: CalibrationResult, tmp_path: Path) -> None:
     (recording, _), store = open_source(session), tmp_path / "x.npz"
     key = content_key(recording, BOARD)
     table = read_corners(session.parent / "rig.corners.npz", key)
@@ -219,20 +214,14 @@ def test_undistorted_pictures_keep_every_pixel() -> None:
     assert whole_view(camera)[0, 0] < camera.matrix[0, 0]
 
 
-def test_a_rig_without_lenses_is_enough_to_begin_with(
-    session: Path, tmp_path: Path, outcome: CalibrationResult
-) -> None:
+def test_a_rig_without_lenses_is_enough_to_begin(session: Path, tmp_path: Path, outcome: CalibrationResult) -> None:
     shutil.copytree(session, tmp_path / "s")
     lines = [f'[[camera]]\nname = "{n}"\nimages = "{n}/*"\nsize = [640, 480]\n' for n in "abc"]
     (tmp_path / "s" / "rig.toml").write_text("\n".join(lines))
     bare, material = open_source(tmp_path / "s")
     assert not material.calibrated and [c.name for c in bare.rig.cameras] == ["a", "b", "c"]
-    views, _ = usable_views(
-        collect_corners(open_source(session)[0], BOARD, None, no_progress),
-        BOARD,
-        ("a", "b", "c"),
-        ((640, 480),) * 3,
-    )
+    table = collect_corners(open_source(session)[0], BOARD, None, no_progress)
+    views, _ = usable_views(table, BOARD, ("a", "b", "c"), ((640, 480),) * 3)
     assert len(views) == len(outcome.calibration.views)
 
 

@@ -148,18 +148,6 @@ def test_a_camera_that_shows_nothing_is_named(
     assert "camera camera 2: pictures = 'none', allowed one within 1 s: camera 2 cannot" in capsys.readouterr().err
 
 
-def test_wrong_words_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    end = ["--board", str(board_file(tmp_path)), "-o", str(tmp_path / "rig.toml")]
-    for words, named in (
-        (["0"], "a name that stays"),
-        (["a.toml", "http://h/1"], "one RIG.toml alone"),
-        (["http://h/1", "--seconds", "-1"], "--seconds = -1.0"),
-        ([str(tmp_path), "--seconds", "3"], "with live cameras"),
-        (["http://h/1", "--keep-lenses"], "--keep-lenses"),
-    ):
-        assert main(["calibrate", "cameras", *words, *end]) == 2 and named in capsys.readouterr().err
-
-
 def test_offsets_of_a_rig_are_found_anew(tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
     entry = '[[camera]]\nname = "{}"\nsource = "http://h/{}"\nsize = [640, 480]\nclock_offset_s = 0.5\n'
@@ -168,9 +156,6 @@ def test_offsets_of_a_rig_are_found_anew(tmp_path: Path) -> None:
     rig.write_text("".join(entry.format(n, n) + numbers + place.format(100 * n) for n in range(2)))
     devices = devices_named([str(rig)])
     assert devices.rig is not None and [place.offset for place in devices.places] == [0.0, 0.0]
-
-
-# -- the guide
 
 
 def seen_by(camera: int, poses: np.ndarray) -> list[np.ndarray]:
@@ -215,9 +200,7 @@ def test_cameras_that_never_see_it_together_are_asked_to() -> None:
     assert f"hold the board where two cameras see it, {MIN_COMMON_SETS - 1} frame sets more" in guide.missing()
 
 
-def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_at_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_sum_is_what_all_views_tell_and_old_ones_are_seldom_seen_again(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = list[int]()
 
     def counted(planes: np.ndarray, f: np.ndarray) -> np.ndarray:
@@ -246,8 +229,5 @@ def test_what_is_added_up_is_what_all_views_tell_and_old_ones_are_seldom_looked_
 
 def test_nothing_seen_lacks_everything() -> None:
     held = coverage_of(np.zeros((0, 12, 2)), SIZE, np.zeros((0, 4, 4)))
-    assert held.parts.shape == COVERAGE_GRID[::-1] and [share for share, _ in missing_coverage("a", held)] == [
-        1.0,
-        1.0,
-        1.0,
-    ]
+    assert held.parts.shape == COVERAGE_GRID[::-1]
+    assert [share for share, _ in missing_coverage("a", held)] == [1.0, 1.0, 1.0]

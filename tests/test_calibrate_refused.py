@@ -1,6 +1,4 @@
-"""Wrong inputs to `stillbed calibrate cameras`: each named by the command, none accepted. Real webcams calibrated from
-a recording of a waved board. Skipped where there is none.
-"""
+"""Wrong inputs to `stillbed calibrate cameras` are named, none accepted; real webcams are calibrated."""
 
 from __future__ import annotations
 
@@ -68,6 +66,7 @@ def change(session: Path, camera: str, made: Change) -> None:
 
 
 Refused = Callable[..., None]
+SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
@@ -75,15 +74,11 @@ Refused = Callable[..., None]
     [
         (replace(BOARD, dictionary="6X6_50"), "camera a: .* dictionary 4X4_50"),
         pytest.param(
-            replace(BOARD, inverted=True),
-            r"camera a: .* black and white exchanged \(`inverted`\)",
-            marks=pytest.mark.slow,
+            replace(BOARD, inverted=True), r"camera a: .* black and white exchanged \(`inverted`\)", marks=SLOW
         ),
         (replace(BOARD, squares=(5, 4)), "camera a: .* another board: 4 x 5|markers"),
         pytest.param(
-            replace(BOARD, squares=(3, 4)),
-            "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too",
-            marks=pytest.mark.slow,
+            replace(BOARD, squares=(3, 4)), "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too", marks=SLOW
         ),
         (replace(BOARD, marker=0.6), r"board.toml: marker = 0.6, allowed what the pictures show"),
         (replace(BOARD, square=43.2), r"board.toml: square_mm = .43.2 mm., allowed about 5\d(\.\d)? mm"),
@@ -106,9 +101,7 @@ def test_a_wrong_board_is_named(refused: Refused, board: Board, words: str) -> N
     ],
     ids=["covered", "board not in view", "mirrored", "turned by 90", "turned by 180", "blurred"],
 )
-def test_a_camera_that_shows_it_wrongly_is_named(
-    session: Path, refused: Refused, camera: str, made: Change, words: str
-) -> None:
+def test_a_camera_that_errs_is_named(session: Path, refused: Refused, camera: str, made: Change, words: str) -> None:
     change(session, camera, made)
     refused(words)
 
@@ -212,17 +205,13 @@ def recording(request: pytest.FixtureRequest) -> tuple[str, BoardViews, Rig]:
     return request.param, views, session.rig
 
 
-def test_corners_lie_within_half_a_pixel_and_their_distances_within_half_a_millimetre(
-    recording: tuple[str, BoardViews, Rig],
-) -> None:
+def test_corners_are_good_to_half_a_pixel_and_half_a_millimetre(recording: tuple[str, BoardViews, Rig]) -> None:
     found = calibrate(recording[1])
     assert median_residual(found) < 0.25 and held_out_residual(found) < 0.25 and board_scatter(found) < 0.4
     assert 0.005 < found.jitter < 0.03
 
 
-def test_with_the_lenses_that_are_given_the_cameras_stand_where_they_are_given(
-    recording: tuple[str, BoardViews, Rig],
-) -> None:
+def test_with_given_lenses_the_cameras_stand_where_they_are_given(recording: tuple[str, BoardViews, Rig]) -> None:
     name, views, rig = recording
     found = calibrate(views, known=KnownLenses(np.stack([lens_of(c) for c in rig.cameras]), np.zeros((3, 9))))
     assert median_residual(found) < 0.25

@@ -68,9 +68,8 @@ def test_pixels_are_those_of_the_rig_and_their_derivatives_are_differences(xi: A
         change = (project_lens(LENSES[0] + np.eye(9)[k] * step, point)[0] - found) / step
         assert np.allclose(change, by_lens[:, k], rtol=1e-4, atol=1e-4 * abs(by_lens).max())
     for k in range(3):
-        assert np.allclose(
-            (project_lens(LENSES[0], point + np.eye(3)[k] * 1e-3)[0] - found) / 1e-3, by_point[:, k], atol=1e-4
-        )
+        change = (project_lens(LENSES[0], point + np.eye(3)[k] * 1e-3)[0] - found) / 1e-3
+        assert np.allclose(change, by_point[:, k], atol=1e-4)
 
 
 def camera_of(lens: Array):  # type: ignore[no-untyped-def]
@@ -279,19 +278,10 @@ def test_views_from_one_side_only_are_refused() -> None:
     level = np.array([se3.make(np.eye(3), [x, 10 * y, 700.0]) for x in range(-150, 150, 60) for y in range(-10, 10, 5)])
     inside = se3.transform_points(level, corners() - corners().mean(0))
     pixels = project_lens(LENSES[2], inside)[0] + np.random.default_rng(0).normal(0, 0.2, (20, 12, 2))
-    views = BoardViews(
-        ("a",), (SIZE,), corners(), np.zeros(20, int), np.arange(20), np.arange(20.0), pixels, np.full(20, 0.2)
-    )
+    of, at = (("a",), (SIZE,), corners(), np.zeros(20, int)), (np.arange(20), np.arange(20.0))
+    views = BoardViews(*of, *at, pixels, np.full(20, 0.2))
     with pytest.raises((Implausible, Undetermined), match="camera a: "):
         calibrate(views)
-
-
-@pytest.mark.slow  # through the command in test_calibrate_refused
-def test_a_wrong_board_is_refused() -> None:
-    views, _ = waved(np.random.default_rng(3))
-    drawn = views.points * [1.0, 1.2, 1.0]
-    with pytest.raises((Implausible, Undetermined), match="camera top: "):
-        calibrate(replace(views, points=drawn))
 
 
 def test_the_predicted_error_is_the_one_that_is_made(known: tuple[Calibration, Truth]) -> None:
@@ -305,19 +295,15 @@ def test_the_predicted_error_is_the_one_that_is_made(known: tuple[Calibration, T
 
 def triangulated(found: Calibration, truth: Truth, points: Array) -> Array:
     """Distances (N,), mm, between points and where the found rig puts them, after the best rigid motion."""
-    true = [replace(camera_of(lens), base_from_camera=place) for lens, place in zip(*truth_of(truth), strict=True)]
+    pairs = zip(truth.lens, truth.base_from_camera, strict=True)
+    true = [replace(camera_of(lens), base_from_camera=place) for lens, place in pairs]
     seen = [pixels_from_points(camera, points)[0] for camera in true]
-    there = np.array(
-        [_nearest([(c, s[i]) for c, s in zip(found.rig.cameras, seen, strict=True)], p) for i, p in enumerate(points)]
-    )
+    looks = list(zip(found.rig.cameras, seen, strict=True))
+    there = np.array([_nearest([(camera, pixels[i]) for camera, pixels in looks], p) for i, p in enumerate(points)])
     a, b = points - points.mean(0), there - there.mean(0)
     u, _, vt = np.linalg.svd(a.T @ b)
     turn = vt.T @ np.diag([1, 1, np.linalg.det(vt.T @ u.T)]) @ u.T
     return np.asarray(np.linalg.norm(b - a @ turn.T, axis=1))
-
-
-def truth_of(truth: Truth) -> tuple[Array, Array]:
-    return truth.lens, truth.base_from_camera
 
 
 def _nearest(sides: list, start: Array) -> Array:  # type: ignore[type-arg]

@@ -1,6 +1,4 @@
-"""One camera in virtual time: stamps, faults, going away and coming back, without a thread or a camera. Live cameras
-over a local HTTP stream and video files: they come, stall, go and come back, and are named.
-"""
+"""One camera in virtual time: stamps, faults, reconnection; live cameras over local HTTP and video files."""
 
 from __future__ import annotations
 

@@ -29,18 +29,13 @@ def test_two_streams_are_watched_and_told(tmp_path: Path, capsys: pytest.Capture
             assert one["size_px"] == [160, 120] and one["frames"] > 5 and one["sharpness"] > 100
             assert 100 < one["grey_level"] < 160 and one["left_out"].get("frozen", 0) == 0
         shown = cv2.imread(str(tmp_path / "sheet.png"))
-        assert (
-            shown is not None
-            and shown.shape[1] == 2 * CELL_SIZE[0]
-            and shown[: CELL_SIZE[1], : CELL_SIZE[0]].std() > 20
-        )
+        assert shown is not None and shown.shape[1] == 2 * CELL_SIZE[0]
+        assert shown[: CELL_SIZE[1], : CELL_SIZE[0]].std() > 20
         assert main(["cameras", urls[0], "http://127.0.0.1:9/none", "--seconds", "0.5"]) == 1
         assert "TROUBLE: camera 2 cannot be opened since" in capsys.readouterr().out
 
 
-def test_a_rig_is_watched_by_its_names_and_a_control_that_is_not_taken_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rig_is_watched_by_name_and_refused_controls_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = HttpCamera(picture_of=lambda n: np.kron(picture(n)[:90], np.ones((8, 8, 1), np.uint8)))
     with served(camera):
         rig = rig_file(tmp_path, f'source = "{camera.url}"\ngain = 3')
@@ -50,17 +45,10 @@ def test_a_rig_is_watched_by_its_names_and_a_control_that_is_not_taken_is_told(
     assert "c0 did not take gain not there, asked for 3" in told
 
 
-def test_nothing_there_says_what_to_do_and_wrong_input_what_is_allowed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_cameras_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     if not list_devices():
         assert main(["cameras"]) == 0 and "plug one in" in capsys.readouterr().out
         assert main(["cameras", "--json"]) == 0 and json.loads(capsys.readouterr().out) == []
-    for wrong, allowed in (
-        (["0"], "a name that stays"),
-        (["http://h/1", "--seconds", "0"], "0 < seconds"),
-        (["http://h/1", "-o", "sheet.txt"], ".jpg or .png"),
-        (["a.toml", "http://h/1"], "one RIG.toml alone"),
-    ):
-        assert main(["cameras", *wrong]) == 2 and allowed in capsys.readouterr().err
 
 
 def test_a_sharper_picture_has_the_higher_number() -> None:
@@ -69,9 +57,8 @@ def test_a_sharper_picture_has_the_higher_number() -> None:
 
 
 def test_a_sheet_has_a_cell_for_a_camera_without_a_picture() -> None:
-    drawn = preview_sheet(
-        [(picture(1), ["one"], True), (None, ["two", "gone"], False), (picture(2)[..., 0], ["three"], True)]
-    )
+    cells = [(picture(1), ["one"], True), (None, ["two", "gone"], False), (picture(2)[..., 0], ["three"], True)]
+    drawn = preview_sheet(cells)
     assert drawn.shape[1] == 2 * CELL_SIZE[0] and drawn.shape[0] > 2 * CELL_SIZE[1]
 
 

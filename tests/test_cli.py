@@ -75,9 +75,7 @@ def test_version() -> None:
     assert stillbed("--version").stdout.startswith("stillbed")
 
 
-def test_the_exit_code_of_a_simulation_says_whether_its_limits_were_met(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_exit_code_says_whether_a_runs_limits_were_met(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     limits = {"p95_mm": 0.1, "duty": 0.9}
     met = write_scenario(tmp_path, IDEAL, seconds=2.5, limits=limits, name="met.toml")
     missed = write_scenario(tmp_path, IDEAL, seconds=2.5, limits={**limits, "max_mm": 0.001}, name="missed.toml")

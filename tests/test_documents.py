@@ -113,9 +113,7 @@ QUICK = {  # commands of the documents that need no device and no recording, eac
 
 
 @pytest.mark.parametrize("text", QUICK)
-def test_commands_that_need_nothing_run_as_they_stand_there(
-    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_that_need_nothing_run_as_shown(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert text in {command for _, command in commands()}
     monkeypatch.chdir(tmp_path)
     try:

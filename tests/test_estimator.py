@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.observations import Observations
+from estimation.observations import Observations, no_observations
 from estimation.online.estimator import Estimator, EstimatorSettings
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState, identity_pose
@@ -31,6 +31,12 @@ def lively(stamp: float) -> Array:
     return BASE_FROM_REST @ se3.make(se3.exp_rotation(w), 12.0 * np.sin(stamp * np.array([3.1, 2.6, 3.7]) + [2, 0, 1]))
 
 
+def joined(stamp: float, parts: Sequence[Observations]) -> Observations:
+    """The observations of several cameras as those of one frame set."""
+    names = ("camera", "track", "pixels", "sigma")
+    return Observations(stamp, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
 def look(
     motion: Motion,
     stamp: float,
@@ -47,20 +53,15 @@ def look(
         only[c, :keep] = True
         draw = np.random.default_rng([seed, c, round(1000 * stamp)])
         parts.append(observations(RIG, LANDMARKS, motion(stamp + delays[c]), stamp, draw, 0.3, outliers, only))
-    if not parts:
-        nothing = np.zeros(0, np.int64)
-        return Observations(stamp, nothing, nothing, np.zeros((0, 2)), np.zeros(0))
-    camera, track, pixels, sigma = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("camera", "track", "pixels", "sigma")
-    )
-    return Observations(stamp, camera, track, pixels, sigma)
+    return joined(stamp, parts) if parts else no_observations(stamp)
 
 
-def begun(
-    motion: Motion, map_error: float = 0.0, seed: int = 0, settings: EstimatorSettings | None = None
-) -> Estimator:
+FIRST = EstimatorSettings(states=StateSettings(first=1))
+
+
+def begun(motion: Motion, map_error: float = 0.0, seed: int = 0, settings: EstimatorSettings = FIRST) -> Estimator:
     """An estimator with a map whose landmarks are `map_error` mm off, one standard deviation an axis."""
-    estimator = Estimator(RIG, settings or EstimatorSettings(states=StateSettings(first=1)))
+    estimator = Estimator(RIG, settings)
     points = LANDMARKS + map_error * np.random.default_rng([seed, 9]).normal(size=LANDMARKS.shape)
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     covariance = map_error**2 * np.eye(3 * len(points))
@@ -195,9 +196,8 @@ def test_the_state_does_not_flicker_between_its_thresholds() -> None:
     for t in stamps(0.5):
         step(estimator, look(breathing, float(t), 3, keep=12))
     draw = np.random.default_rng(8)
-    states = [
-        step(estimator, look(breathing, float(t), 3, keep=int(draw.integers(8, 13)))).state for t in stamps(2.0, 0.55)
-    ]
+    seen = [look(breathing, float(t), 3, keep=int(draw.integers(8, 13))) for t in stamps(2.0, 0.55)]
+    states = [step(estimator, each).state for each in seen]
     assert set(states) == {TrackState.TRACKING}
 
 
@@ -311,9 +311,3 @@ def test_a_caveat_keeps_every_pose_from_being_called_tracking() -> None:
     estimator.begin(0.0, breathing(0.0), surface_map, "the scan's place is open")
     for pose in follow(estimator, breathing, 0.3)[StateSettings().first - 1 :]:
         assert pose.state is TrackState.DEGRADED and pose.reason == "the scan's place is open"
-
-
-def test_two_runs_give_the_same_bits() -> None:
-    a, b = (follow(begun(lively), lively, 1.0)[-1] for _ in range(2))
-    assert a.base_from_surface.tobytes() == b.base_from_surface.tobytes()
-    assert a.covariance.tobytes() == b.covariance.tobytes()

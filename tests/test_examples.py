@@ -1,6 +1,4 @@
-"""The examples run as they stand, and print what they say they do. Every command of the documents is run, in a folder
-that holds what they name.
-"""
+"""The examples and every command of the documents run, in a folder that holds what they name."""
 
 from __future__ import annotations
 
@@ -239,9 +237,7 @@ def every_command_run(text: str, cache: Path) -> int:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("text", TO_RUN, ids=[text[:90] for text in TO_RUN])
-def test_a_command_of_the_documents_runs_and_leaves_what_it_says(
-    text: str, here: Path, cameras: list[str], workspace: Path
-) -> None:
+def test_a_documented_command_leaves_what_it_says(text: str, here: Path, cameras: list[str], workspace: Path) -> None:
     for file in left_by(text):
         without(file)
     with ExitStack() as stack:

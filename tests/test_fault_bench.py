@@ -92,9 +92,8 @@ def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:
     silent = replace(ran(), timeouts=[Statement(4.08, "the motion process has said nothing", False, False, 4.08)])
     hung = judge_fault(silent, replace(FAULT, part=FaultPart.MOTION, kind=FaultKind.HANG), 7.0)
     assert hung is not None and hung.exposure == hung.detected == pytest.approx(0.08) and not hung.restless
-    jumped = judge_fault(
-        ran(said=(4.06, 4.6)), replace(FAULT, part=FaultPart.CLOCK, kind=FaultKind.JUMP, amount=1.0), 7.0
-    )
+    jump = replace(FAULT, part=FaultPart.CLOCK, kind=FaultKind.JUMP, amount=1.0)
+    jumped = judge_fault(ran(said=(4.06, 4.6)), jump, 7.0)
     assert jumped is not None and jumped.exposure == jumped.detected and np.isnan(jumped.recovered)
 
 
@@ -125,9 +124,8 @@ def test_what_never_comes_back_is_told_and_what_struck_no_print_is_left_out() ->
 
 def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fault_run, "SECONDS", 6.0)
-    faults = [
-        fault_from_text("x", "y", text) for text in ("motion hang at 3.2s for 0.4s", "tracking hang at 4.7s for 0.3s")
-    ]
+    texts = "motion hang at 3.2s for 0.4s", "tracking hang at 4.7s for 0.3s"
+    faults = [fault_from_text("x", "y", text) for text in texts]
     hung = FaultRun(prepare_scenario(SCENARIOS / "still.toml"), faults, 1)()
     for fault, until in zip(faults, (4.7, 6.0), strict=True):
         verdict = judge_fault(hung, fault, until)

@@ -63,9 +63,6 @@ def fault(text: str) -> Fault:
     return fault_from_text("x.toml", "faults[0]", text)
 
 
-# -- names
-
-
 @st.composite
 def faults(draw: st.DrawFn) -> Fault:
     (part, kind), spec = draw(st.sampled_from(list(FAULT_SPECS.items())))
@@ -112,16 +109,12 @@ def test_a_text_names_a_fault(text: str, expected: Fault) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("camra0 off", "did you mean 'camera0'"),
-        ("camera0 stcuk", "did you mean 'stuck'"),
-        ("camera9 off", "one of camera0"),
-        ("camera0 bump 2s", "0.01 to 100 mm"),
-        ("tracking kill for 2s", "what is killed stays so"),
-        ("arm stall", "how long"),
-        ("paper flood", "one of camera0"),
-        ("page flud", "did you mean .flood."),
+        ("camra0 off", "did you mean 'camera0'"), ("camera0 stcuk", "did you mean 'stuck'"),
+        ("camera9 off", "one of camera0"), ("camera0 bump 2s", "0.01 to 100 mm"),
+        ("tracking kill for 2s", "what is killed stays so"), ("arm stall", "how long"),
+        ("paper flood", "one of camera0"), ("page flud", "did you mean .flood."),
     ],
-)
+)  # fmt: skip
 def test_a_text_that_names_none_is_told_what_was_meant(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         fault(text)
@@ -140,9 +133,6 @@ def test_every_fault_is_in_the_document_and_can_be_let_happen_by_somebody() -> N
     text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
     for (part, kind), spec in FAULT_SPECS.items():
         assert spec.runners and f"| `{part}" in text and f" {kind}" in text and spec.about in text
-
-
-# -- cameras and the surface
 
 
 def shots(text: str, camera: int = 0, seconds: float = 3.0) -> list[Shot]:
@@ -188,9 +178,6 @@ def test_a_surface_that_runs_away_is_as_fast_as_said_and_comes_back() -> None:
     assert se3.log(se3.inverse(behind) @ ahead) / 2e-5 == pytest.approx(twist, abs=1e-2)
     outside = (TIMES < 1.0) | (TIMES > 1.5)
     assert np.abs(poses[outside] - np.eye(4)).max() < 1e-9
-
-
-# -- a simulated print
 
 
 def printed(folder: Path, *texts: str, seconds: float = 6.5) -> Heard:
@@ -247,9 +234,6 @@ def test_who_knows_the_truth_is_struck_by_nothing_that_pictures_show(tmp_path: P
         run_simulation(file, tmp_path / "out")
 
 
-# -- recordings, and a live run's parts
-
-
 def recorded(count: int = 60) -> list[FrameSet]:
     """Sets of three cameras at 30 Hz whose pictures say which camera they are of, and when."""
     return [
@@ -290,9 +274,8 @@ def test_processes_are_stopped_and_go_on_when_it_is_due_and_not_before(tmp_path:
     crew, begun = ProcessGroup(), RawValue(c_double, math.nan)
     crew.start("tracking", signal.pause, ())
     process = state_of(crew)
-    injector = FaultInjector(
-        [fault("tracking hang at 1s for 1s"), fault("tracking kill at 3s")], crew, tmp_path / "x", begun
-    )
+    faults = [fault("tracking hang at 1s for 1s"), fault("tracking kill at 3s")]
+    injector = FaultInjector(faults, crew, tmp_path / "x", begun)
     try:
         assert not injector.update(50.0) and process() != "T"
         begun.value = 100.0

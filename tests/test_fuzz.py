@@ -27,9 +27,7 @@ READERS = readers()
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_every_reader_takes_or_refuses_what_is_nearly_valid(
-    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_every_reader_takes_or_refuses_mutations(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     blocks = list(fuzzed(name, READERS[name], range(60), 7, tmp_path))
     assert sum(block.count for block in blocks) == 60 and not [block.wrong for block in blocks if block.wrong]
 
@@ -74,9 +72,7 @@ def wrong_reader(path: Path) -> object:
 
 
 @pytest.mark.parametrize(("word", "said"), [("fall", "KeyError"), ("hang", "more than 0.05 s"), ("eat", "MemoryError")])
-def test_a_reader_that_falls_hangs_or_eats_is_found(
-    word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reader_that_fails_is_found(word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz_try, "MAX_SECONDS", 0.05)
     monkeypatch.setattr(fuzz_try, "mutated", lambda valid, rng: word.encode())
     reader = Reader("x.csv", lambda folder: (folder / "x.csv").write_text(PATH_TEXT) and None, wrong_reader)
@@ -99,9 +95,7 @@ def test_a_reader_that_ends_its_process_is_found_and_the_rest_goes_on() -> None:
     assert [block.count for block in blocks if block.name == "fine"] == [1000, 1000, 500]
 
 
-def test_a_run_goes_on_where_it_was_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(fuzz, "readers", lambda: dict.fromkeys(["a", "b"]))
     asked: list[Task] = []
 

@@ -1,6 +1,4 @@
-"""The guard: every limit met exactly passes, broken by one epsilon is refused. And it never changes a command. The
-guard before an oracle written from the limits alone: nothing that breaks one passes, nothing else is refused.
-"""
+"""The guard: a limit met exactly passes, broken by one epsilon is refused; also against an oracle of the limits."""
 
 from __future__ import annotations
 
@@ -279,9 +277,7 @@ REFUSED: list[tuple[RefusalCode, Move, SurfacePose | None, float, float]] = [
 
 
 @pytest.mark.parametrize(("code", "command", "seen", "got", "limit"), REFUSED, ids=[r[0] for r in REFUSED])
-def test_a_refusal_has_its_code_the_number_and_the_limit(
-    code: RefusalCode, command: Move, seen: SurfacePose | None, got: float, limit: float
-) -> None:
+def test_refusal_details(code: RefusalCode, command: Move, seen: SurfacePose | None, got: float, limit: float) -> None:
     fast = code in (RefusalCode.WORKSPACE, RefusalCode.JUMP, RefusalCode.TURN, RefusalCode.STOP_DISTANCE)
     limits = replace(WIDE, speed=np.full(6, 1e9 if fast else 128.0), turn=1.0)
     guard = Guard(limits, ARM, TICK)

@@ -37,9 +37,6 @@ def same(a: PrintHeadLog, b: PrintHeadLog) -> bool:
     return a.rows.tobytes() == b.rows.tobytes() and np.array_equal(a.extruding, b.extruding)
 
 
-# -- of one head
-
-
 @given(st.lists(st.floats(-4, 4), min_size=6, max_size=6), st.floats(-1e6, 2e9), st.booleans())
 def test_a_row_holds_a_head(xi: list[float], stamp: float, extruding: bool) -> None:
     head = PrintHead(se3.exp(np.array(xi) * [1, 1, 1, 200, 200, 200]), extruding)
@@ -73,13 +70,8 @@ def test_without_rows_there_is_no_head() -> None:
     assert len(NO_PRINT_HEADS) == 0 and NO_PRINT_HEADS.at(0.0) is None
 
 
-# -- in files
-
-
 @given(steps=st.lists(st.floats(1e-6, 1e3), max_size=6), start=st.floats(-1e6, 2e9), seed=st.integers(0, 9999))
-def test_both_containers_give_back_the_very_rows(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[float], start: float, seed: int
-) -> None:
+def test_rows_come_back(tmp_path_factory: pytest.TempPathFactory, steps: list[float], start: float, seed: int) -> None:
     folder = tmp_path_factory.mktemp("h")
     heads = made_up((start + np.cumsum(steps)).tolist(), seed)
     write_heads(folder / "head.csv", heads)
@@ -89,10 +81,8 @@ def test_both_containers_give_back_the_very_rows(
         for row, extruding in zip(heads.rows, heads.extruding, strict=True):
             recorder.head_row(row, bool(extruding))
     assert same(open_session(folder / "x.mcap").heads, heads)
-    found = list(recorded_heads(folder / "x.mcap"))
-    assert [(stamp, head.extruding) for stamp, head in found] == list(
-        zip(heads.rows[:, 0], heads.extruding, strict=True)
-    )
+    found = [(stamp, head.extruding) for stamp, head in recorded_heads(folder / "x.mcap")]
+    assert found == list(zip(heads.rows[:, 0], heads.extruding, strict=True))
 
 
 @pytest.fixture

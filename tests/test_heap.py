@@ -1,6 +1,4 @@
-"""The heap: what is free goes back to the system, even below what is still in use. Or stays, where that was asked. The
-quick median is the slow one.
-"""
+"""The heap gives free memory back to the system or keeps it, as was asked; the quick median is the slow one."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Joints: forward and back again in every posture, the Jacobian by differences, singularities where they must be. An
-arm whose A B C are its joints: planned, guarded and read from a file as any other.
-"""
+"""Joints: forward and inverse in every posture, Jacobian by differences, singularities; an arm given by joints."""
 
 from __future__ import annotations
 
@@ -14,6 +12,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.bench.planner import StreamTally, bench_arm, follow_stream
 from hardware.files.arm_file import read_arm, write_arm
@@ -22,7 +21,10 @@ from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.progress import PrintPhase
 from planning.robot.kinematics import (
+    ELBOWS,
     POSTURES,
+    SHOULDERS,
+    WRISTS,
     JointModel,
     axes_from_nozzle,
     jacobian,
@@ -33,10 +35,35 @@ from planning.robot.kinematics import (
     nozzle_from_axes,
     nozzle_from_joints,
 )
-from tests.arms import random_joints, random_model
 from tests.moving import REST, breathing, pose_at, raster
 
 SEEDS = st.integers(0, 100_000)
+FLIP = np.diag([1.0, -1, -1])  # the nozzle's z points back into the tool, the flange's out of it
+
+
+def random_model(draw: np.random.Generator, lateral: float = 30.0) -> JointModel:
+    """An elbow arm of any proportions, side and posture, on any foot, with any tool. lateral: mm of shoulder offset."""
+    sides = draw.choice([-1.0, 1.0], 4)
+    lengths = draw.uniform([-40, 150, -40], [60, 300, 40])
+    shifts = draw.uniform([50, -lateral, -lateral, 100, 30], [250, lateral, lateral, 300, 90])
+    alpha = np.pi / 2 * np.array([sides[0], 0, *sides[1:], 0])
+    dh = np.stack([np.append(lengths, [0.0, 0, 0]), alpha, np.insert(shifts, 4, 0.0), draw.uniform(-3, 3, 6)], 1)
+    return JointModel(
+        "made up",
+        dh,
+        np.full(6, -np.pi),
+        np.full(6, np.pi),
+        np.full(6, 2.0),
+        np.full(6, 10.0),
+        se3.exp(draw.normal(size=6) * [0.3, 0.3, 0.3, 50, 50, 50]),
+        se3.exp(draw.normal(size=6) * [0.3, 0.3, 0.3, 20, 20, 20]) @ se3.make(FLIP, [0, 0, 80.0]),
+        tuple(str(draw.choice(words)) for words in (SHOULDERS, ELBOWS, WRISTS)),  # type: ignore[arg-type]
+    )
+
+
+def random_joints(draw: np.random.Generator, count: int) -> Array:
+    """Joints (count, 6), rad, anywhere."""
+    return np.asarray(draw.uniform(-np.pi, np.pi, (count, 6)))
 
 
 def all_postures(model: JointModel, wanted: np.ndarray) -> np.ndarray:
@@ -202,17 +229,6 @@ def test_the_guard_refuses_a_place_that_the_posture_does_not_reach() -> None:
     move = Move(10.0, settings_.arm.home + [900.0, 0, 0, 0, 0, 0], 10.0, 0, False)
     refused = guard(move, pose_at(breathing, 10.0), 10.0)
     assert isinstance(refused, Refusal) and "no posture" in refused.reason and refused.code is RefusalCode.POSTURE
-
-
-def test_the_guard_knows_each_joints_own_speed() -> None:
-    settings_ = profile()
-    model = settings_.arm.joints
-    assert model is not None
-    slow = replace(settings_.arm, joints=replace(model, speed=np.append([0.05] * 3, model.speed[3:])))
-    guard = Guard(settings_.limits, slow, TICK)
-    refused = guard(Move(10.0, slow.home + [1.0, 0, 0, 0, 0, 0], 50.0, 0, False), pose_at(breathing, 10.0), 10.0)
-    assert isinstance(refused, Refusal) and refused.reason.startswith("refused: J")
-    assert refused.code is RefusalCode.JOINT_SPEED and refused.got > refused.limit == 0.05
 
 
 def test_both_arm_files_come_back_as_written(tmp_path: Folder) -> None:

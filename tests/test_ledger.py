@@ -1,6 +1,4 @@
-"""The ledger: each millisecond has the checkpoint that was due then, only what was commanded is printed. The agenda:
-everything in its order. The line: a byte takes ten bits, and none overtakes another.
-"""
+"""The ledger of what was due and commanded each millisecond; the agenda's order; the line: ten bits a byte."""
 
 from __future__ import annotations
 

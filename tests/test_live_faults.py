@@ -19,8 +19,7 @@ from hardware.live.ipc import ProcessGroup
 from hardware.live.recorded_run import replay_run
 from hardware.process.faults import fault_from_text, faults_from_texts
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
-from tests.light_live import prepare_files
-from tests.live_runs import CLOCK, Running, messages
+from tests.live_runs import CLOCK, Running, light_runs, messages
 from tests.test_arm_port import serving
 
 Start = Callable[..., Running]
@@ -28,18 +27,8 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Starts a run that nobody attends, and leaves none behind."""
-    running: list[Running] = []
-    prepare_files(tmp_path, lines=3, speed=8.0)
-
-    def started(record: Path, *flags: str) -> Running:
-        program = "tests.light_live", str(tmp_path), str(record)
-        running.append(Running("--yes", *flags, cache=tmp_path, program=program))
-        return running[-1]
-
-    yield started
-    for run in running:
-        run.close()
+    with light_runs(tmp_path, "--yes", lines=3, speed=8.0) as starter:
+        yield starter
 
 
 def ticks(record: Path) -> np.ndarray:

@@ -1,6 +1,4 @@
-"""Parts of a live run: settings, what goes between processes, what is shown when, what is kept beside. The course of a
-run: bounded, whatever its length, and nothing of what matters is lost in its bins.
-"""
+"""Parts of a live run: settings, messages between processes, what is shown; the course of a run is bounded."""
 
 from __future__ import annotations
 
@@ -52,9 +50,8 @@ def test_a_dry_run_extrudes_nothing_and_stays_above_along_the_tool() -> None:
     path = raster()
     dry = raised_path(path, 7.0)
     assert not dry.extrude.any()
-    assert (
-        PrintTask(path, PROFILE).fingerprint == fingerprint(path) and not PrintTask(path, PROFILE, lift=7.0).fingerprint
-    )
+    whole, lifted = PrintTask(path, PROFILE), PrintTask(path, PROFILE, lift=7.0)
+    assert whole.fingerprint == fingerprint(path) and not lifted.fingerprint
     up = np.einsum("nij,nj->ni", path.surface_from_nozzle[:, :3, :3], np.tile([0, 0, 7.0], (len(path), 1)))
     assert dry.surface_from_nozzle[:, :3, 3] == pytest.approx(path.surface_from_nozzle[:, :3, 3] + up)
 
@@ -63,9 +60,6 @@ def test_an_arm_that_has_no_place_is_put_where_the_surface_lies_below_its_home()
     pose = replace(SURFACE, base_from_surface=se3.make(se3.exp_rotation([0.3, 0.2, 0.1]), np.array([9.0, 8, 700])))
     assert place_path(raster(), np.eye(4), pose, PROFILE, place=False).unreachable
     assert not place_path(raster(), np.eye(4), pose, PROFILE, place=True).unreachable
-
-
-# -- settings
 
 
 def test_the_session_file_that_init_writes_is_read_back_as_the_defaults(tmp_path: Path) -> None:
@@ -85,14 +79,9 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rig": None}, "one of rig and simulated"),
-        ({"path": None}, "print.path"),
-        ({"arm": ""}, "arm.device"),
-        ({"record": Path("x.bag")}, "ends in .mcap"),
-        ({"lift": -1e-9}, "0 to 100 mm"),
-        ({"lift": 100.1}, "0 to 100 mm"),
-        ({"patience": 0.99}, "1 to 600 s"),
-        ({"jpeg_quality": 101}, "0 to 100"),
+        ({"rig": None}, "one of rig and simulated"), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
+        ({"record": Path("x.bag")}, "ends in .mcap"), ({"lift": -1e-9}, "0 to 100 mm"),
+        ({"lift": 100.1}, "0 to 100 mm"), ({"patience": 0.99}, "1 to 600 s"), ({"jpeg_quality": 101}, "0 to 100"),
         ({"page_port": -4}, "page.port = -4, allowed 1 to 65535, or 0"),
         ({"page_port": 65536}, "page.port = 65536, allowed 1 to 65535, or 0"),
         ({"path": Path("nowhere.csv")}, "a file that exists"),
@@ -101,13 +90,12 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
             for name in ("tracking", "motion", "recorder")
         ),
     ],
-)
+)  # fmt: skip
 def test_settings_that_make_no_sense_are_named(change: dict[str, object], words: str, tmp_path: Path) -> None:
     for name in ("rig.toml", "path.csv"):
         (tmp_path / name).touch()
-    good = LiveSettings(
-        rig=tmp_path / "rig.toml", path=tmp_path / "path.csv", arm="virtual", record=tmp_path / "x.mcap"
-    )
+    files = {"rig": tmp_path / "rig.toml", "path": tmp_path / "path.csv", "record": tmp_path / "x.mcap"}
+    good = LiveSettings(**files, arm="virtual")
     check_settings(replace(good, cores_tracking=THERE), "here")
     with pytest.raises(InputError, match=words):
         check_settings(replace(good, **change), "here")  # type: ignore[arg-type]
@@ -121,9 +109,8 @@ def test_a_key_that_nobody_reads_or_of_a_wrong_kind_is_an_error(text: str, tmp_p
 
 
 def test_flags_override_and_what_was_not_given_does_not() -> None:
-    assert override_settings(LiveSettings(lift=3.0, arm="a"), {"lift": None, "arm": "b"}) == LiveSettings(
-        lift=3.0, arm="b"
-    )
+    given = override_settings(LiveSettings(lift=3.0, arm="a"), {"lift": None, "arm": "b"})
+    assert given == LiveSettings(lift=3.0, arm="b")
 
 
 @pytest.mark.parametrize("lift", [0.0, 20.0])
@@ -132,9 +119,6 @@ def test_a_lift_is_asked_for_in_a_dry_run_alone(lift: float) -> None:
     assert override_settings(LiveSettings(dry_run=True), {"lift": lift, "dry_run": None}).lift == lift
     with pytest.raises(InputError, match=rf"--lift = {lift}, allowed with --dry-run"):
         override_settings(LiveSettings(), {"lift": lift, "dry_run": None})
-
-
-# -- between processes
 
 
 def frames(count: int) -> FrameSet:
@@ -197,7 +181,7 @@ def _taken(inbox: RecorderReceiver) -> list[Entry]:
     return taken
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.integers(0, 5_000) | st.integers(900_000, 3_000_000), max_size=5))
 def test_what_is_put_is_taken_in_order_however_large(sizes: list[int]) -> None:
     ours, theirs = Pipe(duplex=False)
@@ -212,7 +196,6 @@ def test_what_is_put_is_taken_in_order_however_large(sizes: list[int]) -> None:
     assert [(e.stamp, len(e.text)) for e in found if isinstance(e, EventEntry)] == list(enumerate(sizes))
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 300), max_size=5), st.lists(st.integers(1, 200), min_size=1), st.integers(0, 2000))
 def test_what_a_killed_sender_cut_short_is_left_out(sizes: list[int], pieces: list[int], cut: int) -> None:
     entries = [pickle.dumps(EventEntry(float(k), "x" * size, 2, "test")) for k, size in enumerate(sizes)]
@@ -228,9 +211,6 @@ def test_what_a_killed_sender_cut_short_is_left_out(sizes: list[int], pieces: li
     theirs.close()
     found += _taken(inbox)
     assert [len(e.text) for e in found if isinstance(e, EventEntry)] == sizes[:whole]
-
-
-# -- what is shown when
 
 
 @given(st.integers(20, 200), st.integers(0, 2**31))
@@ -253,9 +233,6 @@ def test_a_session_without_truth_is_shown_once() -> None:
     stamps = np.array([3.0, 3.1, 3.3])
     shown = list(schedule(stamps, 50.0, None))
     assert [s.index for s in shown] == [0, 1, 2] and [s.live for s in shown] == pytest.approx([50.0, 50.1, 50.3])
-
-
-# -- what is kept
 
 
 def test_the_place_of_a_path_is_kept_and_read_back(tmp_path: Path) -> None:

@@ -1,6 +1,4 @@
-"""A live run whose tracker needs no pictures: it prints, is stopped by whatever may stop it, loses nothing, goes on. A
-live run operated from its page alone: what the buttons say is so, and the bytes that the arm was sent prove it.
-"""
+"""A live run without pictures: prints, stops, loses nothing, goes on; operated from its page alone."""
 
 from __future__ import annotations
 
@@ -17,9 +15,9 @@ from hardware.files.path_file import read_path, read_progress
 from hardware.live.prepared import RunFiles
 from hardware.live.recorded_run import replay_run
 from hardware.recording.session_reader import open_session
-from tests.browser import Browser, Page, executable
+from tests.browser import Browser, Page
 from tests.light_live import HOME, prepare_files
-from tests.live_runs import CLOCK, Running, closed, executed, messages, printed_once, rests, summary
+from tests.live_runs import CLOCK, Running, closed, executed, light_runs, messages, printed_once, rests, summary
 from tests.slowly import slowly
 from tests.test_arm_port import serving
 
@@ -28,18 +26,8 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Starts runs, and leaves none behind."""
-    running: list[Running] = []
-    prepare_files(tmp_path)
-
-    def started(record: Path, *flags: str) -> Running:
-        program = "tests.light_live", str(tmp_path), str(record)
-        running.append(Running(*flags, cache=tmp_path, program=program))
-        return running[-1]
-
-    yield started
-    for run in running:
-        run.close()
+    with light_runs(tmp_path) as starter:
+        yield starter
 
 
 def begun(start: Start, record: Path, *flags: str) -> Running:
@@ -69,9 +57,7 @@ def last_place(record: Path) -> float:
     return float(str(messages(record, "/tick")[-1]["fraction"]))
 
 
-def test_stopped_paused_home_and_without_its_page_it_goes_on_until_ctrl_c_and_another_run_until_its_terminal_closes(
-    start: Start, tmp_path: Path
-) -> None:
+def test_stopped_paused_home_and_without_its_page_a_run_goes_on_until_ctrl_c(start: Start, tmp_path: Path) -> None:
     record, second = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
     run = start(record, "--page")
     at = confirmed(run)
@@ -109,9 +95,7 @@ def test_stopped_paused_home_and_without_its_page_it_goes_on_until_ctrl_c_and_an
 
 
 @pytest.mark.parametrize("name", ["motion", "tracking", *slowly("recorder")])
-def test_a_process_that_is_killed_is_noticed_the_arm_rests_and_the_place_is_kept(
-    name: str, start: Start, tmp_path: Path
-) -> None:
+def test_a_killed_process_is_noticed_the_arm_rests_the_place_is_kept(name: str, start: Start, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     run = begun(start, record)
     killed = run.kill(name)
@@ -123,9 +107,7 @@ def test_a_process_that_is_killed_is_noticed_the_arm_rests_and_the_place_is_kept
         assert place - last_place(record) < 1.0
 
 
-def test_the_conducting_process_killed_leaves_an_arm_at_rest_and_a_whole_recording(
-    start: Start, tmp_path: Path
-) -> None:
+def test_the_main_process_killed_leaves_an_arm_at_rest_and_a_whole_recording(start: Start, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     run = begun(start, record)
     killed = CLOCK.now()
@@ -174,9 +156,7 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Sta
     assert not open_session(record).damage
 
 
-def test_what_goes_wrong_on_purpose_is_said_held_through_and_in_the_end_stops_the_arm(
-    start: Start, tmp_path: Path
-) -> None:
+def test_what_goes_wrong_on_purpose_is_said_held_through_and_stops_the_arm(start: Start, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     hang, full = "tracking hang at 1s for 1s", "disk full at 4s"
     run = start(record, "--yes", f"--fault={hang}", f"--fault={full}")
@@ -209,26 +189,13 @@ def test_a_run_that_is_ended_once_all_is_printed_is_not_to_be_resumed(start: Sta
     assert "the path is printed; there is nothing to go on with" in run.said and "--resume" not in run.said
 
 
-CHROMIUM = executable()
 SETTLED = 0.3  # s after which what was sent before has been carried out
 RETREATED = 2.0  # s after which the nozzle stands above the surface in a pause
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[Running]:
-    prepare_files(tmp_path)
-    made = Running("--page", cache=tmp_path, program=("tests.light_live", str(tmp_path), str(tmp_path / "run.mcap")))
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def browser() -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium: apt-get install chromium")
-    made = Browser(CHROMIUM)
-    yield made
-    made.close()
+def run(start: Start, tmp_path: Path) -> Running:
+    return start(tmp_path / "run.mcap", "--page")
 
 
 def press(page: Page, wish: str, leads_to: str, sure: bool = False) -> float:

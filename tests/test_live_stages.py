@@ -153,9 +153,7 @@ def test_what_ends_a_run_stops_the_arm_and_says_so(fault: str, words: str) -> No
 
 @pytest.mark.parametrize("phase", [PrintPhase.LEAVING, PrintPhase.WAITING, PrintPhase.FINISHED])
 @pytest.mark.parametrize("unattended", [False, True])
-def test_cameras_that_end_once_all_is_printed_end_nothing_and_the_arm_goes_home(
-    phase: PrintPhase, unattended: bool
-) -> None:
+def test_cameras_ending_after_the_print_end_nothing_and_the_arm_goes_home(phase: PrintPhase, unattended: bool) -> None:
     run = Staged(unattended=unattended, patience=1.0).to_print()
     run.phase, run.fraction, run.ended = phase, 5.0, "session is over"
     assert run.look() is RunStage.HOMING and run.orders == [Order.HOME]

@@ -1,6 +1,4 @@
-"""MotionStep: one frame a tick, the guard's word is the last, and nothing heavy is loaded. A pause: the nozzle leaves
-the surface, waits above it, and goes on at the very place where it left off.
-"""
+"""MotionStep: one frame a tick, the guard's word is last, nothing heavy loaded; a pause goes on where it left."""
 
 from __future__ import annotations
 
@@ -29,16 +27,13 @@ from tests.slowly import slowly
 def test_a_move_is_a_g1_frame_and_a_hold_a_g4_frame() -> None:
     motion = MotionStep(raster())
     hold = motion(None, 1.0)
-    assert isinstance(hold, Hold)
-    assert hold.reason == "no pose yet"
+    assert isinstance(hold, Hold) and hold.reason == "no pose yet"
     pause = decode(held := frame_from_command(hold))
-    assert isinstance(pause, G4)
-    assert pause.duration == pytest.approx(0.001)
+    assert isinstance(pause, G4) and pause.duration == pytest.approx(0.001)
     wanted = motion(pose_at(breathing, 1.02), 1.02)
     assert isinstance(wanted, Move)
     move = decode(frame := frame_from_command(wanted))
-    assert isinstance(move, G1)
-    assert np.allclose(move.axes, wanted.axes, atol=1e-4)
+    assert isinstance(move, G1) and np.allclose(move.axes, wanted.axes, atol=1e-4)
     assert move.feed == pytest.approx(wanted.feed, rel=1e-6)
     assert len(held) == len(frame) == 48
     for one in (held, frame):
@@ -108,8 +103,7 @@ def test_an_empty_path_or_one_with_nan_never_gets_a_motion() -> None:
 
 def test_the_wire_carries_the_ticks() -> None:
     profile = ArmProfile()
-    assert profile.frame_time == pytest.approx(1 / 240)
-    assert profile.tick == 1 / 50
+    assert profile.frame_time == pytest.approx(1 / 240) and profile.tick == 1 / 50
     with pytest.raises(InputError, match="tick"):
         ArmProfile(baud=9600)  # a frame takes 50 ms
     with pytest.raises(InputError, match="tick"):
@@ -141,14 +135,13 @@ def test_clocks_wait_and_never_go_back(clock: Clock) -> None:
 
 PROFILE = ArmProfile()
 AGE = 0.03  # s of a pose
+Lost = Callable[[float], bool]  # whether the surface is LOST at a stamp, s
 
 
 class Paused:
     """A motion that is paused for a while; each tick with the nozzle's height over the surface, mm, and the place."""
 
-    def __init__(
-        self, motion: Motion, between: tuple[float, float], seconds: float, lost: Callable[[float], bool]
-    ) -> None:
+    def __init__(self, motion: Motion, between: tuple[float, float], seconds: float, lost: Lost) -> None:
         step = MotionStep(raster(speed=4.0), PROFILE)
         self.stamps, self.commands, self.heights, self.places = [], [], [], []
         self.phases: list[PrintPhase] = []

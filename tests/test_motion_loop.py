@@ -26,7 +26,6 @@ from planning.command import Hold, Move
 from tests.linked import Linked, linked
 from tests.moving import breathing, pose_at, raster
 from tests.test_arm_port import serving
-from tests.test_floors import MOTION_NEVER
 from tests.virtual_arm import HOME
 
 ROOT = Path(__file__).parents[1]
@@ -133,10 +132,7 @@ def test_a_lost_surface_is_a_pause_on_the_wire_and_the_arm_at_rest() -> None:
     looping = Looping(START, linked(stand=False), lost)
     ticks = looping.run(3.0)
     assert isinstance(ticks[-1].command, Hold) and len(ticks[-1].frame) == 48
-    first, stop = (
-        1,
-        1 + BLIND_RESENDS,
-    )  # the step to where it stands; and the end, said again to an arm that does not answer
+    first, stop = 1, 1 + BLIND_RESENDS  # to where it stands; and the end, said again to an arm that does not answer
     assert looping.link.arm.frames == first + sum(bool(t.frame) for t in ticks) + stop
 
 
@@ -187,13 +183,6 @@ def test_a_histogram_of_lateness_gives_percentiles_to_a_tenth_of_a_millisecond(s
     for share in (1, 50, 99, 100):
         assert histogram.percentile(share) == pytest.approx(np.percentile(late, share), abs=1.1e-4)
     assert histogram.most == late.max()
-
-
-def test_the_motion_process_loads_nothing_that_would_stall_it() -> None:
-    code = "import sys, hardware.motion.step; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "hardware.arm.link" in done.stdout.split()
-    assert MOTION_NEVER.isdisjoint(done.stdout.split())
 
 
 def test_what_priority_was_granted_is_said() -> None:

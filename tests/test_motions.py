@@ -1,10 +1,9 @@
-"""Motions of the surface: twist and pose agree, parts compose, the thesis's experiments move as it says. The scenarios
-of data/scenarios: each can be read, says what it proves, and asks for what can be printed.
-"""
+"""Motions of the surface: twist and pose agree, parts compose; the scenarios of data/scenarios can be printed."""
 
 from __future__ import annotations
 
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +73,9 @@ def test_the_twist_integrates_to_the_pose(seed: int, start: float) -> None:
 def test_parts_compose_in_order(first: str, second: str, start: float) -> None:
     times = start + np.linspace(0, 3, 7)
     both = make(SPECS[first], SPECS[second])
-    assert np.allclose(
-        both(times), ComposedMotion(both.parts[:1])(times) @ ComposedMotion(both.parts[1:])(times), atol=1e-12
-    )
-    assert np.array_equal(ComposedMotion(both.parts[:1])(times), make(SPECS[first])(times))  # a part draws by itself
+    one, two = ComposedMotion(both.parts[:1])(times), ComposedMotion(both.parts[1:])(times)
+    assert np.allclose(both(times), one @ two, atol=1e-12)
+    assert np.array_equal(one, make(SPECS[first])(times))  # a part draws by itself
 
 
 def test_no_parts_are_a_surface_at_rest() -> None:
@@ -121,8 +119,7 @@ def test_breathing_stays_within_its_amplitude_and_speed(seed: int, amplitude: fl
     motion, times = make(spec, seed=seed), np.linspace(0, 300, 6001)
     z = motion(times)[:, 2, 3]
     most = amplitude * sigh * (1 + MAX_DRAW_SIGMAS * 0.15)
-    assert z.min() >= -1e-9
-    assert z.max() <= most + 1e-9
+    assert z.min() >= -1e-9 and z.max() <= most + 1e-9
     steepest = 4 * (3 / 4) ** 1.5 / 2 * np.pi / 2 / 0.4  # of sin^4, in shares of its depth and length
     assert np.abs(motion.twist(times)[:, 5]).max() <= most * steepest / (4 * (1 - MAX_DRAW_SIGMAS * 0.1)) + 1e-9
 
@@ -134,9 +131,7 @@ def test_holding_irregular_breathing_of_ten_millimetres_for_180_ms_costs_one() -
 
 
 @pytest.mark.parametrize(("per_frame", "rate", "amplitude"), [(0.08, 0.1, 5.98), (0.47, 0.5, 7.03)])
-def test_the_shaking_table_goes_as_far_in_a_frame_as_the_thesis_says(
-    per_frame: float, rate: float, amplitude: float
-) -> None:
+def test_the_shaking_table_goes_as_far_as_the_thesis_says(per_frame: float, rate: float, amplitude: float) -> None:
     assert shaking_amplitude(per_frame, rate) == pytest.approx(amplitude, abs=0.005)
     motion = make({"kind": "sine", "mm_per_frame": per_frame, "rate_hz": rate, "direction": [1, 0, 0]})
     frames = np.arange(0, 100, 1 / 29.91)  # ten periods and more
@@ -222,8 +217,7 @@ def test_a_waveform_alone_has_unit_height() -> None:
 def test_a_wrong_table_is_named(spec: Spec, key: str, allowed: str) -> None:
     with pytest.raises(InputError) as caught:
         make(spec)
-    assert caught.value.where == "scenario.toml"
-    assert caught.value.what == key
+    assert caught.value.where == "scenario.toml" and caught.value.what == key
     assert allowed in caught.value.allowed
 
 
@@ -262,17 +256,11 @@ def test_there_is_one_for_each_thing_that_must_be_proved() -> None:
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_a_scenario_says_above_its_title_what_it_proves(file: Path) -> None:
+def test_a_scenario_says_above_its_title_what_it_proves_and_bounds_error_and_duty(file: Path) -> None:
     lines = file.read_text(encoding="utf-8").splitlines()
-    comment = " ".join(
-        line.removeprefix("# ") for line in lines[: next(i for i, x in enumerate(lines) if x[:1] != "#")]
-    )
+    comment = " ".join(line.removeprefix("# ") for line in takewhile(lambda line: line[:1] == "#", lines))
     assert "Proves" in comment
     assert comment.endswith(".")
-
-
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_a_scenario_bounds_error_and_duty(file: Path) -> None:
     assert {"p95_mm", "duty"} <= set(scenario(file).limits)
 
 

@@ -1,6 +1,4 @@
-"""The laws of the error at the nozzle: nothing wrong gives zero, and what was planted comes out as itself. The laws of
-the deposited material: the plan laid is the plan, and what is off is off by its own area.
-"""
+"""The laws of the error at the nozzle and of the deposited material: none for a perfect run, known for known."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ from planning.path import Path
 from tests.moving import raster
 from tests.nozzle_logs import breathing, held, nozzle_log, part, sliding, straight, through, without_target
 
-FEW = settings(max_examples=10, deadline=None)
+FEW = settings(max_examples=10)
 vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
 
 
@@ -53,8 +51,7 @@ def test_a_perfect_run_has_no_error_and_full_duty() -> None:
     for spread in (figures.position, figures.along, figures.across, figures.normal, figures.path, figures.angle):
         assert spread.max < 1e-6
     assert (figures.duty, figures.near, figures.finished) == (1.0, 1.0, True)
-    assert figures.holds == ()
-    assert abs(figures.lag.seconds) < 1e-4
+    assert figures.holds == () and abs(figures.lag.seconds) < 1e-4
 
 
 @FEW
@@ -146,9 +143,8 @@ def test_the_distance_to_the_line_is_that_of_the_nearest_of_many_points_on_it(se
     points = draw.normal(size=(40, 3)) * 15
     corners = path.surface_from_nozzle[:, :3, 3]
     share = np.linspace(0, 1, 2001)[:, None]
-    dense = np.concatenate(
-        [(1 - share) * corners[i - 1] + share * corners[i] for i in np.flatnonzero(path.extrude) if i]
-    )
+    ends = [i for i in np.flatnonzero(path.extrude) if i]
+    dense = np.concatenate([(1 - share) * corners[i - 1] + share * corners[i] for i in ends])
     expected = np.linalg.norm(points[:, None] - dense, axis=2).min(axis=1)
     assert np.allclose(planned_line(path).distance(points), expected, atol=1e-3)
 
@@ -157,8 +153,7 @@ def test_being_late_is_no_distance_from_the_line() -> None:
     path = straight()
     _, figures = judged(part(nozzle_log(path, delay=0.1), slice(200, None)), path)
     assert figures.position.rmse == pytest.approx(0.5, abs=1e-6)
-    assert figures.along.rmse == pytest.approx(0.5, abs=1e-6)
-    assert figures.path.max < 1e-9
+    assert figures.along.rmse == pytest.approx(0.5, abs=1e-6) and figures.path.max < 1e-9
 
 
 def test_what_prints_nothing_has_no_figures() -> None:
@@ -194,16 +189,13 @@ def test_a_hold_costs_duty_to_the_end_of_the_path_or_of_the_run() -> None:
     log.extrude[5000:] = False  # the path is finished after 5 s
     log.reason[5001:] = "path finished"[: log.reason.itemsize // 4]
     _, figures = judged(log, path)
-    assert figures.finished
-    assert figures.duty == pytest.approx(0.8, abs=1e-3)
+    assert figures.finished and figures.duty == pytest.approx(0.8, abs=1e-3)
     assert figures.extruding == pytest.approx(4.0, abs=2e-3)
     assert figures.printing == pytest.approx(5.0, abs=2e-2)
     assert [(h.reason, h.count) for h in figures.holds] == [("surface is LOST", 1)]
-    assert figures.holds[0].seconds == pytest.approx(1.0)
-    assert figures.holds[0].first == pytest.approx(1.0)
+    assert figures.holds[0].seconds == pytest.approx(1.0) and figures.holds[0].first == pytest.approx(1.0)
     _, figures = judged(nozzle_log(path, seconds=4.0, reasons=held(1.0, 99.0)), path)
-    assert not figures.finished
-    assert figures.duty == pytest.approx(0.25, abs=1e-3)
+    assert not figures.finished and figures.duty == pytest.approx(0.25, abs=1e-3)
 
 
 def test_travel_and_the_way_there_are_not_part_of_duty() -> None:
@@ -212,8 +204,7 @@ def test_travel_and_the_way_there_are_not_part_of_duty() -> None:
     log = nozzle_log(path)
     way = without_target(replace(log, extrude=np.zeros(len(log), bool)), slice(None))
     _, figures = judged(join_logs([replace(way, stamps=way.stamps - 10), log]), path)
-    assert figures.duty == 1.0
-    assert figures.printing == pytest.approx(2.0, abs=2e-3)
+    assert figures.duty == 1.0 and figures.printing == pytest.approx(2.0, abs=2e-3)
 
 
 def test_a_place_that_is_not_known_is_the_last_one_that_was() -> None:
@@ -233,8 +224,7 @@ def test_the_share_near_ends_at_half_a_millimetre_and_where_there_is_no_target()
         assert judged(nozzle_log(path, offset=np.array([0, off, 0])), path)[1].near == near
     log = without_target(nozzle_log(path), slice(1000, 1100))
     _, figures = judged(log, path)
-    assert figures.without_target == pytest.approx(0.1)
-    assert figures.near == pytest.approx(1 - 100 / len(log))
+    assert figures.without_target == pytest.approx(0.1) and figures.near == pytest.approx(1 - 100 / len(log))
     assert figures.position.max < 1e-9
 
 
@@ -271,8 +261,7 @@ def test_what_is_laid_as_planned_is_the_plan_on_any_path_at_any_speed(seed: int,
     _, figures = laid(nozzle_log(path, breathing), path, bead)
     assert figures.coverage == pytest.approx(1, abs=0.01)
     assert (figures.gaps, figures.overlap) == (0, 0)
-    assert figures.outside == pytest.approx(0, abs=0.01)
-    assert figures.material == pytest.approx(1, abs=0.01)
+    assert figures.outside == pytest.approx(0, abs=0.01) and figures.material == pytest.approx(1, abs=0.01)
 
 
 def test_a_straight_bead_is_one_thick_over_its_whole_width() -> None:
@@ -302,8 +291,7 @@ def test_a_piece_that_was_left_out_is_a_gap() -> None:
     log = nozzle_log(path)
     log.extrude[1000:2000] = False  # a quarter
     _, figures = laid(log, path)
-    assert figures.gaps == pytest.approx(0.25, abs=0.03)
-    assert figures.coverage == pytest.approx(0.75, abs=0.01)
+    assert figures.gaps == pytest.approx(0.25, abs=0.03) and figures.coverage == pytest.approx(0.75, abs=0.01)
     assert figures.material == pytest.approx(0.75, abs=0.001)
     assert (figures.overlap, figures.outside) == (0, pytest.approx(0, abs=0.01))
 
@@ -332,8 +320,7 @@ def test_material_follows_the_path_and_not_the_nozzle() -> None:
     log = nozzle_log(path)
     log.surface_from_tip[:, 0] *= 0.5  # the same bead on half of the length
     _, figures = laid(log, path)
-    assert figures.material == pytest.approx(1, abs=1e-3)
-    assert figures.coverage == pytest.approx(0.5, abs=0.03)
+    assert figures.material == pytest.approx(1, abs=1e-3) and figures.coverage == pytest.approx(0.5, abs=0.03)
     assert figures.overlap == pytest.approx(0.5, abs=0.03)
 
 

@@ -1,6 +1,4 @@
-"""Nozzle.csv and the limits of a run: what was written comes back, and a limit is missed by one epsilon. The page of a
-simulated print: well-formed, alone in the world, and true to the run. So are its words and figures.
-"""
+"""Nozzle.csv, the limits of a run, and the page and summary of a simulated print: true to the run."""
 
 from __future__ import annotations
 
@@ -124,9 +122,6 @@ def test_a_run_of_20_s_is_written_within_a_second(tmp_path: File) -> None:
     start = time.process_time()
     write(tmp_path / "nozzle.csv", log)
     assert time.process_time() - start < 1.0
-
-
-# -- limits
 
 
 def figures() -> RunFigures:
@@ -253,8 +248,7 @@ def test_the_summary_is_plain_json_and_the_terminal_says_the_same() -> None:
     result = judged(limits=LIMITS)
     summary = nozzle_dict(result)
     loaded = json.loads(json.dumps(summary, allow_nan=False))
-    assert loaded == summary
-    assert loaded["errors"]["position_mm"]["max"] == result.figures.nozzle.position.max
+    assert loaded == summary and loaded["errors"]["position_mm"]["max"] == result.figures.nozzle.position.max
     assert loaded["errors"]["angle_deg"]["max"] == pytest.approx(np.degrees(result.figures.nozzle.angle.max))
     assert loaded["holds"][0]["total_s"] == pytest.approx(0.5)
     text = nozzle_text(loaded)
@@ -264,9 +258,8 @@ def test_the_summary_is_plain_json_and_the_terminal_says_the_same() -> None:
 
 
 def test_a_summary_of_nothing_has_a_text() -> None:
-    summary = json.loads(
-        json.dumps(nozzle_dict(judged(part(nozzle_report_eventful(), slice(0, 0)), limits=LIMITS)), allow_nan=False)
-    )
+    empty = judged(part(nozzle_report_eventful(), slice(0, 0)), limits=LIMITS)
+    summary = json.loads(json.dumps(nozzle_dict(empty), allow_nan=False))
     assert "–" in nozzle_text(summary)
     assert summary["duty"] is None
 
@@ -282,21 +275,11 @@ def test_a_long_run_stays_a_small_file_and_is_the_same_twice(tmp_path: File) -> 
     assert (tmp_path / "a.html").stat().st_size < 2_500_000
 
 
-# -- pictures
-
-
 def test_cells_are_of_one_kind() -> None:
     planned = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0]])
     laid = np.array([[1.0, 0.5, 1.51, 0.5, 0.49, 1.0, 3.01]])
-    assert [CELL_KINDS[k] for k in cell_kinds(planned, laid)[0]] == [
-        "as planned",
-        "missing",
-        "double",
-        "outside",
-        "as planned",
-        "as planned",
-        "double",
-    ]
+    found = ", ".join(CELL_KINDS[k] for k in cell_kinds(planned, laid)[0])
+    assert found == "as planned, missing, double, outside, as planned, as planned, double"
 
 
 def colours(svg: str) -> Array:
@@ -314,12 +297,7 @@ def test_the_bead_map_has_x_to_the_right_and_y_up_and_each_kind_in_its_colour() 
     picture = colours(bead_picture(judged(log, path), 0, 500.0))
     view = whole_map_view(deposit_map(log, planned_line(path), 0.8), picture.shape[1])
     places = view.pixels(np.array([[0.0, 0], [8, 0], [-8, 0], [-8, 3]])).round().astype(int)
-    assert [tuple(picture[y, x]) for x, y in places] == [
-        CELL_COLOURS[0],
-        CELL_COLOURS[1],
-        CELL_COLOURS[1],
-        CELL_COLOURS[3],
-    ]
+    assert [tuple(picture[y, x]) for x, y in places] == [CELL_COLOURS[kind] for kind in (0, 1, 1, 3)]
 
 
 def test_the_way_is_coloured_by_the_worst_error() -> None:

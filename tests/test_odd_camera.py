@@ -16,7 +16,7 @@ from estimation.se3 import Array
 from estimation.synthetic.world import observations
 from tests.slowly import slowly
 from tests.synthetic import breathing
-from tests.test_estimator import LANDMARKS, RIG, begun, follow, look
+from tests.test_estimator import LANDMARKS, RIG, begun, follow, joined, look
 
 SECONDS, NEXT = 2.0, 2.0 + 1 / 30
 
@@ -30,10 +30,7 @@ def seen_by_bumped(camera: int, bump: Array) -> Observations:
     draw = np.random.default_rng(7)
     struck = observations(Rig(tuple(cameras)), LANDMARKS, breathing(NEXT), NEXT, draw, 0.3, visible=only)
     parts = [struck if c == camera else look(breathing, NEXT, 1, cameras=[c]) for c in range(len(RIG))]
-    camera_, track, pixels, sigma = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("camera", "track", "pixels", "sigma")
-    )
-    return Observations(NEXT, camera_, track, pixels, sigma)
+    return joined(NEXT, parts)
 
 
 def followed() -> Estimator:
@@ -92,8 +89,6 @@ def test_few_tracks_that_stand_off_are_no_measurement_though_nothing_surprises(r
 
 
 @pytest.mark.parametrize(("share", "reach", "sound"), [(1.0, 5.0, True), (0.5, 5.0, False), (0.5, 0.0, True)])
-def test_shape_and_clocks_learn_nothing_of_half_the_tracks_where_all_stand_off(
-    share: float, reach: float, sound: bool
-) -> None:
+def test_shape_and_clocks_learn_nothing_where_half_the_tracks_are_off(share: float, reach: float, sound: bool) -> None:
     estimator = followed()
     assert estimator.may_learn(estimator.fit(by_chance(share, reach), estimator.predict(NEXT))) is sound

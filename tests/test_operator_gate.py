@@ -1,6 +1,4 @@
-"""Who is let in to the operator's page, what is served, and what it says back. The page for other machines: by TLS
-alone, under the names that are told, refused in one line where it cannot be.
-"""
+"""Who is let in to the operator's page and what is served; other machines by TLS alone, under given names."""
 
 from __future__ import annotations
 
@@ -51,31 +49,23 @@ def get(url: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, s
 @pytest.mark.parametrize(
     ("reason", "changed", "token"),
     [
-        ("token", {}, TOKEN[:-1] + "t"),
-        ("token", {}, ""),
-        ("token", {}, "schlüssel\udce4"),
-        ("host", {"Host": "evil.example:81"}, TOKEN),
-        ("host", {"Host": "127.0.0.1:82"}, TOKEN),
-        ("host", {"Host": "127.0.0.1"}, TOKEN),
-        ("origin", {"Origin": "http://evil.example"}, TOKEN),
-        ("origin", {"Origin": "http://127.0.0.1:9000"}, TOKEN),
-        ("origin", {"Origin": "null"}, TOKEN),
-        ("site", {"Sec-Fetch-Site": "cross-site"}, TOKEN),
-        ("site", {"Sec-Fetch-Site": "same-site"}, TOKEN),
+        ("token", {}, TOKEN[:-1] + "t"), ("token", {}, ""), ("token", {}, "schlüssel\udce4"),
+        ("host", {"Host": "evil.example:81"}, TOKEN), ("host", {"Host": "127.0.0.1:82"}, TOKEN),
+        ("host", {"Host": "127.0.0.1"}, TOKEN), ("origin", {"Origin": "http://evil.example"}, TOKEN),
+        ("origin", {"Origin": "http://127.0.0.1:9000"}, TOKEN), ("origin", {"Origin": "null"}, TOKEN),
+        ("site", {"Sec-Fetch-Site": "cross-site"}, TOKEN), ("site", {"Sec-Fetch-Site": "same-site"}, TOKEN),
     ],
-)
+)  # fmt: skip
 def test_each_thing_that_is_wrong_is_refused_alone(reason: str, changed: dict[str, str], token: str) -> None:
     gate = AccessControl(SETTINGS, 81)
-    assert gate.refusal(TOKEN, OWN, True) == ""
-    assert gate.refusal(token, OWN | changed, True) == reason
+    assert gate.refusal(TOKEN, OWN, True) == "" and gate.refusal(token, OWN | changed, True) == reason
     assert gate.refused == {reason: 1}
 
 
 def test_what_could_change_something_needs_an_origin_and_what_only_looks_does_not() -> None:
     gate = AccessControl(SETTINGS, 81)
     bare = {"Host": "localhost:81"}
-    assert gate.refusal(TOKEN, bare, False) == ""
-    assert gate.refusal(TOKEN, bare, True) == "origin"
+    assert gate.refusal(TOKEN, bare, False) == "" and gate.refusal(TOKEN, bare, True) == "origin"
 
 
 def test_the_page_and_all_its_files_come_with_the_token_and_forbid_all_that_is_outside(page: Served) -> None:
@@ -215,9 +205,7 @@ def test_by_default_nobody_but_this_machine_is_let_in() -> None:
     assert (made.host, made.port, made.elsewhere, made.scheme) == ("127.0.0.1", 0, False, "http")
 
 
-def test_other_machines_are_served_encrypted_under_the_name_that_is_told_alone(
-    elsewhere: LiveSettings, authority: trustme.CA
-) -> None:
+def test_other_machines_are_served_encrypted_by_name(elsewhere: LiveSettings, authority: trustme.CA) -> None:
     settings = page_settings(elsewhere, "here")
     page = OperatorPage(OperatorLink(), settings)
     page.tend(0.0)
@@ -235,8 +223,7 @@ def test_other_machines_are_served_encrypted_under_the_name_that_is_told_alone(
 
     try:
         assert page.address == f"https://{NAME}:{port}/{settings.token}/"
-        assert asyncio.run(ask("https", NAME)) == 200
-        assert asyncio.run(ask("https", "localhost")) == 403
+        assert asyncio.run(ask("https", NAME)) == 200 and asyncio.run(ask("https", "localhost")) == 403
         with pytest.raises(aiohttp.ClientError):
             asyncio.run(ask("http", NAME))
     finally:
@@ -257,17 +244,13 @@ def test_other_machines_are_served_encrypted_under_the_name_that_is_told_alone(
         ({"page_address": "198.51.100.7"}, "page.address = '198.51.100.7 port 0', allowed one that is this machine's"),
     ],
 )
-def test_what_would_let_others_in_unencrypted_or_cannot_be_served_is_one_error(
-    change: dict[str, object], words: str, elsewhere: LiveSettings
-) -> None:
+def test_what_cannot_be_served_is_one_error(change: dict[str, object], words: str, elsewhere: LiveSettings) -> None:
     with pytest.raises(InputError) as refused:
         page_settings(replace(elsewhere, **change), "here")  # type: ignore[arg-type]
     assert words in str(refused.value)
 
 
-def test_a_key_of_another_certificate_and_a_port_that_is_taken_are_refused(
-    elsewhere: LiveSettings, authority: trustme.CA, tmp_path: Path
-) -> None:
+def test_a_wrong_key_or_taken_port_is_refused(elsewhere: LiveSettings, authority: trustme.CA, tmp_path: Path) -> None:
     other = tmp_path / "other.key"
     authority.issue_cert(NAME).private_key_pem.write_to_path(other)
     with pytest.raises(InputError, match=r"page\.certificate"):

@@ -16,23 +16,12 @@ from hardware.files.images import encode
 from hardware.operator.settings import WindowLimits
 from hardware.operator.shared_state import CameraPicture, OperatorRequest, PagePictures, PageScene
 from hardware.operator.view import Activity, CheckVerdict, OperatorView, RequestAnswer, RunStage, Wish
-from tests.browser import Browser, Page, executable
+from tests.browser import Browser, Page
 from tests.operator_page import OFFERED, Served, full_view
-
-CHROMIUM = executable()
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
 
 SIZES = [(1024, 768), (768, 1024), (1440, 900)]
 SURE = (Wish.START, Wish.HOME, Wish.END)
 LIVE = 'document.body.dataset.news === "live"'
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    assert CHROMIUM is not None
-    made = Browser(CHROMIUM)
-    yield made
-    made.close()
 
 
 class Run:
@@ -92,8 +81,7 @@ def test_every_button_asks_for_what_it_says_once_and_those_that_move_the_arm_ask
             page.until('!document.getElementById("sure").hidden')
             page.click("#sure-yes")
         (request,) = run.served.taken()
-        assert request.wish is wish
-        assert request.turn == (0 if wish is Wish.STOP else view.turn)
+        assert request.wish is wish and request.turn == (0 if wish is Wish.STOP else view.turn)
     assert run.served.link.requests.take() == []
 
 
@@ -224,14 +212,8 @@ def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
 
 def test_the_page_has_words_for_all_that_a_view_can_say(run: Run) -> None:
     page = run.open()
-    kinds = {
-        "STAGES": RunStage,
-        "TRACKING": TrackState,
-        "ACTIVITIES": Activity,
-        "WISHES": Wish,
-        "VERDICTS": CheckVerdict,
-    }
-    for name, kind in kinds.items():
+    kinds = (RunStage, TrackState, Activity, Wish, CheckVerdict)
+    for name, kind in zip(("STAGES", "TRACKING", "ACTIVITIES", "WISHES", "VERDICTS"), kinds, strict=True):
         known = page.js(f'import("./words.js").then((words) => Object.keys(words.{name}))')
         assert set(known) == {each.value for each in kind}
 
@@ -264,9 +246,8 @@ def test_old_news_are_greyed_and_said_to_be_old_and_stop_still_stops(browser: Br
     page.until('document.body.dataset.news === "old"')
     assert "No news from the run" in page.text("#alarm") and "old" in page.text("#alarm")
     assert float(page.js("getComputedStyle(document.querySelector('main')).opacity")) < 0.5
-    assert page.js('[...document.querySelectorAll("footer button:not(:disabled)")].map((b) => b.dataset.wish)') == [
-        "stop"
-    ]
+    enabled = page.js('[...document.querySelectorAll("footer button:not(:disabled)")].map((b) => b.dataset.wish)')
+    assert enabled == ["stop"]
     page.click('[data-wish="stop"]')
     assert [request.wish for request in run.served.taken()] == [Wish.STOP]
     run.served.put(replace(run.view, stamp=99.0))
@@ -339,9 +320,7 @@ def test_a_picture_that_stands_still_says_how_old_it_is_while_the_others_go_on(r
 
 
 @pytest.mark.parametrize("crop", [None, (150, 110, 320, 180)], ids=["whole", "near"])
-def test_printed_path_and_path_to_come_are_drawn_where_they_lie_in_the_picture(
-    run: Run, crop: tuple[int, int, int, int] | None
-) -> None:
+def test_the_path_is_drawn_where_it_lies_in_the_picture(run: Run, crop: tuple[int, int, int, int] | None) -> None:
     page = run.open((1440, 900))
     above = np.diag([1.0, -1.0, -1.0, 1.0])
     above[2, 3] = 300.0

@@ -1,6 +1,4 @@
-"""Live pictures are taken while somebody looks, and cost whoever offers them nothing. What a live run shows beside its
-figures: the outline of what is followed, and the true error where it is known.
-"""
+"""Live pictures cost nothing while nobody looks; what a live run shows beside its figures."""
 
 from __future__ import annotations
 
@@ -38,6 +36,13 @@ def shot(width: int = 1280, height: int = 720) -> CameraShot:
     return CameraShot("camera0", image, (np.array([[1.0, 2.0], [3.0, 4.0]]),), np.array([[5.0, 6.0]]))
 
 
+def looked_at(capacity: int = PICTURES_CAPACITY) -> tuple[SharedLatest[PagePictures], Thumbnailer]:
+    """Where pictures go, and who makes them, with one window open."""
+    pictures, line = SharedLatest[PagePictures](capacity), RequestLine()
+    line.windows = 1
+    return pictures, Thumbnailer(pictures, line)
+
+
 def taken(pictures: SharedLatest[PagePictures]) -> PagePictures:
     end = time.monotonic() + 10
     while (found := pictures.get()) is None and time.monotonic() < end:
@@ -47,10 +52,7 @@ def taken(pictures: SharedLatest[PagePictures]) -> PagePictures:
 
 
 def test_a_picture_is_small_and_says_what_the_shot_said() -> None:
-    pictures: SharedLatest[PagePictures] = SharedLatest(PICTURES_CAPACITY)
-    line = RequestLine()
-    line.windows = 1
-    taker = Thumbnailer(pictures, line)
+    pictures, taker = looked_at()
     assert taker.offer(3.5, [shot()], np.eye(4))
     found = taken(pictures)
     taker.close()
@@ -65,9 +67,7 @@ PLACES = st.tuples(st.floats(0, 1279), st.floats(0, 719), st.floats(1, 900))
 
 
 @given(PLACES)
-def test_the_near_picture_holds_what_was_found_lies_within_the_image_and_has_its_proportions(
-    place: tuple[float, float, float],
-) -> None:
+def test_the_near_picture_holds_the_wound_in_the_images_proportions(place: tuple[float, float, float]) -> None:
     x, y, spread = place
     tracks = np.array([x, y]) + spread * np.random.default_rng(1).uniform(-0.5, 0.5, (200, 2))
     tracks = np.clip(tracks, 0, [1279, 719])
@@ -109,10 +109,7 @@ def test_nothing_is_taken_while_nobody_looks_nor_sooner_than_is_due() -> None:
 
 
 def test_offering_never_waits_for_the_pictures_to_be_made() -> None:
-    pictures: SharedLatest[PagePictures] = SharedLatest(PICTURES_CAPACITY)
-    line = RequestLine()
-    line.windows = 1
-    taker = Thumbnailer(pictures, line)
+    _, taker = looked_at()
     large = [shot(3000, 2000)] * 3  # 60 ms of work
     spent = []
     for _ in range(200):
@@ -125,10 +122,7 @@ def test_offering_never_waits_for_the_pictures_to_be_made() -> None:
 
 
 def test_pictures_that_do_not_fit_are_dropped_and_the_next_ones_come() -> None:
-    pictures: SharedLatest[PagePictures] = SharedLatest(20_000)
-    line = RequestLine()
-    line.windows = 1
-    taker = Thumbnailer(pictures, line)
+    pictures, taker = looked_at(20_000)
     noise = np.random.default_rng(1).integers(0, 255, (360, 640, 3)).astype(np.uint8)
     assert taker.offer(1.0, [CameraShot("camera0", noise)])
     time.sleep(THUMBNAIL_PERIOD + 0.1)

@@ -249,11 +249,9 @@ def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:
         assert {request.wish for request in page.taken()} == {Wish.STOP}
 
 
-def test_a_flood_of_windows_is_turned_away_and_another_one_is_served_all_the_while(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    count, begun = RawValue(FloodCount), RawValue(c_double, math.nan)
-    begun.value = WallClock().now()
+def test_a_flood_of_windows_is_turned_away_and_another_is_served_all_the_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, begun = FloodCount(), PrintStart()
+    begun.instant = WallClock().now()
     poured = Fault(FaultPart.PAGE, FaultKind.FLOOD, 0.0, 60.0)
     monkeypatch.setattr(flood, "RECONNECT_AFTER", 0.01)
 
@@ -277,7 +275,7 @@ def test_a_flood_of_windows_is_turned_away_and_another_one_is_served_all_the_whi
 GARBAGE = st.binary(max_size=400) | st.text(max_size=200)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(GARBAGE, min_size=25, max_size=60))
 def test_garbage_asks_for_nothing_and_ends_only_the_window_it_comes_from(rubbish: list[bytes | str]) -> None:
     async def pour(page: Served) -> int | None:

@@ -1,6 +1,4 @@
-"""What windows say is parsed with suspicion, and what they are sent can always be parsed. Requests cross from the page
-to the run: bounded, in order, and a stop always. What is handed to the page: small enough for a browser, and true.
-"""
+"""Messages of windows are parsed with suspicion; requests are bounded, in order, a stop always comes through."""
 
 from __future__ import annotations
 
@@ -168,8 +166,7 @@ def test_a_stop_finds_room_in_any_line_and_voids_what_came_with_it(before: int, 
     last = line.last_stop
     for _ in range(after):
         line.ask(Wish.START, 1)
-    assert line.take() == [OperatorRequest(last, Wish.STOP, 0)]
-    assert line.take() == []
+    assert line.take() == [OperatorRequest(last, Wish.STOP, 0)] and line.take() == []
     line.ask(Wish.PAUSE, 2)
     assert [r.wish for r in line.take()] == [Wish.PAUSE]
 

@@ -1,7 +1,4 @@
-"""Cameras fail in every way before a moving wound: the tracker says so, is never wrong in silence, and comes back.
-Offsets and shifts of whole cameras: found where they show, not confused, and nothing made up where they do not.
-Tests of what is said of cameras that stand off the pose.
-"""
+"""Cameras fail in every way: never wrong in silence, and back again; offsets and shifts of whole cameras."""
 
 from __future__ import annotations
 
@@ -32,19 +29,12 @@ from hardware.bench.outage_run import (
 )
 from perception.frames import Image
 from tests.slowly import slowly
-from tests.test_estimator import begun, lively, look, stamps, step
+from tests.test_estimator import begun, lively, look, run_skewed, stamps, step
 
 RIG = arc_rig(size=(320, 180), focal=280.0)
 EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 24.0) for y in (-17.0, 17.0)])
 TRACKING, DEGRADED, COASTING = TrackState.TRACKING, TrackState.DEGRADED, TrackState.COASTING
-LIKE = (
-    OutageKind.HAND,
-    OutageKind.GLARE,
-    OutageKind.EXPOSURE,
-)  # much like those beside them: in part hidden, or too bright
-
-
-# -- the judge
+LIKE = (OutageKind.HAND, OutageKind.GLARE, OutageKind.EXPOSURE)  # like those beside them: in part hidden, or too bright
 
 
 def watched(kind: OutageKind = OutageKind.DEAD, start: int = 10, end: int = 20, count: int = 40) -> WatchedOutage:
@@ -66,9 +56,7 @@ def test_what_is_said_at_once_is_no_loss() -> None:
 
 
 @pytest.mark.parametrize(("error", "radius", "silent"), [(0.51, 0.1, True), (0.49, 0.1, False), (0.51, 0.18, False)])
-def test_a_loss_is_silent_when_it_is_off_by_more_than_harmless_and_claimed(
-    error: float, radius: float, silent: bool
-) -> None:
+def test_a_loss_is_silent_when_off_by_more_than_harmless_and_claimed(error: float, radius: float, silent: bool) -> None:
     seen = watched()
     off = np.where(np.arange(40) == 15, error, 0.02)
     said = replace(seen, error=off, radius=np.full(40, radius))
@@ -120,12 +108,8 @@ def test_the_table_has_a_line_for_each_kind_and_the_figures_count_what_is_late()
     lines = outage_table([(OutageKind.DEAD, good), (OutageKind.BLUR, bad)]).splitlines()
     assert [line.split()[0] for line in lines] == ["kind", "dead", "blur", "all"]
     values = {f.what: f.value for f in outage_figures([good, bad])}
-    assert (
-        values["silent losses"]
-        == values["flagged after more than 100 ms"]
-        == values["back after more than 200 ms"]
-        == 1
-    )
+    late = ("silent losses", "flagged after more than 100 ms", "back after more than 200 ms")
+    assert [values[name] for name in late] == [1, 1, 1]
 
 
 def test_every_outage_falls_to_one_scene_and_seeds_differ() -> None:
@@ -133,9 +117,6 @@ def test_every_outage_falls_to_one_scene_and_seeds_differ() -> None:
     assert sum(len(kinds) for _, kinds in jobs) == 200 and len({seed for seed, _ in jobs}) == len(jobs) == 4
     counts = [sum(kinds.count(k) for _, kinds in jobs) for k in OutageKind]
     assert max(counts) - min(counts) <= 1
-
-
-# -- the faults
 
 
 def picture(seed: int) -> Image:
@@ -186,9 +167,6 @@ def test_draws_are_the_same_again_and_within_their_limits() -> None:
             assert 0 < a.end - a.start <= 5 and 1 <= len(a.cameras) <= 3 and set(a.cameras) <= {0, 1, 2}
 
 
-# -- the tracker
-
-
 @pytest.fixture(scope="module")
 def stretch() -> TrackedStretch:
     begun = TrackedStretch(make_pictures(3, 24, arc_rig(size=(480, 270), focal=420.0)), 3)
@@ -210,10 +188,7 @@ def test_the_tracker_is_never_lost_in_silence_and_comes_back(stretch: TrackedStr
 
 def learned(offsets: tuple[float, float, float], seconds: float) -> CameraErrors:
     """After following a world whose cameras are `offsets` late, s."""
-    estimator = begun(lively)
-    for t in stamps(seconds):
-        step(estimator, look(lively, float(t), 6, delays=offsets))
-    return estimator.cameras
+    return run_skewed(offsets, seconds).cameras
 
 
 @pytest.mark.parametrize("offsets", [(0.0, 0.0, 0.0), (0.016, 0.0, -0.016), (0.002, -0.009, 0.013)])

@@ -55,8 +55,7 @@ def test_a_file_gives_the_path_back(tmp_path_factory: pytest.TempPathFactory, se
     assert np.array_equal(back.surface_from_nozzle[:, :3, 3], path.surface_from_nozzle[:, :3, 3])
     for name in ("speed", "material", "temperature", "layer", "extrude"):
         assert np.array_equal(getattr(back, name), getattr(path, name)), name
-    assert list(back.extra) == ["wait_s"]
-    assert np.array_equal(back.extra["wait_s"], path.extra["wait_s"])
+    assert list(back.extra) == ["wait_s"] and np.array_equal(back.extra["wait_s"], path.extra["wait_s"])
 
 
 def test_a_file_as_people_write_it(tmp_path: File) -> None:
@@ -70,8 +69,7 @@ def test_a_file_as_people_write_it(tmp_path: File) -> None:
     path = read_path(file)
     assert np.allclose(path.speed, 5.0)
     assert np.allclose(path.surface_from_nozzle[1, :3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert path.material.tolist() == ["collagen"] * 2
-    assert path.layer.tolist() == [0, 0]
+    assert path.material.tolist() == ["collagen"] * 2 and path.layer.tolist() == [0, 0]
     assert path.extrude.all()
 
 
@@ -79,8 +77,7 @@ def test_the_sample_path_is_a_square_of_10_mm() -> None:
     path = read_path(SAMPLE)
     places = path.surface_from_nozzle[:, :3, 3]
     assert np.ptp(places, axis=0).tolist() == [10, 10, 0]
-    assert (path.speed == 5).all()
-    assert not path.extrude[0]
+    assert (path.speed == 5).all() and not path.extrude[0]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,4 @@
-"""Layers fill the wound: all of it, none of it twice, bottom up, each tissue as thick as it was asked for. Bumps of the
-bed that stand over a layer: low ones are gone over, high ones round, and the wound's wall is none. What is wrong
-with a scan is put right and counted. What cannot be used is refused in one line.
-"""
+"""Layers fill the wound: all of it, none twice, bottom up; bumps of the bed; faults of a scan mended or refused."""
 
 from __future__ import annotations
 
@@ -34,9 +31,7 @@ from tests.wounds import SKIN, scan_of, sheet, wound_of
     st.lists(st.one_of(st.none(), st.floats(0.05, 5)), min_size=1, max_size=5).filter(lambda t: t.count(None) <= 1),
     st.floats(0.1, 12), st.floats(0.05, 2),
 )  # fmt: skip
-def test_layers_fill_the_whole_height_without_a_gap(
-    thicknesses: list[float | None], whole: float, height: float
-) -> None:
+def test_layers_fill_the_height_without_a_gap(thicknesses: list[float | None], whole: float, height: float) -> None:
     tissues = [Tissue(str(i), t, "1", height=height) for i, t in enumerate(thicknesses)]
     cut = slabs(tissues, whole)
     assert cut[0].low == pytest.approx(0, abs=1e-5) and cut[-1].high == pytest.approx(whole, abs=1e-5)
@@ -111,7 +106,7 @@ def test_layers_that_no_bead_fits_into_are_refused() -> None:
 
 
 @given(st.floats(20, 80), st.booleans())
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_a_cylinder_is_unrolled_to_its_true_lengths(radius: float, along_y: bool) -> None:
     grid = grid_over([-12, -12], [12, 12], 0.25)
     across = grid.nodes[..., 0 if along_y else 1]
@@ -123,7 +118,7 @@ def test_a_cylinder_is_unrolled_to_its_true_lengths(radius: float, along_y: bool
 
 
 @given(st.integers(0, 1000))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_the_chart_and_back_is_where_one_was(seed: int) -> None:
     wound = wound_of("foot")
     chart = unroll(wound.grid, wound.skin)
@@ -137,7 +132,7 @@ def steep(wound: WoundVolume) -> np.ndarray[tuple[int, ...], np.dtype[np.float64
 
 
 @given(st.floats(5, 60), st.floats(0.2, 20))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_the_tool_keeps_its_limits_on_any_way(tilt_deg: float, turning_deg: float) -> None:
     wound = wound_of()
     limits = ToolLimits(np.deg2rad(tilt_deg), np.deg2rad(turning_deg))
@@ -267,7 +262,7 @@ def test_vertices_that_every_triangle_has_for_itself_are_merged() -> None:
 
 
 @given(st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_triangles_that_face_against_the_most_are_turned_over(seed: int) -> None:
     vertices, triangles = sheet()
     against = np.random.default_rng(seed).random(len(triangles)) < 0.4
@@ -332,7 +327,7 @@ def test_too_little_to_be_a_surface_is_refused(count: int) -> None:
 )  # fmt: skip
 @example(seed=0, gone=0, turned=0, noise=0, spikes=0, nan=0, double=0, wild=0, scale=0.001)
 @example(seed=0, gone=0, turned=0, noise=0, spikes=0, nan=0, double=0, wild=2, scale=0.001)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_a_damaged_scan_gives_a_wound_or_one_clear_error(
     seed: int, gone: float, turned: float, noise: float, spikes: int, nan: int, double: float, wild: int, scale: float
 ) -> None:

@@ -1,6 +1,4 @@
-"""Checkpoints: every bead is laid, the tip is on the layer, the tool within its limits, travels clear of the wound. The
-wound is found where it is, the skin over it restored as it was, and what cannot be a wound is refused.
-"""
+"""Checkpoints: every bead laid, tool within limits, travels clear of the wound; the wound found where it is."""
 
 from __future__ import annotations
 
@@ -129,7 +127,7 @@ def test_the_same_wound_gives_the_same_path() -> None:
 
 
 @given(st.integers(0, 1000), st.floats(0.1, 3.0), st.floats(0.005, 0.2))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_checkpoints_are_as_near_as_asked_and_on_the_bead(seed: int, spacing: float, chord: float) -> None:
     rng = np.random.default_rng(seed)
     lines = [even_bead(rng.uniform(0, 20, (rng.integers(2, 9), 2)), 0.4) for _ in range(4)]
@@ -147,7 +145,7 @@ def test_checkpoints_are_as_near_as_asked_and_on_the_bead(seed: int, spacing: fl
 
 
 @given(st.floats(0.005, 0.2), st.floats(0.02, 0.15), st.integers(1, 6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_points_that_go_leave_line_and_edges_where_they_were(chord: float, swing: float, waves: int) -> None:
     turn = np.linspace(0, 2 * np.pi, 600)
     line = Bead(5 * np.column_stack([np.cos(turn), np.sin(turn)]), 0.4 + swing * np.sin(waves * turn))
@@ -179,19 +177,14 @@ def test_gcode_says_what_the_path_says() -> None:
 
 
 def test_default_way_is_what_the_help_says() -> None:
-    assert (
-        CheckpointSettings().spacing,
-        CheckpointSettings().chord,
-        CheckpointSettings().travel,
-        CheckpointSettings().lift,
-    ) == (1.0, 0.02, 60.0, 2.0)
+    way = CheckpointSettings()
+    assert (way.spacing, way.chord, way.travel, way.lift) == (1.0, 0.02, 60.0, 2.0)
 
 
 def over_scan(wound: WoundVolume, xy: Array) -> Array:
     """Points (N, 3), scan frame, on the restored skin over points (N, 2) in the plane."""
-    return se3.transform_points(
-        wound.surface_from_plane, np.column_stack([xy, interpolate(wound.grid, wound.skin, xy)])
-    )
+    points = np.column_stack([xy, interpolate(wound.grid, wound.skin, xy)])
+    return se3.transform_points(wound.surface_from_plane, points)
 
 
 @pytest.mark.parametrize("kind", ["forearm", *slowly("chest", "foot")])
@@ -226,8 +219,7 @@ def test_an_outline_that_is_given_is_kept() -> None:
     vertices, triangles = scan_of()
     square = np.array([[-6.0, -5, 0], [6, -5, 0], [6, 5, 0], [-6, 5, 0]])
     wound = find_wound(repair_mesh(vertices, triangles, "scan")[0], 0.4, "scan", square)
-    assert wound.findings.given
-    assert wound.outline.area == pytest.approx(120, rel=0.05)
+    assert wound.findings.given and wound.outline.area == pytest.approx(120, rel=0.05)
 
 
 def test_a_hole_in_the_wound_is_closed_and_told() -> None:
@@ -273,7 +265,7 @@ def test_a_wound_at_the_rim_of_the_scan_is_refused() -> None:
 
 
 @given(st.integers(0, 10_000), st.floats(0.2, 3.0))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_regions_are_where_the_function_is_positive(seed: int, slope: float) -> None:
     rng = np.random.default_rng(seed)
     grid = Grid(0.5, np.array([-8.0, -6.0]), (25, 33))

@@ -108,12 +108,10 @@ def test_a_whole_print(motion: Motion) -> None:
     assert result.reasons == {"path finished"}
     assert over_limit(result.axes, LIMITS) <= 1
     printing, where = extruding(result), tips(result, motion)
-    assert (np.diff(result.places) >= 0).all()
-    assert result.places[-1] == pytest.approx(40.0)
+    assert (np.diff(result.places) >= 0).all() and result.places[-1] == pytest.approx(40.0)
     off = distance_to(where[printing], path)
     rms, worst = (0.01, 0.05) if motion is still else (0.025, 0.06)  # mm; measured 0.004, 0.035 and 0.017, 0.041
-    assert np.sqrt((off**2).mean()) < rms
-    assert off.max() < worst
+    assert np.sqrt((off**2).mean()) < rms and off.max() < worst
     for corner in path.surface_from_nozzle[:, :3, 3]:
         assert np.linalg.norm(where[printing] - corner, axis=1).min() < 0.1  # cut by 0.05 mm, and half a tick
     steps = np.linalg.norm(np.diff(where, axis=0), axis=1)[printing[1:] & printing[:-1]] / TICK
@@ -170,8 +168,7 @@ def test_the_speed_of_each_checkpoint_is_its_way_there() -> None:
     moves = moves_while(result, PrintPhase.PRINTING)
     for checkpoint, speed in ((1, 4.0), (2, 8.0), (3, 2.0)):
         feeds = [m.feed for m in moves if m.checkpoint == checkpoint]
-        assert np.median(feeds) == pytest.approx(speed, rel=0.05)
-        assert np.percentile(feeds, 80) < speed * 1.05
+        assert np.median(feeds) == pytest.approx(speed, rel=0.05) and np.percentile(feeds, 80) < speed * 1.05
 
 
 def test_an_outage_is_braked_held_and_resumed_where_it_stopped() -> None:
@@ -223,8 +220,7 @@ def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
     foreseen = ~((stamps < 18.0) & (stamps + TICK >= 18.0))  # not the tick during which it jumps
     assert distance_to(where[printing & foreseen], path).max() <= LIMITS.on_path
     printed = result.places[printing]
-    assert printed[-1] == pytest.approx(40.0)
-    assert (np.diff(printed) >= 0).all()
+    assert printed[-1] == pytest.approx(40.0) and (np.diff(printed) >= 0).all()
     assert np.diff(printed, prepend=0).max() < 0.25  # no part of the path was passed without printing
     back = stamps[printing & (stamps >= 18.0)][0]
     assert 18.1 < back < 21.5  # up to 10 mm, and down again at 5 mm/s
@@ -235,8 +231,7 @@ def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
 def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
     tally = StreamTally()
     follow_stream((seed, 0), tally, bench_arm(), 200)
-    assert tally.samples == 200
-    assert tally.worst.max() <= 1 + 1e-6
+    assert tally.samples == 200 and tally.worst.max() <= 1 + 1e-6
     assert (tally.refused, tally.errors) == (0, [])
     assert tally.twice < 1e-9
 
@@ -263,14 +258,12 @@ def test_what_is_out_of_reach_is_held_with_its_axis_and_bounds() -> None:
 def test_a_surface_too_fast_is_not_chased(motion: Motion, words: str) -> None:
     near = replace(LIMITS, surface_speed=500.0) if "degrees" in words else LIMITS
     result = run(raster(), exact(motion, 0.5), near)
-    assert np.array_equal(result.axes[-1], ARM.home)
-    assert all(words in reason for reason in result.reasons)
+    assert np.array_equal(result.axes[-1], ARM.home) and all(words in reason for reason in result.reasons)
 
 
 def test_without_any_pose_the_arm_stays_home() -> None:
     result = run(raster(), [(k * TICK, None) for k in range(20)])
-    assert result.reasons == {"no pose yet"}
-    assert np.array_equal(result.axes[-1], ARM.home)
+    assert result.reasons == {"no pose yet"} and np.array_equal(result.axes[-1], ARM.home)
 
 
 def test_a_stalled_caller_finds_the_arm_at_rest() -> None:

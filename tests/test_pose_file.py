@@ -1,6 +1,4 @@
-"""Poses.csv and poses.tum: what is written is read back, by us and by evo, to the last whole line. TUM files: laws of
-the round trip, and every wrong line named.
-"""
+"""Poses.csv and TUM files: read back, by us and by evo, to the last whole line; every wrong line named."""
 
 from __future__ import annotations
 
@@ -51,19 +49,13 @@ def write(folder: Path, table: PoseTable) -> Path:
 def test_csv_round_trip(tmp_path: Path) -> None:
     table, _ = run(20, sigma=np.full(6, 0.01), states=STATES)
     back = read_poses(write(tmp_path, table))
-    assert (back.states, back.reasons, back.cameras, back.stages) == (
-        table.states,
-        table.reasons,
-        table.cameras,
-        table.stages,
-    )
-    assert np.array_equal(back.frames, table.frames)
-    assert np.array_equal(back.used, table.used)
+    for name in ("states", "reasons", "cameras", "stages"):
+        assert getattr(back, name) == getattr(table, name)
+    assert np.array_equal(back.frames, table.frames) and np.array_equal(back.used, table.used)
     assert np.abs(back.stamps - table.stamps).max() < 1e-6
     assert np.abs(back.base_from_surface - table.base_from_surface).max() < 1e-6
     assert np.allclose(back.covariance, table.covariance, rtol=1e-8)
-    assert np.allclose(back.twist, table.twist, rtol=1e-8)
-    assert np.array_equal(back.moving, table.moving)
+    assert np.allclose(back.twist, table.twist, rtol=1e-8) and np.array_equal(back.moving, table.moving)
     for name in ("onset", "moved", "turned"):
         assert np.allclose(getattr(back, name), getattr(table, name), atol=1e-6, equal_nan=True)
     for name in ("offsets", "offset_sigmas", "seconds"):
@@ -86,12 +78,9 @@ def test_a_file_from_before_the_clocks_were_learned_is_read(tmp_path: Path) -> N
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([row[i] for i in kept] for row in rows)
     back = read_poses(path)
-    assert not back.offsets.any()
-    assert np.isnan(back.offset_sigmas).all()
-    assert back.offsets.shape == back.offset_sigmas.shape == (5, 3)
-    assert back.stages == table.stages
-    assert np.abs(back.seconds - table.seconds).max() < 1e-7
-    assert np.array_equal(back.used, table.used)
+    assert not back.offsets.any() and np.isnan(back.offset_sigmas).all()
+    assert back.offsets.shape == back.offset_sigmas.shape == (5, 3) and back.stages == table.stages
+    assert np.abs(back.seconds - table.seconds).max() < 1e-7 and np.array_equal(back.used, table.used)
 
 
 def test_a_pose_that_is_not_known_yet_round_trips(tmp_path: Path) -> None:
@@ -99,8 +88,7 @@ def test_a_pose_that_is_not_known_yet_round_trips(tmp_path: Path) -> None:
     table.base_from_surface[0, :3] = np.nan
     table.covariance[0] = np.inf
     back = read_poses(write(tmp_path, table))
-    assert np.isnan(back.base_from_surface[0, :3]).all()
-    assert np.isinf(back.covariance[0]).all()
+    assert np.isnan(back.base_from_surface[0, :3]).all() and np.isinf(back.covariance[0]).all()
 
 
 def test_tum_holds_the_measured_poses_and_loads_in_evo(tmp_path: Path) -> None:
@@ -181,8 +169,7 @@ def test_a_trajectory_comes_back(
     back = read_tum(path, True)
     assert back.stamps.tobytes() == stamps.tobytes()
     assert back.base_from_surface[:, :3, 3].tobytes() == poses[:, :3, 3].tobytes()
-    assert np.abs(back.base_from_surface - poses).max() < 1e-14
-    assert back.exact
+    assert np.abs(back.base_from_surface - poses).max() < 1e-14 and back.exact
 
 
 def test_rows_written_again_are_the_same_bytes(tmp_path: Path) -> None:
@@ -199,18 +186,14 @@ GOOD = "0.0 1 2 3 0 0 0 1"
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("", "poses"),
-        ("# only words\n\n", "poses"),
-        (f"{GOOD}\n1.0 1 2 3 0 0 nan 1\n", "line 2"),
-        (f"{GOOD}\n1.0 inf 2 3 0 0 0 1\n", "line 2"),
-        (f"{GOOD}\n0.0 1 2 3 0 0 0 1\n", "line 2: stamp"),
+        ("", "poses"), ("# only words\n\n", "poses"), (f"{GOOD}\n1.0 1 2 3 0 0 nan 1\n", "line 2"),
+        (f"{GOOD}\n1.0 inf 2 3 0 0 0 1\n", "line 2"), (f"{GOOD}\n0.0 1 2 3 0 0 0 1\n", "line 2: stamp"),
         (f"# words\n{GOOD}\n-0.5 1 2 3 0 0 0 1\n", "line 3: stamp"),
         ("0.0 1 2 3 0 0 0 0\n", "line 1: length of qx qy qz qw"),
         ("0.0 1 2 3 0 0 0 1.02\n", "line 1: length of qx qy qz qw"),
-        ("0.0 1 2 3 0 0 1\n", "line 1"),
-        ("0.0 1 2 3 0 0 0 one\n", "line 1"),
+        ("0.0 1 2 3 0 0 1\n", "line 1"), ("0.0 1 2 3 0 0 0 one\n", "line 1"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_line_is_named(tmp_path: Path, text: str, what: str) -> None:
     path = tmp_path / "t.tum"
     path.write_text(text)

@@ -15,6 +15,7 @@ from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.synthetic.movements import patch
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from tests.test_estimator import joined
 
 RIG = arc_rig()
 LANDMARKS = patch(60, np.random.default_rng(3)).points
@@ -143,12 +144,7 @@ def apart(mm: float, seed: int) -> tuple[Observations, Observations]:
     along = np.random.default_rng(seed).normal(size=3)
     shift = np.r_[np.zeros(3), mm * along / np.linalg.norm(along)]
     parts = [seen(BASE_FROM_REST @ se3.exp(k * shift), seed, noise=0.0) for k in (-1, 0, 1)]
-    own = [np.flatnonzero(part.camera == c) for c, part in enumerate(parts)]
-    camera, track, pixels, sigma = (
-        np.concatenate([getattr(part, name)[mine] for part, mine in zip(parts, own, strict=True)])
-        for name in ("camera", "track", "pixels", "sigma")
-    )
-    return Observations(0.0, camera, track, pixels, sigma), parts[1]
+    return joined(0.0, [part.only(part.camera == c) for c, part in enumerate(parts)]), parts[1]
 
 
 @pytest.mark.parametrize("mm", [0.3, 1.0, 3.0])

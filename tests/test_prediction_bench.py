@@ -1,7 +1,4 @@
-"""The bench of forecasts: its methods beside motions of which the answer is known. The bench of smoothing: what it
-counts, and one small run. The bench of the link: everything goes wrong in its runs, and what must not happen is
-counted when it does.
-"""
+"""The benches of forecasts, smoothing and the link: known answers, small runs, what must not happen counted."""
 
 from __future__ import annotations
 
@@ -63,8 +60,7 @@ def gliding(speed: float) -> Chest:
 def test_hold_is_off_by_the_way_and_constant_velocity_by_nothing_on_a_steady_glide() -> None:
     errors = errors_of(gliding(5.0), WARM)
     assert errors.hold == pytest.approx(5.0 * np.array(AHEAD), rel=1e-9)
-    assert np.abs(errors.steady).max() < 1e-9
-    assert (errors.ours < 0.02 * errors.hold).all()
+    assert np.abs(errors.steady).max() < 1e-9 and (errors.ours < 0.02 * errors.hold).all()
 
 
 def test_breathing_of_the_simulator_is_foretold_better_than_it_is_held() -> None:

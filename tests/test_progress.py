@@ -74,9 +74,8 @@ def test_any_checkpoint_can_be_the_first(checkpoint: int) -> None:
     planner = Planner(path, MotionLimits(), CLOSE, TICK, start=checkpoint)
     assert (planner.progress.printed, planner.progress.fraction) == (checkpoint, checkpoint)
     intervals = printed_by(planner, 10.0, 6.0)
-    lengths = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1))]
-    )
+    steps = np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(steps)])
     assert planner.progress.phase is PrintPhase.FINISHED
     if checkpoint == 5:
         assert intervals == []

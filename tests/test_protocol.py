@@ -1,6 +1,4 @@
-"""The wire: golden bytes, round trips, and no frame taken that encode could not have made. The arm's replies: golden
-bytes, round trips, and a reader that lives with the stray bytes of the thesis.
-"""
+"""The wire and the arm's replies: golden bytes, round trips, no frame taken that encode could not make."""
 
 from __future__ import annotations
 
@@ -74,8 +72,7 @@ GOLDEN: list[tuple[Instruction, Dialect, str]] = [
 @pytest.mark.parametrize(("instruction", "dialect", "expected"), GOLDEN)
 def test_golden_bytes(instruction: Instruction, dialect: Dialect, expected: str) -> None:
     frame = encode(instruction, dialect)
-    assert frame.hex() == expected.replace(" ", "")
-    assert len(frame) == FRAME_LENGTH
+    assert frame.hex() == expected.replace(" ", "") and len(frame) == FRAME_LENGTH
 
 
 def test_the_fields_stand_where_the_thesis_puts_them() -> None:
@@ -106,17 +103,13 @@ def test_a_control_frame_comes_back_in_any_dialect(instruction: Instruction, dia
 
 
 @given(st.lists(st.floats(-1e30, 1e30), min_size=3, max_size=3), st.floats(1e-30, 1e30), DIALECTS)
-def test_pauses_and_origins_come_back_to_single_precision(
-    origin: list[float], duration: float, dialect: Dialect
-) -> None:
+def test_pauses_and_origins_return_to_single_precision(origin: list[float], duration: float, dialect: Dialect) -> None:
     frame = encode(G54(np.array(origin)), dialect)
     back = decode(frame, dialect)
     assert encode(back, dialect) == frame
-    assert isinstance(back, G54)
-    assert np.allclose(back.origin, origin, rtol=6e-8, atol=1e-37)
+    assert isinstance(back, G54) and np.allclose(back.origin, origin, rtol=6e-8, atol=1e-37)
     pause = decode(encode(G4(duration)))
-    assert isinstance(pause, G4)
-    assert pause.duration == pytest.approx(duration, rel=6e-8)
+    assert isinstance(pause, G4) and pause.duration == pytest.approx(duration, rel=6e-8)
 
 
 @given(st.binary(min_size=0, max_size=60), DIALECTS)
@@ -130,9 +123,7 @@ def test_noise_is_no_frame(noise: bytes, dialect: Dialect) -> None:
     st.lists(st.tuples(st.integers(0, FRAME_LENGTH - 1), st.integers(0, 255)), min_size=1, max_size=6),
     DIALECTS,
 )
-def test_every_frame_taken_is_one_that_encode_makes(
-    frame: bytes, changes: list[tuple[int, int]], dialect: Dialect
-) -> None:
+def test_every_frame_taken_is_one_encode_makes(frame: bytes, changes: list[tuple[int, int]], dialect: Dialect) -> None:
     changed = bytearray(frame)
     for place, value in changes:
         changed[place] = value
@@ -160,19 +151,13 @@ def test_dialects_do_not_understand_each_others_moves() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        G1(np.array([np.nan, 0, 0, 0, 0, 0]), 5.0),
-        G1(np.array([0, 0, 0, np.inf, 0, 0]), 5.0),
-        G1(np.array([1e39, 0, 0, 0, 0, 0]), 5.0),
-        G1(np.zeros(6), 0.0),
-        G1(np.zeros(6), -1.0),
-        G1(np.zeros(6), np.nan),
-        G1(np.zeros(6), 1e-60),
-        G4(0.0),
-        G4(-0.001),
-        G4(np.inf),
-        G54(np.array([0, np.nan, 0])),
-        Mode(1),
-        Mode(-9),
+        *(
+            G1(np.array(axes), 5.0)
+            for axes in ([np.nan, 0, 0, 0, 0, 0], [0, 0, 0, np.inf, 0, 0], [1e39, 0, 0, 0, 0, 0])
+        ),
+        *(G1(np.zeros(6), feed) for feed in (0.0, -1.0, np.nan, 1e-60)),
+        *(G4(duration) for duration in (0.0, -0.001, np.inf)),
+        *(G54(np.array([0, np.nan, 0])), Mode(1), Mode(-9)),
     ],
 )
 def test_what_no_frame_can_hold_is_refused(wrong: Instruction) -> None:
@@ -297,9 +282,7 @@ def test_what_no_reply_can_hold_is_refused(wrong: float) -> None:
 
 
 @given(st.lists(st.tuples(kinds, counts), max_size=6), st.integers(1, 20), st.data())
-def test_single_stray_bytes_between_replies_cost_none(
-    replies: list[tuple[ReplyKind, list[int]]], step: int, data: st.DataObject
-) -> None:
+def test_stray_bytes_cost_no_reply(replies: list[tuple[ReplyKind, list[int]]], step: int, data: st.DataObject) -> None:
     strays = [data.draw(st.binary(max_size=1)) for _ in replies]
     frames = [reply(*r) for r in replies]
     sent = b"".join(stray + frame for stray, frame in zip(strays, frames, strict=True))

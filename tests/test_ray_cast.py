@@ -1,6 +1,4 @@
-"""Rays meet a scan where geometry says: planes and spheres in closed form, any triangles by brute force. A scan is
-found where it lies in the pictures, landmarks lie on it, and what its shape leaves open is said.
-"""
+"""Rays against closed forms and brute force; a scan found in the pictures, and what its shape leaves open."""
 
 from __future__ import annotations
 

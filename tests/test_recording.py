@@ -1,6 +1,4 @@
-"""Recordings: every record comes back, and what could not come back is refused when it is written. An image in a
-recording is what ROS reads as one, and bytes that are none are refused.
-"""
+"""Recordings: every record comes back, what could not is refused; images are what ROS reads as one."""
 
 from __future__ import annotations
 
@@ -63,18 +61,11 @@ def test_frames_that_arrive_late_are_put_in_order(tmp_path: Path) -> None:
 
 
 @given(stamp=EXACT_STAMPS, seed=st.integers(0, 2**32 - 1), size=st.integers(0, 5), data=st.binary(max_size=60))
-def test_every_record_comes_back_bit_by_bit(
-    tmp_path_factory: pytest.TempPathFactory, stamp: float, seed: int, size: int, data: bytes
-) -> None:
+def test_round_trips(tmp_path_factory: pytest.TempPathFactory, stamp: float, seed: int, size: int, data: bytes) -> None:
     path = tmp_path_factory.mktemp("r") / "x.mcap"
     draw = np.random.default_rng(seed)
-    seen = Observations(
-        stamp,
-        draw.integers(0, 3, size),
-        draw.integers(0, 2**62, size),
-        draw.normal(size=(size, 2)) * 1e3,
-        draw.random(size),
-    )
+    camera, track = draw.integers(0, 3, size), draw.integers(0, 2**62, size)
+    seen = Observations(stamp, camera, track, draw.normal(size=(size, 2)) * 1e3, draw.random(size))
     move, hold = Move(stamp, draw.normal(size=6), 1 / 3, 7, True), Hold(stamp, 0.1, "pose is old")
     with Recorder(path, rig()) as recorder:
         for record in (seen, pose(stamp, seed), move, hold, move):
@@ -93,14 +84,11 @@ def test_every_record_comes_back_bit_by_bit(
     for name in ("base_from_surface", "covariance", "twist", "twist_covariance", "acceleration_psd"):
         assert getattr(estimate, name).tobytes() == getattr(pose(stamp, seed), name).tobytes()
     assert (estimate.stamp, estimate.state, estimate.reason) == (stamp, TrackState.DEGRADED, 'why "so"')
-    warp = pose(stamp, seed).warp
-    assert warp is not None and estimate.warp is not None
-    for field in fields(warp):
-        assert np.array_equal(getattr(estimate.warp, field.name), getattr(warp, field.name))
-    forecast = pose(stamp, seed).forecast
-    assert forecast is not None and estimate.forecast is not None
-    for field in fields(forecast):
-        assert np.array_equal(getattr(estimate.forecast, field.name), getattr(forecast, field.name))
+    for name in ("warp", "forecast"):
+        written, read = getattr(pose(stamp, seed), name), getattr(estimate, name)
+        assert written is not None and read is not None
+        for field in fields(written):
+            assert np.array_equal(getattr(read, field.name), getattr(written, field.name))
     assert repr(estimate.motion) == repr(pose(stamp, seed).motion)  # NaN equals nothing, but is written like itself
     first, second, third = channels.read_commands(path)
     assert isinstance(first, Move) and isinstance(third, Move) and second == hold
@@ -212,9 +200,7 @@ class LibraryWriter:
 
 
 @pytest.mark.parametrize("compress", [True, False])
-def test_an_index_kept_as_bytes_gives_the_very_file_and_holds_nothing_of_its_chunks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compress: bool
-) -> None:
+def test_an_index_as_bytes_gives_the_very_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compress: bool) -> None:
     def record(name: str) -> tuple[bytes, int]:
         with Recorder(tmp_path / name, rig(), compress=compress) as recorder:
             recorder.attach("notes.txt", b"before all")
@@ -254,9 +240,8 @@ def test_bytes_that_are_cut_are_refused(data: bytes, cut: int) -> None:
 
 
 def test_a_time_that_ros_cannot_tell_is_its_last() -> None:
-    stamp = STORE.deserialize_cdr(
-        pack_image("png", b"", "", (MAX_TIME_SECOND + 9) * 10**9 + 7), IMAGE_SCHEMA_NAME
-    ).header.stamp
+    packed = pack_image("png", b"", "", (MAX_TIME_SECOND + 9) * 10**9 + 7)
+    stamp = STORE.deserialize_cdr(packed, IMAGE_SCHEMA_NAME).header.stamp
     assert (stamp.sec, stamp.nanosec) == (MAX_TIME_SECOND, 7)
 
 
@@ -278,9 +263,8 @@ def test_an_image_that_is_broken_inside_a_sound_file_is_named(tmp_path: Path) ->
     path = tmp_path / "x.mcap"
     with Recorder(path, rig(2)) as recorder:
         recorder.write(Frame(0, 0.0, image(0, 0)))
-    stored = next(
-        m for part in walk(path) if isinstance(part, ChunkMessages) for m in part.messages if "image" in m.topic
-    )
+    chunks = (part for part in walk(path) if isinstance(part, ChunkMessages))
+    stored = next(message for chunk in chunks for message in chunk.messages if "image" in message.topic)
     assert isinstance(stored, StoredMessage) and unpack_image(stored.data) == encode(image(0, 0))
     with Recorder(path, rig(2), overwrite=True) as recorder:
         recorder.encoded_frame(0, 0.0, "png", b"no picture")

@@ -181,11 +181,7 @@ def old_image(picture: Image) -> dict[str, str]:
 FRAME = {"stamp": 0.0, "camera_stamp": 0.0, "camera": 0, "number": 0}
 HEAD = {"stamp": 0.0, "position": [1, 2, 3], "quaternion": [0, 0, 0, 1], "extruding": False}
 RIG = message_from_rig(rig(2))
-ONE_FRAME = [
-    ("/rig", RIG),
-    ("/camera/left/image", old_image(image(0, 0))),
-    ("/frames", FRAME),
-]
+ONE_FRAME = [("/rig", RIG), ("/camera/left/image", old_image(image(0, 0))), ("/frames", FRAME)]
 
 
 @pytest.mark.parametrize(
@@ -215,9 +211,7 @@ ONE_FRAME = [
         ([("/rig", RIG), ("/camera/left/image", {"data": 3}), ("/frames", FRAME)], "an encoded image"),
     ],
 )
-def test_a_sound_file_with_the_wrong_content_is_one_error(
-    tmp_path: Path, messages: list[tuple[str, object]], words: str
-) -> None:
+def test_wrong_content_is_one_error(tmp_path: Path, messages: list[tuple[str, object]], words: str) -> None:
     foreign(tmp_path / "x.mcap", messages)
     with pytest.raises(InputError) as caught:
         open_session(tmp_path / "x.mcap")

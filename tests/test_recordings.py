@@ -1,6 +1,4 @@
-"""The real recordings beside the project, tracked from end to end by pixels, calibration and region alone. Recorded
-motions: what is written in the file comes out, without its noise, and every unusable file is named.
-"""
+"""The real recordings tracked end to end; recorded motions: each unusable file is named."""
 
 from __future__ import annotations
 
@@ -97,9 +95,7 @@ def test_every_frame_set_has_a_pose_and_its_state_says_why(recording: tuple[Reco
     assert all(p.state is TrackState.INITIALISING for p in run.poses if p.stamp < start - 0.1)
 
 
-def test_the_surface_is_followed_as_well_as_is_asked_and_no_tracked_pose_is_far_off(
-    recording: tuple[Recording, Run],
-) -> None:
+def test_the_surface_is_followed_as_asked_and_no_tracked_pose_is_far_off(recording: tuple[Recording, Run]) -> None:
     wanted, run = recording
     away, tracking = run.errors()
     assert run.followed().mean() >= FOLLOWED and len(away) > 0.9 * run.followed().sum() - 2
@@ -159,8 +155,7 @@ def test_the_twist_is_the_poses_velocity(tmp_path_factory: pytest.TempPathFactor
     motion, times = play(path, loop=loop), start + np.linspace(0, 3, 50)
     quotient = se3.log(se3.inverse(motion(times - H)) @ motion(times + H)) / (2 * H)
     error = np.abs(quotient - motion.twist(times))
-    assert np.median(error) < 1e-6
-    assert error.max() < 1e-2
+    assert np.median(error) < 1e-6 and error.max() < 1e-2
     assert np.abs(np.diff(motion.twist(times[0] + np.linspace(0, 0.05, 51)), axis=0)).max() < 0.2  # no jump of speed
 
 
@@ -239,11 +234,8 @@ def write_csv(path: Path, header: str, rows: Array) -> None:
 def test_csv_column_units(tmp_path: Path, header: str, factors: tuple[float, float, float], rate: float | None) -> None:
     times = np.arange(0, 9, 0.04)
     rows = chest(times)
-    write_csv(
-        tmp_path / "a.csv",
-        header,
-        np.column_stack([times * factors[0], rows[:, 3:] * factors[1], rows[:, :3] * factors[2]]),
-    )
+    columns = [times * factors[0], rows[:, 3:] * factors[1], rows[:, :3] * factors[2]]
+    write_csv(tmp_path / "a.csv", header, np.column_stack(columns))
     trace = read_trace(tmp_path / "a.csv", rate_hz=rate)
     expected = poses_of(rows)
     assert np.allclose(trace.stamps, times)
@@ -292,14 +284,11 @@ def changed(row: int, column: int, value: float) -> Array:
         ("t_s,tx_mm,ty_mm,tz_mm,rx_deg,ry_deg,rz_deg", np.c_[GOOD, GOOD[:, 1:] * 90], {}, "rotation", "150"),
     ],
 )
-def test_a_csv_that_cannot_be_used_is_named(
-    tmp_path: Path, header: str, rows: Array, more: dict[str, Any], what: str, allowed: str
-) -> None:
+def test_unusable_csvs(tmp_path: Path, header: str, rows: Array, more: dict[str, Any], what: str, allowed: str) -> None:
     write_csv(tmp_path / "a.csv", header, rows)
     with pytest.raises(InputError) as caught:
         play(tmp_path / "a.csv", **more)
-    assert caught.value.where == str(tmp_path / "a.csv")
-    assert caught.value.what == what
+    assert caught.value.where == str(tmp_path / "a.csv") and caught.value.what == what
     assert allowed in caught.value.allowed
 
 

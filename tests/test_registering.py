@@ -1,6 +1,4 @@
-"""Registering by the skin's texture: tracks are carried onto the true surface, and the tracker's frame comes out.
-Laying a path onto a surface: at its height, in short pieces, and nothing else changed.
-"""
+"""Registering by the skin's texture carries tracks onto the true surface; laying a path onto a surface."""
 
 from __future__ import annotations
 
@@ -28,9 +26,8 @@ from planning.path import check_path, way_lengths
 from tests.moving import path_through, raster
 
 RIG = arc_rig()
-MOTION = motion_from_tables(
-    "test", [{"kind": "ramp", "speed_mm_s": [5.0, -3.0, 8.0], "speed_deg_s": [3.0, 2.0, -4.0]}], Path("."), 0
-)
+RAMP = {"kind": "ramp", "speed_mm_s": [5.0, -3.0, 8.0], "speed_deg_s": [3.0, 2.0, -4.0]}
+MOTION = motion_from_tables("test", [RAMP], Path("."), 0)
 EXPOSED = np.array([1.0, 1.004, 0.989])  # s: cameras that do not fire together
 STRAINED = Deformation((0.03, -0.02), bulge=2.0, radius=20.0)
 
@@ -90,8 +87,7 @@ def test_a_ray_that_passes_the_surface_by_meets_nothing() -> None:
     found, met = surface_points(replace(observations, pixels=pixels), RIG, true, shape, EXPOSED)
     assert met[2::3].all()
     assert np.abs(found - points)[2::3].max() < 1e-4
-    assert not met[::3].any()
-    assert not met[1::3].any()
+    assert not met[::3].any() and not met[1::3].any()
 
 
 def moved(rig: Rig, shift: Array) -> Rig:
@@ -107,34 +103,23 @@ TOGETHER = np.full(3, 1.0)
 CHANGE = se3.make(se3.exp_rotation([0.3, -1.2, 2.0]), [7.0, -5.0, 3.0])  # truth_surface_from_estimated_surface
 
 
-def test_a_known_change_of_the_surface_frame_is_recovered() -> None:
+@pytest.mark.parametrize(
+    ("shift", "slip"),
+    [
+        (np.eye(4), np.eye(4)),
+        (se3.make(se3.exp_rotation([0.01, 0.02, -0.01]), [0.3, -0.2, 0.5]), np.eye(4)),
+        (np.eye(4), se3.exp([0.001, 0, 0, 0, 0.2, 0])),
+    ],
+    ids=["exact", "shifted rig", "pose that is off"],
+)
+def test_a_change_of_the_surface_frame_is_recovered(shift: Array, slip: Array) -> None:
+    """What the rig has wrong shifts all alike: the frame on the skin is the same. What the tracker's first pose has
+    wrong is laid into the path, as it would be by an operator."""
     shape = shapes()["wound"]
     true = truth(shape)
     observations, _ = seen(shape, true, TOGETHER)
-    pose = at(true.base_from_surface(TOGETHER)[0] @ CHANGE)
-    found = truth_from_estimate(pose, observations, (RIG, RIG), true, shape, TOGETHER)
-    assert found == pytest.approx(CHANGE, abs=1e-5)
-
-
-def test_what_the_rig_has_wrong_stays_in_the_pose_and_not_in_the_change() -> None:
-    """A tracker that was told a shifted rig sees everything shifted: its frame on the skin is the same."""
-    shape = shapes()["wound"]
-    true = truth(shape)
-    observations, _ = seen(shape, true, TOGETHER)
-    shift = se3.make(se3.exp_rotation([0.01, 0.02, -0.01]), [0.3, -0.2, 0.5])
-    pose = at(shift @ true.base_from_surface(TOGETHER)[0] @ CHANGE)
+    pose = at(shift @ true.base_from_surface(TOGETHER)[0] @ CHANGE @ slip)
     found = truth_from_estimate(pose, observations, (RIG, moved(RIG, shift)), true, shape, TOGETHER)
-    assert found == pytest.approx(CHANGE, abs=1e-5)
-
-
-def test_a_pose_that_is_off_by_itself_shows_in_the_change() -> None:
-    """What the tracker's first pose has wrong is laid into the path, as it would be by an operator."""
-    shape = shapes()["wound"]
-    true = truth(shape)
-    observations, _ = seen(shape, true, TOGETHER)
-    slip = se3.exp([0.001, 0, 0, 0, 0.2, 0])
-    pose = at(true.base_from_surface(TOGETHER)[0] @ CHANGE @ slip)
-    found = truth_from_estimate(pose, observations, (RIG, RIG), true, shape, TOGETHER)
     assert found == pytest.approx(CHANGE @ slip, abs=1e-5)
 
 
@@ -184,8 +169,7 @@ def test_a_new_checkpoint_takes_after_the_next_of_the_old_ones() -> None:
     fine = divide_path(path, 1.0)
     assert fine.speed.tolist() == [1, 2, 2, 2, 3, 3, 3]
     assert fine.extrude.tolist() == [False, True, True, True, False, False, False]
-    assert fine.layer.tolist() == [0, 1, 1, 1, 2, 2, 2]
-    assert fine.extra["note"].tolist() == list("abbbccc")
+    assert fine.layer.tolist() == [0, 1, 1, 1, 2, 2, 2] and fine.extra["note"].tolist() == list("abbbccc")
     assert fine.surface_from_nozzle[:, 0, 3] == pytest.approx([0, 1, 2, 3, 3, 3, 3])
     check_path(fine)
 
@@ -240,5 +224,4 @@ def test_the_layers_of_a_path_stay_above_each_other() -> None:
     places = drape_path(both, shape, 0.4).surface_from_nozzle[:, :3, 3]
     above = places[:, 2] - shape.heights_at(places[:, :2])
     half = len(above) // 2
-    assert above[: half - 1] == pytest.approx(0.4)
-    assert above[half + 1 :] == pytest.approx(1.1)
+    assert above[: half - 1] == pytest.approx(0.4) and above[half + 1 :] == pytest.approx(1.1)

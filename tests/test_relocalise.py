@@ -1,6 +1,4 @@
-"""Finding the surface again: anywhere in the image, and not where it is not. Landmarks are found again where the tracks
-do not have them: right, before they joined, and where all were lost.
-"""
+"""Finding the surface again anywhere in the image, not where it is not; landmarks found beside the tracks."""
 
 from __future__ import annotations
 
@@ -93,19 +91,14 @@ def test_each_camera_finds_its_own_instant(search: Relocaliser) -> None:
         assert off(found.single[camera], pose)[0] < 4.0
 
 
-def test_the_room_is_not_the_surface(search: Relocaliser) -> None:
-    assert search.find(look(AWAY)) is None
-
-
-def test_another_surface_is_not_this_one(search: Relocaliser) -> None:
-    assert search.find(look(BASE_FROM_REST, patch(7, wound=WIDE))) is None
+def test_neither_the_room_nor_another_surface_is_this_one(search: Relocaliser) -> None:
+    assert search.find(look(AWAY)) is None and search.find(look(BASE_FROM_REST, patch(7, wound=WIDE))) is None
 
 
 @pytest.mark.parametrize("level", [0, 128])
 def test_nothing_is_found_in_even_images(search: Relocaliser, level: int) -> None:
-    blank = Pyramid(np.full((720, 1280), level, np.uint8))
-    assert search.find(dict.fromkeys(range(3), blank)) is None
-    assert search.find({}) is None
+    blank = pyramid(np.full((720, 1280), level, np.uint8))
+    assert search.find(dict.fromkeys(range(3), blank)) is None and search.find({}) is None
 
 
 def test_a_blind_camera_does_not_hide_what_the_others_see(search: Relocaliser) -> None:
@@ -114,15 +107,11 @@ def test_a_blind_camera_does_not_hide_what_the_others_see(search: Relocaliser) -
     assert found is not None and 1 not in found.single and off(found.base_from_surface, BASE_FROM_REST)[0] < 1.5
 
 
-def test_before_anything_is_learned_nothing_is_found() -> None:
-    assert Relocaliser(Lenses(RIG)).find(look(BASE_FROM_REST)) is None
-
-
-def test_a_surface_out_of_view_teaches_nothing() -> None:
-    search = Relocaliser(Lenses(RIG))
-    aside = BASE_FROM_REST @ se3.exp(np.array([0, 0, 0, 2000.0, 0, 0]))
-    search.learn(0, look(BASE_FROM_REST)[0][0], aside, MAP)
-    assert search.find(look(BASE_FROM_REST)) is None
+def test_before_anything_is_learned_nothing_is_found_and_a_surface_out_of_view_teaches_nothing() -> None:
+    search, seen = Relocaliser(Lenses(RIG)), look(BASE_FROM_REST)
+    assert search.find(seen) is None
+    search.learn(0, seen[0][0], BASE_FROM_REST @ se3.exp(np.array([0, 0, 0, 2000.0, 0, 0])), MAP)
+    assert search.find(seen) is None
 
 
 def test_two_runs_give_the_same_bits(search: Relocaliser) -> None:

@@ -1,6 +1,4 @@
-"""Replay: poses and ticks merged by stamp, files that can be read, and the same bytes every time. The reference
-recordings: what is kept of them comes again, and a change is found, told, and taken by one command.
-"""
+"""Replay: poses and ticks merged by stamp, the same bytes every time; changes of reference recordings are found."""
 
 from __future__ import annotations
 
@@ -65,8 +63,7 @@ def test_the_newest_pose_that_has_arrived_is_the_one_used(delay: float) -> None:
         arrived = stamps[stamps + delay <= now]
         assert used == (arrived[-1] if len(arrived) else None)
     ticks = np.array([now for now, _ in motion.given])
-    assert ticks[0] == stamps[0]
-    assert np.allclose(np.diff(ticks), 0.02)
+    assert ticks[0] == stamps[0] and np.allclose(np.diff(ticks), 0.02)
     assert ticks[-2] < stamps[-1] + delay <= ticks[-1]
     assert motion.given[-1][1] == stamps[-1]
 
@@ -83,11 +80,8 @@ def test_poses_are_asked_for_only_when_they_are_due() -> None:
         assert asked[-1] <= now + 1 / 30 + 1e-9
 
 
-def test_no_poses_are_no_ticks() -> None:
+def test_no_poses_are_no_ticks_and_poses_out_of_order_are_refused() -> None:
     assert list(replay([], MotionStep(raster()))) == []
-
-
-def test_poses_out_of_order_are_refused() -> None:
     stream = list(poses(breathing, 0.5))
     with pytest.raises(InputError, match="stamp"):
         list(replay(stream[::-1], MotionStep(raster())))
@@ -125,22 +119,19 @@ def test_the_two_files_say_the_same(tmp_path: Path) -> None:
             commands.append(command)
             assert (tmp_path / "frames.bin").stat().st_size == 48 * len(commands)  # nothing is kept back
     rows, frames = read(tmp_path)
-    assert len(rows) == len(frames) == len(commands)
-    assert tuple(rows[0]) == COMMAND_COLUMNS
+    assert len(rows) == len(frames) == len(commands) and tuple(rows[0]) == COMMAND_COLUMNS
     assert {row["kind"] for row in rows} == {"move", "hold"}
     for row, frame, command in zip(rows, frames, commands, strict=True):
         sent = decode(frame)
         assert float(row["stamp_s"]) == pytest.approx(command.stamp, abs=1e-6)
         if isinstance(sent, G1):
             shown = [float(row[name]) for name in COMMAND_COLUMNS[2:9]]
-            assert np.allclose(
-                shown, [*sent.axes[:3], *np.rad2deg(sent.axes[3:]), sent.feed * 60], rtol=1e-6, atol=2e-5
-            )
+            told = [*sent.axes[:3], *np.rad2deg(sent.axes[3:]), sent.feed * 60]
+            assert np.allclose(shown, told, rtol=1e-6, atol=2e-5)
             assert isinstance(command, Move)
             assert (row["checkpoint"], row["extrude"]) == (str(command.checkpoint), str(int(command.extrude)))
         else:
-            assert isinstance(sent, G4)
-            assert float(row["hold_ms"]) == pytest.approx(1.0)
+            assert isinstance(sent, G4) and float(row["hold_ms"]) == pytest.approx(1.0)
             assert row["reason"]
 
 
@@ -148,9 +139,8 @@ def test_the_same_bytes_in_every_process() -> None:
     digests = set()
     for seed in ("0", "1"):
         environment = {**os.environ, "PYTHONHASHSEED": seed}
-        done = subprocess.run(
-            [sys.executable, "-c", DIGEST], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-        )
+        command = [sys.executable, "-c", DIGEST]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
         digests.add(done.stdout.strip())
     frames = b"".join(frame_from_command(c) for _, c in replay(poses(breathing, 10.0), MotionStep(raster())))
     assert digests == {hashlib.sha256(frames).hexdigest()}

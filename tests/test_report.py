@@ -1,6 +1,4 @@
-"""Report.html: well-formed, alone in the world, and true to the run. The laws of judging a run: nothing wrong gives
-zero, a known wrong gives itself.
-"""
+"""Report.html: well-formed, self-contained, true to the run; the laws of judging a run."""
 
 from __future__ import annotations
 
@@ -182,8 +180,7 @@ def test_another_surface_frame_is_no_error(seed: int) -> None:
     comparison = compare(*run(20, surface_change=change))
     assert comparison is not None
     for errors in (comparison.start, comparison.aligned):
-        assert errors.translation.max() < 1e-8
-        assert errors.rotation.max() < 1e-8
+        assert errors.translation.max() < 1e-8 and errors.rotation.max() < 1e-8
         assert np.abs(errors.truth_surface_from_estimated_surface - change).max() < 1e-8
 
 
@@ -291,18 +288,15 @@ def test_latency_leaves_the_initialisation_out() -> None:
     table.seconds[:6] = 5.0
     late = latency(table)
     assert (late.initial_sets, late.initialisation) == (6, pytest.approx(30_000))
-    assert late.max.max() < 1000
-    assert np.allclose(late.p50, 1000 * np.median(table.seconds[6:], axis=0))
-    assert (late.p50 <= late.p95).all()
-    assert (late.p95 <= late.p99).all()
+    assert late.max.max() < 1000 and np.allclose(late.p50, 1000 * np.median(table.seconds[6:], axis=0))
+    assert (late.p50 <= late.p95).all() and (late.p95 <= late.p99).all()
     assert len(late.total) == 99
 
 
 def test_a_run_that_never_initialised_has_no_latency() -> None:
     table, truth = run(5, states={i: TrackState.INITIALISING for i in range(5)})
     result = evaluate(table, truth, "short")
-    assert np.isnan(result.latency.p50).all()
-    assert result.latency.initial_sets == 5
+    assert np.isnan(result.latency.p50).all() and result.latency.initial_sets == 5
     assert result.comparison is None
     assert "0 of 5" in verdict(result)[0]
 
@@ -319,8 +313,7 @@ def test_the_summary_is_plain_json_and_says_the_same_again(tmp_path: Path) -> No
     result = evaluate(*run(60, sigma=SIGMA), "monday")
     write_summary(tmp_path / "summary.json", result)
     loaded = json.loads((tmp_path / "summary.json").read_text(), parse_constant=pytest.fail)
-    assert loaded == as_dict(result)
-    assert loaded["states_since_s"] is None
+    assert loaded == as_dict(result) and loaded["states_since_s"] is None
     assert loaded["errors"]["start"]["translation_mm"]["max"] > 0
     assert text_of(loaded) == summary_text(result)
 

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from estimation import se3
 from estimation.pose import SurfacePose
 from hardware.bench.planner import SwingingSurface, random_path
 from planning.limits import MotionLimits
 from planning.motion.curve import CORNER_SPEED_CHANGE, CORNER_TOLERANCE, PathCurve, curve_through, gridpoints_on
 from planning.motion.retime import LIMIT_SHARE, PATH_SPEED_SHARE, RISE_TIME, Timing, axis_derivatives, retime
+from planning.path import Path
 from planning.robot.kinematics import SimpleArm, axes_from_nozzle
-from tests.moving import Motion, pose_at, raster, still
+from tests.moving import Motion, path_through, pose_at, raster, still
 
 ARM, LIMITS = SimpleArm(), MotionLimits()
 BOUNDS = LIMITS.speed, LIMITS.acceleration
@@ -24,9 +24,12 @@ STEP = 0.02  # s, a tick
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def curve_of(seed: int) -> PathCurve:
-    path = random_path(np.random.default_rng(seed))
+def curve_on(path: Path) -> PathCurve:
     return curve_through(path.surface_from_nozzle, path.speed[1:], CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+
+
+def curve_of(seed: int) -> PathCurve:
+    return curve_on(random_path(np.random.default_rng(seed)))
 
 
 def timed(curve: PathCurve, start: float, end: float, speed: float = 0.0, motion: Motion = still) -> Timing:
@@ -64,9 +67,7 @@ def most_of_the_limits(curve: PathCurve, timing: Timing, pose: SurfacePose, end:
 @settings(max_examples=20)
 @given(SEEDS, st.sampled_from([(5.0, 0.05, 0.3), (12.0, 0.1, 0.5), (20.0, 0.0, 0.3)]), st.floats(0, 0.9))
 @example(577, (5.0, 0.05, 0.3), 0.0)
-def test_path_and_surface_together_keep_the_axes_limits(
-    seed: int, swing: tuple[float, float, float], share: float
-) -> None:
+def test_path_and_surface_together_keep_all_limits(seed: int, swing: tuple[float, float, float], share: float) -> None:
     """As long as a surface is foreseen at all, and with the surface moving so."""
     curve, pose = curve_of(seed), pose_at(SwingingSurface(*swing).at, 10.4)
     start = share * curve.length
@@ -92,9 +93,7 @@ def test_the_path_alone_keeps_well_within_the_axes_limits_at_all_its_corners(see
 
 def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
     """X may do 150 mm/s; a surface that asks 115 of TOTAL * 150 leaves 5 to a path that would go at 40."""
-    curve = curve_through(
-        raster(size=40, lines=2).surface_from_nozzle, np.full(3, 40.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE
-    )
+    curve = curve_on(raster(size=40, lines=2, speed=40.0))
     grid = gridpoints_on(curve, 0.0, 35.0)
     asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.zeros_like(asked.speed)
@@ -107,28 +106,24 @@ def test_a_surface_that_takes_most_of_an_axis_leaves_the_path_little() -> None:
 
 
 def test_a_surface_faster_than_an_axis_slows_the_path_and_does_not_stop_it() -> None:
-    curve = curve_through(raster().surface_from_nozzle, np.full(5, 40.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+    curve = curve_on(raster(speed=40.0))
     grid = gridpoints_on(curve, 0.0, 8.0)
     asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     much = np.full_like(asked.speed, 1e4)
     timing = retime(grid, replace(asked, speed=much, acceleration=much), 0.0, 10.0, BOUNDS)
-    assert isinstance(timing, Timing)
-    assert 0 < timing.speeds.max() <= 3.001
+    assert isinstance(timing, Timing) and 0 < timing.speeds.max() <= 3.001
 
 
 @settings(max_examples=15)
 @given(SEEDS)
 def test_a_speed_carried_into_narrower_limits_is_brought_down_and_not_refused(seed: int) -> None:
     draw = np.random.default_rng(seed)
-    curve = curve_through(
-        raster(size=60, lines=2).surface_from_nozzle, np.full(3, 30.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE
-    )
+    curve = curve_on(raster(size=60, lines=2, speed=30.0))
     grid = gridpoints_on(curve, 10.0, 55.0)
     asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     taken = np.broadcast_to(draw.uniform(0, 2) * LIMITS.speed, asked.speed.shape)
     timing = retime(grid, replace(asked, speed=taken), 30.0, 10.0, BOUNDS)
-    assert isinstance(timing, Timing)
-    assert timing.speeds[0] == pytest.approx(30.0, rel=0.002)
+    assert isinstance(timing, Timing) and timing.speeds[0] == pytest.approx(30.0, rel=0.002)
     slowing = -np.diff(timing.speeds**2) / (2 * np.diff(timing.places))
     assert slowing.max() <= 30.0 / RISE_TIME * 1.001
 
@@ -145,7 +140,7 @@ def test_speed_changes_by_no_more_than_the_cruising_speed_in_a_rise(seed: int) -
 def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> None:
     swing = SwingingSurface(10.0, 0.1, 0.25)
     pose = pose_at(swing.at, 10.0)
-    curve = curve_through(raster().surface_from_nozzle, np.full(5, 5.0), CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+    curve = curve_on(raster())
     grid = gridpoints_on(curve, 0.0, 4.0)
     asked = axis_derivatives(ARM, pose, curve, grid, 10.0)
     fixed = curve.poses(grid.places[:1])
@@ -157,9 +152,7 @@ def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> Non
 
 
 def test_two_places_that_are_one_have_no_timing_and_say_so() -> None:
-    curve = curve_through(
-        se3.make(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0]])), np.array([5.0]), CORNER_TOLERANCE, CORNER_SPEED_CHANGE
-    )
+    curve = curve_on(path_through(np.array([[0.0, 0, 0], [1, 0, 0]])))
     grid = gridpoints_on(curve, 0.0, 1.0)
     asked = axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0)
     reason = retime(grid, replace(asked, first=asked.first * np.nan), 0.0, 1.0, BOUNDS)

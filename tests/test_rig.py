@@ -1,6 +1,4 @@
-"""The rig's projection: OpenCV's, and undone by its own inverse. Imaged and ideal pixels: each the way back of the
-other, and no further than the lens model holds.
-"""
+"""The rig's projection is OpenCV's and undone by its inverse, no further than the lens model holds."""
 
 from __future__ import annotations
 
@@ -104,6 +102,9 @@ def lens_camera(distortion: tuple[float, ...]) -> Camera:
     return replace(arc_rig().cameras[0], distortion=np.array(distortion))
 
 
+FOLDING = replace(lens_camera((-0.9, 0.0, 0.0, 0.0, 0.0)), matrix=np.array([[400.0, 0, 640], [0, 400, 360], [0, 0, 1]]))
+
+
 def spots(lens: Camera, seed: int, count: int = 50) -> Array:
     """Pixels (N, 2) anywhere in the image."""
     return np.random.default_rng(seed).uniform(0, 1, (count, 2)) * lens.size
@@ -147,27 +148,21 @@ def test_all_that_a_lens_images_lies_within_its_field(distortion: tuple[float, .
 
 
 def test_the_field_ends_where_the_lens_model_folds_back() -> None:
-    folding = replace(
-        lens_camera((-0.9, 0.0, 0.0, 0.0, 0.0)), matrix=np.array([[400.0, 0, 640], [0, 400.0, 360], [0, 0, 1]])
-    )
-    radius = imaged_radius(folding)
+    radius = imaged_radius(FOLDING)
     fold = 1 / np.sqrt(3 * 0.9)  # where r (1 - 0.9 r^2) stops growing
     assert 0.9 * fold < radius <= fold
     r = np.linspace(0, radius, 100)
-    imaged = distort(folding, np.c_[640 + 400 * r, np.full(100, 360.0)])[:, 0]
+    imaged = distort(FOLDING, np.c_[640 + 400 * r, np.full(100, 360.0)])[:, 0]
     assert (np.diff(imaged) > 0).all()
 
 
 def test_what_folds_back_into_the_image_is_not_seen() -> None:
-    folding = replace(
-        lens_camera((-0.9, 0.0, 0.0, 0.0, 0.0)), matrix=np.array([[400.0, 0, 640], [0, 400.0, 360], [0, 0, 1]])
-    )
-    lenses = Lenses(Rig((folding,)))
+    lenses = Lenses(Rig((FOLDING,)))
     ideal = np.array([[640 + 400 * r, 360.0] for r in (0.1, 0.4, 0.75, 1.0)])
     pixels, seen = lenses.image(0, ideal, np.full(4, 300.0))
     assert seen.tolist() == [True, True, False, False]
-    assert (distort(folding, ideal[2:])[:, 0] < 1280).all()  # the bare model would put them into the image
-    assert np.allclose(pixels[:2], distort(folding, ideal[:2]))
+    assert (distort(FOLDING, ideal[2:])[:, 0] < 1280).all()  # the bare model would put them into the image
+    assert np.allclose(pixels[:2], distort(FOLDING, ideal[:2]))
 
 
 @given(st.integers(0, 10_000))
@@ -195,8 +190,7 @@ def test_undistorting_agrees_with_opencvs_picture() -> None:
     line = np.c_[np.linspace(50, 1200, 60), np.linspace(80, 650, 60)]
     k = np.linalg.inv(lens.matrix)
     rays = np.c_[line, np.ones(60)] @ k.T
-    bent = (
-        cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0].reshape(-1, 2).astype(float)
-    )
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
+    bent = pixels.reshape(-1, 2).astype(float)
     inside = ((bent > 0) & (bent < lens.size)).all(1)
     assert np.abs(bent - line).max() > 2 and np.allclose(undistort(lens, bent[inside]), line[inside], atol=1e-5)

@@ -1,12 +1,11 @@
-"""Rigs in other programs' files: what is written comes back, and what cannot be told is named. `stillbed doctor`: each
-thing that can be wrong with a machine is seen and comes with what to do.
-"""
+"""Rigs in other programs' files come back or are refused; `stillbed doctor` sees what can be wrong."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,7 +18,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
-from hardware.calibration.rig_formats import FORMATS, read_yaml
+from hardware.calibration.rig_formats import FORMATS
 from hardware.cameras.sources import CameraDevice
 from hardware.cli import doctor
 from hardware.cli.doctor import REINSTALL, LoadFailure, library_checks, load_failures
@@ -47,7 +46,7 @@ def rigs(draw: st.DrawFn) -> Rig:
 
 @pytest.mark.parametrize("name", ["opencv", "ros", "kalibr", "anipose"])
 @given(rig=rigs())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_what_is_written_comes_back(name: str, rig: Rig) -> None:
     kind = FORMATS[name]
     with TemporaryDirectory() as folder:
@@ -103,6 +102,7 @@ def test_kalibr_is_in_metres(tmp_path: Path) -> None:
         ("kalibr", "cam0: {camera_model: omni}", "cam0.camera_model"),
         ("kalibr", "cam0: [1", "file"),
         ("kalibr", "- 1", "file"),
+        ("kalibr", "a: " + 2000 * "[", "a YAML file"),
         ("opencv", "image_width: 3", "camera_matrix"),
         ("ros", "distortion_model: equidistant", "distortion_model"),
         ("anipose", "[cam_0]\nmatrix = [[1, 2], [3, 4]]", "rotation"),
@@ -118,31 +118,23 @@ def test_what_is_wrong_with_a_file_is_named(name: str, text: str, named: str, tm
 
 def test_lenses_without_places_are_no_rig(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        FORMATS["opencv"].write(tmp_path, Rig((Camera(name, *one_lens()),)))
+        FORMATS["opencv"].write(tmp_path, Rig((replace(one().cameras[0], name=name),)))
         text = (tmp_path / f"{name}.yaml").read_text()
         (tmp_path / f"{name}.yaml").write_text(text[: text.index("base_from_camera")])
     with pytest.raises(InputError, match="places of the cameras"):
         FORMATS["opencv"].read(tmp_path)
 
 
-def one_lens() -> tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
-    camera = one().cameras[0]
-    return camera.size, camera.matrix, camera.distortion, camera.base_from_camera
-
-
 def test_the_commands_carry_a_rig_there_and_back(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.toml", one(), [None])
-    assert (
-        main(["calibrate", "export", str(tmp_path / "rig.toml"), "--format", "ros", "-o", str(tmp_path / "ros")]) == 0
-    )
-    assert main(["calibrate", "import", str(tmp_path / "ros"), "--format", "ros", "-o", str(tmp_path / "b.toml")]) == 0
+    rig, ros, back = str(tmp_path / "rig.toml"), str(tmp_path / "ros"), str(tmp_path / "b.toml")
+    assert main(["calibrate", "export", rig, "--format", "ros", "-o", ros]) == 0
+    assert main(["calibrate", "import", ros, "--format", "ros", "-o", back]) == 0
     assert np.array_equal(read_rig(tmp_path / "b.toml").rig.cameras[0].matrix, one().cameras[0].matrix)
 
 
 @pytest.mark.parametrize("name", ["anipose", "ros"])
-def test_a_rig_that_stands_there_is_kept_unless_told(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_existing_rig_is_kept_unless_told(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig, out, back = tmp_path / "rig.toml", tmp_path / "other", tmp_path / "back.toml"
     write_rig(rig, one(), [None])
     there = ["calibrate", "export", str(rig), "--format", name, "-o", str(out)]
@@ -154,12 +146,6 @@ def test_a_rig_that_stands_there_is_kept_unless_told(
         assert "--force" in capsys.readouterr().err
         assert all(path.stat().st_mtime_ns == before for path, before in kept.items())
         assert main([*command, "--force"]) == 0
-
-
-def test_brackets_in_brackets_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.yaml").write_text("a: " + 2000 * "[", encoding="utf-8")
-    with pytest.raises(InputError, match="a YAML file"):
-        read_yaml(tmp_path / "x.yaml")
 
 
 WORDS = "libGL.so.1", "signal 4", "hangs: not loaded after 2 s", "still loading after 2 s"
@@ -175,11 +161,6 @@ def test_here_everything_needed_works_and_is_told_in_words_and_as_json(capsys: p
     network = next(check for check in told["devices"] if check["name"] == "wound network")
     assert network["verdict"] == "pass"
     assert all(check["remedy"] for part in told.values() for check in part if check["verdict"] != "pass")
-
-
-def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--folder", str(tmp_path / "none")]) == 2
-    assert "--folder" in capsys.readouterr().err
 
 
 def test_each_library_that_fails_is_named_however_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,8 +199,7 @@ def test_a_processor_without_its_instructions_and_little_memory_are_warnings(tmp
     assert check.verdict is WARN and "without fma" in check.found
     assert doctor.memory_check(root).verdict is WARN and "3.9 GB" in doctor.memory_check(root).found
     (root / "proc/meminfo").write_text("MemAvailable: 4100000 kB\n")
-    assert doctor.memory_check(root).verdict is PASS
-    assert doctor.memory_check(root / "nothing").verdict is WARN
+    assert doctor.memory_check(root).verdict is PASS and doctor.memory_check(root / "nothing").verdict is WARN
 
 
 def test_an_old_python_fails() -> None:
@@ -228,12 +208,9 @@ def test_an_old_python_fails() -> None:
 
 
 @pytest.mark.parametrize(("free", "verdict"), [(0.9, FAIL), (9.0, WARN), (11.0, PASS)])
-def test_the_disk_is_judged_by_what_is_free(
-    free: float, verdict: CheckVerdict, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_disk_is_judged_by_its_space(free: float, verdict: CheckVerdict, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_free_gb", lambda folder: free)
-    assert doctor.disk_check(Path()).verdict is verdict
-    assert doctor.shared_check().verdict is PASS
+    assert doctor.disk_check(Path()).verdict is verdict and doctor.shared_check().verdict is PASS
 
 
 def test_little_shared_memory_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,9 +241,7 @@ def test_an_address_that_nobody_may_listen_on_fails() -> None:
     assert doctor.loopback_check().verdict is PASS
 
 
-def test_what_is_plugged_in_but_closed_to_this_user_says_which_group_to_join(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_closed_to_this_user_says_which_group_to_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     node = tmp_path / "video0"
     node.touch()
     seen = (CameraDevice(node, "a webcam", "", "", ""),)

@@ -1,6 +1,4 @@
-"""The folder of a run: all that passes is in it as it comes, readable however the run ends. The page that is watched
-while a run goes on.
-"""
+"""The folder of a run: readable however the run ends; the page that is watched while a run goes on."""
 
 from __future__ import annotations
 
@@ -109,8 +107,7 @@ def test_however_a_run_ends_everything_until_then_can_be_read(ending: BaseExcept
         session = open_session(out / name)
         assert len(session) == 9
         assert [set(f.camera for f in s.frames) for s in session.frame_sets()] == [{0, 1, 2}] * 9
-        assert len(session.roi) == 3
-        assert session.damage == ""
+        assert len(session.roi) == 3 and session.damage == ""
         assert session.truth is not None and session.truth.exact
         assert session.truth.base_from_surface == pytest.approx(moving(session.truth.stamps), abs=1e-6)
     assert len(read_poses(out / "tracking" / "poses.csv")) == 9
@@ -125,6 +122,7 @@ def test_before_it_is_closed_the_folder_holds_all_but_the_truth(tmp_path: Path) 
         session = open_session(tmp_path / "out" / "session")
         assert (len(session), session.truth) == (4, None)
         assert len(read_nozzle(tmp_path / "out" / "nozzle.csv")) == 400
+    assert not (tmp_path / "out" / "session" / "head.csv").exists()  # the arm never moved
 
 
 def test_the_truth_holds_every_row_and_every_exposure_once_in_order(tmp_path: Path) -> None:
@@ -152,16 +150,8 @@ def test_the_print_head_is_kept_in_both_sessions_and_an_instant_told_again_is_on
         none, *found = (frames.head for frames in open_session(tmp_path / "out" / name).frame_sets())
         assert none is None
         for back, head in zip(found, heads, strict=True):
-            assert back is not None
-            assert back.base_from_nozzle == pytest.approx(head.base_from_nozzle, abs=1e-12)
+            assert back is not None and back.base_from_nozzle == pytest.approx(head.base_from_nozzle, abs=1e-12)
             assert back.extruding == head.extruding
-
-
-def test_a_run_whose_arm_never_moved_has_no_file_of_it(tmp_path: Path) -> None:
-    folder = opened(tmp_path, scenario(tmp_path))
-    with folder:
-        feed(folder, 2)
-    assert not (tmp_path / "out" / "session" / "head.csv").exists()
 
 
 def test_the_pictures_to_show_are_of_the_printing_where_there_is_one(tmp_path: Path) -> None:

@@ -1,6 +1,4 @@
-"""Scenario files: what each key does, and one line that names file and key for each that makes no sense. Scenes and
-sensors from tables: what is written is what is built, and every wrong value is named.
-"""
+"""Scenario files: what each key does, one line that names file and key for each that makes no sense."""
 
 from __future__ import annotations
 
@@ -32,13 +30,11 @@ def test_a_scenario_of_title_seconds_and_path_has_a_default_for_everything_else(
     scenario = read_scenario(file)
     assert (scenario.file, scenario.path, scenario.title, scenario.seconds) == (file, tmp_path / "x.csv", "Least", 20.0)
     assert (scenario.seed, scenario.clearance, scenario.bead, scenario.faults) == (1, None, 1.0, ())
-    assert scenario.tracking.pictures
-    assert scenario.tracking.processing == 0.02
+    assert scenario.tracking.pictures and scenario.tracking.processing == 0.02
     assert not scenario.tracking.scan
     assert (scenario.nozzle, scenario.beads, scenario.jpeg_quality, scenario.strain) == (True, True, 90, None)
     assert [camera.name for camera in scenario.rig.cameras] == ["cam_0", "cam_1", "cam_2"]
-    assert np.array_equal(scenario.motion(np.array([3.0]))[0], np.eye(4))
-    assert scenario.limits == {}
+    assert np.array_equal(scenario.motion(np.array([3.0]))[0], np.eye(4)) and scenario.limits.names == ()
 
 
 def test_the_motion_knows_all_of_the_lag_that_there_is_unless_told_otherwise(tmp_path: Path) -> None:
@@ -46,11 +42,9 @@ def test_the_motion_knows_all_of_the_lag_that_there_is_unless_told_otherwise(tmp
     usual = read_scenario(write_scenario(tmp_path))
     assert usual.profile.lag == pytest.approx(0.02 + wire)
     slow = read_scenario(write_scenario(tmp_path, arm={"dead_time_s": 0.1, "servo_lag_s": 0.05, "wire_baud": math.inf}))
-    assert slow.profile.lag == pytest.approx(0.15)
-    assert slow.baud == math.inf
+    assert slow.profile.lag == pytest.approx(0.15) and slow.baud == math.inf
     told = read_scenario(write_scenario(tmp_path, arm={"dead_time_s": 0.1, "assumed_lag_s": 0.0}))
-    assert told.profile.lag == 0.0
-    assert told.arm.dead_time == 0.1
+    assert told.profile.lag == 0.0 and told.arm.dead_time == 0.1
 
 
 def test_the_arm_is_placed_so_that_the_resting_surface_lies_level_below_its_home(tmp_path: Path) -> None:
@@ -105,17 +99,15 @@ def test_words_become_what_they_say(tmp_path: Path) -> None:
     assert (scenario.jpeg_quality, scenario.nozzle, scenario.beads) == (None, False, False)
     assert scenario.scene == {"body": "chest"}
     assert [fault.kind for fault in scenario.faults] == [FaultKind.STALL, FaultKind.STUCK]
-    assert scenario.strain is not None
-    assert scenario.strain(np.array([1.0])) == pytest.approx([1.0])
+    assert scenario.strain is not None and scenario.strain(np.array([1.0])) == pytest.approx([1.0])
 
 
 def test_chance_depends_on_the_seed(tmp_path: Path) -> None:
     tremor = [{"kind": "tremor", "rms_mm": [0.1, 0.1, 0.1]}]
     strain = {"kind": "breathing", "period_spread": 0.3}
     times = np.linspace(0, 20, 30)
-    one, same, other = (
-        read_scenario(write_scenario(tmp_path, motion=tremor, strain=strain, seed=seed)) for seed in (1, 1, 2)
-    )
+    files = (write_scenario(tmp_path, motion=tremor, strain=strain, seed=seed) for seed in (1, 1, 2))
+    one, same, other = map(read_scenario, files)
     assert np.array_equal(one.motion(times), same.motion(times))
     assert not np.array_equal(one.motion(times), other.motion(times))
     assert one.strain is not None and same.strain is not None and other.strain is not None
@@ -124,50 +116,28 @@ def test_chance_depends_on_the_seed(tmp_path: Path) -> None:
 
 
 WRONG = [
-    ("title", {"title": ""}),
-    ("title", {"title": 3}),
-    ("seconds", {"seconds": 0.05}),
-    ("seconds", {"seconds": 3601}),
-    ("seconds", {"seconds": "long"}),
-    ("seconds", {"seconds": math.inf}),
-    ("seed", {"seed": -1}),
-    ("seed", {"seed": 1.5}),
-    ("path", {"path": 3}),
-    ("path", {"path": ""}),
-    ("clearance_mm", {"clearance_mm": -0.1}),
-    ("clearance_mm", {"clearance_mm": True}),
-    ("bead_mm", {"bead_mm": 0}),
-    ("faults", {"faults": "arm stall 600ms"}),
-    ("faults[1]", {"faults": ["arm drop", "arm dance"]}),
-    ("faults[0]", {"faults": [5]}),
-    ("faults", {"faults": ["camera9 off"]}),
-    ("faults", {"faults": ["disk full"]}),
-    ("motion", {"motion": 5}),
-    ("motion", {"motion": {"kind": "sine"}}),
-    ("motion[0].kind", {"motion": [{"kind": "dance"}]}),
+    ("title", {"title": ""}), ("title", {"title": 3}), ("seconds", {"seconds": 0.05}), ("seconds", {"seconds": 3601}),
+    ("seconds", {"seconds": "long"}), ("seconds", {"seconds": math.inf}), ("seed", {"seed": -1}),
+    ("seed", {"seed": 1.5}), ("path", {"path": 3}), ("path", {"path": ""}), ("clearance_mm", {"clearance_mm": -0.1}),
+    ("clearance_mm", {"clearance_mm": True}), ("bead_mm", {"bead_mm": 0}), ("faults", {"faults": "arm stall 600ms"}),
+    ("faults[1]", {"faults": ["arm drop", "arm dance"]}), ("faults[0]", {"faults": [5]}),
+    ("faults", {"faults": ["camera9 off"]}), ("faults", {"faults": ["disk full"]}), ("motion", {"motion": 5}),
+    ("motion", {"motion": {"kind": "sine"}}), ("motion[0].kind", {"motion": [{"kind": "dance"}]}),
     ("motion[1].rate_hz", {"motion": [{"kind": "hand", "rms_mm": [1, 1, 1]}, {"kind": "sine", "amplitude_mm": 1}]}),
-    ("motion[0].file", {"motion": [{"kind": "trace"}]}),
-    ("titel", {"titel": "x"}),
+    ("motion[0].file", {"motion": [{"kind": "trace"}]}), ("titel", {"titel": "x"}),
     *((table, {table: 5}) for table in ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "limits")),
-    ("planted", {"planted": []}),
-    ("scene.nozzle", {"scene": {"nozzle": 1}}),
-    ("scene.beads", {"scene": {"beads": "yes"}}),
-    ("strain.kind", {"strain": {"rate_hz": 0.25}}),
+    ("planted", {"planted": []}), ("scene.nozzle", {"scene": {"nozzle": 1}}),
+    ("scene.beads", {"scene": {"beads": "yes"}}), ("strain.kind", {"strain": {"rate_hz": 0.25}}),
     ("strain.kind", {"strain": {"kind": "hand"}}),
     ("strain.amplitude_mm", {"strain": {"kind": "sine", "rate_hz": 1, "amplitude_mm": 1}}),
-    ("rig.angle", {"rig": {"angle": 3}}),
-    ("rig.angles_deg", {"rig": {"angles_deg": 3}}),
-    ("rig.angles_deg", {"rig": {"angles_deg": []}}),
-    ("rig.distance_mm", {"rig": {"distance_mm": 50}}),
-    ("rig.focal_px", {"rig": {"focal_px": 50}}),
-    ("rig.size", {"rig": {"size": [640]}}),
-    ("rig.size", {"rig": {"size": [640, 0]}}),
-    ("rig.size", {"rig": {"size": [640.5, 480]}}),
+    ("rig.angle", {"rig": {"angle": 3}}), ("rig.angles_deg", {"rig": {"angles_deg": 3}}),
+    ("rig.angles_deg", {"rig": {"angles_deg": []}}), ("rig.distance_mm", {"rig": {"distance_mm": 50}}),
+    ("rig.focal_px", {"rig": {"focal_px": 50}}), ("rig.size", {"rig": {"size": [640]}}),
+    ("rig.size", {"rig": {"size": [640, 0]}}), ("rig.size", {"rig": {"size": [640.5, 480]}}),
     ("rig.size", {"rig": {"size": [64000, 48000]}}),
     ("rig.distortion", {"rig": {"distortion": [0, 0, 0, 0]}}),
     ("rig.size", {"rig": {"file": "rig.toml", "size": [640, 480]}}),
-    ("cameras.fps", {"cameras": {"fps": 0}}),
-    ("cameras.exposure_s", {"cameras": {"exposure_s": 1}}),
+    ("cameras.fps", {"cameras": {"fps": 0}}), ("cameras.exposure_s", {"cameras": {"exposure_s": 1}}),
     ("cameras.transport_s", {"cameras": {"transport_s": -0.1}}),
     ("cameras.offset_s", {"cameras": {"offset_s": [0, 0]}}),
     ("cameras.offset_s.side", {"cameras": {"offset_s": {"side": 0.01}}}),
@@ -177,34 +147,26 @@ WRONG = [
     ("sensor.jpeg_quality", {"sensor": {"jpeg_quality": -1}}),
     ("sensor.jpeg_quality", {"sensor": {"jpeg_quality": 101}}),
     ("sensor.jpeg_quality", {"sensor": {"jpeg_quality": 90.5}}),
-    ("noise", {"sensor": {"noise": -1}}),
-    ("sensor.grain", {"sensor": {"grain": 1}}),
+    ("noise", {"sensor": {"noise": -1}}), ("sensor.grain", {"sensor": {"grain": 1}}),
     ("tracking.by", {"tracking": {"by": "magic"}}),
     ("tracking.processing_s", {"tracking": {"processing_s": -0.01}}),
     ("tracking.processing_s", {"tracking": {"processing_s": "fast"}}),
     ("tracking.register", {"tracking": {"register": "hand"}}),
-    ("tracking.scan", {"tracking": {"scan": True}}),
-    ("arm.file", {"arm": {"file": 3}}),
+    ("tracking.scan", {"tracking": {"scan": True}}), ("arm.file", {"arm": {"file": 3}}),
     ("arm.assumed_lag_s", {"arm": {"assumed_lag_s": -0.01}}),
     ("arm.assumed_lag_s", {"arm": {"assumed_lag_s": 1.01}}),
     ("arm.assumed_lag_s", {"arm": {"assumed_lag_s": "none"}}),
     ("arm.dead_time_s + servo_lag_s", {"arm": {"dead_time_s": 0.9, "servo_lag_s": 0.9}}),
-    ("arm.wire_baud", {"arm": {"wire_baud": 9600}}),
-    ("arm.wire_baud", {"arm": {"wire_baud": "fast"}}),
-    ("arm.wire_baud", {"arm": {"wire_baud": True}}),
-    ("arm.wire_baud", {"arm": {"wire_baud": math.nan}}),
-    ("arm.tool_mm", {"arm": {"tool_mm": [[0, 1]]}}),
-    ("arm.tool_mm", {"arm": {"tool_mm": "needle"}}),
-    ("arm.dead_time_s", {"arm": {"dead_time_s": -0.1}}),
-    ("arm.replies", {"arm": {"replies": "loud"}}),
+    ("arm.wire_baud", {"arm": {"wire_baud": 9600}}), ("arm.wire_baud", {"arm": {"wire_baud": "fast"}}),
+    ("arm.wire_baud", {"arm": {"wire_baud": True}}), ("arm.wire_baud", {"arm": {"wire_baud": math.nan}}),
+    ("arm.tool_mm", {"arm": {"tool_mm": [[0, 1]]}}), ("arm.tool_mm", {"arm": {"tool_mm": "needle"}}),
+    ("arm.dead_time_s", {"arm": {"dead_time_s": -0.1}}), ("arm.replies", {"arm": {"replies": "loud"}}),
     ("arm.speed", {"arm": {"speed": 1}}),
     ("planted.rig_offset_mm", {"planted": {"rig_offset_mm": [1, 2]}}),
     ("planted.arm_offset_mm", {"planted": {"arm_offset_mm": 1}}),
-    ("planted.wound", {"planted": {"wound": [1, 2, 3]}}),
-    ("limits.p95", {"limits": {"p95": 1}}),
-    ("limits.duty", {"limits": {"duty": 1.5}}),
-    ("limits.p95_mm", {"limits": {"p95_mm": -1}}),
-]
+    ("planted.wound", {"planted": {"wound": [1, 2, 3]}}), ("limits.p95", {"limits": {"p95": 1}}),
+    ("limits.duty", {"limits": {"duty": 1.5}}), ("limits.p95_mm", {"limits": {"p95_mm": -1}}),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("key", "change"), WRONG, ids=[f"{key} {i}" for i, (key, _) in enumerate(WRONG)])
@@ -262,8 +224,7 @@ def test_files_are_relative_to_the_scenario(tmp_path: Path, monkeypatch: pytest.
     file = write_scenario(tmp_path / "deep", arm={"file": "arm.toml"})
     monkeypatch.chdir(tmp_path)
     scenario = read_scenario(file.relative_to(tmp_path))
-    assert scenario.path.exists()
-    assert not np.array_equal(scenario.true_arm.home, ArmProfile().arm.home)
+    assert scenario.path.exists() and not np.array_equal(scenario.true_arm.home, ArmProfile().arm.home)
 
 
 COARSE = {"texel_mm": 0.8}
@@ -284,8 +245,7 @@ def test_a_table_says_what_is_built() -> None:
     assert scene.opening == pytest.approx((120.0, 90.0))
     np.testing.assert_array_equal(scene.base_from_rest, BASE_FROM_REST)
     bare = scene_from_table("a.toml", {**COARSE, "wound": False, "drape": False}, Path(), 2)
-    assert bare.shape.inside is None
-    assert bare.opening == bare.shape.size
+    assert bare.shape.inside is None and bare.opening == bare.shape.size
 
 
 def test_a_scan_is_read_beside_the_file_and_keeps_its_frame(tmp_path: Path) -> None:
@@ -319,27 +279,19 @@ def test_a_scan_too_small_for_a_drape_is_taken_without_one(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("table", "what"),
     [
-        ({"bodi": "chest"}, "scene.bodi"),
-        ({"body": "leg"}, "scene.body"),
-        ({"body": "chest", "scan": "x.ply"}, "scene"),
-        ({"wetness": 1.001}, "scene.wetness"),
-        ({"tone": -0.001}, "scene.tone"),
-        ({"hair": "much"}, "scene.hair"),
-        ({"texel_mm": 0.049}, "scene.texel_mm"),
-        ({"texel_mm": 1.001}, "scene.texel_mm"),
-        ({"drape": 1}, "scene.drape"),
-        ({"wound": "yes"}, "scene.wound"),
-        ({"wound_size_mm": [30]}, "scene.wound_size_mm"),
-        ({"wound_size_mm": [30, 4.99]}, "scene.wound_size_mm"),
+        ({"bodi": "chest"}, "scene.bodi"), ({"body": "leg"}, "scene.body"),
+        ({"body": "chest", "scan": "x.ply"}, "scene"), ({"wetness": 1.001}, "scene.wetness"),
+        ({"tone": -0.001}, "scene.tone"), ({"hair": "much"}, "scene.hair"), ({"texel_mm": 0.049}, "scene.texel_mm"),
+        ({"texel_mm": 1.001}, "scene.texel_mm"), ({"drape": 1}, "scene.drape"), ({"wound": "yes"}, "scene.wound"),
+        ({"wound_size_mm": [30]}, "scene.wound_size_mm"), ({"wound_size_mm": [30, 4.99]}, "scene.wound_size_mm"),
         ({"wound_depth_mm": 8.01}, "scene.wound_depth_mm"),
         ({"deformation": {"bulge": 1.0}}, "scene.deformation.bulge"),
         ({"deformation": {"bulge_mm": 30.01}}, "scene.deformation.bulge_mm"),
         ({"deformation": {"stretch": [0.51, 0]}}, "scene.deformation.stretch"),
         ({"deformation": {"radius_mm": 4.99}}, "scene.deformation.radius_mm"),
-        ({"deformation": 3}, "scene.deformation"),
-        ({"scan": "missing.ply"}, "scan"),
+        ({"deformation": 3}, "scene.deformation"), ({"scan": "missing.ply"}, "scan"),
     ],
-)
+)  # fmt: skip
 def test_wrong_values_are_named(table: dict[str, Any], what: str) -> None:
     with pytest.raises(InputError) as caught:
         scene_from_table("a.toml", {**COARSE, **table}, Path("/nowhere"), 0)
@@ -360,8 +312,7 @@ def test_wrong_values_are_named(table: dict[str, Any], what: str) -> None:
 def test_wrong_sensors_are_named(table: dict[str, Any], what: str) -> None:
     with pytest.raises(InputError) as caught:
         sensor_from_table("a.toml", table)
-    assert caught.value.what == f"sensor.{what}"
-    assert caught.value.where == "a.toml"
+    assert caught.value.what == f"sensor.{what}" and caught.value.where == "a.toml"
 
 
 def test_a_sensor_is_what_its_table_says() -> None:

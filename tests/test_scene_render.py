@@ -1,7 +1,4 @@
-"""Pictures: each material point is imaged where the rig's own projection puts it, at the middle of the exposure.
-Shapes: a height field that is exact between its nodes, from a law, a body or a scan. Pictures as cameras deliver
-them: each its own, whenever it is asked for and whoever else is rendered with it.
-"""
+"""Pictures: points imaged by the rig's projection at mid-exposure; shapes as height fields; each picture its own."""
 
 from __future__ import annotations
 
@@ -125,8 +122,7 @@ def errors(scene: Scene, at: WorldState) -> Array:
 def test_points_are_imaged_where_the_rig_projects_them(radius: float, strain: float, pose: Array) -> None:
     off = errors(dotted(radius), instant(pose, strain=strain))
     length = np.linalg.norm(off, axis=-1)
-    assert length.mean(1).max() < 0.004
-    assert length.max() < 0.03
+    assert length.mean(1).max() < 0.004 and length.max() < 0.03
 
 
 @pytest.mark.parametrize("twist", [(0.3, -0.2, 0.9, -25.0, 40.0, 50.0), *slowly((0.0, 0.0, 0.0, 60.0, 0.0, 0.0))])
@@ -196,8 +192,7 @@ def test_a_scene_built_again_gives_the_same_picture_and_another_seed_another() -
 
 def test_grain_is_as_strong_as_the_sensor_says_and_differs_from_image_to_image() -> None:
     clean, noisy = (taken(wounded(), instant(), s)[1].astype(float) for s in (BARE, Sensor(3.0, 0.0, 0.45)))
-    assert (noisy - clean).std() == pytest.approx(3.0, rel=0.02)
-    assert abs((noisy - clean).mean()) < 0.02
+    assert (noisy - clean).std() == pytest.approx(3.0, rel=0.02) and abs((noisy - clean).mean()) < 0.02
     again = render(wounded(), RIG.cameras[1:2], [instant()], Sensor(3.0, 0.0, 0.45), [np.random.default_rng(9)])[0]
     assert np.corrcoef((noisy - clean).ravel(), (again - clean).ravel())[0, 1] < 0.03
 
@@ -281,17 +276,15 @@ def test_far_cloth_rests_while_cloth_by_the_wound_moves_with_it() -> None:
         taken(wounded(), instant(p))[1].astype(int)
         for p in (BASE_FROM_REST, BASE_FROM_REST @ se3.exp(np.array([0, 0, 0, 2.0, 1, 1])))
     )
-    assert np.abs(moved - still)[:60, :60].max() <= 1
-    assert np.abs(moved - still)[300:420, 400:880].mean() > 4
+    assert np.abs(moved - still)[:60, :60].max() <= 1 and np.abs(moved - still)[300:420, 400:880].mean() > 4
 
 
 def test_a_scan_is_drawn_in_its_own_frame() -> None:
     source = wounded().shape
     surface_from_scanner = se3.make(se3.exp_rotation([0.3, -0.2, 0.1]), [12.0, -7.0, 31.0])
     vertices, triangles = source.mesh(0.5)
-    shape = with_wound(
-        shape_from_scan(se3.transform_points(surface_from_scanner, vertices), triangles, 0.5), Wound(), 2
-    )
+    scan = shape_from_scan(se3.transform_points(surface_from_scanner, vertices), triangles, 0.5)
+    shape = with_wound(scan, Wound(), 2)
     pose = BASE_FROM_REST @ se3.inverse(surface_from_scanner)
     scene = Scene(shape, Appearance(texel=0.4), seed=2, base_from_rest=pose)
     image = taken(scene, instant(pose), cameras=RIG.cameras[1:2])[0].astype(float)
@@ -302,8 +295,7 @@ def test_a_scan_is_drawn_in_its_own_frame() -> None:
 
 def test_a_patch_is_built_quickly_enough_for_tests() -> None:
     scene = Scene(flat(PATCH), unlit_texture(dots(centres()), TEXEL))
-    assert scene.layers.size == (360, 480)
-    assert scene.opening == PATCH
+    assert scene.layers.size == (360, 480) and scene.opening == PATCH
 
 
 @pytest.mark.parametrize("size", [(641, 483), *slowly((320, 240))])
@@ -311,8 +303,7 @@ def test_an_image_of_any_size_is_filled(size: tuple[int, int]) -> None:
     small = arc_rig(size=size, focal=500.0).cameras
     nozzle = BASE_FROM_REST @ se3.make(np.eye(3), [0.0, 0.0, 1.0])
     for image in taken(wounded(), instant(base_from_nozzle=nozzle), cameras=small):
-        assert image.shape == (size[1], size[0], 3)
-        assert image.reshape(-1, 3).max(1).min() > 5
+        assert image.shape == (size[1], size[0], 3) and image.reshape(-1, 3).max(1).min() > 5
 
 
 NUMBERS = st.floats(-1.0, 1.0)
@@ -332,8 +323,7 @@ def test_a_curved_law_is_met_to_the_square_of_the_step() -> None:
     xy = np.random.default_rng(0).uniform(-10, 10, (500, 2))
     truth = np.sqrt(55.0**2 - xy[:, 1] ** 2) - 55.0
     errors = [np.abs(cylinder((24.0, 24.0), 55.0, step).heights_at(xy) - truth).max() for step in (1.0, 0.5, 0.25)]
-    assert errors[0] < 1.0 / (8 * 50)
-    assert errors[0] > 3.5 * errors[1] > 12 * errors[2]
+    assert errors[0] < 1.0 / (8 * 50) and errors[0] > 3.5 * errors[1] > 12 * errors[2]
 
 
 @pytest.mark.parametrize("kind", sorted(BODIES))
@@ -461,8 +451,7 @@ def test_a_picture_does_not_depend_on_threads_or_on_what_else_waits() -> None:
     together = shape_taken(pictures(), ALL)
     assert together == shape_taken(pictures(threads=2), ALL)
     assert together == [shape_taken(pictures(), [one])[0] for one in ALL]
-    assert together[::-1] == shape_taken(pictures(), ALL[::-1])
-    assert len(set(together)) == len(ALL)
+    assert together[::-1] == shape_taken(pictures(), ALL[::-1]) and len(set(together)) == len(ALL)
 
 
 def test_noise_differs_by_seed_and_from_picture_to_picture_of_the_same_thing() -> None:
@@ -482,8 +471,7 @@ def test_a_repeated_frame_is_the_same_and_a_damaged_one_has_the_header_of_the_wh
     assert first == second
     whole = shape_taken(pictures(), [shot(2, 0)])[0]
     damaged = shape_taken(pictures(), [shot(2, 0, Fate.GARBLED)])[0]
-    assert damaged[1] != whole[1]
-    assert damaged[1][:100] == whole[1][:100]
+    assert damaged[1] != whole[1] and damaged[1][:100] == whole[1][:100]
     assert damaged == shape_taken(pictures(), [shot(2, 0, Fate.GARBLED)])[0]
 
 

@@ -23,9 +23,8 @@ def vectors(size: int, bound: float) -> st.SearchStrategy[Array]:
 def tangents(draw: st.DrawFn, angle: float = 3.1, length: float = 500.0) -> Array:
     """Tangent vectors whose rotation stays below pi; angles of 1e-12 rad come up as often as those of 1 rad."""
     axis = draw(vectors(3, 1.0).filter(lambda v: np.linalg.norm(v) > 1e-3))
-    size = draw(
-        st.one_of(st.floats(0, angle), st.sampled_from([0.0, 1e-12, 1e-9, 1e-6, 0.99e-4, 1.01e-4, 0.0499, 0.0501]))
-    )
+    edges = st.sampled_from([0.0, 1e-12, 1e-9, 1e-6, 0.99e-4, 1.01e-4, 0.0499, 0.0501])
+    size = draw(st.one_of(st.floats(0, angle), edges))
     return np.concatenate([axis / np.linalg.norm(axis) * size, draw(vectors(3, length))])
 
 
@@ -118,8 +117,7 @@ def test_near_identity_exp_is_its_series(xi: Array) -> None:
 def test_a_tiny_rotation_is_not_lost(size: float) -> None:
     xi = np.array([size, 0, 0, 1.0, 2.0, 3.0])
     back = se3.log(se3.exp(xi))
-    assert np.allclose(back[3:], xi[3:], atol=1e-15)
-    assert back[0] == pytest.approx(size, rel=1e-6, abs=1e-16)
+    assert np.allclose(back[3:], xi[3:], atol=1e-15) and back[0] == pytest.approx(size, rel=1e-6, abs=1e-16)
 
 
 @pytest.mark.parametrize(
@@ -193,16 +191,11 @@ def test_one_call_serves_any_shape() -> None:
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda t: t * np.nan,
-        lambda t: t @ np.diag([1, 1, -1, 1]),
-        lambda t: t @ np.diag([1.001, 1, 1, 1]),
-        lambda t: t + np.eye(4)[3][:, None] * 1e-3,
-        lambda t: t[:3],
-        lambda t: t @ np.diag([1e200, 1, 1, 1]),
+        lambda t: t * np.nan, lambda t: t @ np.diag([1, 1, -1, 1]), lambda t: t @ np.diag([1.001, 1, 1, 1]),
+        lambda t: t + np.eye(4)[3][:, None] * 1e-3, lambda t: t[:3], lambda t: t @ np.diag([1e200, 1, 1, 1]),
     ],
-)
+)  # fmt: skip
 @pytest.mark.filterwarnings("error")
 def test_what_is_not_a_rigid_motion_is_told(spoil) -> None:  # type: ignore[no-untyped-def]
     t = se3.exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
-    assert se3.is_transform(t)
-    assert not se3.is_transform(spoil(t))
+    assert se3.is_transform(t) and not se3.is_transform(spoil(t))

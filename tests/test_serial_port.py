@@ -139,9 +139,7 @@ def test_two_writers_on_one_port_are_impossible(pair: tuple[int, str], tmp_path:
     again.release()
 
 
-def test_an_adapter_that_comes_back_under_another_name_is_the_same(
-    pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_adapter_back_under_another_name_is_the_same(pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:
     _, name = pair
     there = [("/dev/ttyUSB0", (0x1A86, 0x7523, "at 1-1")), ("/dev/ttyUSB7", (0x0403, 0x6001, "A50285BI"))]
     monkeypatch.setattr(arm_port, "_adapters", lambda: list(there))

@@ -1,6 +1,4 @@
-"""Session folders: what a whole one gives, and one error with file, key and value for everything wrong in it. A video
-whose decoder stumbles ends there, as one that is cut short does.
-"""
+"""Session folders: one error with file, key and value for everything wrong; videos that stop early."""
 
 from __future__ import annotations
 
@@ -227,9 +225,7 @@ FAULTS: list[tuple[str, Callable[[Path], None], str, str, str]] = [
 
 
 @pytest.mark.parametrize(("fault", "act", "file", "what", "words"), FAULTS, ids=[f[0] for f in FAULTS])
-def test_what_is_wrong_is_one_error_that_says_where(
-    tmp_path: Path, fault: str, act: Callable[[Path], None], file: str, what: str, words: str
-) -> None:
+def test_one_error(tmp_path: Path, fault: str, act: Callable[[Path], None], file: str, what: str, words: str) -> None:
     folder = make_folder(tmp_path / "s")
     open_session(folder)
     act(folder)

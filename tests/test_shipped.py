@@ -1,7 +1,4 @@
-"""What comes with stillbed is found from a clone and from an installation, under the names that the documents use. What
-is said of the pins: known vulnerabilities and what mends them, never "none" where nobody was asked. The table of
-hazards: it is what its file says, and every control has tests that are there.
-"""
+"""What comes with stillbed is found under its documented names; vulnerabilities of pins; the table of hazards."""
 
 from __future__ import annotations
 
@@ -24,14 +21,11 @@ ROOT = Path(__file__).parents[1]
 def test_an_installation_carries_every_folder_of_data() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     carried = project["tool"]["setuptools"]["data-files"]
-    assert carried == {
-        f"share/stillbed/{f.name}": [f"data/{f.name}/*"] for f in (ROOT / "data").iterdir() if f.is_dir()
-    }
+    folders = [file.name for file in (ROOT / "data").iterdir() if file.is_dir()]
+    assert carried == {f"share/stillbed/{name}": [f"data/{name}/*"] for name in folders}
 
 
-def test_a_path_of_the_documents_leads_to_the_shipped_file_from_anywhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_documented_path_leads_to_the_shipped_file_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert named_path("data/arms/s6h4d.toml").read_bytes() == (ROOT / "data/arms/s6h4d.toml").read_bytes()
     (tmp_path / "data/arms").mkdir(parents=True)
@@ -73,8 +67,7 @@ def test_each_known_vulnerability_is_listed_with_what_mends_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "trouble"),
-    [("", "ERROR: Connection refused"), ("{}", ""), ("[]", ""), (answer(), ""), (answer(LEFT), "")],
+    ("said", "trouble"), [("", "ERROR: Connection refused"), ("{}", ""), ("[]", ""), (answer(), ""), (answer(LEFT), "")]
 )
 def test_where_nobody_could_be_asked_nothing_is_said_to_be_well(said: str, trouble: str) -> None:
     code, words = told(said, trouble)

@@ -46,8 +46,7 @@ def test_without_faults_frames_come_in_step_after_exposure_and_transport() -> No
     made = cameras(fps=25.0, exposure_s=0.01, transport_s=0.03)
     for camera in range(3):
         for k, shot in enumerate(take(made, camera, 50)):
-            assert shot.exposed == pytest.approx(0.1 + k / 25)
-            assert shot.stamp == shot.exposed
+            assert shot.exposed == pytest.approx(0.1 + k / 25) and shot.stamp == shot.exposed
             assert shot.arrival == pytest.approx(shot.exposed + 0.005 + 0.03)  # from the end of the exposure
             assert (shot.camera, shot.number, shot.picture, shot.gain) == (camera, k, k, 1.0)
             assert shot.fate is Fate.DELIVERED
@@ -112,14 +111,12 @@ def test_a_duplicate_carries_an_earlier_picture_under_its_own_stamp(seed: int) -
 
 
 def test_hidden_offsets_and_jitter_are_in_the_stamps_and_phases_are_told_by_them() -> None:
-    shots = [
-        take(cameras(1, phase_s={"side": 0.01}, offset_s={"middle": 0.016, "side": -0.016}), c, 5) for c in range(3)
-    ]
+    skewed = cameras(1, phase_s={"side": 0.01}, offset_s={"middle": 0.016, "side": -0.016})
+    shots = [take(skewed, camera, 5) for camera in range(3)]
     assert np.allclose([s[3].exposed - s[3].stamp for s in shots], [0, 0.016, -0.016])
     assert np.allclose([s[3].exposed - shots[0][3].exposed for s in shots], [0, 0, 0.01])
     error = [s.stamp - s.exposed for s in take(cameras(1, jitter_s=0.004), 0, 2000)]
-    assert np.std(error) == pytest.approx(0.004, rel=0.05)
-    assert np.abs(error).max() <= 0.012 + 1e-12
+    assert np.std(error) == pytest.approx(0.004, rel=0.05) and np.abs(error).max() <= 0.012 + 1e-12
 
 
 def test_every_third_frame_of_sixty_a_second() -> None:

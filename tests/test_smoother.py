@@ -1,6 +1,4 @@
-"""The sliding window: finds the motion, knows its error, outlives what breaks GTSAM's smoother. The density of the
-acceleration is found from the poses alone, and follows when the motion changes.
-"""
+"""The sliding window finds the motion, knows its error, outlives bad data; the acceleration's density is estimated."""
 
 from __future__ import annotations
 

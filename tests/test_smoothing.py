@@ -109,9 +109,8 @@ def test_a_constant_twist_costs_nothing_and_time_may_be_cut_anywhere() -> None:
     stamps = np.array([0.0, 0.05, 0.2])
     states = States(se3.exp(twist * stamps[:, None]), np.tile(twist, (3, 1)), np.zeros((3, 6)))
     assert np.abs(prior_factors(states, stamps).off).max() < 1e-9
-    both = transition(np.array(0.3)) @ jerk_covariance(np.array(0.2)) @ transition(np.array(0.3)).T + jerk_covariance(
-        np.array(0.3)
-    )
+    step = transition(np.array(0.3))
+    both = step @ jerk_covariance(np.array(0.2)) @ step.T + jerk_covariance(np.array(0.3))
     assert np.allclose(both, jerk_covariance(np.array(0.5)))
 
 

@@ -1,7 +1,4 @@
-"""What tests look at is what it says: same seed same pictures, and files that read back. The Cramer-Rao bound: what an
-efficient estimate reaches and none passes, and how it changes with what is seen. Waveforms: exact derivatives,
-stated bounds, and a function of time alone.
-"""
+"""Synthetic pictures: same seed same pictures; the Cramer-Rao bound; waveforms with exact derivatives."""
 
 from __future__ import annotations
 
@@ -262,8 +259,7 @@ def test_breaths_stay_within_the_stated_depth_and_end_at_rest(seed: int, spread:
     spec = BreathingSpec(depth_spread=spread, sighs_per_min=2.0, pauses_per_min=2.0)
     wave = draw_breathing(spec, np.random.default_rng(seed))
     values = wave(np.linspace(0, 600, 6001))
-    assert values.min() >= 0
-    assert values.max() <= spec.sigh_factor * (1 + MAX_DRAW_SIGMAS * spread) + 1e-12
+    assert values.min() >= 0 and values.max() <= spec.sigh_factor * (1 + MAX_DRAW_SIGMAS * spread) + 1e-12
     ends = wave.starts
     assert np.allclose(wave(ends), 0, atol=1e-12)
     assert np.allclose(wave.rate(ends), 0, atol=1e-9)
@@ -273,8 +269,7 @@ def test_a_breath_is_no_sine_it_rests_longer_than_it_peaks() -> None:
     wave = draw_breathing(BreathingSpec(period_spread=0, depth_spread=0), np.random.default_rng(0))
     values = wave(np.linspace(0, 4, 4001))
     assert abs(np.argmax(values) / 4000 - 0.4) < 0.002  # inspiration is the shorter part
-    assert values.max() == pytest.approx(1)
-    assert np.mean(values < 0.1) > 1.5 * np.mean(values > 0.9)
+    assert values.max() == pytest.approx(1) and np.mean(values < 0.1) > 1.5 * np.mean(values > 0.9)
 
 
 def test_sighs_and_pauses_come_as_often_as_stated() -> None:

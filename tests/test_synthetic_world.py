@@ -54,9 +54,8 @@ def test_the_fixture_makes_a_world_in_one_line(synthetic_world: Worlds) -> None:
 def test_pytest_finds_the_plugin_by_its_entry_point(tmp_path: Path) -> None:
     points = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["pytest11"]
     (name, module), *_ = points.items()
-    (tmp_path / "test_mine.py").write_text(
-        "def test_mine(synthetic_world):\n    assert len(synthetic_world('still')) > 0\n"
-    )
+    code = "def test_mine(synthetic_world):\n    assert len(synthetic_world('still')) > 0\n"
+    (tmp_path / "test_mine.py").write_text(code)
     command = [sys.executable, "-m", "pytest", "-q", "-p", module, "-p", "no:cacheprovider", str(tmp_path)]
     alone = {"PYTHONPATH": str(ROOT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(command, cwd=tmp_path, env=alone, capture_output=True, text=True)
@@ -249,22 +248,12 @@ def test_a_part_comes_into_view() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        dict(movement="dance"),
-        dict(surface="sphere"),
-        dict(noise=-0.1),
-        dict(outliers=1.1),
-        dict(dropouts=float("nan")),
-        dict(dropouts=0.1, dropout_seconds=0.0),
-        dict(outages=((2.0, 1.0),)),
-        dict(outages=((1.0, 2.0, 3),)),
-        dict(seconds=0.0),
-        dict(rate=float("nan")),
-        dict(count=0),
-        dict(views=0),
-        dict(offsets=(0.0, 1e-3)),
-        dict(churn=float("inf")),
+        dict(movement="dance"), dict(surface="sphere"), dict(noise=-0.1), dict(outliers=1.1),
+        dict(dropouts=float("nan")), dict(dropouts=0.1, dropout_seconds=0.0), dict(outages=((2.0, 1.0),)),
+        dict(outages=((1.0, 2.0, 3),)), dict(seconds=0.0), dict(rate=float("nan")), dict(count=0), dict(views=0),
+        dict(offsets=(0.0, 1e-3)), dict(churn=float("inf")),
     ],
-)
+)  # fmt: skip
 def test_wrong_input_is_named(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"synthetic world: .* allowed"):
         made(**wrong)

@@ -65,8 +65,7 @@ def test_an_update_adds_the_measurements_information(seed: int) -> None:
 def test_a_prediction_moves_the_mean_and_widens_by_the_noise() -> None:
     a, q = np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.1, 0.2])
     later = predict(GaussianState(np.array([1.0, 2.0]), np.eye(2)), a, q)
-    assert np.allclose(later.mean, [2.0, 2.0])
-    assert np.allclose(later.covariance, a @ a.T + q)
+    assert np.allclose(later.mean, [2.0, 2.0]) and np.allclose(later.covariance, a @ a.T + q)
 
 
 def test_a_steady_velocity_is_learned() -> None:

@@ -93,8 +93,7 @@ def test_a_turn_about_the_top_cameras_axis_is_measured() -> None:
 def test_the_twist_is_the_velocity(slide: list[FrameSet]) -> None:
     pose = followed(slide)[-1]
     velocity = pose.base_from_surface[:3, :3] @ pose.twist[3:]
-    assert np.linalg.norm(velocity - SLIDE[3:]) < 3.0
-    assert (np.linalg.eigvalsh(pose.covariance) > 0).all()
+    assert np.linalg.norm(velocity - SLIDE[3:]) < 3.0 and (np.linalg.eigvalsh(pose.covariance) > 0).all()
 
 
 def test_threads_change_nothing_and_the_same_pictures_give_the_same_poses(slide: list[FrameSet]) -> None:
@@ -109,9 +108,8 @@ def test_threads_change_nothing_and_the_same_pictures_give_the_same_poses(slide:
 def covered(frames: FrameSet, cameras: Iterable[int]) -> FrameSet:
     """The frame set with black pictures of some cameras."""
     dark = set(cameras)
-    return replace(
-        frames, frames=tuple(replace(f, image=0 * f.image) if f.camera in dark else f for f in frames.frames)
-    )
+    changed = (replace(f, image=0 * f.image) if f.camera in dark else f for f in frames.frames)
+    return replace(frames, frames=tuple(changed))
 
 
 def test_what_is_hidden_for_a_moment_is_coasted_over_and_then_measured_from_before(slide: list[FrameSet]) -> None:
@@ -134,8 +132,7 @@ def test_one_camera_alone_is_degraded_and_named(slide: list[FrameSet]) -> None:
 def test_after_half_a_second_of_nothing_it_is_lost(slide: list[FrameSet]) -> None:
     nothing = [FrameSet(0.1 + i / RATE, ()) for i in range(12)]
     states = [p.state for p in followed([*slide[:3], *nothing[1:]])]
-    assert states[3] is TrackState.COASTING
-    assert states[-1] is TrackState.LOST
+    assert states[3] is TrackState.COASTING and states[-1] is TrackState.LOST
 
 
 def test_before_the_region_is_known_it_waits(slide: list[FrameSet]) -> None:
@@ -173,9 +170,6 @@ def test_a_picture_of_another_size_is_refused(slide: list[FrameSet]) -> None:
         followed([FrameSet(0.0, tuple(Frame(c, 0.0, np.zeros((90, 160), np.uint8)) for c in range(3)))])
 
 
-# -- as a method
-
-
 def test_help_names_every_method(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["track", "--help"])
@@ -200,12 +194,10 @@ def test_a_run_by_the_thesis_leaves_the_same_files_and_says_by_what(method: str,
     assert main([*arguments, "--record", str(tmp_path / "run.mcap")]) == 0
     assert sorted(f.name for f in out.iterdir()) == ["poses.csv", "poses.tum", "report.html", "summary.json"]
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["method"] == method
-    assert summary["measured_share"] == 1.0
+    assert summary["method"] == method and summary["measured_share"] == 1.0
     assert summary["errors"]["start"]["translation_mm"]["max"] < 1.0
     table = read_poses(out / "poses.csv")
-    assert not table.offsets.any()
-    assert np.isnan(table.offset_sigmas).all()
+    assert not table.offsets.any() and np.isnan(table.offset_sigmas).all()
     assert f"method {method}" in (out / "report.html").read_text()
 
 
@@ -228,11 +220,7 @@ def test_the_loop_closes_with_the_thesis(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, SMALL, tracking={"by": "thesis"}, seconds=0.7)
     assert main(["simulate", str(scenario), "-o", str(tmp_path / "out")]) in (0, 1)
     summary = json.loads((tmp_path / "out" / "tracking" / "summary.json").read_text())
-    assert summary["method"] == "thesis"
-    assert summary["measured_share"] > 0.9
-
-
-# -- on the bench
+    assert summary["method"] == "thesis" and summary["measured_share"] > 0.9
 
 
 @pytest.mark.slow
@@ -258,7 +246,6 @@ def test_a_made_recording_is_the_same_each_time_and_moves(name: str) -> None:
     first = [next(iter(shown.frame_sets())) for _ in range(2)]
     for a, b in zip(first[0].frames, first[1].frames, strict=True):
         assert np.array_equal(a.image, b.image)
-    assert len(shown.roi) == 3
-    assert shown.truth is not None
+    assert len(shown.roi) == 3 and shown.truth is not None
     travel = np.linalg.norm(np.ptp(shown.truth.base_from_surface[:, :3, 3], axis=0))
     assert travel > 2.0

@@ -68,8 +68,7 @@ def test_the_recording_of_a_run_is_its_session_again(session: Path, tmp_path: Pa
         for frames in original.frame_sets():
             recorder.write(frames, step(frames), step.last)
     again = open_session(tmp_path / "run.mcap")
-    assert again.truth is not None
-    assert original.truth is not None
+    assert again.truth is not None and original.truth is not None
     assert np.array_equal(again.truth.stamps, original.truth.stamps)
     assert np.allclose(again.truth.base_from_surface, original.truth.base_from_surface)
     assert [r.stamp for r in again.roi] == [r.stamp for r in original.roi]
@@ -89,8 +88,7 @@ def test_a_run_leaves_its_files_and_they_agree(tracked: Path) -> None:
     assert (len(table), summary["frame_sets"], summary["complete"]) == (10, 10, True)
     lines = (tracked / "poses.tum").read_text().splitlines()
     assert len(lines) - 1 == table.measured.sum()
-    assert np.isfinite(table.offset_sigmas).all()
-    assert (table.offset_sigmas[-1] < table.offset_sigmas[0]).all()
+    assert np.isfinite(table.offset_sigmas).all() and (table.offset_sigmas[-1] < table.offset_sigmas[0]).all()
     assert np.abs(table.offsets[-1]).max() < 0.001  # the cameras were triggered together
     assert list(summary["clocks_ms"]) == list(table.cameras)
     assert (table.seconds[:, -1] >= table.seconds[:, :-1].sum(axis=1) - 1e-4).all()
@@ -111,9 +109,7 @@ def test_the_recording_of_the_run_tracks_to_the_same_poses(tracked: Path, tmp_pa
     assert (tmp_path / "again" / "poses.tum").read_bytes() == (tracked / "poses.tum").read_bytes()
 
 
-def test_a_video_that_ends_early_costs_only_what_comes_after(
-    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_early_end_costs_only_the_rest(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = shutil.copytree(session, tmp_path / "broken")
     whole = (broken / "cam_1.avi").read_bytes()
     (broken / "cam_1.avi").write_bytes(whole[: len(whole) * 6 // 10])

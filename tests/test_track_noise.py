@@ -58,9 +58,8 @@ def test_before_anything_is_seen_all_is_new() -> None:
 @pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
 def test_the_scatter_is_that_of_the_residuals(size: float) -> None:
     rng = np.random.default_rng(3)
-    found = [
-        residual_scatter(seen(0.0), fitted(size * SIGMA[:, None] * rng.normal(size=(COUNT, 2)))) for _ in range(40)
-    ]
+    noises = [size * SIGMA[:, None] * rng.normal(size=(COUNT, 2)) for _ in range(40)]
+    found = [residual_scatter(seen(0.0), fitted(noise)) for noise in noises]
     assert np.mean(found) == pytest.approx(size**2, rel=0.1, abs=0.12)
 
 

@@ -1,7 +1,4 @@
-"""What the wound network learns from: labelled pictures, groups that show one wound, samples and covers. Segmentation
-by shape: the thesis's own method, and the one that ranks outlines by colour and shape. Tracking that looks for the
-wound first, where nobody has said where the surface is.
-"""
+"""Labelled pictures, groups and samples to learn from; segmentation by shape; tracking by the wound's place."""
 
 from __future__ import annotations
 
@@ -81,8 +78,7 @@ def test_masks_of_ones_and_of_255_read_alike_and_padding_is_cut_off_both(tmp_pat
     padded[:100, 20:140], mask[:100, 20:140] = image, truth * white
     write(tmp_path / "set", "a", padded, mask)
     (only,) = read_dataset(tmp_path / "set")
-    assert only.name == "set/a.jpg"
-    assert np.allclose(only.picture.shape[:2], (100, 120), atol=2)
+    assert only.name == "set/a.jpg" and np.allclose(only.picture.shape[:2], (100, 120), atol=2)
     assert only.wound.sum() == truth.sum()
 
 
@@ -114,7 +110,7 @@ def test_copies_mirror_images_and_shifted_views_are_one_group_and_strangers_are_
     assert number[1] != number[0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.integers(0, 12), min_size=1, max_size=60), st.integers(0, 40), st.integers(0, 99))
 def test_a_split_never_parts_a_group_and_holds_out_enough(numbers: list[int], wanted: int, seed: int) -> None:
     group = np.array(numbers)
@@ -123,7 +119,7 @@ def test_a_split_never_parts_a_group_and_holds_out_enough(numbers: list[int], wa
     assert not set(group[held]) & set(group[~held])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6), st.booleans())
 def test_a_sample_has_its_size_and_its_wound_stays_on_the_wound(seed: int, wounded: bool) -> None:
     source = sample_pyramid(labelled(seed, wounded))
@@ -178,7 +174,7 @@ def test_healthy_pieces_keep_away_from_the_wound() -> None:
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_half_covered_hides_half_of_the_wound(seed: int) -> None:
     each = labelled(seed)
     _, cover = half_covered(each, np.random.default_rng(seed))
@@ -231,14 +227,12 @@ def test_the_outlines_of_a_coloured_disc_hold_the_disc_itself() -> None:
 
 def test_a_description_does_not_depend_on_the_patterns_scale_or_turn() -> None:
     image, _ = picture((120, 90), 30, (200, 256))
-    scene = small_picture(
-        np.ascontiguousarray(image[..., ::-1]), read_shape_model(shipped_model("shape", ".toml")).colour
-    )
+    model = read_shape_model(shipped_model("shape", ".toml"))
+    scene = small_picture(np.ascontiguousarray(image[..., ::-1]), model.colour)
     outline = find_outlines(scene)[0]
     small, large = (largest_outline(ellipse((400, 400), (200, 200), (20 * k, 8 * k), 30 * k)) for k in (2, 5))
-    assert np.allclose(
-        outline_features(scene, outline, [small], None), outline_features(scene, outline, [large], None), atol=0.1
-    )
+    little, much = (outline_features(scene, outline, [pattern], None) for pattern in (small, large))
+    assert np.allclose(little, much, atol=0.1)
 
 
 def test_an_edge_that_was_drawn_too_wide_settles_where_the_colours_part() -> None:
@@ -364,6 +358,5 @@ def test_a_contact_sheet_has_three_rows_however_few_pictures_there_are() -> None
     image, truth = picture((60, 50), 20, (100, 120))
     shown = [JudgedPicture(image, Segmentation(disc((100, 120), (60, 50), r), 0.9, 0.7), truth) for r in (20, 10, 4)]
     assert contact_sheet(shown).shape == (3 * SHEET_CELL_PX, SHEET_COLUMNS * SHEET_CELL_PX, 3)
-    assert (
-        contact_sheet([JudgedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)]).dtype == np.uint8
-    )
+    nothing = JudgedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)
+    assert contact_sheet([nothing]).dtype == np.uint8

@@ -1,7 +1,4 @@
-"""Points from pixels: the way back of the projection, and how sure it is. Landmarks of one camera get their depth as
-the surface turns under it. What does not fit is left out. Rays meet the surface through known points where it is, as
-surely as claimed. Normals do not lean at its rim.
-"""
+"""Points from pixels and their covariance; depth of one camera's landmarks; rays on a surface through points."""
 
 from __future__ import annotations
 
@@ -166,7 +163,7 @@ def looked(
     return known, agrees
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(seeds)
 def test_a_surface_that_turns_tells_the_depth_as_surely_as_claimed(seed: int) -> None:
     true, known = guessed(seed)
@@ -177,7 +174,7 @@ def test_a_surface_that_turns_tells_the_depth_as_surely_as_claimed(seed: int) ->
     assert 0.4 < error @ np.linalg.solve(after.covariance, error) / len(error) < 2.0
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seeds)
 def test_a_surface_that_does_not_turn_tells_nothing_of_the_depth(seed: int) -> None:
     true, known = guessed(seed)
@@ -246,13 +243,12 @@ def met(seed: int, radius: float, beside: bool, rough: float = 0.0) -> tuple[Ray
     return found, np.einsum("mi,mi->m", found.points - true, found.normals)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.integers(0, 10_000), st.floats(40.0, 300.0), st.booleans())
 def test_a_height_is_no_farther_off_than_claimed(seed: int, radius: float, beside: bool) -> None:
     found, off = met(seed, radius, beside)
     assert found.good.all() and found.sigma.max() < 3.0
-    assert np.mean((off / found.sigma) ** 2) < 1.6
-    assert np.median(np.abs(off)) < (0.3 if beside else 0.03)
+    assert np.mean((off / found.sigma) ** 2) < 1.6 and np.median(np.abs(off)) < (0.3 if beside else 0.03)
 
 
 def test_on_skin_as_rough_as_its_landmarks_say_the_claim_is_the_error() -> None:
@@ -299,7 +295,7 @@ def test_a_ray_that_grazes_meets_nothing(tilt: float) -> None:
     assert not meet_rays(points, np.zeros((180, 180)), -400 * ray, ray, np.array([EXACT])).good.any()
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 10_000), st.floats(35.0, 200.0))
 def test_normals_at_the_rim_do_not_lean_inwards(seed: int, radius: float) -> None:
     rng = np.random.default_rng(seed)
@@ -309,5 +305,4 @@ def test_normals_at_the_rim_do_not_lean_inwards(seed: int, radius: float) -> Non
     off = np.arccos(np.clip((smooth_normals(points, up) * true).sum(1), -1, 1))
     leaning = np.arccos(np.clip((local_normals(points, up) * true).sum(1), -1, 1))
     rim = np.abs(points[:, 1]) > 18
-    assert np.degrees(off).max() < 4
-    assert off[rim].mean() < 0.5 * leaning[rim].mean() + 0.005
+    assert np.degrees(off).max() < 4 and off[rim].mean() < 0.5 * leaning[rim].mean() + 0.005

@@ -63,9 +63,8 @@ def test_the_tool_turns_with_the_skin_under_it(place: Array, instant: float) -> 
     truth = Truth(BASE_FROM_REST, **SMOOTH)  # type: ignore[arg-type]
     times, amount = np.array([instant]), np.sin(2 * np.array([instant]))
     nozzle = nozzles(place[None])
-    turn = (se3.inverse(truth.base_from_surface(times)) @ truth.checkpoints(times, nozzle))[0, :3, :3] @ nozzle[
-        0, :3, :3
-    ].T
+    turned = se3.inverse(truth.base_from_surface(times)) @ truth.checkpoints(times, nozzle)
+    turn = turned[0, :3, :3] @ nozzle[0, :3, :3].T
     step = 1e-3 * np.eye(3)
     gradient = np.eye(3) + np.stack(
         [(truth.displacement(place + s, amount) - truth.displacement(place - s, amount))[0] / 2e-3 for s in step], -1

@@ -1,6 +1,4 @@
-"""`stillbed view`: each instant shows what was recorded, in a real browser too. Strangers are refused. `stillbed
-compare`: evo's own numbers, from every kind of file, and one clear error for what cannot be compared.
-"""
+"""`stillbed view` shows what was recorded, in a real browser too; `stillbed compare` has evo's own numbers."""
 
 from __future__ import annotations
 
@@ -33,13 +31,12 @@ from hardware.offline.viewer import PictureReader, Playback, instant_text, open_
 from hardware.operator.settings import OperatorSettings
 from hardware.recording.recorder import Recorder
 from perception.frames import Frame
-from tests.browser import Browser, executable
+from tests.browser import Browser
 from tests.moving import raster
 from tests.recorded import pose, whole_recording
 from tests.runs import breathing
 from tests.session_files import image, make_folder, rig
 
-CHROMIUM = executable()
 COUNT = 24
 
 
@@ -89,8 +86,7 @@ def test_each_instant_has_its_own_pose_tracks_and_pictures(playback: Playback) -
     book = PictureReader(playback)
     for k in (5, 20, 6):  # back as well
         pose, seen = playback.poses[k], playback.tracks[k]
-        assert pose is not None and seen is not None
-        assert pose.stamp == seen.stamp == playback.stamps[k]
+        assert pose is not None and seen is not None and pose.stamp == seen.stamp == playback.stamps[k]
         said = json.loads(instant_text(playback, k))
         assert np.allclose(said["tracking"]["base_from_surface"], pose.base_from_surface, atol=1e-4)
         pictures = book(k)
@@ -148,47 +144,25 @@ def test_a_picture_that_cannot_be_read_is_said(tmp_path: Path) -> None:
     assert failed == 1
 
 
-@pytest.mark.parametrize("what", ["missing", "garbage", "empty", "poses"])
-def test_a_bad_file_is_one_clear_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], recording: Path, what: str
-) -> None:
-    file, words = tmp_path / f"{what}.mcap", list[str]()
-    if what == "garbage":
-        file.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-    elif what == "empty":
-        file.touch()
-    elif what == "poses":
-        file, words = recording, ["--poses", str(tmp_path / "no.tum")]
-    assert main(["view", str(file), *words]) == WRONG_INPUT
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "allowed" in said and (words or [file.name])[-1].rsplit("/", 1)[-1] in said
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
-def test_the_slider_moves_the_scene(address: str) -> None:
-    assert CHROMIUM is not None
-    browser = Browser(CHROMIUM)
-    try:
-        page = browser.page(address, (1280, 860))
-        page.until("document.body.dataset.shown !== undefined && document.querySelectorAll('.camera').length === 3")
-        scene = "document.querySelector('#scene canvas').toDataURL()"
-        bright = (
-            "(() => { const c = document.querySelector('.camera canvas');"
-            " return c.getContext('2d').getImageData(c.width / 2, 20, 1, 1).data[0]; })()"
-        )
-        before, dark = page.js(scene), page.js(bright)
-        page.js(f"(() => {{ const t = document.getElementById('time'); t.value = {COUNT - 4};"
-                " t.dispatchEvent(new Event('input')); })()")  # fmt: skip
-        page.until(f"document.body.dataset.shown === '{COUNT - 4}'")
-        page.until(f"{scene} !== {json.dumps(before)}")
-        assert page.until(f"{bright} > {dark + 60}")
-        assert f"{COUNT - 3} of {COUNT}" in page.text("#now") and page.js("document.getElementById('alarm').hidden")
-        page.key("Home", "Home")
-        page.until("document.body.dataset.shown === '0'")
-        page.key("Space", " ")
-        page.until(f"document.body.dataset.playing === 'no' && document.body.dataset.shown === '{COUNT - 1}'")
-    finally:
-        browser.close()
+def test_the_slider_moves_the_scene(address: str, browser: Browser) -> None:
+    page = browser.page(address, (1280, 860))
+    page.until("document.body.dataset.shown !== undefined && document.querySelectorAll('.camera').length === 3")
+    scene = "document.querySelector('#scene canvas').toDataURL()"
+    bright = (
+        "(() => { const c = document.querySelector('.camera canvas');"
+        " return c.getContext('2d').getImageData(c.width / 2, 20, 1, 1).data[0]; })()"
+    )
+    before, dark = page.js(scene), page.js(bright)
+    page.js(f"(() => {{ const t = document.getElementById('time'); t.value = {COUNT - 4};"
+            " t.dispatchEvent(new Event('input')); })()")  # fmt: skip
+    page.until(f"document.body.dataset.shown === '{COUNT - 4}'")
+    page.until(f"{scene} !== {json.dumps(before)}")
+    assert page.until(f"{bright} > {dark + 60}")
+    assert f"{COUNT - 3} of {COUNT}" in page.text("#now") and page.js("document.getElementById('alarm').hidden")
+    page.key("Home", "Home")
+    page.until("document.body.dataset.shown === '0'")
+    page.key("Space", " ")
+    page.until(f"document.body.dataset.playing === 'no' && document.body.dataset.shown === '{COUNT - 1}'")
 
 
 def test_a_recording_without_tracks_has_no_surface(tmp_path: Path) -> None:
@@ -241,7 +215,7 @@ def test_the_figures_are_evos(aligned: bool, delta: int) -> None:
                 assert getattr(error_statistics(values), name) == pytest.approx(value, rel=1e-6, abs=1e-9), (name, part)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 1000))
 def test_moving_the_base_or_the_surface_frame_changes_only_what_it_may(seed: int) -> None:
     truth, found = moved(seed)
@@ -254,9 +228,8 @@ def test_moving_the_base_or_the_surface_frame_changes_only_what_it_may(seed: int
         return error_statistics(part.translation).rmse
 
     assert rmse(base, ALIGNMENTS[1]) == pytest.approx(rmse(plain, ALIGNMENTS[1]), rel=1e-6)
-    assert rmse(base, ALIGNMENTS[0], relative=True) == pytest.approx(
-        rmse(plain, ALIGNMENTS[0], relative=True), rel=1e-6
-    )
+    shifted = rmse(base, ALIGNMENTS[0], relative=True)
+    assert shifted == pytest.approx(rmse(plain, ALIGNMENTS[0], relative=True), rel=1e-6)
     judged, expected = (r.of(ALIGNMENTS[2]) for r in (surface, plain))
     assert judged is not None and expected is not None
     assert judged.absolute.rotation == pytest.approx(expected.absolute.rotation, abs=1e-3)
@@ -300,8 +273,7 @@ def test_positions_on_a_line_determine_no_alignment() -> None:
 def test_a_denser_trajectory_gives_each_instant_once() -> None:
     truth, dense = breathing(STAMPS), np.arange(2900) / 1000
     result = compare(posed(breathing(dense), stamps=dense), posed(truth))
-    assert len(result.stamps) == np.sum(dense[-1] + 5e-4 >= STAMPS)
-    assert result.gap <= 5e-4
+    assert len(result.stamps) == np.sum(dense[-1] + 5e-4 >= STAMPS) and result.gap <= 5e-4
 
 
 def test_a_recording_gives_its_poses_by_channel(tmp_path: Path) -> None:
@@ -325,11 +297,8 @@ def test_the_command_writes_page_and_figures(tmp_path: Path, capsys: pytest.Capt
     told = capsys.readouterr().out
     figures = json.loads((out / "compare.json").read_text())
     assert figures["pairs"] == 90 and figures["reference_is_exact"]
-    assert (
-        figures[ALIGNMENTS[1]]["ape"]["translation_mm"]["rmse"]
-        < figures[ALIGNMENTS[0]]["ape"]["translation_mm"]["rmse"]
-    )
-    assert f"{figures[ALIGNMENTS[0]]['ape']['translation_mm']['rmse']:#.3g} mm" in told
+    plain, aligned = (figures[name]["ape"]["translation_mm"]["rmse"] for name in ALIGNMENTS[:2])
+    assert aligned < plain and f"{plain:#.3g} mm" in told
     page = (out / "report.html").read_text()
     assert "Absolute pose error" in page and "NEES" not in page and "http" not in page.replace("http://www.w3.org", "")
 
@@ -354,17 +323,9 @@ def test_the_truth_in_a_recording_is_found_by_itself(tmp_path: Path, capsys: pyt
         ("9 0 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n11 0 0 0 0 0 0 1\n", "one clock"),
     ],
 )
-def test_what_cannot_be_compared_is_one_clear_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str
-) -> None:
+def test_errors_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str) -> None:
     write_tum(tmp_path / "truth.tum", Trajectory(STAMPS, breathing(STAMPS), exact=True))
     (tmp_path / "a.tum").write_text(text)
     assert main(["compare", str(tmp_path / "a.tum"), str(tmp_path / "truth.tum")]) == WRONG_INPUT
     told = capsys.readouterr().err
     assert words in told and told.count("\n") == 1
-
-
-def test_a_missing_file_and_an_empty_folder_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("nothing.tum", "."):
-        assert main(["compare", str(tmp_path / name), str(tmp_path)]) == WRONG_INPUT
-        assert "allowed a TUM or CSV file" in capsys.readouterr().err

@@ -38,7 +38,7 @@ def warp_of(seed: int, size: float = 1.0, modes: WarpModes = MODES) -> Warp:
     return modes.warp(size * drawn / np.linalg.norm(drawn), 1e-4 * np.eye(len(drawn)), 0.01)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), size=st.floats(0.01, 3.0))
 def test_a_warp_moves_the_landmarks_by_its_size_and_neither_shifts_nor_turns_them(seed: int, size: float) -> None:
     moved = warp_of(seed, size).displacement(LANDMARKS)
@@ -47,7 +47,7 @@ def test_a_warp_moves_the_landmarks_by_its_size_and_neither_shifts_nor_turns_the
     assert np.abs(np.cross(LANDMARKS - LANDMARKS.mean(0), moved).mean(0)).max() < 1e-4 * size
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), size=st.floats(0.0, 2.0))
 def test_a_warp_is_undone_and_poses_are_carried_there_and_back(seed: int, size: float) -> None:
     warp = warp_of(seed, size or 1e-9)
@@ -86,9 +86,6 @@ def test_a_warp_is_known_the_less_the_older_it_is_and_the_pose_says_so() -> None
     now, later = pose.error_at(CHECKPOINTS), pose.predict(0.2).error_at(CHECKPOINTS)
     assert (later > now).all() and (now > 0).all()
     assert replace(pose, warp=None).error_at(CHECKPOINTS) == pytest.approx(np.zeros(30))
-
-
-# -- following one
 
 
 class Follow:

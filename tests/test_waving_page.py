@@ -19,30 +19,20 @@ from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet
 from tests.board_session import BOARD, LENSES, RATE, rendered, small_rig
 from tests.boards import motion
-from tests.browser import Browser, Page, executable
+from tests.browser import Browser, Page
 from tests.started import started
 
 CLOCK = WallClock()
-CHROMIUM = executable()
 SIZE = (640, 480)
 PATIENCE = 60.0  # s, on a busy machine
 GREY = np.full((480, 640, 3), 150, np.uint8)
 NAMES = ("camera 1", "camera 2", "camera 3")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
 
 
 @pytest.fixture
 def shown() -> Iterator[WavingPage]:
     with WavingPage(CLOCK) as made:
         yield made
-
-
-@pytest.fixture
-def browser() -> Iterator[Browser]:
-    assert CHROMIUM is not None
-    made = Browser(CHROMIUM)
-    yield made
-    made.close()
 
 
 def seen_at(instant: float) -> dict[int, np.ndarray]:
@@ -116,9 +106,7 @@ def videos(folder: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_board_before_live_cameras_becomes_a_rig_once_somebody_says_enough(
-    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_waved_board_becomes_a_rig(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("board_session.OFFSETS", (0.0, 0.0, 0.0))  # what goes back is late by what it was early before
     board, out, cameras = tmp_path / "board.toml", tmp_path / "rig.toml", videos(tmp_path)
     write_board(board, BOARD)

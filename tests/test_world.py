@@ -34,13 +34,8 @@ def difference(log: NozzleLog) -> Array:
 EARLY = (1 - TICK_FRACTION) * 0.02  # s by which a move ends before the next begins, and the nozzle is ahead
 
 
-# -- the measuring is right
-
-
 @pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
-def test_with_a_perfect_tracker_no_delay_and_an_ideal_arm_every_printed_row_is_within_5_um(
-    motion: list[object], tmp_path: Path
-) -> None:
+def test_with_nothing_wrong_every_printed_row_is_within_5_um(motion: list[object], tmp_path: Path) -> None:
     write_path(tmp_path / "path.csv", [[-0.1, 0, 0], [0.1, 0, 0]], speed=0.2)  # no faster: starting is an error too
     file = write_scenario(tmp_path, IDEAL, motion=motion, seconds=9.5)
     log = heard(file).log
@@ -51,15 +46,12 @@ def test_with_a_perfect_tracker_no_delay_and_an_ideal_arm_every_printed_row_is_w
 
 
 @pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
-def test_at_printing_speed_even_starting_and_stopping_cost_no_more_than_8_um(
-    motion: list[object], tmp_path: Path
-) -> None:
+def test_at_printing_speed_starting_and_stopping_cost_no_more_than_8_um(motion: list[object], tmp_path: Path) -> None:
     file = write_scenario(tmp_path, IDEAL, motion=motion, seconds=3.0)
     log = heard(file).log
     distance = errors(file, log).distance
     assert inner(log).sum() > 1000
-    assert distance[inner(log)].max() < 0.005
-    assert distance[log.extrude].max() < 0.008
+    assert distance[inner(log)].max() < 0.005 and distance[log.extrude].max() < 0.008
 
 
 def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
@@ -78,9 +70,7 @@ def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
     ],
     ids=["dead time", "servo", "both", "wire", "early", "part of it told"],
 )
-def test_a_delay_that_the_motion_does_not_know_costs_speed_times_delay(
-    change: dict[str, object], delay: float, tmp_path: Path
-) -> None:
+def test_an_unknown_delay_costs_speed_times_delay(change: dict[str, object], delay: float, tmp_path: Path) -> None:
     file = write_scenario(tmp_path, IDEAL, change)
     log = heard(file).log
     velocity = BASE_FROM_REST[:3, :3] @ (VELOCITY + [SPEED, 0, 0])  # the surface's and, on it, the path's own
@@ -157,16 +147,11 @@ def test_rows_lie_on_every_millisecond_until_the_very_end(tmp_path: Path) -> Non
 
 def test_a_run_ends_soon_after_the_path(tmp_path: Path) -> None:
     sink = heard(write_scenario(tmp_path, IDEAL, seconds=30.0))
-    finished = next(
-        c.stamp for c, p in zip(sink.commands, sink.progress, strict=True) if p.phase is PrintPhase.FINISHED
-    )
+    phases = zip(sink.commands, sink.progress, strict=True)
+    finished = next(command.stamp for command, p in phases if p.phase is PrintPhase.FINISHED)
     assert sink.log.stamps[-1] == pytest.approx(finished + RUN_OUT, abs=1.1e-3)
     assert "path finished" in sink.reasons
-    assert sink.log.place[-1] == pytest.approx(8.0)
-    assert not sink.log.extrude[sink.log.stamps > finished].any()
-
-
-# -- the same each time
+    assert sink.log.place[-1] == pytest.approx(8.0) and not sink.log.extrude[sink.log.stamps > finished].any()
 
 
 def test_the_same_scenario_is_the_same_run_and_another_seed_is_not(tmp_path: Path) -> None:
@@ -175,12 +160,8 @@ def test_the_same_scenario_is_the_same_run_and_another_seed_is_not(tmp_path: Pat
     for seed in (4, 4, 5):
         sink = heard(write_scenario(tmp_path, IDEAL, motion=[chance], seed=seed, seconds=1.0))
         runs.append((sink.sent, *(getattr(sink.log, name).tobytes() for name in NozzleLog.__slots__)))
-    assert runs[0] == runs[1]
-    assert runs[0][0] != runs[2][0]
+    assert runs[0] == runs[1] and runs[0][0] != runs[2][0]
     assert runs[0][1] == runs[2][1]  # but for the stamps
-
-
-# -- time
 
 
 def test_a_pose_is_known_no_sooner_than_exposure_transport_and_processing_allow(tmp_path: Path) -> None:
@@ -248,9 +229,6 @@ def test_what_the_arm_answers_reaches_the_sink(tmp_path: Path) -> None:
     assert len(sink.received) == pytest.approx(27 * 2.0 / 0.05, abs=27)
 
 
-# -- faults
-
-
 def with_faults(folder: Path, *faults: str) -> tuple[Heard, NozzleLog]:
     sink = heard(write_scenario(folder, IDEAL, faults=list(faults), seconds=3.0))
     return sink, sink.log
@@ -307,8 +285,7 @@ def test_without_a_new_pose_the_arm_holds_and_says_why(tmp_path: Path) -> None:
     sink = heard(write_scenario(tmp_path, IDEAL, off, motion=[STEADY], seconds=3.5))
     log = sink.log
     held = (log.stamps > 1.35) & (log.stamps < 1.5)
-    assert all("old, limit 0.3 s" in reason for reason in log.reason[held])
-    assert not log.extrude[held].any()
+    assert all("old, limit 0.3 s" in reason for reason in log.reason[held]) and not log.extrude[held].any()
     assert log.extrude[log.stamps > 1.8].any()
     assert sink.progress[-1].place == pytest.approx(8.0)  # nothing is left out
 
@@ -339,8 +316,7 @@ def test_cut_short_the_rows_until_then_are_given_out(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         world.run(interrupt)
-    assert len(sink.frames) == 33
-    assert sink.log.stamps[-1] == pytest.approx(sink.frames[-1].stamp, abs=0.021)
+    assert len(sink.frames) == 33 and sink.log.stamps[-1] == pytest.approx(sink.frames[-1].stamp, abs=0.021)
     assert np.allclose(np.diff(sink.log.stamps), 0.001)
 
 

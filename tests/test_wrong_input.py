@@ -1,7 +1,4 @@
-"""Wrong input, whatever is wrong with it: one line that names it and what is allowed, exit code 2, nothing written.
-Processes that work for another end with it. Those of a bench do at Ctrl-C, too, whatever they are at. Commands that
-were started without standard streams: they do what they do, and say nothing.
-"""
+"""Wrong input is one line that names it, exit code 2, nothing written; processes end with the one they work for."""
 
 from __future__ import annotations
 
@@ -15,12 +12,16 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from hardware.bench.figures import workers
 from hardware.cli.main import main
+from hardware.files.rig_file import write_board
 from hardware.live.view import Console
 from hardware.recording.recorder import Recorder
+from tests.board_session import BOARD
 from tests.light_live import prepare_files
 from tests.recorded import write_frames
 from tests.session_files import rig
@@ -36,7 +37,7 @@ track whole.mcap -o OUT --record half.mcap
 replay missing --path missing -o OUT
 replay whole.mcap --path bad.csv -o OUT
 replay whole.mcap --path PATH --resume typo.toml -o OUT
-replay whole.mcap -o OUT
+replay whole.mcap -o OUT  # or give --path
 replay empty -o OUT
 import missing -o OUT
 import whole.mcap -o OUT
@@ -52,23 +53,55 @@ simulate STILL -o OUT --threads 0
 simulate STILL -o OUT --trace bad.csv
 simulate STILL -o OUT --fault dance
 smooth empty -o OUT
-smooth whole.mcap -o OUT --rate nan
+smooth missing -o OUT  # missing
+smooth whole.mcap -o OUT --rate nan  # --rate
+smooth whole.mcap -o OUT --rate 0  # --rate
+smooth whole.mcap whole.mcap -o OUT  # different names
+smooth whole.mcap -o OUT --workers 2  # --workers
+smooth whole.mcap -o OUT --scheduler local --workers 0  # --workers
 compare missing
 compare bad.csv
+compare nothing.tum empty  # allowed a TUM or CSV file
+compare empty empty  # allowed a TUM or CSV file
 compare whole.mcap:truth whole.mcap:truth
 view empty
 view missing
+view junk.mcap
+view half.mcap
+view whole.mcap --poses missing
 segment empty -o OUT
 segment missing -o OUT
 segment empty -o OUT --threads 0
+segment blank.png -o OUT --threads 0
+segment blank.png -o OUT --mm-per-px 0
+segment blank.png -o OUT --method shape --model x.onnx
+segment blank.png -o OUT --scan x.ply
+segment blank.png -o OUT --model gone.onnx
+train empty -o OUT.txt --network shape
+train empty -o gone/x.toml --network shape
+train empty -o typo.toml --network shape
+train empty -o OUT.toml --network shape --hold-out 0
+train empty -o OUT.toml --network shape
 plan -o OUT.csv
 plan junk.stl -o OUT.csv
 plan bad.csv -o OUT.csv
 plan --example foot wound.stl -o OUT.csv
 plan --example foot -o OUT.csv --bead 0
 plan --example foot -o OUT.csv --tissue dermis
+plan contour.csv -o OUT.csv --pattern zigzag --angle steep  # --angle
+plan contour.csv -o OUT.csv --speed -1  # --speed
+plan contour.csv -o OUT.csv --bead 0  # --bead
+plan contour.csv -o OUT.csv --bead nan  # --bead
+plan contour.csv -o OUT.csv --material a,b  # --material
+plan contour.csv -o OUT.csv --tissue dermis  # --tissue
+plan contour.csv -o OUT.csv --tissue dermis=thick:1  # --tissue
+plan contour.csv -o OUT.csv --tissue a=1:1 --tissue a=2:1  # once
+plan contour.csv -o OUT.csv --tissue a=rest:1 --tissue b=rest:1  # rest
+plan contour.csv -o OUT.csv --bead 15  # room
+plan contour.csv -o OUT.txt  # .csv
 reach bad.csv --arm ARM
 reach PATH --arm unknown.toml
+reach PATH --arm jointless.toml  # kinematics = 'missing'
 live typo.toml
 live unknown.toml
 live --rig missing --path PATH --record OUT
@@ -82,13 +115,27 @@ arm --virtual --fault 'dance at 5s'
 cameras missing
 cameras typo.toml
 cameras empty --seconds nan
+cameras 0  # a name that stays
+cameras http://h/1 --seconds 0  # 0 < seconds
+cameras http://h/1 -o OUT.txt  # .jpg or .png
+cameras a.toml http://h/1  # one RIG.toml alone
 calibrate board -o OUT.txt
 calibrate board -o OUT.pdf --marker 2
 calibrate board -o OUT.pdf --dictionary 9X9
 calibrate board -o OUT.pdf --page 0x0
 calibrate cameras whole.mcap --board unknown.toml -o OUT
 calibrate cameras missing --board typo.toml -o OUT
-calibrate arm -o OUT
+calibrate cameras 0 --board board.toml -o OUT.toml  # a name that stays
+calibrate cameras a.toml http://h/1 --board board.toml -o OUT.toml  # one RIG.toml alone
+calibrate cameras http://h/1 --seconds -1 --board board.toml -o OUT.toml  # --seconds = -1.0
+calibrate cameras empty --seconds 3 --board board.toml -o OUT.toml  # with live cameras
+calibrate cameras http://h/1 --keep-lenses --board board.toml -o OUT.toml  # --keep-lenses
+calibrate arm -o OUT  # one of a recorded FOLDER, --device, --virtual or --touched
+calibrate arm moved --virtual -o OUT.toml  # folder and virtual
+calibrate arm --virtual -o OUT.toml  # --record = 'missing'
+calibrate arm --device /dev/x --record r -o OUT.toml  # --cameras = 'missing'
+calibrate arm --device /dev/x --terminal -o OUT.toml  # --terminal
+calibrate arm --device /dev/x --cameras rig.toml --record r -o OUT.toml  # nobody is within the arm's reach
 calibrate arm empty -o OUT
 calibrate arm --touched typo.toml --cameras rig.toml -o OUT
 calibrate import empty --format opencv -o OUT
@@ -132,6 +179,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "unknown.toml").write_text("[dance]\nsteps = 1\n")
     (made / "binary.toml").write_bytes(bytes(range(256)))
     (made / "bad.csv").write_text("left,right\nfar,1\n")
+    (made / "contour.csv").write_text("x_mm,y_mm\n0,0\n12,0\n12,8\n0,8\n")
+    (made / "jointless.toml").write_text("baud = 115200\n")
+    write_board(made / "board.toml", BOARD)
+    cv2.imwrite(str(made / "blank.png"), np.full((60, 60, 3), 90, np.uint8))
     (made / "junk.stl").write_bytes(b"\0junk" * 100)
     (made / "junk.mcap").write_bytes(b"junk" * 100)
     with Recorder(made / "whole.mcap", rig()) as recorder:
@@ -143,26 +194,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def words(text: str) -> list[str]:
     data = ROOT / "data"
     named = {"STILL": "scenarios/still.toml", "PATH": "paths/square_10mm.csv", "ARM": "arms/s6h4d.toml"}
-    return [str(data / named[word]) if word in named else word for word in shlex.split(text)]
+    return [str(data / named[word]) if word in named else word for word in shlex.split(text, comments=True)]
 
 
 @pytest.mark.parametrize("text", WRONG.strip().splitlines())
-def test_wrong_input_is_one_line_and_exit_code_2(
-    text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_one_line(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(folder)
     assert main(words(text)) == 2
     told = capfd.readouterr()
     lines = [line for line in told.err.splitlines() if line.startswith("stillbed")]
     assert told.out == "" and len(lines) == 1 and told.err.splitlines()[-1] == lines[0]
     assert lines[0].startswith("stillbed: ") and "allowed" in lines[0] and "Errno" not in lines[0]
+    assert text.partition("  # ")[2] in lines[0]
     assert not list(folder.glob("OUT*"))
 
 
 @pytest.mark.parametrize("text", MISTYPED.strip().splitlines())
-def test_a_mistyped_command_line_is_one_line_and_exit_code_2(
-    text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistyped(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as ended:
         main(words(text))
@@ -174,9 +222,7 @@ def test_a_mistyped_command_line_is_one_line_and_exit_code_2(
     assert not list(folder.glob("OUT*"))
 
 
-def test_what_the_system_refuses_names_the_file_first(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refusals_name_files(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(folder)
     assert main(["init", "typo.toml/below"]) == 2
     assert capsys.readouterr().err == "stillbed: typo.toml/below: not a directory\n"
@@ -188,7 +234,7 @@ def test_the_same_from_a_shell(folder: Path) -> None:
     assert done.returncode == 2 and done.stdout == "" and done.stderr.startswith(f"stillbed: {folder}/missing: ")
 
 
-def test_a_cache_that_cannot_be_written_is_one_line_that_says_where_to_have_another(
+def test_an_unwritable_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").touch()
@@ -266,9 +312,7 @@ ENDS = [
 
 
 @pytest.mark.parametrize(("pool", "end", "word"), ENDS)
-def test_they_end_with_whoever_started_them(
-    pool: str, end: Callable[[int, int], None], word: int, tmp_path: Path
-) -> None:
+def test_they_end_with_their_parent(pool: str, end: Callable[[int, int], None], word: int, tmp_path: Path) -> None:
     (script := tmp_path / "at_work.py").write_text(AT_WORK.replace("{pool}", pool))
     started = subprocess.Popen(
         [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
