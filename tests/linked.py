@@ -74,7 +74,6 @@ class Linked:
 
     def send(self, axes: Array, seconds: float = 0.02) -> str:
         """A move that takes so long from where the arm was last sent."""
-        assert self.arm.target is not None
         feed = max(float(np.linalg.norm((axes - self.arm.target)[:3])) / seconds, 1.0)
         return self.arm.send(moving(axes, feed), self.clock.now())
 

@@ -152,7 +152,6 @@ class Running:
         self.process.wait()
 
     def _read(self) -> None:
-        assert self.process.stderr is not None
         for line in self.process.stderr:
             self.said += line
 
@@ -218,7 +217,7 @@ def printed_once(*records: Path) -> None:
 def light_runs(folder: Path, *flags: str, **path: float) -> Iterator[Callable[..., Running]]:
     """A starter of runs without pictures, over a printed `path` (`prepare_files`); none is left behind."""
     running: list[Running] = []
-    prepare_files(folder, **path)  # type: ignore[arg-type]
+    prepare_files(folder, **path)
 
     def start(record: Path, *more: str) -> Running:
         program = "tests.light_live", str(folder), str(record)

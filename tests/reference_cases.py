@@ -65,7 +65,6 @@ def recorded_tracks(case: str) -> list[Observations]:
 
 def _followed(rig: Rig, first: Observations, *rest: Observations) -> Iterator[SurfacePose]:
     follower = Follower(rig, first, triangulated_map(rig, first), refine=True)
-    assert follower.estimator.pose is not None
     yield follower.estimator.pose
     for seen in rest:
         yield follower(seen)

@@ -74,7 +74,7 @@ def served(*cameras: HttpCamera) -> Iterator[None]:
             pass
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.handle_error = lambda *_: None  # type: ignore[method-assign, assignment]
+    server.handle_error = lambda *_: None
     for i, camera in enumerate(cameras):
         camera.url = f"http://127.0.0.1:{server.server_port}/{i}"
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)

@@ -51,7 +51,7 @@ def driven(folder: Path, profile: ArmProfile = PROFILE, tell: object = no_progre
     virtual = VirtualArm(ArmSettings(servo_lag=0.02), profile.dialect, HOME, (), profile.baud)
     arm = Arm(VirtualDevice(virtual, clock, profile.baud), profile, 0.0)
     try:
-        move_arm(arm, clock, folder, HOME, SHORT, tell)  # type: ignore[arg-type]
+        move_arm(arm, clock, folder, HOME, SHORT, tell)
     finally:
         virtual.advance(clock.now())
     return virtual, arm, clock
@@ -138,7 +138,7 @@ def test_where_files_go_is_checked_first(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "value"), [("places", 2), ("reach", -1.0), ("speed", 500.0), ("dwell", 0.0)])
 def test_wrong_wishes_are_named(name: str, value: float) -> None:
     with pytest.raises(InputError, match=name):
-        MoveOptions(**{name: value})  # type: ignore[arg-type]
+        MoveOptions(**{name: value})
 
 
 @pytest.mark.parametrize("pictures", [False, True])
@@ -213,7 +213,6 @@ def test_the_end_is_found_to_a_fraction_of_a_pixel(seed: int) -> None:
     draw, behind = np.random.default_rng(seed), cloth(seed)
     tip, angle = np.array([160.0, 120.0]) + draw.uniform(-20, 20, 2), draw.uniform(0, 2 * np.pi)
     found = TipFinder(behind, 4.0)(picture(behind, tip, angle, draw.uniform(1.8, 4.0), 1.0, seed))
-    assert found is not None
     assert np.linalg.norm(np.array(found.pixel) - tip) < 0.35  # 0.13 on average, and five times its scatter
     assert np.dot(found.towards, [np.cos(angle), np.sin(angle)]) > 0.999
 
@@ -224,7 +223,6 @@ def test_a_dark_side_does_not_move_the_tip(monkeypatch: pytest.MonkeyPatch) -> N
 
     def moved() -> float:
         before, after = TipFinder(behind, 4.0)(even), TipFinder(behind, 4.0)(shaded)
-        assert before is not None and after is not None
         return float(abs((np.array(after.pixel) - before.pixel) @ [-np.sin(angle), np.cos(angle)]))
 
     assert moved() < 0.05
@@ -237,7 +235,6 @@ def test_noise_is_told() -> None:
     tip = np.array([150.3, 110.7])
     for seed in range(12):
         found = TipFinder(behind, 4.0)(picture(behind, tip, 0.7, 2.5, 2.0, seed))
-        assert found is not None
         off.append(np.array(found.pixel) - tip)
     spread = float(np.std(off, axis=0).max())
     assert 0.3 < found.sigma / spread < 5.0

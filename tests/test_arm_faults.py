@@ -54,7 +54,7 @@ def test_a_text_names_a_fault(text: str, expected: Fault) -> None:
 )
 def test_what_names_none_is_refused(text: object) -> None:
     with pytest.raises(InputError, match=r"x\.toml: arm\.faults = "):
-        arm_fault(text)  # type: ignore[arg-type]
+        arm_fault(text)
 
 
 def test_a_stall_stops_a_move_and_then_it_goes_on() -> None:
@@ -301,7 +301,7 @@ def test_a_stop_while_it_goes_home_stays_a_stop() -> None:
             astray(link)
             places.append(link.executed())
 
-    Looping({0.4: Order.HOME, 1.01: Order.STOP}, link, pose).run(3.0)  # type: ignore[arg-type]
+    Looping({0.4: Order.HOME, 1.01: Order.STOP}, link, pose).run(3.0)
     assert link.arm.state is ArmState.STOPPED and link.virtual.in_flight == 0
     assert link.executed()[0] - places[0][0] < SPEED * (LOST + RESEND_AFTER + ANSWERS + 0.07)
 
@@ -313,7 +313,7 @@ def test_the_last_stop_of_a_session_is_said_again_too(ends: str) -> None:
     astray(link)
     link.run(0.012)
     if ends == "the loop":
-        Looping({1.0: Order.QUIT}, link, lambda now: None).run(5.0)  # type: ignore[arg-type, return-value]
+        Looping({1.0: Order.QUIT}, link, lambda now: None).run(5.0)
     else:
         shut_down(link.arm, "interrupted", link.clock, 0.002)
     ended = link.clock.now()
@@ -326,14 +326,13 @@ def test_the_last_stop_of_a_session_is_said_again_too(ends: str) -> None:
 def test_an_arm_that_answers_half_is_told_for_as_long_as_that_half_moves(kind: ReplyKind) -> None:
     link = linked(ANSWERING, arm_fault("drop at 1s for 0.7s"))
     line = link.arm._line
-    assert line is not None
     whole = line.receive
 
     def half() -> tuple[list[Reply], bytes]:
         replies, strays = whole()
         return [reply for reply in replies if reply.kind is kind], strays
 
-    line.receive = half  # type: ignore[method-assign]
+    line.receive = half
     link.run(0.98)
     far = [200, 0, 0, 0, 0, 0] if kind is ReplyKind.PLACE else [0, 0, 0, 0, 0, 1.0]
     link.virtual.receive(encode(G1(HOME + far, SPEED)), link.virtual.now)

@@ -104,7 +104,6 @@ def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float
     rng = np.random.default_rng(seed)
     for wait in waits:
         axes = link.arm.target
-        assert axes is not None
         step = np.append(rng.normal(size=3), np.zeros(3))
         step *= rng.uniform(0.2, 2.0) / np.linalg.norm(step)
         now = link.clock.now()
@@ -273,7 +272,6 @@ def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None
 
     def each(now: float) -> None:
         goal = circle(link.phase + 0.02)
-        assert link.arm.target is not None
         feed = feed_for(link.arm.target, goal, 0.02)
         if not link.arm.hold(now) and not link.arm.send(moving(goal, feed), now):
             link.phase += 0.02
@@ -311,8 +309,7 @@ def test_an_arm_that_falls_silent_is_held_and_then_stopped() -> None:
     link = linked(ANSWERING, arm_fault("unplug at 2s"))
     refused = link.follow(6.0)
     assert any("has not answered for" in reason for reason in refused) and link.arm.state is ArmState.STOPPED
-    never = linked()
-    assert never.follow(2.0) == []
+    assert linked().follow(2.0) == []
 
 
 def test_one_wrong_answer_alone_is_not_believed() -> None:

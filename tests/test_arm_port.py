@@ -38,9 +38,7 @@ def wait(seconds: float) -> None:
 def serving(link: Path, settings: ArmSettings = IDEAL, **more: object) -> Iterator[list[VirtualArm]]:
     """A virtual arm that serves meanwhile; the list holds it afterwards."""
     stop, ended = threading.Event(), list[VirtualArm]()
-    thread = threading.Thread(
-        target=lambda: ended.append(run_virtual_arm(settings, link=link, stop=stop, **more))  # type: ignore[arg-type]
-    )
+    thread = threading.Thread(target=lambda: ended.append(run_virtual_arm(settings, link=link, stop=stop, **more)))
     thread.start()
     try:
         for _ in range(200):

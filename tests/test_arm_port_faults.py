@@ -58,8 +58,6 @@ def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(mo
     link = linked(ANSWERING)
     link.run(0.5)
     line = link.arm._line
-    assert line is not None
-
     monkeypatch.setattr(line.port, "write", gone)
     monkeypatch.setattr(line, "receive", lambda: ([Reply(ReplyKind.ORIGIN, np.array([5.0, 0, 0]))], b""))
     link.arm.poll(link.clock.now())
@@ -70,8 +68,6 @@ def test_a_port_that_goes_while_an_arm_is_asked_to_obey_is_an_arm_unplugged(monk
     link = linked(ANSWERING, arm_fault("drop at 1s for 900ms"))
     link.follow(1.4)
     line, frames = link.arm._line, link.arm.frames
-    assert line is not None
-
     monkeypatch.setattr(line.port, "write", gone)
     link.run(0.2)
     assert link.arm.frames == frames and any("gone" in event.text for event in link.arm.events())
@@ -91,8 +87,8 @@ def test_a_step_home_that_waited_in_the_port_when_called_back_is_made_after_all(
 
 def test_bytes_that_wait_in_the_port_are_a_hold() -> None:
     link = linked()
-    port = link.arm._line.port  # type: ignore[union-attr]
-    port.waiting = lambda: 500  # type: ignore[method-assign]
+    port = link.arm._line.port
+    port.waiting = lambda: 500
     assert "500 bytes wait" in link.arm.hold(0.0)
 
 
@@ -155,7 +151,6 @@ def test_at_9600_bits_a_second_one_frame_is_on_the_wire_and_one_move_in_the_arm(
 
     def each(now: float) -> None:
         goal = circle(link.phase + 0.05)
-        assert link.arm.target is not None
         feed = feed_for(link.arm.target, goal, 0.05)
         if reason := link.arm.hold(now) or link.arm.send(moving(goal, feed), now):
             refused.append(reason)
@@ -197,9 +192,9 @@ def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:
 
 def test_an_origin_that_is_not_the_one_it_was_told_stops_it() -> None:
     link = linked()
-    port = link.arm._line.port  # type: ignore[union-attr]
+    port = link.arm._line.port
     answers = [encode_reply(Reply(ReplyKind.ORIGIN, place)) for place in (np.array([0.1, 0, 0]), HOME[:3])]
-    port.read = lambda: answers.pop(0) if answers else b""  # type: ignore[method-assign]
+    port.read = lambda: answers.pop(0) if answers else b""
     link.arm.poll(0.0)
     assert link.arm.state is ArmState.ARMED  # a count of rounding
     link.arm.poll(0.001)
@@ -245,7 +240,6 @@ def test_closed_it_is_not_opened_again() -> None:
 def test_an_arm_turned_off_its_way_is_held() -> None:
     link = linked(ANSWERING)
     link.follow(1.0)
-    assert link.arm._queue is not None
     for _ in range(2):
         tool = Reply(ReplyKind.TOOL, HOME[3:] + np.deg2rad([0, 3.0, 0]))
         link.arm._feedback.take(tool, link.arm._queue, np.zeros(3), link.clock.now())

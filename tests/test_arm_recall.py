@@ -94,8 +94,7 @@ def test_a_step_that_is_lost_is_given_again_and_goes_no_farther() -> None:
     rested = link.executed()
     assert sum("called back" in event.text for event in link.arm.events()) == 1  # and pause frames since
     link.run(0.5)
-    recalled = link.arm.take_up()
-    assert recalled is not None
+    assert link.arm.take_up() is not None
     assert np.linalg.norm((link.executed() - rested)[:3]) < 0.03 * link.arm.settings.speed + ROUNDING
 
 

@@ -160,8 +160,7 @@ def test_solve_pnp_finds_exact_tracks_exactly_and_no_pose_of_too_few() -> None:
     world = synthetic_world("still", seconds=0.1, noise=1e-6, seed=2)
     place, turn = best_camera([world])
     assert place < 1e-4 and turn < 1e-4
-    camera = world.rig.cameras[0]
-    assert pnp_pose(camera, world.map.points[:3], np.zeros((3, 2))) is None
+    assert pnp_pose(world.rig.cameras[0], world.map.points[:3], np.zeros((3, 2))) is None
 
 
 def test_solve_pnp_by_one_camera_is_off_by_more_than_the_bound_of_all() -> None:
@@ -242,8 +241,7 @@ def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch:
     (tmp_path / "plan/options.json").write_text(json.dumps(["abc", "--body", "foot"]))
     (done,) = measure_all(tmp_path, False, [BenchPart("plan", ("--body", "foot"))])
     assert done.figures == (FIGURES[0],) and whole._earlier(tmp_path / "plan", ["--body", "chest"], machine) is None
-    other = replace(machine, commit="abd")
-    assert whole._earlier(tmp_path / "plan", ["--body", "foot"], other) is None
+    assert whole._earlier(tmp_path / "plan", ["--body", "foot"], replace(machine, commit="abd")) is None
 
 
 @pytest.mark.parametrize(("line", "quick"), [(["--all"], False), (["--quick"], True), (["--all", "--quick"], True)])

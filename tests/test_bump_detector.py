@@ -122,8 +122,7 @@ def test_a_change_of_one_picture_comes_back_in_its_numbers() -> None:
     pixels[mine] += slopes @ true
     parts = camera_equations(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
     told = reduced_alone(parts, 1, parts)
-    found = np.linalg.solve(told.information, told.pull)
-    assert found == pytest.approx(true, rel=0.02, abs=1e-4)
+    assert np.linalg.solve(told.information, told.pull) == pytest.approx(true, rel=0.02, abs=1e-4)
     without = reduced_alone({**parts, 1: parts[1].without(true)}, 1, parts)
     assert np.abs(without.pull).max() < 0.02 * np.abs(told.pull).max()
 

@@ -72,7 +72,7 @@ def test_pixels_are_those_of_the_rig_and_their_derivatives_are_differences(xi: A
         assert np.allclose(change, by_point[:, k], atol=1e-4)
 
 
-def camera_of(lens: Array):  # type: ignore[no-untyped-def]
+def camera_of(lens: Array):
     from estimation.calibration.lens_model import matrix_of
     from estimation.rig import Camera
 
@@ -306,7 +306,7 @@ def triangulated(found: Calibration, truth: Truth, points: Array) -> Array:
     return np.asarray(np.linalg.norm(b - a @ turn.T, axis=1))
 
 
-def _nearest(sides: list, start: Array) -> Array:  # type: ignore[type-arg]
+def _nearest(sides: list, start: Array) -> Array:
     point = start.copy()
     for _ in range(8):
         rows, rest = [], []

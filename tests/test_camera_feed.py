@@ -359,8 +359,7 @@ def test_a_pipe_of_jpegs_is_a_camera(tmp_path: Path) -> None:
                 image = np.random.default_rng(number).integers(60, 200, (*size[::-1], 3)).astype(np.uint8)
                 out.write(cv2.imencode(".jpg", image)[1].tobytes())
 
-    writer = threading.Thread(target=write, daemon=True)
-    writer.start()
+    threading.Thread(target=write, daemon=True).start()
     source = CameraSource(Identity(SourceKind.FILE, str(pipe)))
     with LiveCameras(rig_of(1, size), [source], CLOCK) as live:
         assert list(sets_until(live, live_cameras_given(1)))

@@ -93,10 +93,8 @@ def test_coasting_poses_are_where_they_claim_to_be() -> None:
 def test_the_first_pose_after_a_loss_is_as_good_as_any(movement: str) -> None:
     run = followed(movement, "restart")
     back = int(np.flatnonzero(~run.measured)[-1]) + 1
-    bound = np.linalg.inv(run.informations[back])
-    assert (
-        run.errors[back] @ np.linalg.solve(2 * bound, run.errors[back]) < 25.0
-    )  # of chi-square 6, one in 3,000 is beyond
+    bound, error = np.linalg.inv(run.informations[back]), run.errors[back]
+    assert error @ np.linalg.solve(2 * bound, error) < 25.0  # of chi-square 6, one in 3,000 is beyond
 
 
 OFFSETS = (0.0, 0.016, -0.016)

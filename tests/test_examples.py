@@ -89,8 +89,7 @@ def test_poses_are_judged_by_evo(tmp_path: Path, capsys: pytest.CaptureFixture[s
     write_tum(tmp_path / "truth.tum", Trajectory(stamps, true, True))
     write_tum(tmp_path / "poses.tum", Trajectory(stamps, true @ shift @ moved, True))
     run("evaluate_with_evo.py", tmp_path / "poses.tum", tmp_path / "truth.tum")
-    told = capsys.readouterr().out
-    assert "off by: rmse 0.3536, median 0.2500, max 0.5000" in told
+    assert "off by: rmse 0.3536, median 0.2500, max 0.5000" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)
@@ -204,7 +203,6 @@ def run_until_ctrl_c(words: list[str]) -> int:
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    assert process.stdout is not None
     try:
         said = ""
         for line in process.stdout:

@@ -72,8 +72,7 @@ def ran(
     nozzle = target.copy()
     nozzle[:, 1, 3] += error
     extrude = np.ones(len(ROWS), bool)
-    still = np.array([held is not None and held[0] <= t < held[1] for t in ROWS])
-    extrude[still] = False
+    extrude[np.array([held is not None and held[0] <= t < held[1] for t in ROWS])] = False
     none = np.zeros(len(ROWS))
     log = NozzleLog(ROWS, target, nozzle, target, none, none.astype(np.int64), extrude, none.astype(str), none[:, None])
     words = []

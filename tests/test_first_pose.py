@@ -174,7 +174,6 @@ def test_a_forecast_is_claimed_as_its_pose_is() -> None:
     pose = pose_at(2.0)
     ahead = Forecast(np.array([0.1, 0.2]), np.zeros((2, 6)), np.stack([pose.covariance, 2 * pose.covariance]))
     given = claim.measured(replace(pose, forecast=ahead), fit_at(2.0), RESTED, BELIEVED, LITTLE)
-    assert given.forecast is not None
     less = given.covariance - pose.covariance
     assert given.forecast.covariances == pytest.approx(ahead.covariances + less)
 

@@ -54,7 +54,7 @@ def up(value: float) -> float:
 def pose(stamp: float = 0.0, **changes: object) -> SurfacePose:
     covariance = np.diag([0.0, 0, 0, 0.01, 0.01, 0.01])
     exact = SurfacePose(stamp, np.eye(4), covariance, np.zeros(6), TrackState.TRACKING)
-    return replace(exact, **changes)  # type: ignore[arg-type]
+    return replace(exact, **changes)
 
 
 def axes(*values: float) -> Array:
@@ -232,7 +232,7 @@ def test_a_hold_passes_and_moves_nothing() -> None:
 )  # fmt: skip
 def test_limits_are_checked(name: str, value: object) -> None:
     with pytest.raises(InputError, match="limits"):
-        replace(MotionLimits(), **{name: value})  # type: ignore[arg-type]
+        replace(MotionLimits(), **{name: value})
 
 
 def test_the_arm_is_checked() -> None:
@@ -352,7 +352,6 @@ def test_the_oracle_finds_a_guard_that_refuses_too_much() -> None:
 def standing(rules: GuardRules, **changes: np.ndarray) -> tuple[Guard, Move, np.ndarray, np.ndarray]:
     """A guard whose arm has these joints, a small move, and the joints before and after it (6,)."""
     model = rules.arm.jointed
-    assert model is not None
     home = rules.arm.home
     axes = home + np.array([1.0, -0.5, 0.7, 0.01, -0.02, 0.015])
     before, after = joints_from_axes(model, np.stack([home, axes]))
@@ -370,7 +369,6 @@ def code_of(guard: Guard, move: Move) -> RefusalCode | None:
 def test_the_range_and_speed_of_each_joint_are_met_and_broken_by_next_to_nothing(joint: int) -> None:
     rules = jointed_rules()
     model = rules.arm.jointed
-    assert model is not None
     _, _, before, after = standing(rules)
     for name, exact, beyond in (
         ("low", after[joint], HAIR),
@@ -389,7 +387,6 @@ def test_the_range_and_speed_of_each_joint_are_met_and_broken_by_next_to_nothing
 
 def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:
     rules = jointed_rules()
-    assert rules.arm.jointed is not None
     slow = replace(rules.arm.jointed, speed=rules.arm.jointed.speed / 10)
     tight = replace(rules, arm=replace(rules.arm, joints=slow))
     guard = Guard(rules.limits, rules.arm, rules.tick, rules.zone, rules.lag)

@@ -63,8 +63,7 @@ def at_home(times: Array) -> Array:
 
 
 def test_before_anything_is_commanded_there_is_no_target_and_nothing_is_extruded() -> None:
-    times = row_instants(0.0, 0.05)
-    log = ledger().rows(times, at_home)
+    log = ledger().rows(row_instants(0.0, 0.05), at_home)
     assert np.isnan(log.base_from_target).all() and np.isnan(log.place).all() and (log.checkpoint == -1).all()
     assert not log.extrude.any() and set(log.reason) == {"no surface is followed yet"}
     assert ledger().known_until == -np.inf
@@ -158,7 +157,7 @@ RANKS = (ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT)
 def test_actions_come_by_instant_then_rank_then_in_the_order_they_were_put(entries: list[tuple[float, int]]) -> None:
     agenda, done = EventQueue(), list[tuple[float, int, int]]()
     for i, (instant, rank) in enumerate(entries):
-        agenda.at(instant, rank, lambda now, i=i, rank=rank: done.append((now, rank, i)))  # type: ignore[misc]
+        agenda.at(instant, rank, lambda now, i=i, rank=rank: done.append((now, rank, i)))
     instants = list(agenda.run(lambda: np.inf))
     assert done == sorted((instant, rank, i) for i, (instant, rank) in enumerate(entries))
     assert instants == [instant for instant, _, _ in done]

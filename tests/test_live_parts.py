@@ -98,7 +98,7 @@ def test_settings_that_make_no_sense_are_named(change: dict[str, object], words:
     good = LiveSettings(**files, arm="virtual")
     check_settings(replace(good, cores_tracking=THERE), "here")
     with pytest.raises(InputError, match=words):
-        check_settings(replace(good, **change), "here")  # type: ignore[arg-type]
+        check_settings(replace(good, **change), "here")
 
 
 @pytest.mark.parametrize("text", ["[arm]\nspeed = 3", "[arms]", "[print]\ndry_run = 1", '[cores]\nmotion = ["a"]'])
@@ -230,8 +230,7 @@ def test_a_session_shown_to_and_fro_is_smooth_where_it_turns(count: int, seed: i
 
 
 def test_a_session_without_truth_is_shown_once() -> None:
-    stamps = np.array([3.0, 3.1, 3.3])
-    shown = list(schedule(stamps, 50.0, None))
+    shown = list(schedule(np.array([3.0, 3.1, 3.3]), 50.0, None))
     assert [s.index for s in shown] == [0, 1, 2] and [s.live for s in shown] == pytest.approx([50.0, 50.1, 50.3])
 
 

@@ -77,7 +77,7 @@ def test_stopped_paused_home_and_without_its_page_a_run_goes_on_until_ctrl_c(sta
     run.process.send_signal(signal.SIGINT)
     assert run.end() == 128 + signal.SIGINT
     assert "ended: Ctrl-C" in run.said and "go on with: stillbed live --resume" in run.said
-    stops = summary(record)["latency_ms"]["stop decided to on the wire"]  # type: ignore[index,call-overload]
+    stops = summary(record)["latency_ms"]["stop decided to on the wire"]
     assert stops["count"] >= 2
     resumed = begun(start, record, "--resume")
     now = CLOCK.now()

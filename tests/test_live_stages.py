@@ -29,7 +29,7 @@ class Staged:
     """A conductor with the reports that it is given; time goes on by `look`."""
 
     def __init__(self, **task: object) -> None:
-        self.conductor = RunStateMachine(PrintTask(raster(), PROFILE, stands_home=True, **task))  # type: ignore[arg-type]
+        self.conductor = RunStateMachine(PrintTask(raster(), PROFILE, stands_home=True, **task))
         self.now, self.arm = 0.0, ArmState.DISARMED
         self.phase: PrintPhase | None = None
         self.fraction = 1.0  # of 5 checkpoints
@@ -108,8 +108,7 @@ def test_nothing_moves_before_it_was_confirmed_and_started() -> None:
 def test_a_stop_is_always_ordered_whatever_the_window_showed(stage: RunStage) -> None:
     run = Staged().to_print()
     run.conductor.stage = stage
-    orders = run.conductor(run.now, run.seen, [OperatorRequest(1, Wish.STOP, -7)])
-    assert orders[0] is Order.STOP
+    assert run.conductor(run.now, run.seen, [OperatorRequest(1, Wish.STOP, -7)])[0] is Order.STOP
 
 
 def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:

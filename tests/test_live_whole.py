@@ -96,7 +96,7 @@ def test_stopped_in_the_terminal_it_rests_and_another_run_resumes(start: Start, 
     os.kill(run.process.pid, signal.SIGTERM)
     assert run.end() == 128 + signal.SIGTERM and "go on with: stillbed live --resume" in run.said
     found = summary(record)
-    stops = found["latency_ms"]["stop decided to on the wire"]  # type: ignore[index,call-overload]
+    stops = found["latency_ms"]["stop decided to on the wire"]
     assert stops["count"] >= 2
     resumed = start("--resume", record, "--yes")
     resumed.wait_for(r"\nprint\n")

@@ -69,7 +69,6 @@ def watched(tell: Callable[[int], Observations], count: int) -> list[float]:
     estimator, local, found = begun(), LocalMotion(), []
     for number in range(1, count + 1):
         seen = tell(number)
-        assert estimator.map is not None
         local(seen, estimator.fit(seen, breathing(seen.stamp)), seen.sigma, estimator.map, 0.0)
         found.append(local.size)
     return found
@@ -123,7 +122,6 @@ def test_what_the_map_takes_in_is_displaced_no_more() -> None:
         seen = look(number, 2.0, 8)
         if number == 30:
             estimator.replace_map(surface(folded))  # as it is, which the pose of the one before was not
-        assert estimator.map is not None
         local(seen, estimator.fit(seen, breathing(seen.stamp)), seen.sigma, estimator.map, 0.0)
         assert not local.active
 

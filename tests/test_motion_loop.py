@@ -70,8 +70,7 @@ def test_it_moves_only_between_arming_and_disarming() -> None:
 def test_ticks_come_a_hair_slower_than_moves_last_so_that_no_queue_grows() -> None:
     looping = Looping(START, linked(stand=False), seen)
     ticks = looping.run(4.0)
-    stamps = np.array([t.stamp for t in ticks])
-    assert np.diff(stamps) == pytest.approx(0.02 * 1.005, abs=1e-6)
+    assert np.diff(np.array([t.stamp for t in ticks])) == pytest.approx(0.02 * 1.005, abs=1e-6)
     assert looping.link.virtual.deepest <= 0.0245  # the first step, to where it stands, goes before a tick
 
 
@@ -108,18 +107,15 @@ def test_after_a_stop_and_a_new_arming_the_print_goes_on_where_it_was() -> None:
 def test_an_arm_far_from_home_is_not_armed_before_it_went_there() -> None:
     away = HOME + np.array([30.0, 0, 20, 0, 0, 0])
     link = linked(ArmSettings(servo_lag=0.01, replies=ReplyMode.STREAM), stand=False, begin=away)
-    looping = Looping({0.5: Order.ARM, 1.0: Order.HOME, 5.0: Order.ARM}, link, seen)
-    ticks = looping.run(6.0)
+    ticks = Looping({0.5: Order.ARM, 1.0: Order.HOME, 5.0: Order.ARM}, link, seen).run(6.0)
     assert any("from where the motion left off" in t.answer for t in ticks)
     assert {t.status.state for t in ticks if 4.5 < t.stamp < 5.0} == {ArmState.DISARMED}
-    first = next(t for t in ticks if isinstance(t.command, Move))
-    assert first.stamp > 5.0
+    assert next(t for t in ticks if isinstance(t.command, Move)).stamp > 5.0
 
 
 def test_while_the_arm_is_held_the_motion_is_not_asked() -> None:
     link = linked(port=PortFaults(blocked=[(1.0, 1.15)]), stand=False)
-    looping = Looping(START, link, seen)
-    ticks = looping.run(2.0)
+    ticks = Looping(START, link, seen).run(2.0)
     held = [t for t in ticks if isinstance(t.command, Hold) and "taken no bytes" in t.command.reason]
     assert 4 <= len(held) <= 9
     assert max(link.virtual.deepest, link.deepest) <= 0.05
@@ -143,7 +139,7 @@ def test_a_late_tick_is_made_once_and_missed_ones_are_not_made_up() -> None:
             super().wait_until(instant + late)
 
     link = linked(stand=False)
-    link.clock.__class__ = Slow  # type: ignore[assignment]
+    link.clock.__class__ = Slow
     looping = Looping(START, link, seen)
     ticks = looping.run(2.0)
     assert looping.loop.skipped in (2, 3)
@@ -164,8 +160,7 @@ def test_whatever_ends_it_the_arm_is_stopped() -> None:
     assert looping.link.arm.state is ArmState.STOPPED
     looping.link.run(0.2)
     assert looping.link.virtual.in_flight == 0 and len(looping.link.arm.stops) == 1
-    ended = Looping({**START, 1.0: Order.QUIT}, linked(stand=False), seen)
-    assert ended.run(5.0)[-1].stamp < 1.03
+    assert Looping({**START, 1.0: Order.QUIT}, linked(stand=False), seen).run(5.0)[-1].stamp < 1.03
 
 
 def test_the_same_input_gives_the_same_bytes() -> None:

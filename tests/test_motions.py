@@ -158,8 +158,7 @@ def test_turns_reach_25_and_minus_16_degrees_and_come_back() -> None:
     motion = make({"kind": "turn", "duration_s": 1.0, "hold_s": 1.0})
     angles = np.rad2deg(motion.parts[0].coordinates(np.array([0.0, 1, 2, 3, 4, 5, 6, 7, 8, 10])))[:, 2]
     assert np.allclose(angles, [0, 0, 25, 25, 0, 0, -16, -16, 0, 25])
-    once = make({"kind": "turn", "repeat": False})
-    assert np.allclose(once(np.array([8.0, 10.0, 100.0])), np.eye(4))
+    assert np.allclose(make({"kind": "turn", "repeat": False})(np.array([8.0, 10.0, 100.0])), np.eye(4))
 
 
 def test_a_ramp_goes_at_its_speed_and_comes_back() -> None:
@@ -223,9 +222,9 @@ def test_a_wrong_table_is_named(spec: Spec, key: str, allowed: str) -> None:
 
 def test_what_is_no_list_of_tables_is_refused() -> None:
     with pytest.raises(InputError, match="motion"):
-        motion_from_tables("s.toml", {"kind": "sine"}, Path(), 0)  # type: ignore[arg-type]
+        motion_from_tables("s.toml", {"kind": "sine"}, Path(), 0)
     with pytest.raises(InputError, match=r"scene\.breathing = 3"):
-        waveform_from_table("s.toml", "scene.breathing", 3, np.random.default_rng(0))  # type: ignore[arg-type]
+        waveform_from_table("s.toml", "scene.breathing", 3, np.random.default_rng(0))
     with pytest.raises(InputError, match=r"scene\.breathing\.amplitude_mm"):
         spec = {"kind": "breathing", "amplitude_mm": 1.0}
         waveform_from_table("s.toml", "scene.breathing", spec, np.random.default_rng(0))
@@ -271,11 +270,9 @@ def test_a_path_lies_in_the_wound_and_can_be_printed_in_time(file: Path) -> None
     surface = shape(kind, asked.seed)
     path = read_path(asked.path)
     places = path.surface_from_nozzle[:, :3, 3]
-    assert surface.inside is not None
     x, y = np.rint(surface._nodes(places)).astype(int).T
     assert surface.inside[y, x].min() > asked.bead / 2  # not even the bead's edge is on the rim
     assert (np.abs(places[:, :2]) < np.array(BODIES[kind][1]) / 2).all()
-    assert asked.clearance is not None
     fine = check_path(drape_path(path, surface, asked.clearance))
     length = np.linalg.norm(np.diff(fine.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
     assert 5.0 + float(np.sum(length / fine.speed[1:])) < asked.seconds  # 5 s to see the surface and to get there

@@ -178,7 +178,7 @@ def nozzle_report_eventful() -> NozzleLog:
 
 
 def judged(log: NozzleLog | None = None, path: Path = PATH, **more: object) -> NozzleResult:
-    return evaluate_run(NozzleRun("monday <1>", nozzle_report_eventful() if log is None else log, path, 0.8, **more))  # type: ignore[arg-type]
+    return evaluate_run(NozzleRun("monday <1>", nozzle_report_eventful() if log is None else log, path, 0.8, **more))
 
 
 LIMITS = limits_from_table("x.toml", {"p95_mm": 0.1, "duty": 0.5, "max_mm": 1.0})
@@ -284,7 +284,6 @@ def test_cells_are_of_one_kind() -> None:
 
 def colours(svg: str) -> Array:
     data = re.search(r"base64,([^\"]+)", svg)
-    assert data is not None
     picture = cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_UNCHANGED)
     return np.where(picture[..., 3:] == 255, picture[..., 2::-1], 0)
 

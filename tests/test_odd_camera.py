@@ -57,7 +57,7 @@ def test_a_jerk_of_the_surface_is_followed_by_all_cameras(size: float) -> None:
     for _ in range(8):
         shift = draw.normal(size=3)
         jerked = breathing(NEXT) @ se3.exp(np.concatenate([np.zeros(3), size * shift / np.linalg.norm(shift)]))
-        fit = estimator.fit(look(lambda stamp, pose=jerked: pose, NEXT, 1), estimator.predict(NEXT))  # type: ignore[misc]
+        fit = estimator.fit(look(lambda stamp, pose=jerked: pose, NEXT, 1), estimator.predict(NEXT))
         assert fit.measured and not fit.outliers
         assert np.linalg.norm(fit.solution.base_from_surface[:3, 3] - jerked[:3, 3]) < 0.15
 
@@ -68,7 +68,7 @@ def test_one_camera_against_the_others_and_the_motion_is_no_measurement() -> Non
     estimator.health.left_out = frozenset({1, 2})
     far = breathing(NEXT) @ se3.exp(np.array([0, 0, 0, 6.0, -4.0, 0]))
     for cameras, there, measured in (((0, 1, 2), far, False), ((0,), far, True), ((0, 1, 2), breathing(NEXT), True)):
-        seen = look(lambda stamp, pose=there: pose, NEXT, 1, cameras=cameras)  # type: ignore[misc]
+        seen = look(lambda stamp, pose=there: pose, NEXT, 1, cameras=cameras)
         assert estimator.fit(seen, there).measured is measured
 
 

@@ -246,7 +246,7 @@ def test_other_machines_are_served_encrypted_by_name(elsewhere: LiveSettings, au
 )
 def test_what_cannot_be_served_is_one_error(change: dict[str, object], words: str, elsewhere: LiveSettings) -> None:
     with pytest.raises(InputError) as refused:
-        page_settings(replace(elsewhere, **change), "here")  # type: ignore[arg-type]
+        page_settings(replace(elsewhere, **change), "here")
     assert words in str(refused.value)
 
 

@@ -36,7 +36,7 @@ class Run:
         """Put the view, changed, one turn on if the turn was not told."""
         self._stamp += 1.0
         turn = changed.pop("turn", self.view.turn + 1)
-        self.view = replace(self.view, stamp=self._stamp, turn=turn, **changed)  # type: ignore[arg-type]
+        self.view = replace(self.view, stamp=self._stamp, turn=turn, **changed)
         self.served.put(self.view)
         for page in self.pages:
             page.until(f"{LIVE} && document.body.dataset.turn === '{turn}'")

@@ -250,8 +250,8 @@ def test_a_flood_of_stops_is_one_stop_after_another_and_nothing_else() -> None:
 
 
 def test_a_flood_of_windows_is_turned_away_and_another_is_served_all_the_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    count, begun = FloodCount(), PrintStart()
-    begun.instant = WallClock().now()
+    count, begun = RawValue(FloodCount), RawValue(c_double, math.nan)
+    begun.value = WallClock().now()
     poured = Fault(FaultPart.PAGE, FaultKind.FLOOD, 0.0, 60.0)
     monkeypatch.setattr(flood, "RECONNECT_AFTER", 0.01)
 
@@ -298,7 +298,6 @@ def test_a_page_that_is_killed_comes_back_at_its_address_and_the_run_does_not_wa
     try:
         link.views.put(full_view())
         assert asyncio.run(first_view(page.address)) == 1
-        assert page.process is not None and page.process.pid is not None
         os.kill(page.process.pid, signal.SIGINT)  # Ctrl-C goes to the whole group: the run decides what it means
         os.kill(page.process.pid, signal.SIGKILL)
         page.process.join(5)

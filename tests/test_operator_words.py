@@ -97,7 +97,6 @@ def test_no_course_of_messages_goes_beyond_the_allowance(gaps: list[float]) -> N
 @given(st.floats(), st.text())
 def test_any_view_becomes_json_that_says_the_same(error: float, reason: str) -> None:
     view = full_view(reason=reason)
-    assert view.motion is not None
     said = json.loads(text(view=view, error=error), parse_constant=lambda name: pytest.fail(name))
     assert said["view"]["reason"] == reason and said["view"]["stage"] == "print"
     assert said["view"]["tracking"]["state"] == "TRACKING" and said["view"]["offers"][0] == "confirm"
@@ -173,8 +172,7 @@ def test_a_stop_finds_room_in_any_line_and_voids_what_came_with_it(before: int, 
 
 def test_another_process_that_holds_the_line_sees_the_last_stop() -> None:
     line = RequestLine()
-    context = multiprocessing.get_context("spawn")
-    child = context.Process(target=_stop, args=(line,))
+    child = multiprocessing.get_context("spawn").Process(target=_stop, args=(line,))
     child.start()
     child.join(20)
     assert line.last_stop == 1 and line.take() == [OperatorRequest(1, Wish.STOP, 0)]
@@ -189,7 +187,6 @@ def test_a_page_that_is_killed_while_it_asks_leaves_a_line_that_still_works() ->
         before = line.last_stop
         while line.last_stop < before + 50:
             line.take()
-        assert child.pid is not None
         os.kill(child.pid, signal.SIGKILL)
         child.join(5)
         line.take()

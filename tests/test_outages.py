@@ -61,13 +61,11 @@ def test_a_loss_is_silent_when_off_by_more_than_harmless_and_claimed(error: floa
     off = np.where(np.arange(40) == 15, error, 0.02)
     said = replace(seen, error=off, radius=np.full(40, radius))
     assert not judge_outage(said).silent and judge_outage(said).beyond == silent
-    hushed = replace(said, states=(TRACKING,) * 40)
-    assert judge_outage(hushed).silent == silent
+    assert judge_outage(replace(said, states=(TRACKING,) * 40)).silent == silent
 
 
 def test_what_was_wrong_before_the_outage_does_not_count() -> None:
-    early = np.where(np.arange(40) == 5, 3.0, 0.02)
-    assert not judge_outage(replace(watched(), error=early)).beyond
+    assert not judge_outage(replace(watched(), error=np.where(np.arange(40) == 5, 3.0, 0.02))).beyond
 
 
 @pytest.mark.parametrize("late", [1, 4])
@@ -89,8 +87,7 @@ def test_an_outage_that_nobody_mentions_is_never_flagged() -> None:
 def test_a_fault_that_costs_nothing_need_not_be_mentioned() -> None:
     seen = replace(watched(OutageKind.EXPOSURE), states=(TRACKING,) * 40, reasons=("",) * 40, used=np.full((40, 3), 80))
     assert np.isnan(judge_outage(seen).flagged)
-    off = np.where(np.arange(40) >= 12, 0.3, 0.02)
-    assert judge_outage(replace(seen, error=off)).flagged == np.inf
+    assert judge_outage(replace(seen, error=np.where(np.arange(40) >= 12, 0.3, 0.02))).flagged == np.inf
 
 
 def test_back_is_the_first_pose_without_a_reservation_and_its_error_the_worst_from_then_on() -> None:
@@ -154,7 +151,6 @@ def test_a_turned_camera_sees_all_shifted_by_focal_length_times_angle() -> None:
     images[1][88:93, 158:163] = 200
     outage = Outage(OutageKind.BUMPED, (1,), 1.0, 3.0, 0.7, se3.exp(np.array([0, 0.05, 0, 0, 0, 0])), 5)
     moved = Spoiler(RIG, EXTENT)(outage, 2.0, images, images, BASE_FROM_REST)[1]
-    assert moved is not None
     columns = np.arange(320) @ moved.sum(0) / moved.sum()
     assert columns - 160 == pytest.approx(-0.05 * 280 * 1.01, abs=0.3)
 

@@ -94,7 +94,7 @@ def test_a_full_set_is_given_out_before_the_next_frame_is_there() -> None:
         yield Item(1, 0.001)
         raise AssertionError("looked ahead")
 
-    assert len(next(pair(frames(), 0.1, 2))) == 2  # type: ignore[arg-type]
+    assert len(next(pair(frames(), 0.1, 2))) == 2
 
 
 def test_the_stamp_of_a_set_is_the_mean_also_far_from_zero() -> None:

@@ -75,8 +75,7 @@ def test_a_file_as_people_write_it(tmp_path: File) -> None:
 
 def test_the_sample_path_is_a_square_of_10_mm() -> None:
     path = read_path(SAMPLE)
-    places = path.surface_from_nozzle[:, :3, 3]
-    assert np.ptp(places, axis=0).tolist() == [10, 10, 0]
+    assert np.ptp(path.surface_from_nozzle[:, :3, 3], axis=0).tolist() == [10, 10, 0]
     assert (path.speed == 5).all() and not path.extrude[0]
 
 

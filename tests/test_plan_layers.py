@@ -109,8 +109,7 @@ def test_layers_that_no_bead_fits_into_are_refused() -> None:
 @settings(max_examples=10)
 def test_a_cylinder_is_unrolled_to_its_true_lengths(radius: float, along_y: bool) -> None:
     grid = grid_over([-12, -12], [12, 12], 0.25)
-    across = grid.nodes[..., 0 if along_y else 1]
-    chart = unroll(grid, np.sqrt(radius**2 - across**2))
+    chart = unroll(grid, np.sqrt(radius**2 - grid.nodes[..., 0 if along_y else 1] ** 2))
     a, b = np.array([[-10.0, 3.0], [8.0, 3.0]]) if along_y else np.array([[3.0, -10.0], [3.0, 8.0]])
     arc = radius * (np.arcsin(8 / radius) + np.arcsin(10 / radius))
     charted = chart.from_plane(np.stack([a, b]))

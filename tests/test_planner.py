@@ -123,8 +123,7 @@ def test_a_whole_print(motion: Motion) -> None:
 def test_checkpoints_are_counted_and_their_extrusion_obeyed() -> None:
     path = raster(lines=3)
     quiet = replace(path, extrude=np.array([False, True, False, True, False, True]))
-    result = run(quiet, exact(still, 16))
-    moves = moves_while(result, PrintPhase.PRINTING)
+    moves = moves_while(run(quiet, exact(still, 16)), PrintPhase.PRINTING)
     assert list(dict.fromkeys(m.checkpoint for m in moves if m.extrude)) == [1, 3, 5]
     on_lines = {m.checkpoint for m in moves if not m.extrude}
     assert {2, 4} <= on_lines

@@ -274,7 +274,6 @@ def followed(poses: Array) -> list[Forecast | None]:
 
 def claim(forecast: Forecast | None) -> float:
     """Standard deviation, mm, of the position a tenth of a second ahead, along its worst direction."""
-    assert forecast is not None
     return float(np.sqrt(np.linalg.eigvalsh(forecast.covariances[0][3:, 3:])[-1]))
 
 

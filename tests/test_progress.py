@@ -86,8 +86,7 @@ def test_any_checkpoint_can_be_the_first(checkpoint: int) -> None:
 
 @pytest.mark.parametrize("left", [1e-3, 1e-6, 1e-7, 1e-9])
 def test_a_last_bit_too_short_to_go_along_ends_the_print(left: float) -> None:
-    path = raster(size=2, lines=3)
-    planner = Planner(path, MotionLimits(), CLOSE, TICK, start=5 - left)
+    planner = Planner(raster(size=2, lines=3), MotionLimits(), CLOSE, TICK, start=5 - left)
     printed_by(planner, 10.0, 6.0)
     assert planner.progress.phase is PrintPhase.FINISHED
 
@@ -154,5 +153,5 @@ def test_every_column_counts_in_the_fingerprint() -> None:
         "layer": path.layer + 1,
         "extrude": ~path.extrude,
     }
-    prints = {fingerprint(replace(path, **{name: value})) for name, value in other.items()}  # type: ignore[arg-type]
+    prints = {fingerprint(replace(path, **{name: value})) for name, value in other.items()}
     assert len(prints | {fingerprint(path)}) == len(other) + 1

@@ -113,8 +113,7 @@ def test_any_triangles_large_small_and_behind(seed: int) -> None:
 def test_no_ray_slips_through_between_triangles() -> None:
     scan = scans.height_field(scans.plane, step=5.0)
     targets = scan.vertices[(np.abs(scan.vertices[:, :2]) < [39, 29]).all(axis=1)]  # rays through inner vertices
-    directions = se3.transform_points(se3.inverse(DOWN), targets)
-    hits = cast_rays(scan, DOWN, directions)
+    hits = cast_rays(scan, DOWN, se3.transform_points(se3.inverse(DOWN), targets))
     points, hit = hits.points, hits.hit
     assert hit.all()
     np.testing.assert_allclose(points, targets, atol=1e-9)
@@ -195,7 +194,6 @@ def _arguments(kind: str) -> tuple[dict[int, Image], FirstMap, dict[int, Array]]
 def over_wound(kind: str, found: Registration) -> Array:
     """Errors (N, 3) mm, surface axes, of points of the wound."""
     body_shape = shape(kind)
-    assert body_shape.inside is not None
     flat_places = body_shape.grid(body_shape.step)
     points = body_shape.points(flat_places[(body_shape.inside > 0).ravel()])
     off = se3.transform_points(found.base_from_surface @ SCAN_FROM_SURFACE, points) - se3.transform_points(POSE, points)
@@ -229,7 +227,6 @@ def test_dense_points_lie_on_the_true_surface_whatever_they_began_on(lift: float
 def test_every_other_node_is_matched_as_among_all() -> None:
     lattice = nodes()[0]
     whole, some = (match_near(LENSES, seen("wound")[0], lattice, 1, every) for every in (1, 3))
-    assert whole is not None and some is not None
     both = whole.sure[::3, ::3] & some.sure
     assert both.sum() > 0.8 * some.sure.sum()
     assert np.allclose(whole.points[::3, ::3][both], some.points[both], atol=1e-6)

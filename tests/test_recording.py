@@ -251,7 +251,6 @@ def test_the_schema_in_the_file_is_the_one_that_ros_knows(tmp_path: Path) -> Non
     with open(tmp_path / "x.mcap", "rb") as file:
         found = list(SeekingReader(file, validate_crcs=True).iter_messages(topics=["/camera/left/image"]))
     for number, (schema, channel, message) in enumerate(found):
-        assert schema is not None
         assert (schema.name, schema.encoding, channel.message_encoding) == (IMAGE_SCHEMA_NAME, "ros2msg", "cdr")
         defined = get_types_from_msg(schema.data.decode(), schema.name)
         assert all(STORE.fielddefs[name] == fields for name, fields in defined.items())

@@ -42,7 +42,6 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
     """End of each chunk, bytes, and the frames that can be read up to there."""
     with open(path, "rb") as file:
         summary = SeekingReader(file).get_summary()
-    assert summary is not None
     ends = []
     frames = 0
     chunks = {p.offset: p for p in walk(path) if isinstance(p, ChunkMessages)}
@@ -114,7 +113,6 @@ def test_a_killed_run_is_readable_to_the_last_second(tmp_path: Path) -> None:
     root = Path(__file__).parent.parent
     command = [sys.executable, "-c", KILLED, str(tmp_path / "x.mcap")]
     child = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, text=True)
-    assert child.stdout is not None
     while int(child.stdout.readline()) < 100:
         pass
     child.send_signal(signal.SIGKILL)

@@ -61,7 +61,6 @@ class Run:
         """Position errors (M,), mm, of the measured poses under the first tracked pose's change of frame, and which
         of them are TRACKING (M,)."""
         truth = self.session.truth
-        assert truth is not None
         first = next(i for i, p in enumerate(self.poses) if p.state is TrackState.TRACKING)
         kept = [p for p in self.poses[first:] if p.state.measured]
         rows, near = associate(np.array([p.stamp for p in kept]), truth.stamps)

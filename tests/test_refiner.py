@@ -28,7 +28,6 @@ def shapes(seed: int) -> list[float]:
         fit = estimator.fit(observations, swaying(observations.stamp))
         take = refiner.confirm if len(points) == 1 else refiner.rebuild
         adjusted = take(fit, observations, delays)
-        assert adjusted is not None
         points.append(adjusted.map.points)
     return [shape_error(p, true) for p in points]
 

@@ -82,7 +82,7 @@ def slides(result: Registration) -> Array:
     return result.free[np.linalg.norm(result.free[:, :3], axis=1) < 1e-3][:, 3:]
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_plane_slides_and_spins(noise: float) -> None:
     result, _ = found(scans.height_field(scans.plane), 1, noise)
     assert not result.sure and result.free.shape == (3, 6)
@@ -92,7 +92,7 @@ def test_a_plane_slides_and_spins(noise: float) -> None:
     assert result.verdict.count("slide along") == 2 and result.verdict.count("turn about (0.00 0.00 1.00)") == 1
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_cylinder_slides_along_and_turns_about_its_axis(noise: float) -> None:
     result, _ = found(scans.cylinder(), 2, noise)
     assert not result.sure and result.free.shape == (2, 6)
@@ -104,7 +104,7 @@ def test_a_cylinder_slides_along_and_turns_about_its_axis(noise: float) -> None:
     assert through[2] == pytest.approx(-70, abs=1.0)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_sphere_turns_about_its_centre(noise: float) -> None:
     result, _ = found(scans.height_field(scans.sphere), 3, noise)
     assert not result.sure and result.free.shape == (3, 6) and result.verdict.count("turn about") == 3
@@ -114,8 +114,7 @@ def test_a_sphere_turns_about_its_centre(noise: float) -> None:
 
 def test_the_covariance_is_wide_along_what_is_free_and_narrow_across() -> None:
     result, _ = found(scans.height_field(scans.plane), 4, noise=0.05)
-    std = np.sqrt(np.diag(result.covariance))
-    assert (std[3:5] > 30).all()
+    assert (np.sqrt(np.diag(result.covariance))[3:5] > 30).all()
     normal = np.array([0.0, 0, 0, 0, 0, 1])
     assert np.sqrt(normal @ result.covariance @ normal) < 0.05
 

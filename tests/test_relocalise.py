@@ -97,7 +97,7 @@ def test_neither_the_room_nor_another_surface_is_this_one(search: Relocaliser) -
 
 @pytest.mark.parametrize("level", [0, 128])
 def test_nothing_is_found_in_even_images(search: Relocaliser, level: int) -> None:
-    blank = pyramid(np.full((720, 1280), level, np.uint8))
+    blank = Pyramid(np.full((720, 1280), level, np.uint8))
     assert search.find(dict.fromkeys(range(3), blank)) is None and search.find({}) is None
 
 
@@ -147,7 +147,6 @@ class Case:
             if frames.stamp in references.stamps:
                 references.cut(frames)
         cut = references.matcher()
-        assert cut is not None
         relinker = Reobserver(motion, *cut)
         found = [seen for frames in sets for seen in relinker(frames)]
         return with_looks(self.tracks, map(relinker.as_tracks, found))

@@ -138,8 +138,7 @@ def test_speed_changes_by_no_more_than_the_cruising_speed_in_a_rise(seed: int) -
 
 
 def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> None:
-    swing = SwingingSurface(10.0, 0.1, 0.25)
-    pose = pose_at(swing.at, 10.0)
+    pose = pose_at(SwingingSurface(10.0, 0.1, 0.25).at, 10.0)
     curve = curve_on(raster())
     grid = gridpoints_on(curve, 0.0, 4.0)
     asked = axis_derivatives(ARM, pose, curve, grid, 10.0)

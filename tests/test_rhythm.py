@@ -145,7 +145,7 @@ def test_a_pose_comes_through_whole() -> None:
     newest.put(pose)
     back = newest.get()
     assert type(back) is type(pose)
-    assert np.array_equal(back.base_from_surface, pose.base_from_surface)  # type: ignore[attr-defined]
+    assert np.array_equal(back.base_from_surface, pose.base_from_surface)
 
 
 def test_what_is_too_large_is_refused_and_what_was_there_stays() -> None:

@@ -229,7 +229,7 @@ def watch_frames(stamp: float = 1.0, cameras: tuple[int, ...] = (0, 1, 2), gray:
 
 
 def shown(folder: Path, pose: SurfacePose = POSE, line: np.ndarray | None = DOTTED, **more: object) -> Image:
-    WatchPage(folder, RIG, "A <title>").show(watch_frames(**more), pose, line, [("arm", "prints & waits")])  # type: ignore[arg-type]
+    WatchPage(folder, RIG, "A <title>").show(watch_frames(**more), pose, line, [("arm", "prints & waits")])
     picture = cv2.imread(str(folder / "watch.jpg"))
     assert picture is not None
     return np.asarray(picture, np.uint8)
@@ -295,6 +295,5 @@ def test_a_missing_camera_is_a_dark_tile_and_gray_pictures_are_shown(tmp_path: P
 def test_rigs_of_one_camera_and_of_five_have_a_page(tmp_path: Path) -> None:
     for count in (1, 5):
         rig = arc_rig(tuple(20.0 * i for i in range(count)))
-        watch = WatchPage(tmp_path, rig, "x")
-        watch.show(watch_frames(cameras=tuple(range(count))), POSE, DOTTED, [])
+        WatchPage(tmp_path, rig, "x").show(watch_frames(cameras=tuple(range(count))), POSE, DOTTED, [])
         assert (tmp_path / "watch.jpg").stat().st_size > 1000

@@ -34,13 +34,12 @@ def test_a_scenario_of_title_seconds_and_path_has_a_default_for_everything_else(
     assert not scenario.tracking.scan
     assert (scenario.nozzle, scenario.beads, scenario.jpeg_quality, scenario.strain) == (True, True, 90, None)
     assert [camera.name for camera in scenario.rig.cameras] == ["cam_0", "cam_1", "cam_2"]
-    assert np.array_equal(scenario.motion(np.array([3.0]))[0], np.eye(4)) and scenario.limits.names == ()
+    assert np.array_equal(scenario.motion(np.array([3.0]))[0], np.eye(4)) and scenario.limits == {}
 
 
 def test_the_motion_knows_all_of_the_lag_that_there_is_unless_told_otherwise(tmp_path: Path) -> None:
     wire = 48 * 10 / 115200
-    usual = read_scenario(write_scenario(tmp_path))
-    assert usual.profile.lag == pytest.approx(0.02 + wire)
+    assert read_scenario(write_scenario(tmp_path)).profile.lag == pytest.approx(0.02 + wire)
     slow = read_scenario(write_scenario(tmp_path, arm={"dead_time_s": 0.1, "servo_lag_s": 0.05, "wire_baud": math.inf}))
     assert slow.profile.lag == pytest.approx(0.15) and slow.baud == math.inf
     told = read_scenario(write_scenario(tmp_path, arm={"dead_time_s": 0.1, "assumed_lag_s": 0.0}))
@@ -202,7 +201,7 @@ def test_the_files_that_a_scenario_names_must_be_there(tmp_path: Path) -> None:
         ({"motion": [{"kind": "trace", "file": "lost.tum"}]}, "lost.tum"),
     ):
         with pytest.raises(InputError, match=name):
-            read_scenario(write_scenario(tmp_path, change))  # type: ignore[arg-type]
+            read_scenario(write_scenario(tmp_path, change))
     with pytest.raises(InputError, match=r"nothing\.toml"):
         read_scenario(tmp_path / "nothing.toml")
 

@@ -196,6 +196,6 @@ def test_one_call_serves_any_shape() -> None:
     ],
 )  # fmt: skip
 @pytest.mark.filterwarnings("error")
-def test_what_is_not_a_rigid_motion_is_told(spoil) -> None:  # type: ignore[no-untyped-def]
+def test_what_is_not_a_rigid_motion_is_told(spoil) -> None:
     t = se3.exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     assert se3.is_transform(t) and not se3.is_transform(spoil(t))

@@ -134,8 +134,7 @@ def test_specks_are_dropped_and_a_second_wound_is_kept() -> None:
 
 
 def test_the_centroid_is_the_mean_of_the_pixels() -> None:
-    mask = disc((80, 90), (41, 33), 11)
-    assert np.allclose(centroid(mask), (41, 33), atol=1e-9)
+    assert np.allclose(centroid(disc((80, 90), (41, 33), 11)), (41, 33), atol=1e-9)
     assert np.isnan(centroid(np.zeros((5, 5), bool))).all()
 
 

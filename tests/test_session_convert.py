@@ -117,8 +117,7 @@ def test_a_camera_that_gave_nothing_stays_in_the_rig(tmp_path: Path) -> None:
 
 
 def test_jpeg_pictures_keep_their_bytes(tmp_path: Path) -> None:
-    folder = make_folder(tmp_path / "s")
-    import_folder(folder, tmp_path / "a.mcap", jpeg_quality=90)
+    import_folder(make_folder(tmp_path / "s"), tmp_path / "a.mcap", jpeg_quality=90)
     export_recording(tmp_path / "a.mcap", tmp_path / "out")
     assert (tmp_path / "out" / "left" / "000003.jpg").is_file()
     import_folder(tmp_path / "out", tmp_path / "b.mcap")
@@ -154,11 +153,11 @@ def stop_at(count: int) -> object:
 def test_an_interrupted_import_or_export_leaves_nothing(tmp_path: Path) -> None:
     folder, recording = make_folder(tmp_path / "s"), tmp_path / "a.mcap"
     with pytest.raises(Stop):
-        import_folder(folder, recording, stop_at(5))  # type: ignore[arg-type]
+        import_folder(folder, recording, stop_at(5))
     assert leftovers(tmp_path, "s") == []
     import_folder(folder, recording)
     with pytest.raises(Stop):
-        export_recording(recording, tmp_path / "out", stop_at(5))  # type: ignore[arg-type]
+        export_recording(recording, tmp_path / "out", stop_at(5))
     assert leftovers(tmp_path, "s", "a.mcap") == []
 
 
@@ -235,7 +234,6 @@ def test_a_real_folder_survives_the_way_there_and_back(tmp_path: Path) -> None:
         for a, b in islice(zip(folder.frame_sets(), back.frame_sets(), strict=True), 20):
             assert a.stamp == b.stamp
             assert all(np.array_equal(f.image, g.image) for f, g in zip(a.frames, b.frames, strict=True))
-        assert folder.truth is not None and back.truth is not None
         assert folder.truth.base_from_surface.tobytes() == back.truth.base_from_surface.tobytes()
 
 

@@ -46,8 +46,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A finished run without pictures."""
     folder = tmp_path_factory.mktemp("quick")
     file = write_scenario(folder, IDEAL, seconds=4.0, limits={"p95_mm": 0.06, "duty": 0.9})
-    outcome = run_simulation(file, folder / "out")
-    assert outcome.met
+    assert run_simulation(file, folder / "out").met
     yield folder
 
 
@@ -206,7 +205,7 @@ def test_what_makes_no_sense_is_refused_before_anything_is_written(tmp_path: Pat
         ({"scene": {"deformation": {"bulge_mm": 1.0}}}, "strain, scene.deformation"),
         ({"tracking": {"by": "truth", "register": "scan"}}, "tracking.register"),
     ):
-        refused(write_scenario(tmp_path, IDEAL, no_effect), out, words)  # type: ignore[arg-type]
+        refused(write_scenario(tmp_path, IDEAL, no_effect), out, words)
     write_path(tmp_path / "path.csv", [[0, 0, 0], [0, 90, 0]])
     refused(write_scenario(tmp_path, IDEAL, clearance_mm=0.4), out, r"path\.csv: a place on the path")
 
@@ -226,8 +225,7 @@ def test_a_run_in_which_nothing_could_be_printed_has_a_report(tmp_path: Path) ->
     outcome = run_simulation(write_scenario(tmp_path, IDEAL, seconds=0.15, limits={}), tmp_path / "out")
     assert "Nothing was printed" in outcome.text and not outcome.met
     assert (tmp_path / "out" / "report.html").exists()
-    path = read_path(tmp_path / "path.csv")
-    assert len(path) == 2
+    assert len(read_path(tmp_path / "path.csv")) == 2
 
 
 def test_a_scenario_is_not_run_over_itself(tmp_path: Path) -> None:

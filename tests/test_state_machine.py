@@ -201,7 +201,7 @@ def test_a_step_of_300_um_or_0_1_degrees_is_flagged_within_two_frames(seed: int,
     change = np.concatenate([towards(seed) * size * turn, towards(seed) * size * (not turn)])
     said = watched(stepped(se3.exp(change)), SIGMA, claimed, seed)
     assert not any(motion.moving for motion in said[40:START]) and said[START + 1].moving
-    assert said[START + 1].onset == START / RATE
+    assert said[START + 1].onset * RATE in (START - 1, START)  # by noise, the pose before stands out in 1 of 90
     assert (said[START + 1].turned if turn else said[START + 1].moved) == pytest.approx(size, rel=0.3)
 
 

@@ -68,7 +68,6 @@ def test_the_recording_of_a_run_is_its_session_again(session: Path, tmp_path: Pa
         for frames in original.frame_sets():
             recorder.write(frames, step(frames), step.last)
     again = open_session(tmp_path / "run.mcap")
-    assert again.truth is not None and original.truth is not None
     assert np.array_equal(again.truth.stamps, original.truth.stamps)
     assert np.allclose(again.truth.base_from_surface, original.truth.base_from_surface)
     assert [r.stamp for r in again.roi] == [r.stamp for r in original.roi]
@@ -86,8 +85,7 @@ def test_a_run_leaves_its_files_and_they_agree(tracked: Path) -> None:
     table = read_poses(tracked / "poses.csv")
     summary = json.loads((tracked / "summary.json").read_text())
     assert (len(table), summary["frame_sets"], summary["complete"]) == (10, 10, True)
-    lines = (tracked / "poses.tum").read_text().splitlines()
-    assert len(lines) - 1 == table.measured.sum()
+    assert len((tracked / "poses.tum").read_text().splitlines()) - 1 == table.measured.sum()
     assert np.isfinite(table.offset_sigmas).all() and (table.offset_sigmas[-1] < table.offset_sigmas[0]).all()
     assert np.abs(table.offsets[-1]).max() < 0.001  # the cameras were triggered together
     assert list(summary["clocks_ms"]) == list(table.cameras)

@@ -311,8 +311,7 @@ def test_a_surface_at_rest_stays_at_rest() -> None:
 
 
 def test_nothing_is_tracked_before_the_regions_instant(sets: list[FrameSet]) -> None:
-    later = rois(SCENE, RIG, breathing(0.4), 0.4)
-    poses = run(sets[:9], later)
+    poses = run(sets[:9], rois(SCENE, RIG, breathing(0.4), 0.4))
     for p in poses[:3]:
         assert p.state is TrackState.INITIALISING and "region of interest" in p.reason
     assert states(poses[4 + FIRST :]) == {TrackState.TRACKING} and errors(poses)[4 + FIRST :].max() < 0.1

@@ -112,8 +112,7 @@ def test_a_network_that_cannot_be_rounded_is_refused(tmp_path: Path) -> None:
 def test_both_networks_keep_the_size_and_ours_is_below_three_million() -> None:
     planes = torch.zeros(1, 3, 64, 96)
     for name in ("wound", "thesis"):
-        network = build_network(name, 1).eval()
-        assert network(planes).shape == (1, 1, 64, 96)
+        assert build_network(name, 1).eval()(planes).shape == (1, 1, 64, 96)
     assert parameter_count(WoundNet()) < 3e6 < parameter_count(ThesisUNet())
 
 

@@ -41,14 +41,14 @@ def nozzles(points: Array) -> Array:
 
 @given(places, instants, st.sampled_from([np.eye(4), GRID]))
 def test_material_is_the_inverse_of_checkpoints(place: Array, instant: float, grid: Array) -> None:
-    truth, times = Truth(BASE_FROM_REST, surface_from_grid=grid, **SMOOTH), np.array([instant])  # type: ignore[arg-type]
+    truth, times = Truth(BASE_FROM_REST, surface_from_grid=grid, **SMOOTH), np.array([instant])
     base_from_target = truth.checkpoints(times, nozzles(place[None]))
     assert truth.material(times, base_from_target[:, :3, 3]) == pytest.approx(place[None], abs=1e-8)
 
 
 @given(places, instants, st.sampled_from([np.eye(4), GRID]))
 def test_a_checkpoint_is_a_rigid_pose_where_the_displacement_says(place: Array, instant: float, grid: Array) -> None:
-    truth, times = Truth(BASE_FROM_REST, surface_from_grid=grid, **SMOOTH), np.array([instant])  # type: ignore[arg-type]
+    truth, times = Truth(BASE_FROM_REST, surface_from_grid=grid, **SMOOTH), np.array([instant])
     (target,) = truth.checkpoints(times, nozzles(place[None]))
     assert se3.is_transform(target)
     amount = float(np.sin(2 * instant))
@@ -60,7 +60,7 @@ def test_a_checkpoint_is_a_rigid_pose_where_the_displacement_says(place: Array, 
 @given(places, instants)
 def test_the_tool_turns_with_the_skin_under_it(place: Array, instant: float) -> None:
     """A polar rotation is the one nearest to the gradient: what is left of the gradient is symmetric."""
-    truth = Truth(BASE_FROM_REST, **SMOOTH)  # type: ignore[arg-type]
+    truth = Truth(BASE_FROM_REST, **SMOOTH)
     times, amount = np.array([instant]), np.sin(2 * np.array([instant]))
     nozzle = nozzles(place[None])
     turned = se3.inverse(truth.base_from_surface(times)) @ truth.checkpoints(times, nozzle)
@@ -87,7 +87,7 @@ def test_without_strain_a_checkpoint_is_carried_rigidly() -> None:
 def test_checkpoints_are_not_changed_by_asking() -> None:
     nozzle = nozzles(np.ones((3, 3)))
     before = nozzle.copy()
-    Truth(BASE_FROM_REST, **SMOOTH).checkpoints(np.array([0.3, 0.6, 0.9]), nozzle)  # type: ignore[arg-type]
+    Truth(BASE_FROM_REST, **SMOOTH).checkpoints(np.array([0.3, 0.6, 0.9]), nozzle)
     assert np.array_equal(nozzle, before)
 
 

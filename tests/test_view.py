@@ -107,8 +107,7 @@ def test_the_surface_lies_where_its_landmarks_are(playback: Playback) -> None:
 
 
 def test_a_folder_shows_its_truth_or_other_poses(tmp_path: Path, recording: Path) -> None:
-    folder = make_folder(tmp_path / "s", pictures=True)
-    shown = open_playback(folder)
+    shown = open_playback(make_folder(tmp_path / "s", pictures=True))
     assert shown.source in ("truth", "reference") and not any(shown.tracks)
     assert json.loads(session_text(shown))["states"].count("TRACKING") == sum(p is not None for p in shown.poses)
     assert open_playback(recording, poses=f"{recording}:truth").source.endswith(":truth")
@@ -198,7 +197,6 @@ def test_the_figures_are_evos(aligned: bool, delta: int) -> None:
     if aligned:
         theirs.align(reference, correct_scale=False)
     ours = compare(posed(found), posed(truth), delta).of(ALIGNMENTS[int(aligned)])
-    assert ours is not None
     parts = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad
     for part, absolute, relative in zip(
         parts,
@@ -223,7 +221,7 @@ def test_moving_the_base_or_the_surface_frame_changes_only_what_it_may(seed: int
     plain, base, surface = (compare(posed(p), posed(truth)) for p in (found, shift @ found, found @ shift))
 
     def rmse(result: object, name: str, relative: bool = False) -> float:
-        judged = result.of(name)  # type: ignore[attr-defined]
+        judged = result.of(name)
         part = judged.relative if relative else judged.absolute
         return error_statistics(part.translation).rmse
 
@@ -231,7 +229,6 @@ def test_moving_the_base_or_the_surface_frame_changes_only_what_it_may(seed: int
     shifted = rmse(base, ALIGNMENTS[0], relative=True)
     assert shifted == pytest.approx(rmse(plain, ALIGNMENTS[0], relative=True), rel=1e-6)
     judged, expected = (r.of(ALIGNMENTS[2]) for r in (surface, plain))
-    assert judged is not None and expected is not None
     assert judged.absolute.rotation == pytest.approx(expected.absolute.rotation, abs=1e-3)
     assert rmse(plain, ALIGNMENTS[1]) <= rmse(plain, ALIGNMENTS[0]) + 1e-9
 

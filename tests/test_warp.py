@@ -197,7 +197,6 @@ def test_a_rigid_surface_is_never_lively() -> None:
 def test_what_the_map_is_told_of_its_error_was_no_deformation() -> None:
     """A map that is found to have been wrong by what looked like a deformation leaves none."""
     warps = _filtered(BREATH[:25])
-    assert warps.warp is not None
     bent = warps.points(MAP)
     before = warps.warp.deformation
     warps.replace_map(replace(MAP, points=bent), right=True)

@@ -111,7 +111,6 @@ def test_a_waved_board_becomes_a_rig(browser: Browser, tmp_path: Path, monkeypat
     board, out, cameras = tmp_path / "board.toml", tmp_path / "rig.toml", videos(tmp_path)
     write_board(board, BOARD)
     run = started(["calibrate", "cameras", *cameras, "--board", str(board), "-o", str(out), "--limit-mm", "1"])
-    assert run.stderr is not None and run.stdout is not None
     page = browser.page(run.stderr.readline().split()[1])
     page.until('parseInt(document.querySelector("#looked")?.textContent) >= 30', timeout=PATIENCE)
     page.until('[...document.querySelectorAll("canvas")].every((each) => each.dataset.drawn)', timeout=PATIENCE)

@@ -71,8 +71,7 @@ def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
     ids=["dead time", "servo", "both", "wire", "early", "part of it told"],
 )
 def test_an_unknown_delay_costs_speed_times_delay(change: dict[str, object], delay: float, tmp_path: Path) -> None:
-    file = write_scenario(tmp_path, IDEAL, change)
-    log = heard(file).log
+    log = heard(write_scenario(tmp_path, IDEAL, change)).log
     velocity = BASE_FROM_REST[:3, :3] @ (VELOCITY + [SPEED, 0, 0])  # the surface's and, on it, the path's own
     off = difference(log)[inner(log)]
     assert len(off) > 800
@@ -91,16 +90,14 @@ def test_an_unknown_delay_costs_speed_times_delay(change: dict[str, object], del
     ids=["arm", "transport and processing", "exposure", "shutters"],
 )
 def test_what_the_loop_knows_of_costs_nothing_at_constant_speed(change: dict[str, object], tmp_path: Path) -> None:
-    file = write_scenario(tmp_path, IDEAL, change, motion=[STEADY], seconds=5.0)
-    log = heard(file).log
+    log = heard(write_scenario(tmp_path, IDEAL, change, motion=[STEADY], seconds=5.0)).log
     assert np.linalg.norm(difference(log)[inner(log)], axis=1).max() < 0.005
 
 
 @pytest.mark.parametrize("offset", [0.016, *slowly(-0.016)])
 def test_a_hidden_clock_offset_costs_the_speed_of_the_surface_alone(offset: float, tmp_path: Path) -> None:
     cameras = {"offset_s": [offset] * 3, "transport_s": 0.03}  # no pose may come before its stamp
-    file = write_scenario(tmp_path, IDEAL, {"cameras": cameras}, motion=[STEADY], seconds=2.2)
-    log = heard(file).log
+    log = heard(write_scenario(tmp_path, IDEAL, {"cameras": cameras}, motion=[STEADY], seconds=2.2)).log
     wanted = BASE_FROM_REST[:3, :3] @ VELOCITY * offset  # what is stamped t was seen at t + offset
     off = difference(log)[inner(log)]
     early = EARLY * np.linalg.norm(VELOCITY + [SPEED, 0, 0])
@@ -176,8 +173,7 @@ def test_a_pose_is_known_no_sooner_than_exposure_transport_and_processing_allow(
 
 def test_a_slow_tracker_takes_the_newest_frame_set_and_the_rest_is_counted(tmp_path: Path) -> None:
     change = {"cameras": {"fps": 50.0, "transport_s": 0.003}, "tracking": {"processing_s": 0.07}}
-    scenario = read_scenario(write_scenario(tmp_path, IDEAL, change))
-    world = world_of(scenario, sink := Heard())
+    world = world_of(read_scenario(write_scenario(tmp_path, IDEAL, change)), sink := Heard())
     world.run()
     taken = np.array([frames.stamp for frames in sink.frames])
     exposed = 0.1 + np.arange(95) / 50
@@ -186,9 +182,7 @@ def test_a_slow_tracker_takes_the_newest_frame_set_and_the_rest_is_counted(tmp_p
         start += 0.07
         assert stamp == pytest.approx(exposed[exposed + 0.003 <= start + 1e-9][-1])
     assert world.pipeline.tracked == len(taken) == 28
-    assert world.pipeline.tracked + world.pipeline.skipped == pytest.approx(
-        95, abs=2
-    )  # what waits at the end is neither
+    assert 28 + world.pipeline.skipped == pytest.approx(95, abs=2)  # what waits at the end is neither
 
 
 def test_a_frame_set_that_is_left_out_has_a_print_head_all_the_same(tmp_path: Path) -> None:
@@ -216,8 +210,7 @@ def test_the_line_carries_every_frame_to_the_arm(tmp_path: Path) -> None:
         passed.append(data)
         return data
 
-    scenario = read_scenario(write_scenario(tmp_path, IDEAL))
-    world = world_of(scenario, sink := Heard(), line)
+    world = world_of(read_scenario(write_scenario(tmp_path, IDEAL)), sink := Heard(), line)
     world.run()
     assert b"".join(passed) == sink.sent
     assert len(sink.sent) == 48 * len(sink.commands)
@@ -306,8 +299,7 @@ def test_lost_and_repeated_frames_change_sets_and_do_not_end_the_run(tmp_path: P
 
 
 def test_cut_short_the_rows_until_then_are_given_out(tmp_path: Path) -> None:
-    scenario = read_scenario(write_scenario(tmp_path, IDEAL))
-    world = world_of(scenario, sink := Heard())
+    world = world_of(read_scenario(write_scenario(tmp_path, IDEAL)), sink := Heard())
 
     def interrupt(done: int, total: int) -> None:
         assert total == 100
@@ -325,7 +317,7 @@ def test_cut_short_within_a_tick_the_rows_until_then_are_given_out(tmp_path: Pat
         def command(self, *told: object) -> None:
             if len(self.commands) == 40:
                 raise KeyboardInterrupt
-            super().command(*told)  # type: ignore[arg-type]
+            super().command(*told)
 
     scenario = replace(read_scenario(write_scenario(tmp_path, IDEAL)), seconds=2.0)
     world = world_of(scenario, sink := Interrupting())

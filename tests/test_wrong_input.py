@@ -317,7 +317,6 @@ def test_they_end_with_their_parent(pool: str, end: Callable[[int, int], None], 
     started = subprocess.Popen(
         [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
     )
-    assert started.stdout is not None
     try:
         own = [int(started.stdout.readline()) for _ in range(2)]
         assert not any(map(pipe_closed, own))
@@ -343,7 +342,6 @@ def test_ctrl_c_while_a_process_loads_is_its_parents_alone(how: str, tmp_path: P
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    assert started.stdout is not None
     try:
         assert started.stdout.readline() == "loads\n"
         os.killpg(started.pid, signal.SIGINT)
