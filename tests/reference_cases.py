@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mapping.triangulation import triangulated_map
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.synthetic.follow import Follower
+from estimation.triangulation import triangulated_map
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import frame_from_command
 from hardware.files.path_file import read_path
@@ -25,8 +25,8 @@ from hardware.files.rig_file import read_rig
 from hardware.motion.step import MotionStep
 from hardware.offline.replay import placed_by, replay
 from planning.command import Command, Move
+from planning.kinematics import axes_from_nozzle
 from planning.path import Path as Route
-from planning.robot.kinematics import axes_from_nozzle
 
 FOLDER = Path(__file__).parent / "reference"
 TRACKS = ("breathing", "outage")

@@ -12,7 +12,7 @@ from estimation import se3
 from estimation.mapping.bundle_adjustment import AdjustedMap, KeyFrame, adjust, frame_change, without_frame
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
-from estimation.online.pose_solver import PointTracks, solve_pose
+from estimation.pose_solver import PointTracks, solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.movements import patch

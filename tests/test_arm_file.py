@@ -18,9 +18,9 @@ from hardware.arm.protocol import Dialect
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
 from planning.command import Move, Refusal, RefusalCode
+from planning.kinematics import SimpleArm
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 from planning.motion.guard import Guard
-from planning.robot.kinematics import SimpleArm
 from tests.test_guard import ARM, TICK, WIDE, axes, move, pose
 
 

@@ -18,8 +18,8 @@ from hardware.arm.queue import ArmQueue
 from hardware.motion.loop import Order, Tick
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Move
+from planning.kinematics import nozzle_from_axes
 from planning.motion.planner import Planner, place_passed
-from planning.robot.kinematics import nozzle_from_axes
 from tests.linked import Linked, circle, linked
 from tests.moving import breathing, pose_at, raster
 from tests.test_motion_loop import Looping, seen

@@ -10,8 +10,8 @@ import pytest
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.bump_detector import BumpDetector, camera_equations, reduced_alone, reduced_together
-from estimation.online.pose_solver import project
 from estimation.pose import TrackState
+from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import observations

@@ -20,11 +20,11 @@ from hardware.motion.step import MotionStep
 from hardware.process.ticks import PoseLockedSchedule
 from hardware.simulator.scene.scene import Scene, rois
 from perception.lens import Lenses
+from perception.mapping.features import grey, polygon_mask
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
-from perception.matching.features import grey, polygon_mask
-from perception.matching.patches import Pyramid
+from perception.mapping.patches import Pyramid
 from planning.command import Hold, Move
-from planning.robot.kinematics import nozzle_from_axes
+from planning.kinematics import nozzle_from_axes
 from tests.linked import linked
 from tests.moving import breathing, pose_at, raster
 from tests.slowly import slowly

@@ -9,7 +9,6 @@ import pytest
 
 from estimation.online.camera_errors import CameraErrors
 from estimation.online.fit import FitCovariance, FrameFit
-from estimation.online.pose_solver import PoseFit, SharedFit
 from estimation.online.reported_covariance import (
     CALM_BEFORE_NARROWING_S,
     FrameOriginError,
@@ -18,6 +17,7 @@ from estimation.online.reported_covariance import (
     WindowNoise,
 )
 from estimation.pose import Forecast, SurfacePose, TrackState
+from estimation.pose_solver import PoseFit, SharedFit
 from estimation.se3 import Array
 
 CAMERAS = 3

@@ -24,10 +24,10 @@ from hardware.simulator.scene.scene import rois
 from hardware.simulator.scene.shape import Wound
 from perception.frames import Frame, FrameSet
 from perception.lens import Lenses
+from perception.mapping.features import MAX_DESCRIPTORS, Relocaliser, grey
 from perception.mapping.first_map import FirstMap, build_first_map
 from perception.mapping.growth import NewLandmarks, Probation, SurfaceSnapshot, between_known
-from perception.matching.features import MAX_DESCRIPTORS, Relocaliser, grey
-from perception.matching.patches import Pyramid
+from perception.mapping.patches import Pyramid
 from perception.tracking.step import TrackingStep
 from tests.synthetic import frame_sets, patch, pictures
 

@@ -24,9 +24,9 @@ from hardware.bench.campaigns.guard import (
     simple_rules,
 )
 from planning.command import Command, Hold, Move, Refusal, RefusalCode
+from planning.kinematics import SimpleArm, joints_from_axes
 from planning.limits import MotionLimits
 from planning.motion.guard import Guard
-from planning.robot.kinematics import SimpleArm, joints_from_axes
 from tests.slowly import slowly
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit

@@ -17,10 +17,7 @@ from hardware.arm.profile import ArmProfile
 from hardware.bench.planner import StreamTally, bench_arm, follow_stream
 from hardware.files.arm_file import read_arm, write_arm
 from planning.command import Hold, Move, Refusal, RefusalCode
-from planning.motion.guard import Guard
-from planning.motion.planner import Planner
-from planning.progress import PrintPhase
-from planning.robot.kinematics import (
+from planning.kinematics import (
     ELBOWS,
     POSTURES,
     SHOULDERS,
@@ -35,6 +32,9 @@ from planning.robot.kinematics import (
     nozzle_from_axes,
     nozzle_from_joints,
 )
+from planning.motion.guard import Guard
+from planning.motion.planner import Planner
+from planning.progress import PrintPhase
 from tests.moving import REST, breathing, pose_at, raster
 
 SEEDS = st.integers(0, 100_000)

@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from perception.frames import SYRINGE, PrintHead
 from perception.lens import Lenses
-from perception.matching.masks import (
+from perception.mapping.masks import (
     BEAD_REACH_MM,
     BEAD_STEP_MM,
     GEL_TIME_S,

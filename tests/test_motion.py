@@ -16,10 +16,10 @@ from hardware.arm.protocol import G1, G4, Dialect, decode, encode, frame_from_co
 from hardware.motion.step import MotionStep
 from hardware.process.clock import Clock, SimClock, WallClock
 from planning.command import Hold, Move, Refusal
+from planning.kinematics import axes_from_nozzle, nozzle_from_axes
 from planning.limits import MotionLimits
 from planning.motion.curve import APPROACH_HEIGHT
 from planning.progress import PrintPhase
-from planning.robot.kinematics import axes_from_nozzle, nozzle_from_axes
 from tests.moving import REST, Motion, breathing, pose_at, raster, still
 from tests.slowly import slowly
 

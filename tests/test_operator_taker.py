@@ -25,8 +25,8 @@ from hardware.operator.shared_state import PICTURES_CAPACITY, PagePictures, Requ
 from hardware.process.shared_latest import SharedLatest
 from perception.frames import Roi
 from planning.command import Move
+from planning.kinematics import axes_from_nozzle
 from planning.progress import PrintPhase, PrintProgress
-from planning.robot.kinematics import axes_from_nozzle
 from tests.moving import breathing, pose_at, raster
 
 

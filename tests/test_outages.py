@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors, VarianceEstimate
 from estimation.online.camera_health import CameraHealth
-from estimation.online.pose_solver import SharedFit
 from estimation.pose import TrackState
+from estimation.pose_solver import SharedFit
 from estimation.synthetic.follow import Follower, first_map
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
 from hardware.bench.campaigns.outages import judge_outage, outage_figures, outage_table, scene_jobs

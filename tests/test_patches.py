@@ -15,11 +15,11 @@ from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from perception.frames import Image
 from perception.lens import BILATERAL_PREFILTER, NO_PREFILTER, PREFILTERS, Lenses
-from perception.matching import features
-from perception.matching.alignment_kernels import CONVERGED_STEP
-from perception.matching.features import grey, match
-from perception.matching.matcher import optical_flow
-from perception.matching.patches import (
+from perception.mapping import features
+from perception.mapping.alignment_kernels import CONVERGED_STEP
+from perception.mapping.features import grey, match
+from perception.mapping.matcher import optical_flow
+from perception.mapping.patches import (
     RELIEF_PX,
     Alignment,
     Projection,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import EFFICIENCY, PointTracks, PoseFit, project, solve_pose
+from estimation.pose_solver import EFFICIENCY, PointTracks, PoseFit, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.synthetic.movements import patch

@@ -17,11 +17,11 @@ from hardware.arm.profile import ArmProfile
 from hardware.files.path_file import ProgressFile, read_progress
 from hardware.motion.step import MotionStep
 from planning.command import Move
+from planning.kinematics import SimpleArm
 from planning.limits import MotionLimits
 from planning.motion.planner import Planner
 from planning.path import Path
 from planning.progress import PrintPhase, fingerprint, progress_mark, resume_fraction
-from planning.robot.kinematics import SimpleArm
 from tests.moving import breathing, pose_at, raster
 
 TICK = 0.02

@@ -20,7 +20,9 @@ from hardware.simulator.scene.scene import Scene, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
 from perception.frames import Image
 from perception.lens import Lenses
+from perception.mapping.features import grey
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
+from perception.mapping.patches import Pyramid
 from perception.mapping.scan_map import (
     MIN_SCAN_SIGMA_MM,
     DenseMatch,
@@ -29,8 +31,6 @@ from perception.mapping.scan_map import (
     landmarks_on_scan,
     match_near,
 )
-from perception.matching.features import grey
-from perception.matching.patches import Pyramid
 from tests import scans
 from tests.synthetic import LOOK, SCAN_FROM_SURFACE, WIDE, pictures
 

@@ -16,8 +16,8 @@ from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
 from hardware.files.path_file import read_path, write_path
 from hardware.report.page import Plot
-from planning.robot.kinematics import POSTURES, JointModel, nozzle_from_joints
-from planning.robot.reach import REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
+from planning.kinematics import POSTURES, JointModel, nozzle_from_joints
+from planning.reach import REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
 from tests.moving import path_through, raster
 
 ARMS = Path(__file__).parents[1] / "data" / "arms"

@@ -20,10 +20,10 @@ from hardware.report.evaluation import best_constant
 from hardware.simulator.scene.scene import Scene, rois
 from perception.frames import FrameSet, Image
 from perception.lens import Lenses
+from perception.mapping.features import Relocaliser, grey
 from perception.mapping.first_map import FirstMap, build_first_map
-from perception.matching.features import Relocaliser, grey
-from perception.matching.matcher import Matcher
-from perception.matching.patches import Pyramid
+from perception.mapping.matcher import Matcher
+from perception.mapping.patches import Pyramid
 from perception.tracking.reobservation import KnownMotion, ReferencePictures, Reobserver
 from tests.synthetic import AWAY, WIDE, frame_sets, patch, pictures
 

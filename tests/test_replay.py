@@ -22,7 +22,7 @@ from hardware.arm.protocol import G1, G4, decode, frame_from_command
 from hardware.motion.step import MotionStep
 from hardware.offline.replay import COMMAND_COLUMNS, CommandWriter, placed_by, replay
 from planning.command import Command, Hold, Move
-from planning.robot.kinematics import nozzle_from_axes
+from planning.kinematics import nozzle_from_axes
 from tests import process_replay, reference_cases
 from tests.moving import breathing, pose_at, poses, raster
 from tests.pinned import ENVIRONMENT, PACKAGES, made_with, run_pinned, unlike

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose
 from hardware.bench.planner import SwingingSurface, random_path
+from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.limits import MotionLimits
 from planning.motion.curve import CORNER_SPEED_CHANGE, CORNER_TOLERANCE, PathCurve, curve_through, gridpoints_on
 from planning.motion.retime import LIMIT_SHARE, PATH_SPEED_SHARE, RISE_TIME, Timing, axis_derivatives, retime
 from planning.path import Path
-from planning.robot.kinematics import SimpleArm, axes_from_nozzle
 from tests.moving import Motion, path_through, pose_at, raster, still
 
 ARM, LIMITS = SimpleArm(), MotionLimits()

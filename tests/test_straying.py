@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.online.pose_solver import SharedFit
 from estimation.online.reported_covariance import ImageShiftDrift
+from estimation.pose_solver import SharedFit
 from estimation.se3 import Array
 
 CAMERAS = 3

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import GATE, PointTracks, solve_pose
+from estimation.pose_solver import GATE, PointTracks, solve_pose
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.follow import filtered_bound, pose_bound, pose_information
@@ -29,7 +29,7 @@ from estimation.synthetic.world import BASE_FROM_REST, World, arc_rig, synthetic
 from hardware.files.folder_tables import read_tum
 from hardware.recording.session_reader import open_session
 from hardware.simulator.scene.scene import rois
-from perception.matching.features import grey
+from perception.mapping.features import grey
 from tests.slowly import slowly
 from tests.synthetic import (
     AWAY,

@@ -7,8 +7,8 @@ import pytest
 
 from estimation.observations import Observations
 from estimation.online.fit import residual_scatter
-from estimation.online.pose_solver import PoseFit
 from estimation.online.reported_covariance import TrackNoise
+from estimation.pose_solver import PoseFit
 from estimation.se3 import Array
 
 COUNT, CAMERAS = 120, 3

@@ -18,7 +18,7 @@ from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, WOUND_CENTRE, arc_rig
 from hardware.simulator.scene.scene import Scene, rois
 from perception.frames import Frame, FrameSet, Image, Roi
-from perception.matching.features import grey
+from perception.mapping.features import grey
 from perception.tracking.step import STAGES, TrackingStep
 from tests.slowly import slowly
 from tests.synthetic import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures

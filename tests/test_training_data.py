@@ -15,7 +15,7 @@ from estimation.errors import InputError
 from estimation.pose import TrackState
 from estimation.scans.scan import scan_from_triangles
 from perception.frames import FrameSet, Image, Roi
-from perception.matching.features import polygon_mask
+from perception.mapping.features import polygon_mask
 from perception.tracking.step import TrackingStep
 from perception.tracking.wound_step import MAX_EMPTY_LOOKS, WoundTrackingStep
 from perception.training.augmentation import Augmentation, cover_sample, draw_sample, relight, sample_pyramid

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.online.deformation import WarpFilter, WarpModes, modes_from_map
 from estimation.online.estimator import Estimator
-from estimation.online.pose_solver import PointTracks, solve_pose
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
+from estimation.pose_solver import PointTracks, solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, Warp
 from estimation.synthetic.movements import patch

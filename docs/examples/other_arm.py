@@ -13,10 +13,10 @@ from estimation.pose import SurfacePose, TrackState
 from hardware.cli.parser import run_script
 from hardware.files.path_file import read_path
 from planning.command import Command, Hold
+from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.limits import MotionLimits
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
-from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
 TICK, LAG = 0.02, 0.03  # s between lines, and what the arm is later than they say
 ARM = SimpleArm()

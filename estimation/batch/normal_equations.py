@@ -4,7 +4,7 @@ A compiled loop sums what a frame set's tracks say of its pose, the landmarks an
 camera's own pose of the surface. All else is linear in those: a late camera sees the pose carried on along twist and
 acceleration; a camera's place moves the surface the other way. Errors that all tracks of one camera share in one frame
 set alone (jitter of its exposure, shift of its image) are eliminated at once (Henderson 1975, as in
-`estimation/online/pose_solver.py`).
+`estimation/pose_solver.py`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from estimation import se3
 from estimation.batch.initialisation import TrackArrays
 from estimation.batch.smoothed import STATE_DOF, CorrectedCameras, States, right_jacobian
-from estimation.online.pose_solver import EFFICIENCY, GATE
+from estimation.pose_solver import EFFICIENCY, GATE
 from estimation.runtime import compiled
 from estimation.se3 import Array, Index, Mask
 

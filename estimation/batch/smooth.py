@@ -23,8 +23,8 @@ from estimation.batch.smoothed import CalibrationPrior, FitStatistics, Smoothed,
 from estimation.batch.solve import FREE_POSE_SIGMA, HELD_POSE_SIGMA, Elimination, NormalEquations, Priors
 from estimation.errors import InputError
 from estimation.observations import Observations
-from estimation.online.pose_solver import CHI2_MEDIAN, EFFICIENCY
 from estimation.pose import Trajectory
+from estimation.pose_solver import CHI2_MEDIAN, EFFICIENCY
 from estimation.rig import Rig
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, local_normals

@@ -17,7 +17,7 @@ from estimation import se3
 from estimation.mapping.local_surface import smooth_normals
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
-from estimation.online.pose_solver import PointTracks, PoseFit, project, solve_pose
+from estimation.pose_solver import PointTracks, PoseFit, project, solve_pose
 from estimation.rig import Rig
 from estimation.runtime import trim_heap
 from estimation.se3 import Array, Index, Mask

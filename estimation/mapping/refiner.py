@@ -19,7 +19,7 @@ from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, AdjustedMap, Anc
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
 from estimation.online.fit import FrameFit
-from estimation.online.pose_solver import INLIER_WEIGHT
+from estimation.pose_solver import INLIER_WEIGHT
 from estimation.rig import Rig
 from estimation.runtime import trim_heap
 from estimation.se3 import Array, Mask

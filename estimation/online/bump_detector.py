@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.observations import Observations
-from estimation.online.pose_solver import project
+from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array

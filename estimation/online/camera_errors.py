@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.online.pose_solver import SharedErrors, SharedFit
+from estimation.pose_solver import SharedErrors, SharedFit
 from estimation.se3 import Array, Index
 
 

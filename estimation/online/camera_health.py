@@ -17,8 +17,8 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.bump_detector import BumpDetector
-from estimation.online.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.pose import SurfacePose, TrackState
+from estimation.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index, Mask

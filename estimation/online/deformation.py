@@ -18,7 +18,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import PoseFit
+from estimation.pose_solver import PoseFit
 from estimation.runtime import CONTIGUOUS, compiled
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, Warp, bells, farthest_points

@@ -20,11 +20,11 @@ from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, Ca
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.local_motion import LocalMotion
-from estimation.online.pose_solver import INLIER_WEIGHT, PoseFit, project
 from estimation.online.reported_covariance import CalibrationError, ReportedCovariance, widened
 from estimation.online.surface_state import Measurement, MotionDetector, PoseStateMachine, StateSettings
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
+from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index

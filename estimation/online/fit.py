@@ -8,7 +8,7 @@ import numpy as np
 
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
-from estimation.online.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors
+from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors
 from estimation.runtime import compiled
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap

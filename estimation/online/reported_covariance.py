@@ -18,8 +18,8 @@ import numpy as np
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrors
 from estimation.online.fit import FrameFit
-from estimation.online.pose_solver import INLIER_WEIGHT, PoseFit, SharedFit
 from estimation.pose import SurfacePose, TrackState
+from estimation.pose_solver import INLIER_WEIGHT, PoseFit, SharedFit
 from estimation.se3 import Array, Index
 
 NOISE_MEMORY_SETS = 300.0  # ten seconds, over which the shares of the tracks' noise are learned

@@ -12,9 +12,9 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
 from perception.frames import SYRINGE, check_profile
+from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
 from planning.motion.follow import LOOKAHEAD
-from planning.robot.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead

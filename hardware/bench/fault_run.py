@@ -37,10 +37,10 @@ from hardware.simulator.simulate import LandmarkTracker
 from hardware.simulator.truth import Truth, TruthLog, disturbed_motion, drape_path, fold_deformation, row_instants
 from perception.frames import FrameSet
 from planning.command import Move
+from planning.kinematics import axes_from_nozzle
 from planning.limits import MotionLimits
 from planning.path import Path
 from planning.progress import PrintPhase
-from planning.robot.kinematics import axes_from_nozzle
 
 AXES_LIMITS = "speed", "acceleration", "jerk", "jump", "turn"
 LIMIT_SLACK = 1.001  # a sample counts as over a limit from 0.1 % on

@@ -31,8 +31,8 @@ from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
 from perception.frames import Frame, FrameSet, Image
 from perception.lens import Lenses
-from perception.matching.features import grey
-from perception.matching.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
+from perception.mapping.features import grey
+from perception.mapping.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
 from perception.tracking.step import TrackingStep
 
 SCAN_SPACING = 1.0  # mm between the vertices of a scan, as handheld scanners give them

@@ -24,11 +24,11 @@ from hardware.bench.figures import Figure, at_most, milliseconds, percentile, wi
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import CpuClock
 from planning.command import Hold, Move
+from planning.kinematics import axes_from_nozzle
 from planning.motion.guard import Guard
 from planning.motion.planner import STALL_TICKS, Planner
 from planning.path import MIN_SPACING, Path, way_lengths
 from planning.progress import progress_mark, resume_fraction
-from planning.robot.kinematics import axes_from_nozzle
 
 Draw = np.random.Generator
 Tick = tuple[float, SurfacePose | None]  # now, s, and the newest pose

@@ -41,7 +41,7 @@ from hardware.process import checks
 from hardware.process.progress import ProgressReport
 from perception.boards.needle_tip import MIN_NEEDLE_LENGTH, Tip, TipFinder, background
 from perception.frames import Image
-from planning.robot.kinematics import SimpleArm, nozzle_from_axes
+from planning.kinematics import SimpleArm, nozzle_from_axes
 
 HELD_OUT_FOLDS = 8  # with fewer, each fit lacks too many sightings
 REST_AFTER = 0.25  # s after its last command, when the arm is at rest: ten times a servo's lag

@@ -47,8 +47,8 @@ from hardware.arm.profile import ArmProfile, at_baud
 from hardware.arm.protocol import Dialect
 from hardware.process import checks
 from perception.frames import check_profile
+from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
-from planning.robot.kinematics import AngleMode, JointModel, SimpleArm
 
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")

@@ -14,9 +14,9 @@ from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, RunReports, TrackingReport
 from hardware.operator.view import Check, CheckVerdict
 from hardware.process.progress import count_text
+from planning.kinematics import axes_from_nozzle, joints_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN
 from planning.path import Path
-from planning.robot.kinematics import axes_from_nozzle, joints_from_axes
 
 MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
 PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN

@@ -24,8 +24,8 @@ from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import RunStage
 from hardware.process.ticks import Histogram
 from planning.command import Move
+from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.progress import PrintPhase
-from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
 TIMELINE_BINS = 600  # an even number: two bins become one
 FIRST_BIN_WIDTH = 0.1  # s of a bin at first

@@ -26,8 +26,8 @@ from hardware.process.clock import Clock
 from hardware.process.ticks import Histogram, TickSchedule
 from perception.frames import PrintHead
 from planning.command import Command, Hold, Move
+from planning.kinematics import nozzle_from_axes
 from planning.progress import PrintPhase
-from planning.robot.kinematics import nozzle_from_axes
 
 
 class TickMotion(Protocol):

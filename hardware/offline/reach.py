@@ -27,9 +27,9 @@ from hardware.report.page import (
     section,
     spanning,
 )
+from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
 from planning.path import Path
-from planning.robot.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
-from planning.robot.reach import REASONS, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
+from planning.reach import REASONS, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
 
 PAGE_WIDTH_PX = 900
 PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS = "estimate", "off", "aside"  # classes of report.css

@@ -94,7 +94,7 @@ def tracker(
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
-    from perception.matching.masks import Tool
+    from perception.mapping.masks import Tool
     from perception.tracking.step import TrackingStep
     from perception.tracking.wound_step import WoundTrackingStep
 

@@ -50,7 +50,7 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
-from planning.robot.kinematics import SimpleArm
+from planning.kinematics import SimpleArm
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,9 +18,9 @@ from hardware.process.faults import Fault, FaultKind, FaultPart, fault_rng, faul
 from hardware.simulator.deposit import NozzleLog, planned_line
 from hardware.simulator.scene.shape import Deformation, Shape
 from planning.command import Command, Move
+from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.path import Path
 from planning.progress import PrintPhase, PrintProgress
-from planning.robot.kinematics import SimpleArm, nozzle_from_axes
 
 GRADIENT_STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth over centimetres
 

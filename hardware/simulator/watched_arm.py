@@ -36,8 +36,8 @@ from hardware.simulator.scene.render import StillScene, render
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import cylinder
 from perception.frames import Image
-from perception.matching.features import grey
-from planning.robot.kinematics import SimpleArm, nozzle_from_axes
+from perception.mapping.features import grey
+from planning.kinematics import SimpleArm, nozzle_from_axes
 
 DEAD_TIME_RANGE, LAG_RANGE = (0.005, 0.025), (0.012, 0.03)  # s between which the virtual arm's own are drawn
 PLACEMENT_SIGMA = np.array([0.02] * 3 + [4.0] * 3)  # rad and mm, from where its file says that it stands

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import PointTracks, solve_pose
 from estimation.pose import SurfacePose, TrackState
+from estimation.pose_solver import PointTracks, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.protocol import frame_from_command
@@ -52,9 +52,9 @@ from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from perception.frames import FrameSet
 from planning.command import Command
+from planning.kinematics import nozzle_from_axes
 from planning.path import Path
 from planning.progress import PrintPhase, PrintProgress
-from planning.robot.kinematics import nozzle_from_axes
 
 ROW_BLOCK = 0.2  # s of truth rows handed to the sink at once
 RUN_OUT = 0.3  # s that the run goes on after the path is finished

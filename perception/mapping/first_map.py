@@ -18,14 +18,14 @@ from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.mapping.local_surface import smooth_normals
-from estimation.mapping.triangulation import epipolar_distance, rays, triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
+from estimation.triangulation import epipolar_distance, rays, triangulate
 from perception.lens import Lenses, undistort
-from perception.matching.features import Features, ImageMask, corners, match, polygon_mask, sift
-from perception.matching.masks import trackable
-from perception.matching.patches import (
+from perception.mapping.features import Features, ImageMask, corners, match, polygon_mask, sift
+from perception.mapping.masks import trackable
+from perception.mapping.patches import (
     MIN_PATCH_CONTRAST,
     Projection,
     Pyramid,

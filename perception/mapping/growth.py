@@ -20,20 +20,19 @@ from estimation import se3
 from estimation.mapping.bundle_adjustment import of_frame
 from estimation.mapping.local_surface import meet_rays
 from estimation.mapping.refiner import MIN_TRACK_SIGMA_PX
-from estimation.mapping.triangulation import rays, updated_by_looks
 from estimation.observations import Observations
-from estimation.online.pose_solver import project
+from estimation.pose_solver import project
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, Warp, joined_map
+from estimation.triangulation import rays, updated_by_looks
 from perception.frames import Image
 from perception.lens import Lenses, undistort
+from perception.mapping.features import Features, ImageMask, corners, sift
 from perception.mapping.first_map import Landmarks, Seeds, assemble, best_landmarks, find_seeds
-from perception.mapping.scan_map import REFERENCE_SIGMA_PX, as_at_one_instant
-from perception.matching.features import Features, ImageMask, corners, sift
-from perception.matching.masks import trackable
-from perception.matching.matcher import Matcher
-from perception.matching.patches import (
+from perception.mapping.masks import trackable
+from perception.mapping.matcher import Matcher
+from perception.mapping.patches import (
     MIN_PATCH_CONTRAST,
     Pyramid,
     Templates,
@@ -42,6 +41,7 @@ from perception.matching.patches import (
     project_squares,
     square_axes,
 )
+from perception.mapping.scan_map import REFERENCE_SIGMA_PX, as_at_one_instant
 
 MIN_MATCHING_FACING = 0.35  # cosine of the viewing angle, from which two cameras can match
 MIN_SPACING_PX = 8  # px between landmarks

@@ -21,6 +21,7 @@ from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
+from perception.mapping.features import Relocaliser
 from perception.mapping.first_map import FirstMap, build_first_map, in_frame
 from perception.mapping.growth import (
     GROWTH_SHARE,
@@ -32,11 +33,10 @@ from perception.mapping.growth import (
     between_known,
     find_new_landmarks,
 )
+from perception.mapping.masks import Ink, TrackingMasks, patch_reach
+from perception.mapping.matcher import Matcher
+from perception.mapping.patches import Pyramid
 from perception.mapping.scan_map import ScanPlacing, as_at_one_instant, landmarks_on_scan
-from perception.matching.features import Relocaliser
-from perception.matching.masks import Ink, TrackingMasks, patch_reach
-from perception.matching.matcher import Matcher
-from perception.matching.patches import Pyramid
 
 EAGER_TRIES = 5  # tries for a first map, 0.5 s and more each, before only every tenth frame set is tried
 RETRY_INTERVAL_SETS = 10  # frame sets from one try to the next after those

@@ -24,16 +24,16 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
-from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.scans.registration import Registration, register, register_near
 from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.triangulation import triangulate
 from perception.frames import Image
 from perception.lens import Lenses
+from perception.mapping.features import polygon_mask
 from perception.mapping.first_map import FirstMap
-from perception.matching.features import polygon_mask
 
 NODE_PIXELS = 1.1  # of the cameras, a node: a finer lattice shows nothing more
 FLOW_PATCH_NODES, FLOW_STRIDE_NODES, FLOW_STEPS = 12, 3, 25  # nodes, nodes and steps of the flow

@@ -17,7 +17,7 @@ from estimation.rig import Camera
 from estimation.se3 import Array
 from perception.frames import Image
 from perception.lens import bilateral, undistort
-from perception.matching.features import FLANN_KD_TREE, bounding_box, grey
+from perception.mapping.features import FLANN_KD_TREE, bounding_box, grey
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, the last two excluded
 

@@ -20,16 +20,16 @@ from estimation.batch.smoothed import Smoothed
 from estimation.mapping.bundle_adjustment import single_fit
 from estimation.mapping.local_surface import smooth_normals
 from estimation.observations import Observations, no_observations
-from estimation.online.pose_solver import PointTracks, project, solve_pose
+from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import DuplicateFilter, FrameSet
 from perception.lens import Lenses
+from perception.mapping.features import grey
 from perception.mapping.first_map import on_rays
-from perception.matching.features import grey
-from perception.matching.matcher import Matcher
-from perception.matching.patches import MIN_PATCH_CONTRAST, Pyramid, Templates, cut_templates, join
+from perception.mapping.matcher import Matcher
+from perception.mapping.patches import MIN_PATCH_CONTRAST, Pyramid, Templates, cut_templates, join
 from perception.pairing import frame_period, pairing_tolerance
 from perception.tracking.step import COARSE_REACH_PX, FINE_REACH_PX, ROUGH_START_SCALES
 

@@ -24,11 +24,11 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import DuplicateFilter, FrameSet, Image, Roi, parallel_map
 from perception.lens import Lenses, unfiltered
+from perception.mapping.features import Relocaliser, grey
 from perception.mapping.mapping import Mapping, TrackedSet
-from perception.matching.features import Relocaliser, grey
-from perception.matching.masks import Tool, TrackingMasks
-from perception.matching.matcher import Matcher
-from perception.matching.patches import Pyramid
+from perception.mapping.masks import Tool, TrackingMasks
+from perception.mapping.matcher import Matcher
+from perception.mapping.patches import Pyramid
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
 # Of a camera: at 0.2 px they give a pose to 0.01 mm, and more landmarks do not reduce the errors that they share.

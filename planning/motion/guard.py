@@ -15,8 +15,8 @@ from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.command import Command, Move, Refusal, RefusalCode
+from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
-from planning.robot.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 
 AXIS_NAMES = "XYZABC"
 LINEAR_AXES = 3  # X Y Z in mm, the others in rad

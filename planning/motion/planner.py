@@ -21,6 +21,7 @@ from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from planning.command import Command, Hold, Move, feed_for
+from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
 from planning.motion.curve import (
     CORNER_SPEED_CHANGE,
@@ -37,7 +38,6 @@ from planning.motion.follow import LOOKAHEAD, AxisFollower
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import Path, check_path
 from planning.progress import PrintPhase, PrintProgress, check_start
-from planning.robot.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
 
 HORIZON_TIME = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second

@@ -29,8 +29,8 @@ from toppra.solverwrapper import seidelWrapper
 
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
+from planning.kinematics import SimpleArm, limited_axes, max_axis_change
 from planning.motion.curve import Gridpoints, PathCurve
-from planning.robot.kinematics import SimpleArm, limited_axes, max_axis_change
 
 DIFFERENCE_STEP = 0.05  # mm along the path between differences: what a slow tool moves in one tick
 DIFFERENCE_TIME = 0.02  # s between differences: one tick

@@ -19,9 +19,9 @@ from estimation.se3 import Array
 from hardware.bench.figures import Figure, at_most, columns
 from perception.package_data import shipped_file
 from planning.command import Command, Hold, Move
+from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_joints
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 from planning.motion.guard import Guard
-from planning.robot.kinematics import SimpleArm, joints_from_axes, nozzle_from_joints
 
 Flags = NDArray[np.bool_]
 Verdicts = NDArray[np.int_]

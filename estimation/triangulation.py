@@ -8,7 +8,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.pose_solver import project
+from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations, no_observations
-from estimation.online.pose_solver import PointTracks, project, solve_pose
+from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import Image, parallel_map
 from perception.lens import Lenses, undistort
-from perception.matching.features import bounding_box
-from perception.matching.masks import TrackingMasks, near_bead, patch_reach
-from perception.matching.patches import Pyramid, Templates, align_in, join, project_into
+from perception.mapping.features import bounding_box
+from perception.mapping.masks import TrackingMasks, near_bead, patch_reach
+from perception.mapping.patches import Pyramid, Templates, align_in, join, project_into
 
 FLOW_WINDOW_PX = 21
 MIN_WINDOW_SPREAD = 2.0  # grey levels: a flatter window gives no gain

@@ -15,8 +15,8 @@ from estimation import se3
 from estimation.se3 import Array
 from perception.frames import SYRINGE, Image, PrintHead, check_profile
 from perception.lens import Lenses
-from perception.matching.alignment_kernels import PATCH_RADIUS
-from perception.matching.features import ImageMask
+from perception.mapping.alignment_kernels import PATCH_RADIUS
+from perception.mapping.features import ImageMask
 
 BEAD_REACH_MM = 1.0  # mm from the bead's middle: half of a wide bead, as it spreads
 BEAD_STEP_MM = 0.5  # mm between the points that stand for a bead

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.se3 import Array
+from planning.kinematics import POSTURES, JointDistance, JointModel, jacobian, joint_distance, joints_from_nozzle
 from planning.path import Path, way_lengths
-from planning.robot.kinematics import POSTURES, JointDistance, JointModel, jacobian, joint_distance, joints_from_nozzle
 
 # rad from a singular wrist or elbow: there joints turn ten times as fast as the tool
 MIN_SINGULAR_ANGLE = float(np.deg2rad(5))

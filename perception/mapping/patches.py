@@ -21,7 +21,7 @@ from estimation.runtime import CONTIGUOUS
 from estimation.se3 import Array
 from perception.frames import Image, parallel_map
 from perception.lens import Lenses
-from perception.matching.alignment_kernels import PATCH_RADIUS, PATCH_SIDE, Float32, descend, sample_grids
+from perception.mapping.alignment_kernels import PATCH_RADIUS, PATCH_SIDE, Float32, descend, sample_grids
 
 MIN_PATCH_CONTRAST = 3.0  # grey levels: a patch with less contrast is not worth a track
 

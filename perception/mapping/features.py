@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.mapping.triangulation import rays
-from estimation.online.pose_solver import PointTracks, project, solve_pose
+from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
+from estimation.triangulation import rays
 from perception.frames import Image
 from perception.lens import Lenses, undistort
-from perception.matching.patches import Pyramid
+from perception.mapping.patches import Pyramid
 
 ImageMask = NDArray[np.uint8]
 Features = tuple[Array, NDArray[np.float32]]  # (N, 2) px and descriptors (N, 128)

@@ -1,1 +1,0 @@
-"""Patches of the surface and the same patches found again: features, optical flow, alignment, masks."""
