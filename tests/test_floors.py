@@ -30,7 +30,7 @@ ROOMS = (  # from the ground; a room imports rooms of earlier lines only, and no
     ("estimation.mapping",),
     ("estimation.batch", "estimation.calibration", "estimation.synthetic"),
     ("perception", "planning"),
-    ("perception.matching", "planning.robot", "planning.fill"),
+    ("planning.fill",),
     ("perception.mapping", "perception.wound", "perception.boards", "planning.motion"),
     ("perception.tracking", "perception.training", "planning.layers"),
     ("perception.thesis",),

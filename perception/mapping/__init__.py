@@ -1,1 +1,1 @@
-"""The map made from pictures: the first map, its growth, a scan's landmarks, relocalisation."""
+"""The map made from pictures: first map, matching of its patches in new pictures, growth, a scan's landmarks."""
