@@ -273,3 +273,12 @@ def test_what_cannot_be_smoothed_is_said() -> None:
     wrong = [Observations(s.stamp, s.camera, s.track, s.pixels, 0 * s.sigma) for s in seen]
     with pytest.raises(InputError, match="sigma"):
         smooth(world.rig, wrong)
+
+
+@given(st.floats(0.0, 1e7), st.integers(2, 6000), st.sampled_from([30.0, 50.0, 60.0, 1000.0]))
+@settings(max_examples=300)
+def test_times_at_a_rate_lie_within_the_recording_at_any_uptime(uptime: float, sets: int, rate: float) -> None:
+    recorded = replace(smoothed("breathing")[0], stamps=np.array([uptime, uptime + sets / 30.0]))
+    times, (first, last) = recorded.times(rate), recorded.stamps
+    assert first == times[0] and times[-1] < last <= times[-1] + 1 / rate + 1e-8
+    assert np.abs(np.diff(times) - 1 / rate).max(initial=0.0) < 1e-8

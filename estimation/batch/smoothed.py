@@ -261,6 +261,16 @@ class Smoothed:
         by_pose, by_twist = (self.own[:, part, part] + self.share[:, part, part] for part in (slice(6), slice(6, 12)))
         return Instants(self.stamps, self.states.poses, by_pose, self.states.twists, by_twist)
 
+    def times(self, rate: float) -> Array:
+        """Times (M,), s, 1 / rate apart from the first stamp on, all before the last one.
+
+        Not `np.arange(first, last, step)`: its step is a difference of two large stamps, so that its last time may lie
+        beyond the recording after a few minutes of uptime.
+        """
+        first, last = self.stamps[[0, -1]]
+        times = first + np.arange(np.ceil((last - first) * rate) + 1) / rate
+        return np.asarray(times[times < last])
+
     def at(self, times: Array) -> Instants:
         """The surface at times (M,), s, within the recording, by the continuous-time prior (Barfoot 2017, 11.3).
 

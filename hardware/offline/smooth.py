@@ -119,8 +119,7 @@ def _solve(session: Session, tracks: SessionTracks, options: SmoothOptions, stre
 
 def _write(out: Path, session: Session, result: Smoothed, options: SmoothOptions) -> None:
     write_tum(out / "smoothed.tum", result.trajectory)
-    first, end = result.stamps[[0, -1]]
-    instants = result.instants if options.rate is None else result.at(np.arange(first, end, 1 / options.rate))
+    instants = result.instants if options.rate is None else result.at(result.times(options.rate))
     write_instants(out / "smoothed.csv", instants)
     write_rig(out / "rig.toml", result.rig, [None] * len(result.rig))
     write_map(out / "map.ply", result, session)

@@ -44,18 +44,17 @@ class MotionSpectrum:
 
 def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
     """The spectrum (Hann window) of the origin's position, resampled at `rate` Hz."""
-    first, last = smoothed.stamps[[0, -1]]
-    times = np.arange(first, last, 1 / rate)
+    times, seconds = smoothed.times(rate), float(np.ptp(smoothed.stamps))
     positions = smoothed.at(times).base_from_surface[:, :3, 3]
     centred = positions - positions.mean(0)
     direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
     along = centred @ direction
-    along = along - np.polyval(np.polyfit(times - first, along, 1), times - first)
+    along = along - np.polyval(np.polyfit(times - times[0], along, 1), times - times[0])
     window = np.hanning(len(along))
     hertz = np.asarray(np.fft.rfftfreq(len(along), 1 / rate), float)
     amplitude = np.asarray(2 * np.abs(np.fft.rfft(along * window)) / max(window.sum(), 1e-9), float)
-    breathing = _peak(hertz, amplitude, BREATHING_BAND_HZ, last - first)
-    pulse = _peak(hertz, amplitude, PULSE_BAND_HZ, last - first, breathing)
+    breathing = _peak(hertz, amplitude, BREATHING_BAND_HZ, seconds)
+    pulse = _peak(hertz, amplitude, PULSE_BAND_HZ, seconds, breathing)
     return MotionSpectrum(hertz, amplitude, direction, breathing, pulse)
 
 
@@ -160,9 +159,9 @@ def delay_errors(smoothed: Smoothed) -> Array:
     with it extrapolated by its twist. The nozzle stands over the middle of the map; smoothed poses are taken as exact.
     """
     middle = np.median(smoothed.map.points, axis=0)
-    first, last = smoothed.stamps[[0, -1]]
+    last = smoothed.stamps[-1]
     out = np.full((len(LOOP_DELAYS_S), 4), np.nan)
-    times = np.arange(first, last, 1 / LOOP_RATE_HZ)
+    times = smoothed.times(LOOP_RATE_HZ)
     now = smoothed.at(times)
     for i, delay in enumerate(LOOP_DELAYS_S):
         inside = times + delay <= last
