@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,12 +12,13 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
+from hardware.arm import link as arm_link
 from hardware.arm import port as arm_port
 from hardware.arm.device import ArmState
-from hardware.arm.link import Arm
+from hardware.arm.link import Arm, emergency_stop
 from hardware.arm.port import PortOpener, SerialPort, UnpluggedError
 from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import FRAME_LENGTH
+from hardware.arm.protocol import FRAME_LENGTH, Pause, encode
 from hardware.process.clock import WallClock
 from hardware.simulator.arm.ports import open_pty
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
@@ -203,3 +205,54 @@ def test_a_pty_that_goes_and_comes_back_is_disarmed(tmp_path: Path) -> None:
         assert "nobody knows" in arm.arm(CLOCK.now())
         arm.close()
         device.release()
+
+
+def full(name: str) -> int:
+    """How many bytes a line takes that nobody reads, until it takes no more."""
+    port, sent, refused = SerialPort(name, 115_200), 0, 0
+    while refused < 10:  # the system carries bytes on for a moment, and then takes more
+        taken = port.write(bytes(65_536))
+        sent, refused = sent + taken, 0 if taken else refused + 1
+        CLOCK.wait_until(CLOCK.now() + 0.002)
+    port.close()
+    return sent
+
+
+def test_an_emergency_stop_waits_for_a_full_line_and_goes_out_whole(pair: tuple[int, str]) -> None:
+    (ours, name), received = pair, bytearray()
+    waiting, stop = full(name), encode(Pause(), ArmProfile().dialect) * arm_link.STOP_FRAMES
+
+    def drain() -> None:
+        CLOCK.wait_until(CLOCK.now() + 0.1)
+        while len(received) < waiting + len(stop):
+            received.extend(os.read(ours, 4096))
+
+    reader = threading.Thread(target=drain, daemon=True)
+    reader.start()
+    begun = CLOCK.now()
+    sent, reason = emergency_stop(name, ArmProfile())
+    reader.join(5.0)
+    assert reason == "" and sent > begun + 0.1 and bytes(received[waiting:]) == stop
+
+
+def test_an_emergency_stop_that_a_full_line_does_not_take_is_told(pair: tuple[int, str]) -> None:
+    _, name = pair
+    full(name)
+    assert emergency_stop(name, ArmProfile())[1] == "its line is full and took 0 of the stop's 96 bytes"
+
+
+def test_an_emergency_stop_tries_again_on_a_line_that_goes_while_it_writes(
+    pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (ours, name), write, failures = pair, SerialPort.write, [UnpluggedError("gone"), UnpluggedError("gone")]
+
+    def failing(port: SerialPort, data: bytes) -> int:
+        if failures:
+            raise failures.pop()
+        return write(port, data)
+
+    monkeypatch.setattr(SerialPort, "write", failing)
+    assert emergency_stop(name, ArmProfile())[1] == "" and not failures
+    assert os.read(ours, 999) == encode(Pause(), ArmProfile().dialect) * arm_link.STOP_FRAMES
+    failures.extend([UnpluggedError("gone")] * 1000)
+    assert emergency_stop(name, ArmProfile())[1] == "gone"

@@ -8,6 +8,8 @@ and the answers.
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
 
 from estimation.errors import InputError
@@ -313,26 +315,28 @@ def shut_down(arm: Arm, reason: str, clock: Clock, poll_period: float) -> None:
 
 
 def emergency_stop(url: str, profile: ArmProfile) -> tuple[float, str]:
-    """Stop an arm whose motion process is gone, as soon as its line is free.
+    """Stop an arm whose motion process is gone: tries until its line is free and has taken the whole stop.
 
     Gives when the stop was on the wire, s, and why it could not be sent, "" if it was.
     """
     clock, device = WallClock(), PortOpener(url, profile.baud)
+    stop = encode(Pause(), profile.dialect) * STOP_FRAMES
     until, reason = clock.now() + LINE_TAKEOVER_TIME, ""
     try:
         while clock.now() < until:
             try:
-                port = device()
+                with closing(device()) as port:
+                    unsent = stop
+                    while (unsent := unsent[port.write(unsent) :]) and clock.now() < until:
+                        clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
+                    if not unsent:
+                        sent = clock.now() + profile.frame_time
+                        clock.wait_until(sent + profile.frame_time)
+                        return sent, ""
+                    reason = f"its line is full and took {len(stop) - len(unsent)} of the stop's {len(stop)} bytes"
             except (InputError, UnpluggedError) as error:
                 reason = str(error)
                 clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
-                continue
-            for _ in range(STOP_FRAMES):
-                port.write(encode(Pause(), profile.dialect))
-            sent = clock.now() + profile.frame_time
-            clock.wait_until(sent + profile.frame_time)
-            port.close()
-            return sent, ""
     finally:
         device.release()
     return clock.now(), reason
