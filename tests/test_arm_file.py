@@ -15,6 +15,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import Dialect
+from hardware.files import arm_file
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
 from planning.command import Move, Refusal, RefusalCode
@@ -47,7 +48,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
             *(se3.exp(draw.normal(size=6)), se3.exp_rotation(draw.normal(size=3)), draw.uniform(-0.5, 0.5, 6)),
             tool_offset=draw.uniform(-9, 9, 3),
         ),
-        MotionLimits(speed=draw.uniform(1, 100, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
+        MotionLimits(speed=draw.uniform(1, 30, 6), turn=draw.uniform(0.01, 0.1), surface_turn=draw.uniform(0.1, 1)),
         Dialect(int(draw.integers(2)), ("J5", "J4", "J6"), (1, 10)[int(draw.integers(2))], (0.0, 1500.0)[seed % 2]),
         int(draw.integers(57_600, 1_000_000)),
         draw.uniform(0.01, 0.04),
@@ -104,6 +105,13 @@ def test_on_a_slow_line_ticks_and_lag_follow_unless_they_are_given(tmp_path: Pat
         ("[limits]\nspeed = 100", ["limits.speed", "6 finite numbers"]),
         ("[limits]\njump = -1", ["limits", "jump", "> 0"]),
         ("[limits]\nspead = 1", ["limits.spead", "did you mean 'speed'"]),
+        ("[limits]\npose_age = 1e9", ["limits.pose_age = 1000000000.0, allowed 0.01 to 2, s"]),
+        ("[limits]\npose_error = 500", ["limits.pose_error = 500, allowed 0.001 to 10, mm"]),
+        ("[limits]\nstop_time = 1e9", ["limits.stop_time", "0.01 to 2, s"]),
+        ("[limits]\nturn = 240", ["limits.turn = 240, allowed 0.001 to 40, degrees"]),
+        ("[limits]\nspeed = [150, 150, 150, 120, 120, 1e308]", ["allowed 0.1 to 2000, mm and degrees per s"]),
+        ("[limits]\njerk = [1e-300, 9e3, 9e3, 9e3, 9e3, 9e3]", ["allowed 10 to 1e+07, mm and degrees per s^3"]),
+        ("[limits]\nsurface_speed = 1e9", ["limits.surface_speed", "0.1 to 1000, mm per s"]),
     ],
 )  # fmt: skip
 def test_faults_are_told_by_file_and_key(tmp_path: Path, text: str, words: list[str]) -> None:
@@ -234,6 +242,8 @@ def test_zones_come_back_from_a_file_and_home_must_be_outside(tmp_path: Path) ->
         ('name = "x"\ncylinder = [[1, 1, 1], [1, 1, 1]]\nradius = 3', "two ends apart"),
         ('name = "x"\ncylinder = [[0, 0, 0], [1, 1, 1]]\nradius = 0', "radius > 0"),
         ('name = "x"\nboxx = 3', "no_go.boxx"),
+        ('name = "bed in m"\nbox = [[-0.3, -0.3, -0.1], [0.3, 0.3, 0.0]]', "1 mm or more"),
+        ('name = "post in m"\ncylinder = [[0, 0, 0], [0, 0, 0.2]]\nradius = 0.05', "the unit is mm, not m"),
     ],
 )
 def test_a_zone_that_makes_no_sense_is_refused_by_its_key(tmp_path: Path, text: str, words: str) -> None:
@@ -249,3 +259,11 @@ def test_a_zone_of_wrong_shapes_is_refused() -> None:
         NoGo("x", np.zeros((2, 3)), np.zeros(3))
     with pytest.raises(InputError, match="unit normals"):
         NoGo("x", np.ones((1, 3)), np.zeros(1))
+
+
+def test_every_limit_has_a_range_with_room_around_its_default() -> None:
+    defaults = MotionLimits()
+    assert set(arm_file.LIMIT_RANGES) == set(arm_file.LIMIT_KEYS)
+    for name, (low, high) in arm_file.LIMIT_RANGES.items():
+        value = np.asarray(getattr(defaults, name)) / arm_file._unit(name)
+        assert (low < value).all() and (1.5 * value < high).all(), name

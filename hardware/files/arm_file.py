@@ -129,12 +129,36 @@ def _zone(where: object, table: checks.Table) -> NoGo:
     if len(kinds) != 1 or ("radius" in table) != (kinds == ["cylinder"]):
         raise InputError(where, f"no_go {name!r}", kinds, "half_space, box, or cylinder with radius")
     first, second = checks.numbers(where, f"no_go.{kinds[0]}", table[kinds[0]], (2, 3), "mm")
-    if kinds == ["cylinder"]:
-        return cylinder(name, first, second, checks.number(where, "no_go.radius", table["radius"]))
-    return half_space(name, first, second) if kinds == ["half_space"] else box(name, first, second)
+    if kinds == ["half_space"]:
+        return half_space(name, first, second)
+    radius = checks.number(where, "no_go.radius", table["radius"]) if kinds == ["cylinder"] else 0.0
+    zone = cylinder(name, first, second, radius) if kinds == ["cylinder"] else box(name, first, second)
+    if max(np.abs(second - first).max(), 2 * radius) < MIN_ZONE_SIZE:
+        allowed = f"{MIN_ZONE_SIZE:g} mm or more along its longest side; the unit is mm, not m"
+        raise InputError(where, f"no_go {name!r}", table[kinds[0]], allowed)
+    return zone
 
 
 LIMIT_KEYS = tuple(f.name for f in fields(MotionLimits) if f.name != "zones")
+LIMIT_RANGES = {  # in the file's units: beyond, a slip of the pen would switch a check off, or the arm would never move
+    "speed": (0.1, 2000.0),  # the arm's own top speed is 250 mm/s; a large industrial arm's is 2 m/s
+    "acceleration": (1.0, 100_000.0),  # 100 m/s^2 is ten times gravity
+    "jerk": (10.0, 10_000_000.0),  # full acceleration within 10 ms
+    "jump": (0.001, 40.0),  # 2 m/s at 50 ticks a second
+    "turn": (0.001, 40.0),  # 2000 degrees/s likewise
+    "low": (-3000.0, 3000.0),  # nothing on a bench reaches 3 m; angles are within two turns anyhow
+    "high": (-3000.0, 3000.0),
+    "feed": (0.1, 2000.0),  # as speed
+    "pose_age": (0.01, 2.0),  # after 2 s a breathing chest is anywhere within its breath
+    "pose_error": (0.001, 10.0),  # ten beads' width
+    "surface_speed": (0.1, 1000.0),  # a cough moves a chest by 200 mm/s
+    "surface_turn": (0.1, 720.0),
+    "stop_time": (0.01, 2.0),  # five times what the slowest arm needs
+    "stop_distance": (0.1, 200.0),
+    "on_path": (0.001, 10.0),  # ten beads' width
+    "pause": (0.0001, 1.0),
+}
+MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
 _ARRAYS = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)}  # shapes
@@ -242,6 +266,14 @@ def _unit(name: str) -> Array:
     return _AXIS_UNITS if name in _AXES else np.asarray(_RAD if name in _ANGLES else 1.0)
 
 
+def _unit_text(name: str) -> str:
+    """The unit of a limit in the file."""
+    units = {"speed": "s", "acceleration": "s^2", "jerk": "s^3", "feed": "s", "surface_speed": "s", "surface_turn": "s"}
+    length = "mm and degrees" if name in _AXES else "degrees" if name in _ANGLES else "mm"
+    length = "s" if name in ("pose_age", "stop_time", "pause") else length
+    return f"{length} per {units[name]}" if name in units else length
+
+
 def _limits(path: Path, table: object, zones: object) -> MotionLimits:
     if not isinstance(table, dict):
         raise InputError(path, "limits", table, "a table [limits]")
@@ -251,7 +283,12 @@ def _limits(path: Path, table: object, zones: object) -> MotionLimits:
         number = checks.numbers(path, f"limits.{name}", value, (6,) if name in _AXES else ()) * _unit(name)
         limits[name] = number if name in _AXES else float(number)
     no_go = [] if zones is None else [_zone(path, each) for each in checks.tables(path, "no_go", zones)]
-    return MotionLimits(**limits, zones=tuple(no_go))  # type: ignore[arg-type]
+    checked = MotionLimits(**limits, zones=tuple(no_go))  # type: ignore[arg-type]
+    for name, value in table.items():
+        low, high = LIMIT_RANGES[name]
+        if np.min(value) < low or np.max(value) > high:
+            raise InputError(path, f"limits.{name}", value, f"{low:g} to {high:g}, {_unit_text(name)}")
+    return checked
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:
