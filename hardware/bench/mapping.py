@@ -24,7 +24,7 @@ from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import MIN_FRAME_SETS
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench.estimator import nees
-from hardware.bench.figures import Figure, Target, at_least, at_most, columns, relative_nees, rms
+from hardware.bench.figures import Figure, Target, at_least, at_most, relative_nees, rms
 from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
@@ -208,7 +208,8 @@ def _map_errors(name: str, shape: Shape, stamps: Array) -> list[Figure]:
     # NEES/6 of the poses after the first: an error that map and tracks have in common is not theirs
     first, later = result.first, result.poses[result.first + 1 :]
     change = se3.inverse(poses[first]) @ result.poses[first].base_from_surface
-    estimated, covariance = columns(later, "base_from_surface", "covariance")
+    estimated = np.stack([pose.base_from_surface for pose in later])
+    covariance = np.stack([pose.covariance for pose in later])
     errors = se3.log(se3.inverse(estimated) @ poses[first + 1 :] @ change)
     what, squares = f"{name}: squared error of poses, of what is claimed", float(nees(errors, covariance).mean() / 6)
     return [*figures, Figure(what, squares, "", at_most(1.25))]
