@@ -41,9 +41,9 @@ class PointTracks:
     sigma: Array  # (N,) px, one standard deviation per axis
 
     @staticmethod
-    def of(seen: Observations, points: Array) -> PointTracks:
+    def of(observations: Observations, points: Array) -> PointTracks:
         """Observations of points (N, 3), one for each row."""
-        return PointTracks(seen.camera, points, seen.pixels, seen.sigma)
+        return PointTracks(observations.camera, points, observations.pixels, observations.sigma)
 
     def only(self, rows: Mask) -> PointTracks:
         """Those of the rows (N,)."""

@@ -73,12 +73,12 @@ class TriangulatedMap:
     tracks: Index  # (N,) id of each landmark among the observations
 
 
-def triangulated_map(rig: Rig, seen: Observations) -> TriangulatedMap:
+def triangulated_map(rig: Rig, observations: Observations) -> TriangulatedMap:
     """The map of landmarks that two cameras or more see alike, in a frame in their middle, z out of the surface."""
-    _, point, count = np.unique(seen.track, return_inverse=True, return_counts=True)
+    _, point, count = np.unique(observations.track, return_inverse=True, return_counts=True)
     several = count[point] > 1
-    ids, point = np.unique(seen.track[several], return_inverse=True)
-    camera, pixels, sigma = seen.camera[several], seen.pixels[several], seen.sigma[several]
+    ids, point = np.unique(observations.track[several], return_inverse=True)
+    camera, pixels, sigma = observations.camera[several], observations.pixels[several], observations.sigma[several]
     points, covariance, residual = triangulate(rig, point, camera, pixels, len(ids))
     off = np.bincount(point, ((residual / sigma[:, None]) ** 2).sum(1)) / np.bincount(point) / 2
     good = np.isfinite(points).all(1) & (off < MAX_RESIDUAL_SIGMAS**2)

@@ -102,11 +102,23 @@ def _six(length: float, angle_deg: float) -> Array:
 class MotionLimits:
     """Limits of one run; axes are the machine's X Y Z A B C, mm and rad. InputError names one that makes no sense.
 
-    speed, acceleration, jerk: (6,) per s, s^2, s^3. The planner keeps all three, the guard checks the speed.
-    jump, turn: mm and rad in one tick. low, high: (6,) range of the axes. feed: mm/s. pose_age: s.
-    pose_error: mm, standard deviation of the place under the nozzle. surface_speed, surface_turn: mm/s there, rad/s.
-    stop_time, stop_distance: s and mm within which the arm comes to rest without a trusted pose.
-    on_path: mm by which the nozzle may be off its place and still print. zones: no-go volumes. pause: s of one hold.
+    speed: (6,) mm/s and rad/s; kept by the planner, checked by the guard.
+    acceleration: (6,) mm/s^2 and rad/s^2; kept by the planner.
+    jerk: (6,) mm/s^3 and rad/s^3; kept by the planner.
+    jump: mm in one tick.
+    turn: rad in one tick.
+    low: (6,) lower ends of the axes' ranges.
+    high: (6,) upper ends.
+    feed: mm/s, the most that a G1 frame asks for.
+    pose_age: s.
+    pose_error: mm, standard deviation of the position under the nozzle.
+    surface_speed: mm/s under the nozzle.
+    surface_turn: rad/s.
+    stop_time: s within which the arm comes to rest without a trusted pose.
+    stop_distance: mm likewise.
+    on_path: mm by which the nozzle may be off its place and still print.
+    zones: no-go volumes.
+    pause: s of one hold.
     """
 
     speed: Array = field(default_factory=lambda: _six(150.0, 120.0))  # public drivers run the arm at 167 mm/s

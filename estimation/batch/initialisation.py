@@ -154,28 +154,30 @@ def _first(rig: Rig, data: TrackArrays, points: Array, mapped: bool) -> tuple[in
     raise InputError("observations", "tracks", "no frame set", allowed)
 
 
-def _fit(rig: Rig, seen: Observations, points: Array, start: Array) -> Array | None:
+def _fit(rig: Rig, observations: Observations, points: Array, start: Array) -> Array | None:
     """The pose (4, 4) of a frame set by landmarks known so far, or None; what it shows anew is added to them."""
-    usable = np.isfinite(points[seen.track, 0])
+    usable = np.isfinite(points[observations.track, 0])
     if usable.sum() < MIN_FIT_LANDMARKS:
         return None
-    known = seen.only(usable)
+    known = observations.only(usable)
     fit = solve_pose(rig, PointTracks.of(known, points[known.track]), start, scales=(8.0, 2.0), iterations=4)
     if (fit.weights > INLIER_WEIGHT).sum() < MIN_FIT_INLIERS or not np.isfinite(fit.base_from_surface).all():
         return None
-    _add(rig, seen, ~usable, points, fit.base_from_surface)
+    _add(rig, observations, ~usable, points, fit.base_from_surface)
     return fit.base_from_surface
 
 
-def _add(rig: Rig, seen: Observations, new: Mask, points: Array, pose: Array) -> None:
+def _add(rig: Rig, observations: Observations, new: Mask, points: Array, pose: Array) -> None:
     """Landmarks that two cameras see in this frame set for the first time."""
-    _, index, count = np.unique(seen.track[new], return_inverse=True, return_counts=True)
+    _, index, count = np.unique(observations.track[new], return_inverse=True, return_counts=True)
     both = count[index] > 1
     if not both.any():
         return
-    rows, index = np.unique(seen.track[new][both], return_inverse=True)
-    sigma = seen.sigma[new][both]
-    new_points, _, residual = triangulate(rig, index, seen.camera[new][both], seen.pixels[new][both], len(rows))
+    rows, index = np.unique(observations.track[new][both], return_inverse=True)
+    sigma = observations.sigma[new][both]
+    new_points, _, residual = triangulate(
+        rig, index, observations.camera[new][both], observations.pixels[new][both], len(rows)
+    )
     off = np.bincount(index, ((residual / sigma[:, None]) ** 2).sum(1)) / np.bincount(index) / 2
     good = np.isfinite(new_points).all(1) & (off < MAX_TRIANGULATION_SIGMAS**2)
     points[rows[good]] = se3.transform_points(se3.inverse(pose), new_points[good])

@@ -155,9 +155,9 @@ def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Arra
     return change
 
 
-def single_fit(rig: Rig, points: Array, seen: Observations, camera: int, near: Array) -> PoseFit:
+def single_fit(rig: Rig, points: Array, observations: Observations, camera: int, near: Array) -> PoseFit:
     """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
-    mine = seen.only(seen.camera == camera)
+    mine = observations.only(observations.camera == camera)
     tracks = PointTracks.of(mine, points[mine.track])
     return solve_pose(rig, tracks, near, scales=(4.0, 1.0), prior=SINGLE_CAMERA_PRIOR)
 

@@ -89,7 +89,13 @@ class BumpDetector:
         return {c: text for c, text in self.bumped.items() if np.isnan(self._since[c])}
 
     def update(
-        self, rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array, outliers: frozenset[int]
+        self,
+        rig: Rig,
+        observations: Observations,
+        points: Array,
+        exposed: Array,
+        jacobians: Array,
+        outliers: frozenset[int],
     ) -> None:
         """Take an accepted frame set.
 
@@ -97,16 +103,16 @@ class BumpDetector:
         jacobians: (N, 2, 6) px by the pose. outliers: cameras so far off that the pose is without them; their change is
         forgotten once they are back.
         """
-        if seen.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
+        if observations.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
             return
         self._forget(self._outliers - outliers)
         self._outliers = outliers
-        parts = camera_equations(rig, seen, points, exposed, jacobians)
+        parts = camera_equations(rig, observations, points, exposed, jacobians)
         if np.isnan(self._first):
-            self._first = self._stamp = seen.stamp
-        step, self._stamp = max(seen.stamp - self._stamp, 0.0), seen.stamp
+            self._first = self._stamp = observations.stamp
+        step, self._stamp = max(observations.stamp - self._stamp, 0.0), observations.stamp
         self._count += 1
-        if young := seen.stamp - self._first < WARMUP_S:
+        if young := observations.stamp - self._first < WARMUP_S:
             self._learn(parts, step, 1 / self._count)
         usual = self._usual.numbers().reshape(-1, PICTURE_DOF)
         known = {c: part.without(usual[c]) for c, part in parts.items() if self._learned[c] + step >= WARMUP_S / 2}
@@ -185,19 +191,19 @@ class CameraEquations:
 
 
 def camera_equations(
-    rig: Rig, seen: Observations, points: Array, exposed: Array, jacobians: Array
+    rig: Rig, observations: Observations, points: Array, exposed: Array, jacobians: Array
 ) -> dict[int, CameraEquations]:
     """The equations of each camera with enough tracks, by camera number."""
     parts: dict[int, CameraEquations] = {}
     for camera in range(len(rig)):
-        mine = np.flatnonzero(seen.camera == camera)
+        mine = np.flatnonzero(observations.camera == camera)
         if len(mine) < MIN_CAMERA_TRACKS:
             continue
-        pixels = seen.pixels[mine]
-        left = pixels - project(rig, seen.camera[mine], exposed[camera], points[mine])[0]
+        pixels = observations.pixels[mine]
+        left = pixels - project(rig, observations.camera[mine], exposed[camera], points[mine])[0]
         middle = np.array([median(left[:, 0]), median(left[:, 1])])
         beside = ((left - middle) ** 2).sum(1) / OUTLIER_PX**2
-        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(seen.sigma[mine], 0.1)) ** 2, 2)[:, None]
+        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(observations.sigma[mine], 0.1)) ** 2, 2)[:, None]
         rows, slopes = jacobians[mine].reshape(-1, 6), _picture_jacobian(rig, camera, pixels)
         flat, gap = slopes.reshape(-1, PICTURE_DOF), left.ravel()
         posed, own = (rows * weights).T, (flat * weights).T

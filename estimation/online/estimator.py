@@ -54,7 +54,7 @@ class _MappedSurface:
     """What is known of the surface since its first map; the next first map begins it anew."""
 
     pose: SurfacePose  # the last one, with the covariance that decisions are made by
-    given: SurfacePose  # the same with the reported covariance
+    reported_pose: SurfacePose  # the same with the reported covariance
     measured: SurfacePose  # the last one that was measured
 
     def __init__(self, surface_map: SurfaceMap, cameras: int, caveat: str) -> None:
@@ -102,7 +102,7 @@ class Estimator:
     @property
     def pose(self) -> SurfacePose | None:
         """The last pose given, or None before there is a map."""
-        return None if self._mapped is None else self._mapped.given
+        return None if self._mapped is None else self._mapped.reported_pose
 
     @property
     def confirmed(self) -> bool:
@@ -272,13 +272,13 @@ class Estimator:
     def set_twist(self, twist: Array) -> None:
         """Take the velocity (6,) before the window can estimate it: the first pose's covariance needs it."""
         surface = self._surface
-        surface.pose = surface.given = replace(surface.pose, twist=twist)
+        surface.pose = surface.reported_pose = replace(surface.pose, twist=twist)
 
     def hold(self, stamp: float, reason: str) -> SurfacePose:
         """The first map is not confirmed at `stamp`: the pose stands still and counts for nothing."""
         surface = self._surface
-        surface.pose = surface.given = replace(surface.pose, stamp=stamp, reason=reason)
-        return surface.given
+        surface.pose = surface.reported_pose = replace(surface.pose, stamp=stamp, reason=reason)
+        return surface.reported_pose
 
     def learn(self) -> None:
         """Learn the cameras' errors from the last accepted fit: no pose waits for it, but the next fit needs it."""
@@ -324,8 +324,8 @@ class Estimator:
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        surface.given = widened(given, surface.local.covariance) if surface.local.active else given
-        return surface.given
+        surface.reported_pose = widened(given, surface.local.covariance) if surface.local.active else given
+        return surface.reported_pose
 
     def _update_health(self, fit: FrameFit) -> None:
         used = fit.used if fit.measured else np.zeros_like(fit.used)
@@ -361,7 +361,7 @@ class Estimator:
             surface.warp.warp,
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
-        surface.pose = surface.measured = surface.given = entered
+        surface.pose = surface.measured = surface.reported_pose = entered
         return entered
 
     def coast(self, fit: FrameFit) -> SurfacePose:
@@ -376,8 +376,8 @@ class Estimator:
             stays = surface.measured.predict(surface.measured.stamp + self.settings.states.coast)
             predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6), forecast=None)
         surface.pose = replace(predicted, state=state, reason=reason)
-        surface.given = surface.reported.missed(surface.pose)
-        return surface.given
+        surface.reported_pose = surface.reported.missed(surface.pose)
+        return surface.reported_pose
 
     def replace_map(self, surface_map: SurfaceMap, crooked: bool = False, bent: bool = False) -> None:
         """Take a refined or longer map of the same surface frame; rows keep their meaning.

@@ -66,12 +66,14 @@ class FrameFit:
         return max(0.0, 1 - noise / whole) if whole > 0 else 0.0
 
 
-def failed_fit(seen: Observations, start: Array, cameras: int, reason: str, outliers: frozenset[int]) -> FrameFit:
+def failed_fit(
+    observations: Observations, start: Array, cameras: int, reason: str, outliers: frozenset[int]
+) -> FrameFit:
     """No measurement of what was `seen` by a rig of so many cameras: the pose stays `start` (4, 4)."""
-    count, zero, unknown = len(seen), np.zeros((6, 6)), np.full(cameras, np.nan)
+    count, zero, unknown = len(observations), np.zeros((6, 6)), np.full(cameras, np.nan)
     by_delay, by_shift = np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
     return FrameFit(
-        stamp=seen.stamp,
+        stamp=observations.stamp,
         solution=PoseFit(start, zero, np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2, 6)), 1.0),
         parts=FitCovariance(np.full((6, 6), np.inf), zero, zero, 1.0, zero, by_delay, by_shift),
         twist=np.zeros(6),
@@ -132,14 +134,14 @@ class MapError:
         return wide
 
 
-def residual_scatter(seen: Observations, solution: PoseFit) -> float:
+def residual_scatter(observations: Observations, solution: PoseFit) -> float:
     """Variance of the tracks over their stated variance, estimated from the residuals of one fit.
 
     The variance of the estimating equations over their slope (Huber 1981, 6.8), relative to its value for normal errors
     of the stated size, which counts as PRIOR_RESIDUALS. Tracks of clean pictures are two or three times better than
     stated. Where some are worse without being outliers, the weights alone would show too little of it.
     """
-    root = seen.sigma * solution.scale
+    root = observations.sigma * solution.scale
     square = (solution.residuals**2).sum(1) / root**2
     used = solution.weights > 0
     weight = (1 + square[used] / GATE**2) ** -2
@@ -155,22 +157,22 @@ def residual_scatter(seen: Observations, solution: PoseFit) -> float:
 
 
 def fit_covariance(
-    seen: Observations, solution: PoseFit, shared: SharedErrors, map_error: MapError, warp: WarpFilter
+    observations: Observations, solution: PoseFit, shared: SharedErrors, map_error: MapError, warp: WarpFilter
 ) -> FitCovariance:
     """The covariance of a pose that was fitted to what was `seen`, by its parts."""
     information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
     noise = np.linalg.pinv(information, hermitian=True)
-    weight = EFFICIENCY * solution.weights / (seen.sigma * solution.scale) ** 2
-    rows, landmark = np.unique(seen.track, return_inverse=True)
+    weight = EFFICIENCY * solution.weights / (observations.sigma * solution.scale) ** 2
+    rows, landmark = np.unique(observations.track, return_inverse=True)
     cameras = len(shared.shift)
-    camera = np.ascontiguousarray(seen.camera)
+    camera = np.ascontiguousarray(observations.camera)
     by_landmark, by_camera = pose_pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
     weighted = solution.jacobians * weight[:, None, None]
     lasting = map_error.reaching_pose(rows, by_landmark)
-    lasting = lasting + warp.pull(seen.track, weighted, solution.jacobians[:, :, 3:])
+    lasting = lasting + warp.pull(observations.track, weighted, solution.jacobians[:, :, 3:])
     by_delay, by_shift = noise @ by_camera[:, 0], noise @ by_camera[:, 1:].swapaxes(1, 2).reshape(6, -1)
     new = noise + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
-    smear, scatter = by_delay @ shared.delay @ by_delay.T, residual_scatter(seen, solution)
+    smear, scatter = by_delay @ shared.delay @ by_delay.T, residual_scatter(observations, solution)
     return FitCovariance(new, smear, noise @ lasting @ noise, scatter, noise, by_delay, by_shift)
 
 

@@ -63,14 +63,14 @@ class LocalMotion:
         return np.diag([0.0] * 3 + [(HEIGHT_RATIO * max(self.size, MIN_DISPLACEMENT_MM)) ** 2] * 3)
 
     def __call__(
-        self, seen: Observations, fit: FrameFit, sigma: Array, surface_map: SurfaceMap, smeared: float
+        self, observations: Observations, fit: FrameFit, sigma: Array, surface_map: SurfaceMap, smeared: float
     ) -> None:
         """Take an accepted fit to what was `seen`. sigma: (N,) px. Cameras that were left out count for nothing.
 
         smeared: mm that the surface moves in the time by which the cameras' exposures are unknown.
         """
         self._take(surface_map)
-        normal, right, weight, plain = self._landmarks(seen, fit, sigma)
+        normal, right, weight, plain = self._landmarks(observations, fit, sigma)
         moved, square, enough = self._means(normal, plain, weight, (weight > 0) & (self._looks >= MIN_LANDMARK_SETS))
         chance = square / np.maximum(self._usual, 1.0)
         far = np.linalg.norm(moved, axis=1)
@@ -101,12 +101,12 @@ class LocalMotion:
             self._bells = np.ascontiguousarray(bells(points, self._centres, BELL_SIGMA_MM).T)
             self._squares = self._bells**2
 
-    def _landmarks(self, seen: Observations, fit: FrameFit, sigma: Array) -> tuple[Array, Array, Array, Array]:
+    def _landmarks(self, observations: Observations, fit: FrameFit, sigma: Array) -> tuple[Array, Array, Array, Array]:
         """Each landmark's displacement: normal equations (N, 3, 3) and (N, 3), weight (N,), right sides less usual."""
         precision = (sigma * fit.solution.scale) ** -2.0
         for camera in fit.outliers:
-            precision[seen.camera == camera] = 0.0
-        row = np.require(seen.track, np.int64, CONTIGUOUS)
+            precision[observations.camera == camera] = 0.0
+        row = np.require(observations.track, np.int64, CONTIGUOUS)
         jacobian = np.require(fit.solution.jacobians, float, CONTIGUOUS)
         residual = np.require(fit.solution.residuals, float, CONTIGUOUS)
         normal, right, square, views = displacement_sums(len(self._points), row, jacobian, residual, precision)

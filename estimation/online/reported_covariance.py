@@ -71,12 +71,12 @@ class TrackNoise:
         whole, changed = self._sums[2:]
         return float(np.clip(changed / max(whole, PRIOR_TRACKS) - self.new, 0.0, 1.0 - self.new))
 
-    def learn(self, seen: Observations, solution: PoseFit, sigma: Array) -> None:
+    def learn(self, observations: Observations, solution: PoseFit, sigma: Array) -> None:
         """Take the residuals of one fit. sigma: (N,) px as claimed."""
         good = solution.weights > INLIER_WEIGHT
-        key = seen.track[good] * self._cameras + seen.camera[good]
+        key = observations.track[good] * self._cameras + observations.camera[good]
         pull = solution.weights[good] / (sigma[good] * solution.scale)
-        now = _TrackResiduals(seen.stamp, key, solution.residuals[good] * pull[:, None])
+        now = _TrackResiduals(observations.stamp, key, solution.residuals[good] * pull[:, None])
         if not self._past:
             self._past = [now] * 3
             return
@@ -214,10 +214,10 @@ class ReportedCovariance:
         self._stamp, self._trouble = -np.inf, -np.inf  # s, of the last pose, and of the last with trouble
         self._added = np.zeros((6, 6))  # the last pose's lasting errors beyond its own covariance
 
-    def learn(self, seen: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
+    def learn(self, observations: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
         """Take the residuals of an accepted fit, after the cameras did. seen.sigma: as claimed."""
         assert fit.solution.shared is not None
-        self._tracks.learn(seen, fit.solution, seen.sigma)
+        self._tracks.learn(observations, fit.solution, observations.sigma)
         self._drift.learn(fit.solution.shared, cameras.shift, self._tracks.lasting * fit.parts.scatter)
 
     def measured(

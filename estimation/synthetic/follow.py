@@ -26,13 +26,13 @@ MIN_FRAME_SETS = StateSettings().first + 3  # the map's, those averaged into the
 Mapping = Literal["told", "seen"]  # the world's own map, or one triangulated from the first frame set and refined
 
 
-def pose_information(rig: Rig, base_from_surface: Array, points: Array, seen: Observations) -> Array:
+def pose_information(rig: Rig, base_from_surface: Array, points: Array, observations: Observations) -> Array:
     """Fisher information (6, 6) of one frame set about the right perturbation of the true pose (4, 4), rad and mm.
 
     rig: the true cameras. points: (N, 3) mm, the true landmarks; seen.track are their rows. seen.sigma: px, white.
     """
-    _, _, jacobian = project(rig, seen.camera, base_from_surface, points[seen.track])
-    return np.asarray(np.einsum("nki,n,nkj->ij", jacobian, seen.sigma**-2.0, jacobian))
+    _, _, jacobian = project(rig, observations.camera, base_from_surface, points[observations.track])
+    return np.asarray(np.einsum("nki,n,nkj->ij", jacobian, observations.sigma**-2.0, jacobian))
 
 
 def pose_bound(information: Array) -> Array:
@@ -75,28 +75,28 @@ class Follower:
         if self.refiner is not None:
             self.refiner.begin(start.map, first.stamp, start.base_from_surface, self.of_map(first))
 
-    def __call__(self, seen: Observations) -> SurfacePose:
+    def __call__(self, observations: Observations) -> SurfacePose:
         """The pose at `seen.stamp` from this frame set and the ones before."""
-        estimator, seen = self.estimator, self.of_map(seen)
-        fit = estimator.fit(seen, estimator.predict(seen.stamp))
+        estimator, observations = self.estimator, self.of_map(observations)
+        fit = estimator.fit(observations, estimator.predict(observations.stamp))
         refiner, refined = self.refiner, None
         if not estimator.confirmed:
             if len(estimator.carrying_cameras(fit)) < 2:
-                return estimator.hold(seen.stamp, fit.reason or "one camera sees the surface")
-            refined = None if refiner is None else refiner.confirm(fit, seen, estimator.cameras.delays)
+                return estimator.hold(observations.stamp, fit.reason or "one camera sees the surface")
+            refined = None if refiner is None else refiner.confirm(fit, observations, estimator.cameras.delays)
             if refiner is not None and refined is not None:
                 estimator.set_twist(refiner.speed(fit))
         elif refiner is not None and fit.measured and not fit.outliers and estimator.too_fast_for_map(fit):
-            refined = refiner.rebuild(fit, seen, estimator.cameras.delays)
+            refined = refiner.rebuild(fit, observations, estimator.cameras.delays)
         if refined is not None:
             self._take(refined)
-            refit = estimator.fit(seen, fit.solution.base_from_surface)
+            refit = estimator.fit(observations, fit.solution.base_from_surface)
             fit = refit if refit.measured else fit
         if not fit.measured:
             return estimator.coast(fit)
-        pose = estimator.accept(fit, seen)
+        pose = estimator.accept(fit, observations)
         if refiner is not None:
-            refiner.offer(fit, seen, pose.twist, estimator.cameras.delays)
+            refiner.offer(fit, observations, pose.twist, estimator.cameras.delays)
         return pose
 
     def idle(self) -> None:
@@ -104,13 +104,19 @@ class Follower:
         if self.refiner is not None and (refined := self.refiner.poll()) is not None:
             self._take(refined)
 
-    def of_map(self, seen: Observations) -> Observations:
+    def of_map(self, observations: Observations) -> Observations:
         """The observations of landmarks in the map that agree with it, numbered by the map's rows."""
-        known = seen.track < len(self._row)
-        row = np.where(known, self._row[np.where(known, seen.track, 0)], -1)
+        known = observations.track < len(self._row)
+        row = np.where(known, self._row[np.where(known, observations.track, 0)], -1)
         keep = row >= 0
         keep[keep] = self._agrees[row[keep]]
-        return Observations(seen.stamp, seen.camera[keep], row[keep], seen.pixels[keep], seen.sigma[keep])
+        return Observations(
+            observations.stamp,
+            observations.camera[keep],
+            row[keep],
+            observations.pixels[keep],
+            observations.sigma[keep],
+        )
 
     def _take(self, refined: AdjustedMap) -> None:
         self.estimator.replace_map(refined.map)

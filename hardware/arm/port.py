@@ -161,7 +161,7 @@ class SerialPort:
         try:
             if self._file is None:
                 return bytes(self._serial.read(self._serial.in_waiting))
-            if self._device and not self._asked(termios.FIONREAD):
+            if self._device and not self._queried_count(termios.FIONREAD):
                 return b""  # reading would say the same of a device that is gone
             data = os.read(self._file, READ_BYTES)
         except BlockingIOError:
@@ -177,7 +177,7 @@ class SerialPort:
         if self._file is None:
             return 0
         try:
-            return self._asked(termios.TIOCOUTQ)
+            return self._queried_count(termios.TIOCOUTQ)
         except OSError:
             return 0
 
@@ -185,9 +185,9 @@ class SerialPort:
         """Close the device."""
         self._serial.close()
 
-    def _asked(self, question: int) -> int:
+    def _queried_count(self, request: int) -> int:
         assert self._file is not None
-        answer: int = struct.unpack("i", fcntl.ioctl(self._file, question, b"\0\0\0\0"))[0]
+        answer: int = struct.unpack("i", fcntl.ioctl(self._file, request, b"\0\0\0\0"))[0]
         return answer
 
 

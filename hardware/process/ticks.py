@@ -147,11 +147,11 @@ SLOW_RATIO = 3.0  # times the usual
 
 @dataclass(frozen=True, slots=True)
 class Evenness:
-    """usual, largest: s that a piece of work took. slow: share of the time in pieces that took over SLOW usual ones."""
+    """How evenly this machine works: the time that equal pieces of work take."""
 
-    usual: float
-    largest: float
-    slow: float
+    usual: float  # s, median of the pieces
+    largest: float  # s
+    slow: float  # share of the time spent in pieces that took more than SLOW_RATIO usual ones
 
     def __str__(self) -> str:
         """In words."""
