@@ -22,7 +22,7 @@ MIN_SINGULAR_ANGLE = float(np.deg2rad(5))
 MIN_SHOULDER_DISTANCE = 20.0
 SPIN_CANDIDATES = 24  # candidates all round: 15 degrees apart
 REACHABLE = "ok"
-REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed")
+REACH_REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed")
 UNREACHABLE_COST = 1e3  # no smoothness is worth a checkpoint that cannot be printed
 SPIN_STEP_COST = 1.0  # of a spin by one candidate from one checkpoint to the next
 RANGE_END_COST = 1.0  # per rad that a joint is nearer than RANGE_END_ANGLE to the end of its range
@@ -60,7 +60,7 @@ class Reach:
     shoulder: Array  # (N,) mm
     manipulability: Array  # (N,)
     speed: Array  # (N,) largest share of a joint's speed limit, for path and surface together
-    reason: NDArray[np.int64]  # (N,) index into REASONS, 0 where it can be printed
+    reason: NDArray[np.int64]  # (N,) index into REACH_REASONS, 0 where it can be printed
     spin: Array  # (N,) rad that the tool is spun about its axis
 
     @property
@@ -87,7 +87,7 @@ def reach_of(
             (wrist < MIN_SINGULAR_ANGLE) | (elbow < MIN_SINGULAR_ANGLE) | (shoulder < MIN_SHOULDER_DISTANCE),
             ~(speed <= 1),
         ]
-    reason = np.select(wrong, list(range(1, len(REASONS))), 0)
+    reason = np.select(wrong, list(range(1, len(REACH_REASONS))), 0)
     unspun = np.zeros(len(path))
     return Reach(joints[0], bound, wrist, elbow, shoulder, manipulability, speed, reason.astype(np.int64), unspun)
 

@@ -18,7 +18,7 @@ from estimation.synthetic.follow import Follower, first_map
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
 from hardware.bench.campaigns.outages import judge_outage, outage_figures, outage_table, scene_jobs
 from hardware.bench.outage_run import (
-    FPS,
+    FRAME_RATE_HZ,
     Outage,
     OutageKind,
     Spoiler,
@@ -39,13 +39,20 @@ LIKE = (OutageKind.HAND, OutageKind.GLARE, OutageKind.EXPOSURE)  # like those be
 
 def watched(kind: OutageKind = OutageKind.DEAD, start: int = 10, end: int = 20, count: int = 40) -> WatchedOutage:
     """A tracker that says at once what is wrong and is back at once."""
-    outage = Outage(kind, (0,), start / FPS, end / FPS, 0.5, np.eye(4), 0)
+    outage = Outage(kind, (0,), start / FRAME_RATE_HZ, end / FRAME_RATE_HZ, 0.5, np.eye(4), 0)
     struck = [start <= k < end for k in range(count)]
     used = np.array([[0 if s else 90, 90, 90] for s in struck])
     states = tuple(DEGRADED if s else TRACKING for s in struck)
     reasons = tuple("cam_0" if s else "" for s in struck)
     return WatchedOutage(
-        outage, np.arange(count) / FPS, np.full(count, 0.02), np.full(count, 0.05), states, reasons, used, False
+        outage,
+        np.arange(count) / FRAME_RATE_HZ,
+        np.full(count, 0.02),
+        np.full(count, 0.05),
+        states,
+        reasons,
+        used,
+        False,
     )
 
 
@@ -74,7 +81,7 @@ def test_the_flag_is_timed_from_the_first_blind_frame(late: int) -> None:
     quiet = range(10, 10 + late)
     states = tuple(TRACKING if k in quiet else s for k, s in enumerate(seen.states))
     reasons = tuple("" if k in quiet else r for k, r in enumerate(seen.reasons))
-    assert judge_outage(replace(seen, states=states, reasons=reasons)).flagged == pytest.approx(late / FPS)
+    assert judge_outage(replace(seen, states=states, reasons=reasons)).flagged == pytest.approx(late / FRAME_RATE_HZ)
 
 
 def test_an_outage_that_nobody_mentions_is_never_flagged() -> None:
@@ -95,7 +102,7 @@ def test_back_is_the_first_pose_without_a_reservation_and_its_error_the_worst_fr
     states = tuple(COASTING if 10 <= k < 23 else s for k, s in enumerate(seen.states))
     error = np.where(np.arange(40) == 25, 0.4, 0.02)
     verdict = judge_outage(replace(seen, states=states, error=error))
-    assert verdict.back == pytest.approx(3 / FPS) and verdict.after == 0.4
+    assert verdict.back == pytest.approx(3 / FRAME_RATE_HZ) and verdict.after == 0.4
     assert judge_outage(replace(seen, states=(*seen.states[:10], *(COASTING,) * 30))).back == np.inf
 
 

@@ -16,8 +16,8 @@ from hardware.arm.protocol import G1, encode
 from hardware.bench.campaigns import link as link_run
 from hardware.bench.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from hardware.bench.prediction import (
-    AHEAD,
     POINTS_AROUND,
+    PREDICTION_HORIZONS,
     SIMULATED,
     Chest,
     errors_of,
@@ -26,7 +26,7 @@ from hardware.bench.prediction import (
     simulated,
 )
 from hardware.bench.smoothing import (
-    MISSING,
+    PYCOLMAP_MISSING,
     MovementErrors,
     RenderedErrors,
     ceres_figures,
@@ -59,7 +59,7 @@ def gliding(speed: float) -> Chest:
 
 def test_hold_is_off_by_the_way_and_constant_velocity_by_nothing_on_a_steady_glide() -> None:
     errors = errors_of(gliding(5.0), WARM)
-    assert errors.hold == pytest.approx(5.0 * np.array(AHEAD), rel=1e-9)
+    assert errors.hold == pytest.approx(5.0 * np.array(PREDICTION_HORIZONS), rel=1e-9)
     assert np.abs(errors.steady).max() < 1e-9 and (errors.ours < 0.02 * errors.hold).all()
 
 
@@ -115,14 +115,14 @@ def test_a_session_of_pictures_is_tracked_smoothed_and_judged(tmp_path: Path) ->
     cameras = arc_rig(size=(320, 240), focal=280.0)
     write_session(tmp_path / "breathing", seconds=1.0, rate=10.0, seed=2, cameras=cameras)
     found = smooth_rendered(tmp_path / "breathing")
-    assert found.found.looks > 0
+    assert found.reobserved.looks > 0
     assert 0 < found.smoothed < 0.1 and 0 < found.tracked < 0.1 and 0 < found.causal < 0.1
 
 
 def test_ceres_finds_no_lower_cost() -> None:
     found = ceres_figures(0.5, 30)
-    if all(f.note == MISSING for f in found):
-        pytest.skip(MISSING)
+    if all(f.note == PYCOLMAP_MISSING for f in found):
+        pytest.skip(PYCOLMAP_MISSING)
     cost, time = found
     assert cost.verdict == "met" and cost.value > 0.999
     assert time.value > 0
@@ -130,7 +130,7 @@ def test_ceres_finds_no_lower_cost() -> None:
 
 def test_that_pycolmap_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert [(f.note, f.verdict) for f in ceres_figures(0.5, 30)] == [(MISSING, "")] * 2
+    assert [(f.note, f.verdict) for f in ceres_figures(0.5, 30)] == [(PYCOLMAP_MISSING, "")] * 2
 
 
 @pytest.mark.slow  # three clusters; tests/test_smooth_many.py has the same of one

@@ -17,7 +17,7 @@ from hardware.files.arm_file import read_arm
 from hardware.files.path_file import read_path, write_path
 from hardware.report.page import Plot
 from planning.kinematics import POSTURES, JointModel, nozzle_from_joints
-from planning.reach import REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
+from planning.reach import REACH_REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
 from tests.moving import path_through, raster
 
 ARMS = Path(__file__).parents[1] / "data" / "arms"
@@ -31,7 +31,7 @@ def nominal() -> JointModel:
 
 
 def reasons(model: JointModel, place: Array, motion: SurfaceMotion = STILL, speed: float = 5.0) -> set[str]:
-    return {REASONS[i] for i in reach_of(model, place, raster(speed=speed), motion).reason}
+    return {REACH_REASONS[i] for i in reach_of(model, place, raster(speed=speed), motion).reason}
 
 
 def test_a_path_under_home_is_printable_and_its_joints_bring_the_nozzle_there() -> None:
@@ -65,7 +65,7 @@ def test_a_wrist_within_five_degrees_of_singular_is_told_though_its_range_allows
     point = path_through(np.array([[0.0, 0, 0], [0.1, 0, 0]]))
     for degrees, reason in ((80.0, "ok"), (86.5, "singular"), (89.0, "joint range")):
         place = nozzle_from_joints(model, np.array([0.1, -0.4, -0.3, 0.2, np.deg2rad(degrees), 0.1]))
-        assert {REASONS[i] for i in reach_of(model, place, point, STILL).reason} == {reason}
+        assert {REACH_REASONS[i] for i in reach_of(model, place, point, STILL).reason} == {reason}
 
 
 def test_a_motion_of_the_surface_takes_reach_away() -> None:
@@ -90,7 +90,7 @@ def test_speed_of_joints_is_that_of_differences() -> None:
 def test_the_tool_spins_to_stay_within_the_last_joint_and_no_more_than_it_must() -> None:
     model, path = nominal(), raster()
     narrow = replace(model, low=np.append(model.low[:5], -0.5), high=np.append(model.high[:5], 0.5))
-    assert {REASONS[i] for i in reach_of(narrow, ARM_FROM_BENCH, path, STILL).reason} == {"joint range"}
+    assert {REACH_REASONS[i] for i in reach_of(narrow, ARM_FROM_BENCH, path, STILL).reason} == {"joint range"}
     spin = best_spin(narrow, ARM_FROM_BENCH, path, STILL)
     assert reach_at_spin(narrow, ARM_FROM_BENCH, path, STILL, spin).feasible.all()
     assert np.ptp(spin) < 1e-9  # one angle serves the whole path
@@ -109,7 +109,7 @@ def test_the_command_marks_the_path_and_what_can_be_printed(tmp_path: Path, caps
     with (tmp_path / "bad" / "reach.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["feasible"] for row in rows] == marked.tolist()
-    assert {row["reason"] for row in rows if row["feasible"] == "0"} <= set(REASONS[1:])
+    assert {row["reason"] for row in rows if row["feasible"] == "0"} <= set(REACH_REASONS[1:])
     assert "<svg" in (tmp_path / "bad" / "reach.html").read_text()
 
 

@@ -256,7 +256,7 @@ def test_the_environment_reaches_the_libraries() -> None:
 def test_a_constant_that_is_another_one_by_a_billionth_is_found(capfd: pytest.CaptureFixture[str]) -> None:
     if reasons := unlike(json.loads((FOLDER / "made_with.json").read_text(encoding="utf-8"))):
         pytest.skip("; ".join(reasons))
-    changed = "import estimation.online.estimator as e\ne.PERSISTS *= 1 + 1e-9"
+    changed = "import estimation.online.estimator as e\ne.ACCELERATION_PERSISTENCE_S *= 1 + 1e-9"
     assert run_pinned("tests.process_replay", ["--case", "outage"]) == 0
     assert run_pinned("tests.process_replay", ["--case", "outage"], changed) == 1
     assert "CHANGED" in capfd.readouterr().out

@@ -107,7 +107,9 @@ def videos(folder: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_a_waved_board_becomes_a_rig(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("board_session.OFFSETS", (0.0, 0.0, 0.0))  # what goes back is late by what it was early before
+    monkeypatch.setattr(
+        "tests.board_session.OFFSETS", (0.0, 0.0, 0.0)
+    )  # what goes back is late by what it was early before
     board, out, cameras = tmp_path / "board.toml", tmp_path / "rig.toml", videos(tmp_path)
     write_board(board, BOARD)
     run = started(["calibrate", "cameras", *cameras, "--board", str(board), "-o", str(out), "--limit-mm", "1"])

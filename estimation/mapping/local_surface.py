@@ -23,10 +23,10 @@ MIN_BODY_RADIUS_MM = 30.0  # of a wrist, the most strongly curved body that is p
 MIN_SCATTER_MM = 0.02  # no skin is smoother, no landmark better known
 OUTLIER_SCATTERS = 3.0  # times the scatter, from which a point counts by its distance only (Huber)
 MIN_RAY_COSINE = 0.15  # between ray and normal: beyond, nothing is visible
-POWERS = [(n - j, j) for n in range(POLYNOMIAL_ORDER + 1) for j in range(n + 1)]
+MONOMIAL_POWERS = [(n - j, j) for n in range(POLYNOMIAL_ORDER + 1) for j in range(n + 1)]
 # mm^(1 - order), one standard deviation: h = y^2 / 2R + y^4 / 8R^3 on a cylinder, and as much askew in between
 COEFFICIENT_SIGMAS = (1e2, 1e1, 0.5 / MIN_BODY_RADIUS_MM, 0.25 / MIN_BODY_RADIUS_MM**2, 0.125 / MIN_BODY_RADIUS_MM**3)
-COEFFICIENT_PRIOR = np.array([COEFFICIENT_SIGMAS[a + b] ** -2 for a, b in POWERS])
+COEFFICIENT_PRIOR = np.array([COEFFICIENT_SIGMAS[a + b] ** -2 for a, b in MONOMIAL_POWERS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,12 +140,12 @@ def _nearest(points: Array, origins: Array, directions: Array) -> Index:
 
 
 def _basis(u: Array, v: Array) -> Array:
-    return np.stack([u**a * v**b for a, b in POWERS], -1)
+    return np.stack([u**a * v**b for a, b in MONOMIAL_POWERS], -1)
 
 
 def _slopes(coefficients: Array, u: Array, v: Array) -> tuple[Array, Array]:
-    across = np.stack([a * u ** max(a - 1, 0) * v**b for a, b in POWERS], -1)
-    along = np.stack([b * u**a * v ** max(b - 1, 0) for a, b in POWERS], -1)
+    across = np.stack([a * u ** max(a - 1, 0) * v**b for a, b in MONOMIAL_POWERS], -1)
+    along = np.stack([b * u**a * v ** max(b - 1, 0) for a, b in MONOMIAL_POWERS], -1)
     return (across * coefficients).sum(-1), (along * coefficients).sum(-1)
 
 

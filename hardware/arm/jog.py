@@ -22,7 +22,7 @@ from estimation.se3 import Array
 from hardware.arm.feedback import REST_TOLERANCE, ArmFeedback, near
 from hardware.arm.protocol import G1, Pause
 
-PLACE, ANGLES = slice(0, 3), slice(3, 6)  # of axes (6,)
+POSITION, ANGLES = slice(0, 3), slice(3, 6)  # of axes (6,)
 
 
 def travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: float) -> Iterator[G1]:
@@ -31,7 +31,7 @@ def travel_steps(start: Array, goal: Array, speed: float, turning: float, tick: 
     speed: mm/s. turning: rad/s. The last step ends at the goal exactly.
     """
     yield G1(start, speed)
-    yield from _steps(start, goal, PLACE, speed * tick, speed)
+    yield from _steps(start, goal, POSITION, speed * tick, speed)
     turned = np.concatenate([goal[:3], start[3:]])
     yield from _steps(turned, goal, ANGLES, turning * tick, float(np.rad2deg(turning)))  # on the spot: degrees/s
 
@@ -42,9 +42,9 @@ def lifted_travel_steps(start: Array, goal: Array, speed: float, turning: float,
     above = np.array([*goal[:2], height, *goal[3:]])
     lift = np.array([*start[:2], height, *start[3:]])
     yield G1(start, speed)
-    yield from _steps(start, lift, PLACE, speed * tick, speed)
+    yield from _steps(start, lift, POSITION, speed * tick, speed)
     yield from travel_steps(lift, above, speed, turning, tick)
-    yield from _steps(above, goal, PLACE, speed * tick, speed)
+    yield from _steps(above, goal, POSITION, speed * tick, speed)
 
 
 def _steps(start: Array, goal: Array, part: slice, longest: float, feed: float) -> Iterator[G1]:

@@ -46,7 +46,7 @@ CORNER_SIGMA = 0.15  # px, of the corners that are drawn without pictures
 DRAWN_INSTANTS = 30  # of a run without pictures
 LENS_SIGMA = np.array([0.003, 0.003, 0.1])  # of p1, p2 and k3 of the worst lens drawn: as webcams were measured
 MIN_LENS_FACTOR = 0.01  # on LENS_SIGMA, of the best lens drawn
-NO_REFERENCE, CLAIMED = "none", "squared error, in parts of what is claimed"
+NO_REFERENCE, ERROR_BY_COVARIANCE = "none", "squared error, in parts of what is claimed"
 
 
 def run_calibration(options: argparse.Namespace) -> list[Figure]:
@@ -56,7 +56,7 @@ def run_calibration(options: argparse.Namespace) -> list[Figure]:
         nees = float(np.mean([_nees(seed) for seed in range(options.runs)]))
         what = f"{options.runs} runs on drawn corners of {CORNER_SIGMA:g} px, {DRAWN_INSTANTS} instants"
         note = f"{what}, lenses bent more or less"
-        figures.append(Figure(CLAIMED, nees, "", CONSISTENT_NEES, NO_REFERENCE, note))
+        figures.append(Figure(ERROR_BY_COVARIANCE, nees, "", CONSISTENT_NEES, NO_REFERENCE, note))
     return figures
 
 
@@ -219,7 +219,7 @@ def run_arm_calibration(options: argparse.Namespace) -> list[Figure]:
     if options.runs:
         nees, *errors = np.array([_drawn_arm(options.seed + number) for number in range(options.runs)]).T.copy()
         note = f"{options.runs} arms on drawn tips, {TIP_NOISE_PX:g} px, {100 * TIP_OUTLIERS:g} % of them astray"
-        figures.append(Figure(CLAIMED, nees.mean(), "", CONSISTENT_NEES, NO_REFERENCE, note))
+        figures.append(Figure(ERROR_BY_COVARIANCE, nees.mean(), "", CONSISTENT_NEES, NO_REFERENCE, note))
         for error, what, unit in zip(errors, ("tip", "dead time", "lag"), ("mm", "ms", "ms"), strict=True):
             figures.append(Figure(f"{what}, drawn tips, RMS", rms(error), unit))
     return figures
@@ -249,7 +249,7 @@ def _rendered_arm(seed: int) -> Iterator[Figure]:
     yield Figure(f"servo's lag, arm {seed}", 1e3 * abs(float(error[10])), "ms", at_most(3.0))
     yield Figure(f"held-out tips, median, arm {seed}", float(np.nanmedian(solution.held_px)), "px")
     nees = relative_nees(error[:11], fit.covariance[:11, :11])  # the truth does not state the needle's radius
-    yield Figure(f"{CLAIMED}, arm {seed}", nees)
+    yield Figure(f"{ERROR_BY_COVARIANCE}, arm {seed}", nees)
     yield Figure(f"likewise, before the claim is widened, arm {seed}", nees * fit.widened_by)
 
 

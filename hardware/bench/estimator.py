@@ -29,7 +29,7 @@ from estimation.se3 import Array
 from estimation.synthetic.follow import FollowResult, Mapping, follow, follow_steps
 from estimation.synthetic.world import World, synthetic_world
 from hardware.bench.figures import CONSISTENT_NEES, INSIDE_95, Figure, Target, at_least, at_most, rms, with_progress
-from hardware.bench.outage_run import FPS, make_pictures
+from hardware.bench.outage_run import FRAME_RATE_HZ, make_pictures
 from hardware.process.clock import CpuClock
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet
@@ -297,14 +297,14 @@ class SceneRun:
 
 def run_consistency(options: argparse.Namespace) -> list[Figure]:
     """Figures over all scenes, and each scene's own."""
-    runs, count = {}, round(options.seconds * FPS)
+    runs, count = {}, round(options.seconds * FRAME_RATE_HZ)
     for seed in range(options.seed, options.seed + options.scenes):
         pictures = make_pictures(seed, LOOP_SETS)
         loop = pictures.near
         step = TrackingStep(pictures.rig, rois(pictures.scene, pictures.rig, loop.poses[0], 0.0))
         poses = []
         for number in range(count):
-            stamp = number / FPS
+            stamp = number / FRAME_RATE_HZ
             frames = [Frame(c, stamp, loop.noisy(image)) for c, image in enumerate(loop.images(number))]
             poses.append(step(FrameSet(stamp, tuple(frames))))
             step.idle()

@@ -85,7 +85,7 @@ MAIN_PERIOD = 0.02  # s between the main process's checks of the others
 START_HEIGHT = 3.0  # mm over its first checkpoint, where the nozzle begins
 WATCHED_AFTER_KILL = 1.5  # s that the rest of the world goes on without the motion
 ORDER_PERIOD = 0.3  # s between an operator's orders
-FAULT_FREE_S, SECONDS = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
+FAULT_FREE_S, MAX_RUN_S = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +108,7 @@ def prepare_scenario(file: File) -> PreparedScenario:
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, shape.surface_from_grid)
     tracking = TrackingSettings(pictures=False, tracks=True)
     answering = replace(scenario.arm, replies=ReplyMode.STREAM)
-    plain = replace(scenario, tracking=tracking, arm=answering, known_rig=scenario.rig, seconds=SECONDS)
+    plain = replace(scenario, tracking=tracking, arm=answering, known_rig=scenario.rig, seconds=MAX_RUN_S)
     return PreparedScenario(plain, shape, truth, path)
 
 
@@ -147,7 +147,7 @@ class _NoSink:
 
 
 class FaultRun:
-    """One run with faults, from the first frame until the path is printed, the motion is killed, or `SECONDS`."""
+    """One run with faults, from the first frame until the path is printed, the motion is killed, or `MAX_RUN_S`."""
 
     def __init__(self, on: PreparedScenario, faults: Sequence[Fault], seed: int) -> None:
         self._events, self._clock = EventQueue(), SimClock()
@@ -188,7 +188,7 @@ class FaultRun:
         self._cameras.begin()
         loop = MotionLoop(self._motion, self._arm, self, lambda: self._pose, self._orders, self._note)
         try:
-            loop.run(SECONDS)
+            loop.run(MAX_RUN_S)
         except _KilledError:
             self._device.faults = PortFaults(away=[(self._clock.now(), np.inf)])
             self._advance(self._clock.now() + WATCHED_AFTER_KILL)
@@ -210,7 +210,7 @@ class FaultRun:
         self._advance(instant)
         for fault in self._hangs:
             if fault.covers(self._clock.now()):
-                if fault.kind is FaultKind.KILL or fault.end >= SECONDS:
+                if fault.kind is FaultKind.KILL or fault.end >= MAX_RUN_S:
                     raise _KilledError
                 self._advance(fault.end)
         if self._motion.progress.phase is PrintPhase.FINISHED:
@@ -273,7 +273,7 @@ class FaultRun:
 
 FAULT_SPACING, FAULTS_A_RUN = 2.6, 7  # s from one fault to the next, and faults of a run
 MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to have an effect, short enough to be over before the next
-AMOUNTS = {  # of what has one, uniform in the logarithm
+FAULT_AMOUNTS = {  # of what has one, uniform in the logarithm
     (FaultPart.CAMERA, FaultKind.SLOW): (0.03, 0.3),  # s
     (FaultPart.CAMERA, FaultKind.BUMP): (2.0, 10.0),  # mm: what is less is no harm to three cameras
     (FaultPart.CLOCK, FaultKind.JUMP): (0.05, 5.0),  # s
@@ -302,7 +302,7 @@ def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generat
 
     start = round(slot + float(rng.uniform(0.0, 0.4)), 3)
     duration = draw(MIN_DURATION, MAX_DURATION)
-    amount = draw(*AMOUNTS[key]) if key in AMOUNTS else 0.0
+    amount = draw(*FAULT_AMOUNTS[key]) if key in FAULT_AMOUNTS else 0.0
     if key == (FaultPart.CLOCK, FaultKind.JUMP):
         amount *= float(rng.choice([-1.0, 1.0]))
     if key[1] is FaultKind.KILL:

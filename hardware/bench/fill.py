@@ -40,8 +40,8 @@ MIN_AREA = 4.0  # mm2: smaller parts and holes are noise of the segmentation
 
 def random_wound(rng: Rng) -> tuple[str, Region]:
     """What kind of wound it is, and its valid region, mm, somewhere near the origin at any rotation."""
-    name = str(rng.choice(list(MAKERS)))
-    region = affinity.rotate(MAKERS[name](rng), rng.uniform(0, 360), origin=(0, 0))
+    name = str(rng.choice(list(REGION_GENERATORS)))
+    region = affinity.rotate(REGION_GENERATORS[name](rng), rng.uniform(0, 360), origin=(0, 0))
     if rng.random() < 0.5:
         region = _rough(region, rng)
     region = affinity.translate(region, *rng.uniform(-50, 50, 2))
@@ -138,7 +138,7 @@ def _rough(region: Region, rng: Rng) -> Region:
     return only_areas(shapely.union_all([shapely.make_valid(p, method="structure") for p in parts]))
 
 
-MAKERS: dict[str, Callable[[Rng], Region]] = {
+REGION_GENERATORS: dict[str, Callable[[Rng], Region]] = {
     **{"round": _round, "star": lambda rng: _round(rng, (10.0, 18.0), 0.6), "angular": _angular, "bent": _bent},
     **{"slit": _slit, "necked": _necked, "holed": _holed, "parted": _parted},
 }
@@ -194,7 +194,7 @@ def _drawn(beads: Sequence[Bead], left: float, high: float) -> str:
 
 RETRY_ANGLE = 0.7  # rad: by which each tenth wound is turned and filled again, a multiple of no pattern's angle
 THESIS_CONTOUR = 3995.5, 3.0  # px2 and px: the largest contour of thesis 5.3, and its lines' spacing
-PEERS = {  # what other planners reach at PEER_WIDTH and Pace(): covered %, s
+REFERENCE_PLANNERS = {  # what other planners reach at PEER_WIDTH and Pace(): covered %, s
     "blob": "contour-parallel by shapely 99.40 % in 48.3 s, PrusaSlicer concentric 98.82 % in 48.6 s",
     "crescent": "contour-parallel by shapely 97.32 % in 15.0 s, PrusaSlicer concentric 95.37 % in 15.4 s",
 }
@@ -229,7 +229,7 @@ def _contour_figures(name: str, region: Region, pattern: Pattern) -> list[Figure
     targets = CONTOUR_TARGETS.get(name)
     covered, seconds = (at_least(targets[0]), at_most(targets[1])) if targets else (None, None)
     note = f"{cost.printed:.0f} mm printed, {cost.travelled:.0f} mm travelled, {cost.turns} turns, {len(beads)} beads"
-    peers = PEERS.get(name, "")
+    peers = REFERENCE_PLANNERS.get(name, "")
     return [
         Figure(f"{name}: covered", 100 * coverage.covered, "%", covered, peers),
         Figure(f"{name}: over", 100 * coverage.over, "%", at_most(0.05)),

@@ -38,7 +38,7 @@ from planning.path import Path as Toolpath
 from planning.path import way_lengths
 
 WATCHED_PROCESSES = ("tracking", "motion", "recorder")  # by the main process; the cameras notice the feed's end
-VICTIMS = ("run", "tracking", "motion", "recorder", "feed")
+KILLED_PROCESSES = ("run", "tracking", "motion", "recorder", "feed")
 PRINTED_TEXT = "the path is printed"
 MAX_PRINTING = 3.0  # s of printing before a kill
 MAX_REST_DELAY = 0.5  # s from a kill until the arm must rest: 0.1 until it is noticed, 0.05 queued, its servo
@@ -109,7 +109,7 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
                 kills.stuck.append(run.last_lines)
             return math.nan
         clock.wait_until(clock.now() + rng.uniform(0, MAX_PRINTING))
-        victim = str(rng.choice(VICTIMS))
+        victim = str(rng.choice(KILLED_PROCESSES))
         now = run.kill(victim)
         if victim in WATCHED_PROCESSES and run.wait_for("was killed", timeout=END_TIMEOUT) >= 0:
             kills.noticed.append(clock.now() - now)

@@ -174,7 +174,7 @@ def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Arr
     return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
 
 
-FPS = 30.0
+FRAME_RATE_HZ = 30.0
 MOTION_SETS = 96  # frame sets of the motion's loop: a breath of 3.2 s
 LOOP_WOUND = Wound((40.0, 28.0))
 WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 0.0, 24.0) for y in (-17.0, 0.0, 17.0)])  # mm, around the wound
@@ -183,7 +183,7 @@ SPACE_95 = 2.8  # 95 % of a normal error in space lie within so many standard de
 START_S, CALM_S, REST_S = 1.5, 0.5, 0.7  # s before the first outage, before each, and watched after each
 HIDING_KINDS = OutageKind.OCCLUDED, OutageKind.DEAD, OutageKind.BLACK  # where they strike all cameras
 JUMP_SHARE = 0.3  # of the outages that hide the surface, in which it moves elsewhere meanwhile
-ELSEWHERE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
+FAR_POSE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,7 @@ class ScenePictures:
     @cached_property
     def far(self) -> PictureLoop:
         """And at another, rendered when it is needed first."""
-        return PictureLoop(self.scene, self.rig, self.near.poses @ ELSEWHERE, self.seed + 1)
+        return PictureLoop(self.scene, self.rig, self.near.poses @ FAR_POSE, self.seed + 1)
 
 
 def make_pictures(seed: int, period: int = MOTION_SETS, rig: Rig | None = None) -> ScenePictures:
@@ -245,11 +245,11 @@ class TrackedStretch:
     def begin(self) -> bool:
         """Start up; whether the tracker then tracks. The transform between the two surface frames is measured here."""
         offsets = []
-        for _ in range(round(START_S * FPS)):
+        for _ in range(round(START_S * FRAME_RATE_HZ)):
             truth, pose = self._frame(None)
             if pose.state is TrackState.TRACKING:
                 offsets.append(se3.inverse(truth) @ pose.base_from_surface)
-        if len(offsets) < START_S * FPS / 2:
+        if len(offsets) < START_S * FRAME_RATE_HZ / 2:
             return False
         middle = offsets[len(offsets) // 2]
         self._constant = middle @ se3.exp(se3.log(se3.inverse(middle) @ np.stack(offsets)).mean(0))
@@ -259,17 +259,17 @@ class TrackedStretch:
     def outage(self, kind: OutageKind, longest: float = MAX_OCCLUSION) -> WatchedOutage:
         """Calm, one outage of `longest` s at most, and the rest after it."""
         self._rows.clear()
-        for _ in range(round(CALM_S * FPS)):
+        for _ in range(round(CALM_S * FRAME_RATE_HZ)):
             self._frame(None)
-        outage = draw_outage(kind, self._pictures.rig, self._count / FPS, self._rng, longest)
+        outage = draw_outage(kind, self._pictures.rig, self._count / FRAME_RATE_HZ, self._rng, longest)
         hidden = len(outage.cameras) == len(self._pictures.rig) and kind in HIDING_KINDS
         before, jumps = self._loop, hidden and outage.end - outage.start > 1.0 and self._rng.random() < JUMP_SHARE
-        while self._count / FPS < outage.end - 1e-9:
-            if jumps and self._count / FPS > outage.start + 0.5:
+        while self._count / FRAME_RATE_HZ < outage.end - 1e-9:
+            if jumps and self._count / FRAME_RATE_HZ > outage.start + 0.5:
                 near = self._pictures.near
                 jumps, self._loop = False, self._pictures.far if self._loop is near else near
             self._frame(outage)
-        for _ in range(round(REST_S * FPS)):
+        for _ in range(round(REST_S * FRAME_RATE_HZ)):
             self._frame(None)
         stamps, error, radius, states, reasons, used = zip(*self._rows, strict=True)
         numbers, jumped = (np.array(stamps), np.array(error), np.array(radius)), self._loop is not before
@@ -277,7 +277,7 @@ class TrackedStretch:
 
     def _frame(self, outage: Outage | None) -> tuple[Array, SurfacePose]:
         """One frame set through the tracker; the true pose and the tracker's."""
-        stamp, truth = self._count / FPS, self._loop.poses[self._at % len(self._loop)]
+        stamp, truth = self._count / FRAME_RATE_HZ, self._loop.poses[self._at % len(self._loop)]
         images: list[Image | None] = list(self._loop.images(self._at))
         last = list(self._last)
         if outage is not None:

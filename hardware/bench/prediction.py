@@ -94,7 +94,7 @@ def _weighted(values: Array, experts: Array, ahead: tuple[int, ...]) -> Array:
     return combined
 
 
-AHEAD = (0.1, 0.2, 0.3, 0.5)  # s
+PREDICTION_HORIZONS = (0.1, 0.2, 0.3, 0.5)  # s
 HOLD_SHARES = (0.42, 0.42, 0.44, 0.47)  # of hold's error: targets for recorded chests
 SIMULATED = (None,) * 4
 ENSEMBLE_TARGET = 0.92  # of the plain ensemble's error
@@ -146,7 +146,7 @@ def recorded(file: Path, warm_up: float) -> Chest:
     """A trace as it was recorded, long enough to be judged."""
     trace = read_tum(file, exact=True)
     duration = trace.stamps[-1] - trace.stamps[0]
-    if duration < warm_up + 1 + max(AHEAD):
+    if duration < warm_up + 1 + max(PREDICTION_HORIZONS):
         raise InputError(file, "duration", f"{duration:g} s", f"more than {warm_up + 2:g} s")
     return Chest(file.stem, trace, _marker_points(file, trace))
 
@@ -164,7 +164,10 @@ def errors_of(chest: Chest, warm_up: float) -> TraceErrors:
     """Run every method over one trace, once through."""
     trace, points = chest.observed, chest.points
     step = float(np.median(np.diff(trace.stamps)))
-    first, ahead = int(np.searchsorted(trace.stamps, trace.stamps[0] + warm_up)), tuple(round(a / step) for a in AHEAD)
+    first, ahead = (
+        int(np.searchsorted(trace.stamps, trace.stamps[0] + warm_up)),
+        tuple(round(a / step) for a in PREDICTION_HORIZONS),
+    )
     places = se3.transform_points(trace.base_from_surface, points)  # (T, P, 3)
     flat = places.reshape(len(places), -1)
     plain = places + plain_forecasts(flat, step, ahead).reshape(len(ahead), *places.shape)
@@ -187,14 +190,17 @@ def _predicted(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:
     twists = np.zeros((count, 6))
     moves = se3.log(se3.inverse(trace.base_from_surface[:-1]) @ trace.base_from_surface[1:])
     twists[1:] = moves / np.diff(trace.stamps)[:, None]
-    places, radii = np.zeros((len(AHEAD), count, len(points), 3)), np.zeros((len(AHEAD), count, len(points)))
+    places, radii = (
+        np.zeros((len(PREDICTION_HORIZONS), count, len(points), 3)),
+        np.zeros((len(PREDICTION_HORIZONS), count, len(points))),
+    )
     ms, covariance = np.zeros(count), TRACE_VARIANCE * np.eye(6)
     for i, stamp in enumerate(trace.stamps.tolist()):
         start = clock.now()
         pose = SurfacePose(stamp, trace.base_from_surface[i], covariance, twists[i], TrackState.TRACKING)
         pose = replace(pose, forecast=predictor.add(pose))
         ms[i] = 1000 * (clock.now() - start)
-        for k, ahead in enumerate(AHEAD):
+        for k, ahead in enumerate(PREDICTION_HORIZONS):
             later = pose.predict(stamp + ahead)
             places[k, i] = se3.transform_points(later.base_from_surface, points)
             radii[k, i] = later.radius_at(points)
@@ -220,13 +226,13 @@ def prediction_figures(traces: list[TraceErrors], shares: Sequence[float | None]
     """The figures of traces, each method's mean error relative to hold's. shares: targets, if there are any."""
     methods = [np.mean(errors, axis=0).tolist() for errors in columns(traces, "hold", "steady", "plain", "ours")]
     rows = []
-    for ahead, share, hold, steady, plain, ours in zip(AHEAD, shares, *methods, strict=True):
+    for ahead, share, hold, steady, plain, ours in zip(PREDICTION_HORIZONS, shares, *methods, strict=True):
         others = f"constant velocity {steady / hold:.3f}, plain ensemble {plain / hold:.3f}"
         name, target = f"{1000 * ahead:.0f} ms", None if share is None else at_most(share)
         rows.append(Figure(f"{name}: error by hold's", ours / hold, "", target, others, f"hold {hold:.3f} mm"))
         rows.append(Figure(f"{name}: error by the plain ensemble's", ours / plain, "", at_most(ENSEMBLE_TARGET)))
     for trace in traces:
-        for k, ahead in enumerate(AHEAD):
+        for k, ahead in enumerate(PREDICTION_HORIZONS):
             note = f"error by hold's {trace.ours[k] / trace.hold[k]:.3f}"
             name = f"{trace.name}, {1000 * ahead:.0f} ms: inside 90 %"
             rows.append(Figure(name, float(trace.covered[k]), "", COVERED_TARGET, "", note))

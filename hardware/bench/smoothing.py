@@ -150,11 +150,11 @@ def _errors(session: Session, result: Smoothed, tracks: SessionTracks) -> tuple[
     return spread(errors[0].translation).rmse, spread(errors[1].translation).rmse
 
 
-UNGATED = 1e4  # times the gate: no residual is that large, and all count by their squares
+NO_GATE = 1e4  # times the gate: no residual is that large, and all count by their squares
 NO_MOTION_PRIOR = np.array([1e10] * 3 + [1e15] * 3)  # rad^2/s^5, mm^2/s^5: neighbouring poses are independent
 NO_JITTER = 1e-7, 1e-5  # s, px: exposures and images without a jitter
 COST_TOLERANCE, MAX_STEPS = 1e-8, 50  # of the cost; solver steps
-MISSING = "pycolmap is not installed (the extra [bench]): not compared"
+PYCOLMAP_MISSING = "pycolmap is not installed (the extra [bench]): not compared"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +173,7 @@ def ceres_figures(seconds: float, count: int) -> list[Figure]:
         import pycolmap
     except ImportError:
         whats = f"{name}: cost by Ceres's", f"{name}: time by Ceres's"
-        return [Figure(what, math.nan, "", None, "", MISSING) for what in whats]
+        return [Figure(what, math.nan, "", None, "", PYCOLMAP_MISSING) for what in whats]
     world = synthetic_world("breathing", seconds, count=count)
     data = pack_tracks(list(world), len(world.rig))
     poses, points = rough_start(world.rig, data, None, None)
@@ -199,7 +199,7 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
         poses[0], 0, HELD_POSE_SIGMA, np.tile(NO_MOTION_PRIOR, (len(poses) - 1, 1)),
     )  # fmt: skip
     problem = BatchProblem(data, np.zeros(0, np.int64))
-    noise = NoiseModel(np.ones(len(rig)), *NO_JITTER, gate=UNGATED)
+    noise = NoiseModel(np.ones(len(rig)), *NO_JITTER, gate=NO_GATE)
     estimate, costs = Estimate(smoothed.States(poses, rest, rest), cameras, points), list[float]()
     while len(costs) < MAX_STEPS:
         equations = NormalEquations(problem, estimate, known, noise)

@@ -29,7 +29,7 @@ from hardware.report.page import (
 )
 from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
 from planning.path import Path
-from planning.reach import REASONS, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
+from planning.reach import REACH_REASONS, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
 
 PAGE_WIDTH_PX = 900
 PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS = "estimate", "off", "aside"  # classes of report.css
@@ -38,7 +38,7 @@ PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS = "estimate", "off", "aside"  # class
 def reach_page(path_name: str, arm: str, text: str, path: Path, reach: Reach) -> str:
     """The whole page as HTML. text: the answer as the terminal has it."""
     good, count = int(reach.feasible.sum()), len(reach.reason)
-    rows = [[name, str(int((reach.reason == i).sum()))] for i, name in enumerate(REASONS)]
+    rows = [[name, str(int((reach.reason == i).sum()))] for i, name in enumerate(REACH_REASONS)]
     body = [
         section("From above", "The checkpoints in the surface frame, mm.", _above(path, reach)),
         section("Along the path", "The worst over where the surface may be; by checkpoint.", _along(reach)),
@@ -157,7 +157,7 @@ def reach_text(model: JointModel, reach: Reach, best: tuple[int, int], question:
         ("posture", ", ".join(model.posture)),
         ("surface moves by", f"+-{swing}" if question.amplitude_mm or question.turn_deg else "nothing"),
         ("checkpoints", f"{good} of {count} can be printed"),
-        *((f"  {name}", str(int((reach.reason == i).sum()))) for i, name in enumerate(REASONS) if i),
+        *((f"  {name}", str(int((reach.reason == i).sum()))) for i, name in enumerate(REACH_REASONS) if i),
         ("nearest to a joint's end", f"{_smallest(np.rad2deg(reach.bound))} degrees"),
         ("nearest to a singular wrist", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
         ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
@@ -187,7 +187,7 @@ def _within(profile: ArmProfile, place: Array, path: Path, motion: SurfaceMotion
     tips = (place @ motion.places[:, None] @ path.surface_from_nozzle)[..., :3, 3]
     low, high = profile.limits.low[:3], profile.limits.high[:3]
     beyond = ((tips < low) | (tips > high)).any(axis=(0, 2))
-    return replace(reach, reason=np.where(beyond & reach.feasible, REASONS.index("too far"), reach.reason))
+    return replace(reach, reason=np.where(beyond & reach.feasible, REACH_REASONS.index("too far"), reach.reason))
 
 
 def _write(out: File, path: Path, reach: Reach) -> None:
@@ -201,7 +201,7 @@ def _write(out: File, path: Path, reach: Reach) -> None:
         writer.writerow(REACH_COLUMNS)
         for i, row in enumerate(table.tolist()):
             numbers = [f"{value:.4f}" if np.isfinite(value) else "" for value in row]
-            writer.writerow([i, int(reach.feasible[i]), REASONS[reach.reason[i]], *numbers])
+            writer.writerow([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])
 
 
 def _smallest(values: Array) -> str:

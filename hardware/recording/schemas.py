@@ -17,13 +17,13 @@ INFO, WARNING, ERROR = 2, 3, 4  # levels of an event, Foxglove's numbers
 
 NUMBER: Schema = {"type": "number"}
 TEXT: Schema = {"type": "string"}
-WHOLE: Schema = {"type": "integer", "minimum": 0}
+COUNT: Schema = {"type": "integer", "minimum": 0}
 FLAG: Schema = {"type": "boolean"}
 BASE64: Schema = {"type": "string", "contentEncoding": "base64"}
 TIME = {
     "type": "object",
     "title": "time",
-    "properties": {"sec": WHOLE, "nsec": {**WHOLE, "maximum": 999_999_999}},
+    "properties": {"sec": COUNT, "nsec": {**COUNT, "maximum": 999_999_999}},
     "required": ["sec", "nsec"],
 }
 
@@ -62,7 +62,7 @@ CAMERA = {
     "type": "object",
     "properties": {
         "name": TEXT,
-        "size": _array(WHOLE, 2, "[width, height], px"),
+        "size": _array(COUNT, 2, "[width, height], px"),
         "matrix": _array(NUMBER, 9, "3x3, px"),
         "distortion": _array(NUMBER, 5, "k1 k2 p1 p2 k3"),
         "base_from_camera": _array(NUMBER, 16, "4x4, mm"),
@@ -76,8 +76,8 @@ CALIBRATION = _message(
     "A camera of the rig",
     timestamp=TIME,
     frame_id=TEXT,
-    width=WHOLE,
-    height=WHOLE,
+    width=COUNT,
+    height=COUNT,
     distortion_model=TEXT,
     D=_array(NUMBER),
     K=_array(NUMBER, 9),
@@ -118,7 +118,7 @@ TOPICS: dict[str, Schema] = {
         "stillbed.Roi",
         "Where the surface is in one image, px",
         stamp=STAMP,
-        camera=WHOLE,
+        camera=COUNT,
         polygon=_array(NUMBER, None, "x y of each corner"),
     ),
     "/frames": _message(
@@ -126,8 +126,8 @@ TOPICS: dict[str, Schema] = {
         "When an image was taken; the image is the message of the same sequence number on its camera's channel",
         stamp=_described(NUMBER, "s on the common clock, exact"),
         camera_stamp=_described(NUMBER, "s on the camera's own clock, exact"),
-        camera=WHOLE,
-        number=_described(WHOLE, "sequence number of the image"),
+        camera=COUNT,
+        number=_described(COUNT, "sequence number of the image"),
     ),
     "/truth": _message(
         "stillbed.Truth",
@@ -147,7 +147,7 @@ TOPICS: dict[str, Schema] = {
         "stillbed.Observations",
         "Tracks of one frame set, parallel arrays of length N",
         stamp=STAMP,
-        camera=_array(WHOLE),
+        camera=_array(COUNT),
         track=_array({"type": "integer"}),
         pixels=_finite_array("x y of each track, undistorted px"),
         sigma=_finite_array("px, one standard deviation per axis"),
@@ -201,18 +201,18 @@ TOPICS: dict[str, Schema] = {
         stamp=STAMP,
         stage=TEXT,
         width=_described(NUMBER, "s, of a bin"),
-        counts=_array(WHOLE, None, "in each bin; the last holds all that were later"),
+        counts=_array(COUNT, None, "in each bin; the last holds all that were later"),
         most=_described(NUMBER, "s, the largest"),
     ),
     "/events": _message(
         "foxglove.Log",
         "Something that happened",
         timestamp=TIME,
-        level=_described(WHOLE, "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
+        level=_described(COUNT, "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
         message=TEXT,
         name=TEXT,
         file=TEXT,
-        line=WHOLE,
+        line=COUNT,
         stamp=STAMP,
     ),
     "/tf": _message(

@@ -33,7 +33,7 @@ REST_AFTER_FRAME = 0.055  # s after the last frame by which nothing may be under
 POLL_INTERVAL = 0.005  # s
 HOME_AXES = ArmProfile().arm.home
 RECENT_FRAMES = 400  # frames and answers that may still arrive
-OBEYING, STALLING, LOSSY = MANNERS = "obeying", "stalling", "losing frames"  # of the arm
+OBEYING, STALLING, LOSSY = ANSWER_MODES = "obeying", "stalling", "losing frames"  # of the arm
 AXIS_RATES = np.array([0.21, 0.34, 0.27, 0.11, 0.17, 0.13])  # Hz, that never meet
 AXIS_SIZES = np.array([15.0, 12, 8, 0.08, 0.06, 0.1])  # mm and rad: up to 40 mm/s
 
@@ -130,7 +130,7 @@ class LinkRun:
         rng = self._rng = np.random.default_rng(seed)
         self._counts = counts
         replies = ReplyMode.STREAM if seed % 2 else (ReplyMode.OFF, ReplyMode.STRAY)[rng.integers(2)]
-        manner = MANNERS[seed // 2 % len(MANNERS)]
+        manner = ANSWER_MODES[seed // 2 % len(ANSWER_MODES)]
         self.kind = f"{manner}, {'answering' if seed % 2 else 'silent'}"
         faults: list[Fault] = []
         self._ends: deque[float] = deque()
