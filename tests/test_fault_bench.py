@@ -122,7 +122,7 @@ def test_what_never_comes_back_is_told_and_what_struck_no_print_is_left_out() ->
 
 
 def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fault_run, "SECONDS", 6.0)
+    monkeypatch.setattr(fault_run, "MAX_RUN_S", 6.0)
     texts = "motion hang at 3.2s for 0.4s", "tracking hang at 4.7s for 0.3s"
     faults = [fault_from_text("x", "y", text) for text in texts]
     hung = FaultRun(prepare_scenario(SCENARIOS / "still.toml"), faults, 1)()
@@ -133,7 +133,7 @@ def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: py
 
 
 def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fault_run, "SECONDS", 11.0)
+    monkeypatch.setattr(fault_run, "MAX_RUN_S", 11.0)
     rows = one_run(SCENARIOS, 1, 1)
     assert len(rows) >= 2 and all(row.over == 0 and not row.verdict.silent for row in rows)
     append_log(log := tmp_path / "faults.csv", rows)
