@@ -22,8 +22,10 @@ class Move:
     axes: Array  # (6,) X Y Z A B C, mm and rad
     feed: float  # mm/s; degrees/s, as arm controllers read it, of a move by MIN_TRAVEL or less along X Y Z
     checkpoint: int  # that the move leads to
-    extrude: bool
-    reason: str = ""  # why it brakes; "" of a move along the path
+    extrude: bool  # whether material is due at the nozzle during the move
+    reason: str = ""  # why it brakes or rests; "" of a move along the path
+    flow: float = 0.0  # mm^3/s that the dispenser is told, its delay led; 0: off
+    flow_after: float = 0.0  # s into the tick at which it is told; until then as before
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class RefusalCode(StrEnum):
     POSE_ERROR = "pose_error"
     WATCHDOG = "watchdog"
     STOP_DISTANCE = "stop_distance"
+    FLOW = "flow"
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ class PrintProgress:
     place: float  # mm of the path
     length: float  # mm of the whole path
     fraction: float  # the place in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3
+    wanted: str = ""  # material that an operator has to put in before it goes on, "" if none
 
     @property
     def printed(self) -> int:

@@ -19,7 +19,8 @@ from hardware.motion.loop import Order, Tick
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Move
 from planning.kinematics import nozzle_from_axes
-from planning.motion.planner import Planner, place_passed
+from planning.motion.curve import place_passed
+from planning.motion.planner import Planner
 from tests.linked import Linked, circle, linked
 from tests.moving import breathing, pose_at, raster
 from tests.test_motion_loop import Looping, seen

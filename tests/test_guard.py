@@ -26,7 +26,7 @@ from hardware.bench.campaigns.guard import (
 from planning.command import Command, Hold, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, joints_from_axes
 from planning.limits import MotionLimits
-from planning.motion.guard import Guard
+from planning.motion.guard import MAX_FLOW, Guard
 from tests.slowly import slowly
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit
@@ -273,6 +273,11 @@ REFUSED: list[tuple[RefusalCode, Move, SurfacePose | None, float, float]] = [
     (RefusalCode.POSE_ERROR, PRINT, pose(1.0, covariance=np.diag([0.0, 0, 0, 1, 0, 0])), 1.0, 0.5),
     (RefusalCode.STOP_DISTANCE, move(axes(5), 1.25), None, 5.0, 4.0),
     (RefusalCode.WATCHDOG, move(axes(0.5), 1.75), None, 0.75, 0.5),
+    (RefusalCode.FLOW, replace(move(axes(0.5)), flow=-1.0), pose(1.0), -1.0, 0.0),
+    (RefusalCode.FLOW, replace(move(axes(0.5)), flow=np.inf), pose(1.0), np.inf, MAX_FLOW),
+    (RefusalCode.FLOW, replace(move(axes(0.5)), flow=1.0, flow_after=1.0), pose(1.0), 1.0, TICK),
+    (RefusalCode.NO_POSE, replace(move(axes(0.5)), flow=1.0), None, np.nan, np.nan),
+    (RefusalCode.POSE_AGE, replace(move(axes(0.5)), flow_after=TICK / 2), pose(0.5), 0.5, 0.25),
 ]
 
 

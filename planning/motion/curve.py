@@ -10,6 +10,7 @@ The change is fixed in the tool's frame when the tool turns about it, so the spi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -211,3 +212,19 @@ def _through(poses: list[Array], last_speed: float) -> PathCurve | None:
         return None
     speed = np.array([APPROACH_SPEED] * (len(way) - 2) + [min(last_speed, APPROACH_SPEED)])
     return curve_through(way, speed, CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+
+
+def place_passed(sent: Sequence[tuple[Array, float]], where: Array) -> float:
+    """The place on the path, mm, at which moves passed `where` (3,), mm; the last where they did so twice.
+
+    sent: of each move its goal (3,), mm, and the place on the path there.
+    """
+    ends, places = np.stack([end for end, _ in sent]), np.array([place for _, place in sent])
+    if len(ends) == 1:
+        return float(places[0])
+    ways = np.diff(ends, axis=0)  # (N - 1, 3)
+    squares = np.maximum((ways**2).sum(1), 1e-12)
+    shares = np.clip(((where - ends[:-1]) * ways).sum(1) / squares, 0.0, 1.0)
+    off = np.linalg.norm(ends[:-1] + shares[:, None] * ways - where, axis=1)
+    last = int(np.flatnonzero(off <= off.min() + 1e-6)[-1])
+    return float(places[last] + shares[last] * (places[last + 1] - places[last]))

@@ -19,6 +19,7 @@ from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
 
 AXIS_NAMES = "XYZABC"
+MAX_FLOW = 2000.0  # mm^3/s: a bead of 10 mm^2 at MAX_SPEED; bioprinting lays 0.1 to 10
 LINEAR_AXES = 3  # X Y Z in mm, the others in rad
 
 
@@ -58,6 +59,7 @@ class Guard:
             self._trusted_at, self._trusted_axes = now, self._axes
         if not breach and isinstance(command, Move):
             breach = self._reach(command) or self._motion(command) or self._joints(command) or self._no_go(command)
+            breach = breach or self._material(command)
             breach = breach or (self._stopping(command, distrust) if distrust else None)
         if breach:
             return Refusal(now, self._limits.pause, f"refused: {breach.text}", breach.code, breach.got, breach.limit)
@@ -130,9 +132,19 @@ class Guard:
                 return Breach(RefusalCode.NO_GO, depth, 0.0, f"{depth:.3f} mm inside the no-go zone {zone.name!r}")
         return None
 
+    def _material(self, move: Move) -> Breach | None:
+        """What the dispenser is told: a finite flow, at an instant within the tick."""
+        if not 0 <= move.flow <= MAX_FLOW:
+            text = f"flow of {move.flow:g} mm^3/s, allowed 0 to {MAX_FLOW:g}"
+            return Breach(RefusalCode.FLOW, move.flow, MAX_FLOW if move.flow > 0 else 0.0, text)
+        if not 0 <= move.flow_after <= self._tick:
+            text = f"flow told {move.flow_after:g} s into a tick of {self._tick:g} s"
+            return Breach(RefusalCode.FLOW, move.flow_after, self._tick if move.flow_after > 0 else 0.0, text)
+        return None
+
     def _stopping(self, move: Move, distrust: Breach) -> Breach | None:
         limits = self._limits
-        if move.extrude:
+        if move.extrude or move.flow or move.flow_after:
             return distrust._replace(text=f"extrusion while {distrust.text}")
         if (since := move.stamp - self._trusted_at) > limits.stop_time:
             text = f"still moving after {since:.3f} s, limit {limits.stop_time:g} s, while {distrust.text}"

@@ -23,6 +23,7 @@ from estimation.se3 import Array
 from planning.command import Command, Hold, Move, feed_for
 from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
+from planning.material import Outlets, material_plan
 from planning.motion.curve import (
     CORNER_SPEED_CHANGE,
     CORNER_TOLERANCE,
@@ -31,9 +32,11 @@ from planning.motion.curve import (
     curve_through,
     entry_curve,
     gridpoints_on,
+    place_passed,
     point_above,
     straight_curve,
 )
+from planning.motion.flow import FlowCommands, FlowOrder, RestsAhead
 from planning.motion.follow import LOOKAHEAD, AxisFollower
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import Path, check_path
@@ -43,6 +46,7 @@ HORIZON_TIME = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second
 PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
 PAUSED = "paused"
+RESTS = "rests for wait_s"
 STALL_TICKS = 3.0  # ticks without a call after which the arm has come to rest by itself
 MAX_SENT_MOVES = 64  # a second of them, more than an arm is sent before they are called back
 POSE_LIMIT_FRACTION = 0.98  # of the guard's limits for a pose: the planner brakes before the guard would refuse
@@ -61,11 +65,19 @@ class Planner:
     """Decides each tick where the nozzle goes next; keeps the place on the path and the arm's commanded motion."""
 
     def __init__(
-        self, path: Path, limits: MotionLimits, arm: SimpleArm, tick: float, lag: float = 0.0, start: float = 0.0
+        self,
+        path: Path,
+        limits: MotionLimits,
+        arm: SimpleArm,
+        tick: float,
+        lag: float = 0.0,
+        start: float = 0.0,
+        outlets: Outlets | None = None,
     ) -> None:
         """tick: s between calls. lag: s from one tick after a command until the arm is at its axes.
 
-        start: how much of the path is printed already, in checkpoints (PrintProgress.fraction).
+        start: how much of the path is printed already, in checkpoints (PrintProgress.fraction). outlets: of materials;
+        one that is not among them leaves at once.
         """
         self._path, self._limits, self._arm, self._tick, self._lag = check_path(path), limits, arm, tick, lag
         self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
@@ -76,6 +88,9 @@ class Planner:
         self._targets: tuple[Segment | None, Array] = None, np.empty((5, 6))  # this tick's: a segment and its axes
         start = check_start(path, start)
         self._place = float(np.interp(start, np.arange(len(path)), self._curve.knots))  # mm of it that are printed
+        self._material = material_plan(path, self._curve.knots)
+        self._rests = RestsAhead(self._material, self._place)
+        self._flow = FlowCommands(self._material, outlets or {}, lag, tick)
         self.horizons = 0  # timed so far
         self._finished = False
         self._last_call = -np.inf
@@ -97,7 +112,7 @@ class Planner:
             return self._stop(now, reason)
         if self._lag:  # as the arm, late by the lag, will meet it, under its own stamp
             pose = replace(pose.predict(pose.stamp + self._lag), stamp=pose.stamp)
-        if self.paused:
+        if self.paused or self._rests.wanted:
             return self._retreat(pose, now)
         if self._pause_pose is not None:  # after a pause the way back to the path begins anew
             self._pause_pose, self._retreated, self._segment = None, False, None
@@ -111,7 +126,18 @@ class Planner:
         """Note that the last move was not sent: the arm is at `axes` (6,), and the segment begins anew."""
         self._follower.rest(axes)
         self._segment = None
+        self._flow.closed()
         self._sent.clear()
+
+    def material_in(self) -> None:
+        """Note that the material that was wanted is in; another nozzle goes from above to where the path goes on."""
+        rest = self._rests.next
+        if rest is None or not self._rests.wanted:
+            return
+        before, after = (self._flow.outlet(self._material.materials[rest.checkpoint - k]) for k in (1, 0))
+        if before.offset != after.offset:
+            self._place = float(self._curve.knots[rest.checkpoint])
+        self._rests.passed()
 
     def recalled(self, place: Array, stands: Array) -> None:
         """Note that moves were called back: the arm stopped at `place` (6,) on its way and is at `stands` (6,).
@@ -128,7 +154,9 @@ class Planner:
         phase = PrintPhase.WAITING if self._segment is None else self._segment.phase
         phase = PrintPhase.FINISHED if self._finished else phase
         fraction = float(np.interp(self._place, self._curve.knots, np.arange(len(self._path))))
-        return PrintProgress(phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction)
+        return PrintProgress(
+            phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction, self._rests.wanted
+        )
 
     # -- whether to move
 
@@ -171,7 +199,7 @@ class Planner:
         left = segment.timing.end - now
         if left > RENEW_BEFORE_END and now < segment.timing.times[0] + HORIZON_TIME:
             return ""
-        if segment.timing.places[-1] < segment.curve.length or left > RENEW_BEFORE_END:
+        if segment.timing.places[-1] < self._end_of(segment) or left > RENEW_BEFORE_END:
             return self._renew(pose, segment, now)
         if segment.phase is PrintPhase.ENTERING:  # the next begins LOOKAHEAD from now, as this one comes to rest
             away = off + segment.curve.length - float(segment.timing.at(np.array([now]))[0])
@@ -184,8 +212,9 @@ class Planner:
         """Begin the segment from where the nozzle is to where the path goes on, or up if it is done."""
         self._segment = None
         nozzle = self._nozzle(pose, now)
-        if self._place > self._curve.length - PATH_END_TOLERANCE:
-            self._place = self._curve.length
+        if self._place > self._rests.end - PATH_END_TOLERANCE:
+            self._place = self._rests.end
+        if self._place >= self._curve.length:
             up = straight_curve(nozzle, point_above(nozzle))
             assert up is not None
             return self._start(pose, PrintPhase.LEAVING, up, 0.0, now + LOOKAHEAD)
@@ -204,6 +233,7 @@ class Planner:
     def _retreat(self, pose: SurfacePose, now: float) -> Command:
         """In a pause: straight up from where it began, then at rest; an interrupted retreat is resumed."""
         nozzle, segment = self._nozzle(pose, now), self._segment
+        waits = PAUSED if self.paused else f"material {self._rests.wanted} is to be put in"
         if self._pause_pose is None:
             self._pause_pose = point_above(nozzle)
         if segment is not None and segment.phase is PrintPhase.RETREATING and now >= segment.timing.end:
@@ -211,23 +241,33 @@ class Planner:
             segment = None
         curve = None if self._retreated else straight_curve(nozzle, self._pause_pose)
         if curve is None:
-            return self._stop(now, PAUSED)
+            return self._stop(now, waits)
         begins = segment is None or segment.phase is not PrintPhase.RETREATING
         if begins and (reason := self._start(pose, PrintPhase.RETREATING, curve, 0.0, now + LOOKAHEAD)):
-            return self._stop(now, f"{PAUSED}; {reason}")
+            return self._stop(now, f"{waits}; {reason}")
         return self._follow(pose, now)
 
     def _next(self, pose: SurfacePose, phase: PrintPhase, now: float) -> str:
         """Begin the segment after one of `phase`; why that cannot be, or ""."""
-        if phase is PrintPhase.ENTERING:
-            end = -np.inf if self._segment is None else self._segment.timing.end
-            begin = max(end, now + LOOKAHEAD - self._tick)  # within the tick that ends LOOKAHEAD from now
-            return self._start(pose, PrintPhase.PRINTING, self._curve, self._place, begin)
         if phase is PrintPhase.PRINTING:
-            self._place = self._curve.length
-            return self._begin(pose, now)
+            self._place = self._rests.end
+            if self._rests.next is None:
+                return self._begin(pose, now)
+        if phase in (PrintPhase.ENTERING, PrintPhase.PRINTING):
+            if self._rests.left(self._place, now) > 0 or self._rests.wanted:
+                return "" if self._segment else RESTS
+            if self._rests.end <= self._place:
+                self._rests.passed()
+            entered = -np.inf if self._segment is None else self._segment.timing.end
+            begin = max(entered, now + LOOKAHEAD - self._tick)  # within the tick that ends LOOKAHEAD from now
+            self._flow.begun = max(begin, now + self._tick + self._flow.lead_on(self._place))
+            return self._start(pose, PrintPhase.PRINTING, self._curve, self._place, self._flow.begun)
         self._finished = True
         return ""
+
+    def _end_of(self, segment: Segment) -> float:
+        """The place, mm, at which a segment comes to rest."""
+        return self._rests.end if segment.phase is PrintPhase.PRINTING else segment.curve.length
 
     def _start(self, pose: SurfacePose, phase: PrintPhase, curve: PathCurve, place: float, begin: float) -> str:
         """Begin a segment from rest at `place`, mm, at `begin`, s; why that cannot be, or "".
@@ -259,7 +299,8 @@ class Planner:
         self, pose: SurfacePose, curve: PathCurve, place: float, begin: float
     ) -> tuple[Gridpoints, AxisDerivatives]:
         """The next horizon's grid points from `place`, mm, passed at `begin`, s, and the axes' derivatives there."""
-        grid = gridpoints_on(curve, place, curve.after(place, HORIZON_TIME))
+        end = self._rests.end if curve is self._curve else curve.length
+        grid = gridpoints_on(curve, place, min(curve.after(place, HORIZON_TIME), end))
         return grid, axis_derivatives(self._arm, pose, curve, grid, begin)
 
     # -- the motion
@@ -276,12 +317,15 @@ class Planner:
         axes = self._follower.aim(ahead, (after - before) / self._tick, (after - 2 * ahead + before) / half**2)
         if isinstance(axes, str):
             return self._stop(now, axes)
-        extrude = False
+        extrude, told, reason = False, None, ""
         if segment.phase is PrintPhase.PRINTING and np.linalg.norm(axes[:3] - reference[:3]) <= self._limits.on_path:
             before = self._place
             self._place = max(before, float(segment.timing.at(np.array([now + self._tick]))[0]))
             extrude = bool(self._path.extrude[self._checkpoint()]) and self._place > before
-        return self._move(now, start, axes, extrude)
+            told = self._flow(segment.timing, before, self._rests.end, now)
+        if now >= segment.timing.end and (left := self._rests.left(self._place, now)) > 0:
+            reason = f"{RESTS}: {left:.1f} s left"
+        return self._move(now, start, axes, extrude, reason, told)
 
     def _segment_axes(self, pose: SurfacePose, segment: Segment, now: float) -> Array:
         """Machine axes (5, 6) on the segment: now, a tick later, and half a tick before, at and after LOOKAHEAD."""
@@ -301,12 +345,16 @@ class Planner:
             if not isinstance(axes, str):
                 return self._move(now, start, axes, extrude=False, reason=reason)
             self._follower.rest()
+        self._flow.closed()
         return Hold(now, self._limits.pause, reason)
 
-    def _move(self, now: float, start: Array, axes: Array, extrude: bool, reason: str = "") -> Move:
+    def _move(
+        self, now: float, start: Array, axes: Array, extrude: bool, reason: str = "", told: FlowOrder | None = None
+    ) -> Move:
+        """told: to the dispenser; None: off at once."""
         feed = min(feed_for(start, axes, self._tick), self._limits.feed)
         self._sent.append((axes[:3], self._place))
-        return Move(now, axes, feed, self._checkpoint(), extrude, reason)
+        return Move(now, axes, feed, self._checkpoint(), extrude, reason, *(told or self._flow.closed()))
 
     def _checkpoint(self) -> int:
         """The checkpoint that the place on the path leads to."""
@@ -340,22 +388,6 @@ class Planner:
         unit = "mm" if axis in "XYZ" else "degrees"
         got, low, high = (got, low, high) if unit == "mm" else np.rad2deg([got, low, high])
         return f"{where}: {axis} = {got:.1f}, allowed {low:g} to {high:g} {unit}"
-
-
-def place_passed(sent: Sequence[tuple[Array, float]], where: Array) -> float:
-    """The place on the path, mm, at which moves passed `where` (3,), mm; the last where they did so twice.
-
-    sent: of each move its goal (3,), mm, and the place on the path there.
-    """
-    ends, places = np.stack([end for end, _ in sent]), np.array([place for _, place in sent])
-    if len(ends) == 1:
-        return float(places[0])
-    ways = np.diff(ends, axis=0)  # (N - 1, 3)
-    squares = np.maximum((ways**2).sum(1), 1e-12)
-    shares = np.clip(((where - ends[:-1]) * ways).sum(1) / squares, 0.0, 1.0)
-    off = np.linalg.norm(ends[:-1] + shares[:, None] * ways - where, axis=1)
-    last = int(np.flatnonzero(off <= off.min() + 1e-6)[-1])
-    return float(places[last] + shares[last] * (places[last + 1] - places[last]))
 
 
 def _finite(pose: SurfacePose) -> bool:

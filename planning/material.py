@@ -1,0 +1,169 @@
+"""Material along a path: where it flows and how much, where the path rests, and how a dispenser's delay is led.
+
+A dispenser that is told to open gives half of its flow `on` s later, and still gives half of it `off` s after it was
+told to close. A bead begins and ends where it is planned if the dispenser is told that much earlier than the nozzle is
+there. A path rests before a checkpoint with a waiting time (column `wait_s`), and where another material begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from planning.path import Path
+
+MAX_DELAY = 0.4  # s: the path is timed for half a second at least, and a bead's end must be known before it is told
+MAX_WAIT = 3600.0  # s before a checkpoint
+UNIT_AREA = 1.0  # mm^2, of a path without volumes: a dispenser that only opens and closes does not ask
+ROUNDING = 1e-6  # mm of a place on the path
+
+
+@dataclass(frozen=True, slots=True)
+class SwitchDelay:
+    """A dispenser's delays, s, from a switch to half the flow. InputError beyond 0 to MAX_DELAY."""
+
+    on: float = 0.0
+    off: float = 0.0
+    with_moves: bool = False  # the switch is a part of the arm's move: it takes effect where the arm carries that out
+
+    def __post_init__(self) -> None:
+        for name, value in (("on", self.on), ("off", self.off)):
+            if not 0 <= value <= MAX_DELAY:
+                raise InputError("dispenser", f"delay {name}", value, f"0 to {MAX_DELAY:g} s: dead time and 0.69 lag")
+
+    def leads(self, lag: float) -> tuple[float, float]:
+        """How long, s, before the planned instant a switch is due, where the arm is late by `lag` s; below 0: after."""
+        late = 0.0 if self.with_moves else lag
+        return self.on - late, self.off - late
+
+
+NO_DELAY = SwitchDelay(with_moves=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Outlet:
+    """How late a material leaves, and where: its nozzle's tip (x, y, z), mm, in the frame of the tool's nozzle."""
+
+    delay: SwitchDelay = NO_DELAY
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+Outlets = Mapping[str, Outlet]  # by material
+OWN_OUTLET = Outlet()
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """A place at which the path comes to rest."""
+
+    place: float  # mm of the path
+    checkpoint: int  # to which it goes on
+    wait: float  # s to rest there
+    material: str  # that is wanted from there on; "": as before
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaterialPlan:
+    """Material along a path whose checkpoints (N,) lie at `knots` (N,), mm."""
+
+    begins: Array  # (B,) mm, where each bead begins, rising
+    ends: Array  # (B,) mm
+    knots: Array  # (N,) mm
+    area: Array  # (N,) mm^2, cross-section of the bead on the way to each checkpoint
+    rests: tuple[Rest, ...]  # by place
+    materials: tuple[str, ...]  # (N,) on the way to each checkpoint
+
+    def material_at(self, place: float) -> str:
+        """The material on the way to the checkpoint that `place`, mm, leads to."""
+        return self.materials[min(int(np.searchsorted(self.knots, place, "right")), len(self.knots) - 1)]
+
+    def area_at(self, place: float) -> float:
+        """Cross-section, mm^2, of the bead at `place`, mm."""
+        return float(self.area[min(int(np.searchsorted(self.knots, place, "right")), len(self.knots) - 1)])
+
+    def open(self, led_on: Array, led_off: Array, until: float) -> NDArray[np.bool_]:
+        """Whether the dispenser is to be open (M,), on the way to a rest or the end at `until`, mm.
+
+        led_on: (M,) mm, where the nozzle will be once an opening takes effect. led_off: (M,) mm, once a closing does.
+        """
+        begins = self.begins[self.begins < until - ROUNDING]
+        if not len(begins):
+            return np.zeros(len(led_on), bool)
+        bead = np.searchsorted(begins, led_on + ROUNDING, "right") - 1
+        return np.asarray((bead >= 0) & (led_off < self.ends[bead] - ROUNDING))
+
+
+def material_plan(path: Path, knots: Array, where: object = "path") -> MaterialPlan:
+    """The material along a path whose checkpoints lie at `knots` (N,), mm. InputError: a wait that is no time."""
+    extrude = np.concatenate([path.extrude[1:], [False]])
+    flips = np.diff(np.concatenate([[False], extrude]).astype(np.int8))
+    begins, ends = knots[np.flatnonzero(flips > 0)], knots[np.flatnonzero(flips < 0)]
+    materials = tuple(map(str, path.material.tolist()))
+    rests = _rests(path, knots, materials, where)
+    within = [rest.place for rest in rests if ((begins < rest.place) & (rest.place < ends)).any()]
+    begins, ends = np.sort(np.append(begins, within)), np.sort(np.append(ends, within))  # a bead ends where it rests
+    return MaterialPlan(begins, ends, knots, bead_areas(path, where), rests, materials)
+
+
+def bead_areas(path: Path, where: object = "path") -> Array:
+    """Cross-sections (N,), mm^2: volume_mm3 by the way's length, or width_mm times height_mm, or UNIT_AREA."""
+    if is_metered(path):
+        if "volume_mm3" in path.extra:
+            ways = np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
+            volume = _numbers(path, "volume_mm3", where)
+            return np.concatenate([[0.0], volume[1:] / np.maximum(ways, 1e-9)])
+        return _numbers(path, "width_mm", where) * _numbers(path, "height_mm", where)
+    return np.full(len(path), UNIT_AREA)
+
+
+def is_metered(path: Path) -> bool:
+    """Whether the path says how much material it needs."""
+    return "volume_mm3" in path.extra or {"width_mm", "height_mm"} <= set(path.extra)
+
+
+def _rests(path: Path, knots: Array, materials: tuple[str, ...], where: object) -> tuple[Rest, ...]:
+    wait = _numbers(path, "wait_s", where) if "wait_s" in path.extra else np.zeros(len(path))
+    if (wrong := np.flatnonzero(~(wait <= MAX_WAIT))).size:
+        raise InputError(where, f"checkpoint {wrong[0]}: wait_s", float(wait[wrong[0]]), f"0 to {MAX_WAIT:g} s")
+    rests = []
+    for i in range(1, len(path)):
+        changed = i > 1 and materials[i] != materials[i - 1]
+        if changed or (wait[i] > 0 and i > 1):
+            rests.append(Rest(float(knots[i - 1]), i, float(wait[i]), materials[i] if changed else ""))
+    return tuple(rests)
+
+
+def _numbers(path: Path, column: str, where: object) -> Array:
+    values = np.empty(len(path))
+    for i, text in enumerate(path.extra[column].tolist()):
+        try:
+            values[i] = float(text)
+        except ValueError:
+            values[i] = math.nan
+        if not (math.isfinite(values[i]) and values[i] >= 0):
+            raise InputError(where, f"checkpoint {i}: {column}", text, "a finite number, 0 or more")
+    return values
+
+
+def with_offsets(path: Path, outlets: Outlets) -> Path:
+    """The path of the tool's nozzle, by which each material's own nozzle follows `path`.
+
+    InputError: another nozzle's material begins in the middle of a bead, without a way on which nothing is extruded.
+    """
+    names = list(map(str, path.material.tolist()))
+    offsets = np.array([outlets.get(name, OWN_OUTLET).offset for name in names])
+    if not offsets.any():
+        return path
+    for i in range(2, len(path)):
+        if path.extrude[i] and (offsets[i] != offsets[i - 1]).any():
+            allowed = f"a way to the first place of {names[i]!r} with extrude = 0: its nozzle is another one"
+            raise InputError("path", f"checkpoint {i}: extrude", 1, allowed)
+    shift = np.tile(np.eye(4), (len(path), 1, 1))
+    shift[:, :3, 3] = -offsets
+    return replace(path, surface_from_nozzle=path.surface_from_nozzle @ shift)
