@@ -37,6 +37,7 @@ ROOMS = (  # from the ground; a room imports rooms of earlier lines only, and no
     ("hardware",),
     ("hardware.process",),
     ("hardware.arm",),
+    ("hardware.dispenser",),
     ("hardware.motion",),
     ("hardware.files",),
     ("hardware.recording",),

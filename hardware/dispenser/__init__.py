@@ -1,0 +1,1 @@
+"""What switches material on and off: contract, drivers, and the line to a device."""
