@@ -23,6 +23,7 @@ from planning.path import MAX_TEMPERATURE, MIN_TEMPERATURE, Path
 
 MAX_DISPENSER_DELAY = 5.0  # s, of a dead time or a lag: what is slower cannot start a bead where it begins
 MAX_FLOW = 1000.0  # mm^3/s: a bead of 5 mm^2 at the fastest path, 200 mm/s
+MAX_DRAWN_BACK = 100.0  # mm^3: more than any nozzle and needle hold
 MAX_NOZZLE_OFFSET = 200.0  # mm: what hangs on the same tool is no farther away
 KEPT_WITHIN = 1.0  # degrees C by which a path's temperature may differ from one that is kept elsewhere
 CLOSE_TIME = 1.0  # s for which a close insists that the line takes the off
@@ -87,7 +88,7 @@ class DispenserProfile:
         if self.temperature_range is not None and self.kept_at is not None:
             raise InputError("dispenser", "kept_at", self.kept_at, "left out where temperature_range is given")
         for name in ("prime_volume", "retract_volume"):
-            self._check(name, getattr(self, name), 0.0, MAX_FLOW, "mm^3")
+            self._check(name, getattr(self, name), 0.0, MAX_DRAWN_BACK, "mm^3")
 
     def _check(self, name: str, value: float, low: float, high: float, unit: str) -> None:
         if not low <= value <= high:  # NaN fails as well

@@ -230,7 +230,7 @@ def run_virtual_arm(
         ours, theirs, device = open_pty()
         try:
             os.set_blocking(ours, False)
-            with _device_link(link, device), _stop_on_signals(stop):
+            with device_link(link, device), stop_on_signals(stop):
                 say(device)
                 _serve(ours, arm, profile.baud / BITS_PER_BYTE, clock, stop)
         finally:
@@ -307,7 +307,7 @@ def _arrivals(data: bytes, before: float, now: float) -> Iterator[tuple[bytes, f
 
 
 @contextmanager
-def _device_link(link: Path | None, device: str) -> Iterator[None]:
+def device_link(link: Path | None, device: str) -> Iterator[None]:
     """Have `link` point at the device meanwhile; a link left behind by a run that is gone makes way."""
     if link is None:
         yield
@@ -325,7 +325,8 @@ def _device_link(link: Path | None, device: str) -> Iterator[None]:
 
 
 @contextmanager
-def _stop_on_signals(stop: threading.Event) -> Iterator[None]:
+def stop_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Have Ctrl-C and SIGTERM set `stop` meanwhile, in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,0 +1,271 @@
+"""Dispenser files: one or several `[[dispenser]]` tables; keys that a file leaves out have their preset's values.
+
+[[dispenser]]
+name = "syringe"
+materials = ["gel", 1]           # as the path's column `material` names them; a material is in one dispenser
+preset = "arduino"               # one of PRESETS, or arm_pwm: the arm's own frames switch it
+port = "/dev/ttyACM0"            # a device's path, a URL of pyserial's, or http://HOST:PORT
+baud = 115200
+on_dead_time_s = 0.03            # from the line taking the message until material begins to flow
+on_lag_s = 0.02                  # time constant of its rise
+off_dead_time_s = 0.02
+off_lag_s = 0.05
+nozzle_offset_mm = [0, 0, 0]     # its tip in the tool's nozzle frame
+watchdog_s = 0.1                 # after which the device switches itself off; 0: it never does
+keepalive_s = 0.04               # at most two fifths of the watchdog
+start_s = 2.0                    # after opening, in which the device takes in nothing but an off
+gap_s = 0.0                      # between two lines
+timeout_s = 0.2                  # twice that without progress is a failed line; of an HTTP request once
+metered = false                  # whether the device gives the flow that it is told
+flow_range_mm3_s = [0.1, 20]     # of a metered one
+flow_mm3_s = 1.0                 # that an unmetered one gives
+temperature_range_c = [4, 60]    # that it can set
+kept_at_c = 22                   # or: at which something else keeps it
+prime_mm3 = 0.0                  # pushed before on, where it was drawn back before
+retract_mm3 = 0.0                # drawn back after off
+plunger_mm2 = 78.5               # cross-section of what pushes, for messages in mm
+pwm_on, pwm_off = 2000, 0        # of arm_pwm: bytes 27 to 30 of a G1 frame (a key each)
+[dispenser.messages]             # instead of the preset's, see hardware/dispenser/messages.py
+on = "ON {flow_ul_s}"
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from estimation.errors import InputError
+from hardware.dispenser.dispenser import ArmPwmDispenser, Dispenser, DispenserProfile, Dispensers
+from hardware.dispenser.line_dispenser import LineDispenser, opener_for
+from hardware.dispenser.messages import PRESETS, DispenserLine, DispenserMessages, MessageValues, Preset
+from hardware.process import checks
+
+ARM_PWM = "arm_pwm"
+PRESET_NAMES = (*PRESETS, ARM_PWM)
+DELAY_KEYS = {f"{name}_s": name for name in ("on_dead_time", "on_lag", "off_dead_time", "off_lag")}
+PAIR_KEYS = {"flow_range_mm3_s": "flow_range", "temperature_range_c": "temperature_range"}
+PROFILE_KEYS = {  # key: field of the profile
+    **{**DELAY_KEYS, **PAIR_KEYS, "nozzle_offset_mm": "nozzle_offset", "watchdog_s": "watchdog"},
+    **{"metered": "metered", "flow_mm3_s": "flow", "kept_at_c": "kept_at"},
+    **{"prime_mm3": "prime_volume", "retract_mm3": "retract_volume", "materials": "materials"},
+}
+LINE_RANGES = {  # key: field of the line, least and greatest value
+    "keepalive_s": ("keepalive", 0.01, 10.0),
+    "start_s": ("start", 0.0, 30.0),
+    "gap_s": ("gap", 0.0, 1.0),
+    "timeout_s": ("timeout", 0.05, 5.0),
+    "plunger_mm2": ("plunger", 0.01, 10_000.0),
+}
+PWM_KEYS = ("pwm_on", "pwm_off")
+NEEDED = ("name", "materials", "preset")
+LINE_KEYS = ("port", "baud", *LINE_RANGES, "messages")
+PWM_RANGE = (-1e6, 1e6)  # as a binary32 it is exact to a tenth there
+KEEPALIVE_SHARE = 0.4  # of the watchdog, at most: one keepalive may be lost and the next late
+
+
+@dataclass(frozen=True, slots=True)
+class DispenserSettings:
+    """One table of a dispenser file. line: None of arm_pwm, which has pwm instead, the numbers for on and off."""
+
+    profile: DispenserProfile
+    preset: str
+    line: DispenserLine | None
+    pwm: tuple[float, float] | None = None
+
+
+def read_dispensers(path: str | Path) -> tuple[DispenserSettings, ...]:
+    """What is in a dispenser file; InputError names the key that makes no sense."""
+    return _settings(Path(path), checks.read_toml(Path(path)))
+
+
+def dispensers_from_text(text: str, where: str | Path) -> tuple[DispenserSettings, ...]:
+    """What is in the text of a dispenser file; InputError (where) as `read_dispensers`."""
+    return _settings(Path(where), checks.toml_from_text(where, text))
+
+
+def dispenser_from_settings(settings: DispenserSettings) -> Dispenser:
+    """The driver of one; nothing is opened yet."""
+    if settings.line is None:
+        assert settings.pwm is not None
+        return ArmPwmDispenser(settings.profile, *settings.pwm)
+    return LineDispenser(settings.profile, settings.line)
+
+
+def open_dispensers(path: str | Path) -> Dispensers:
+    """The drivers of a dispenser file, closed; InputError as `read_dispensers`."""
+    return Dispensers([dispenser_from_settings(each) for each in read_dispensers(path)], path)
+
+
+def _settings(path: Path, table: checks.Table) -> tuple[DispenserSettings, ...]:
+    checks.check_keys(path, "", table, ("dispenser",))
+    tables = checks.tables(path, "dispenser", table["dispenser"])
+    found = [_one(path, each) for each in tables]
+    names = [each.profile.name for each in found]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise InputError(path, "dispenser.name", name, "a name, and each once")
+    Dispensers([ArmPwmDispenser(each.profile, 0, 0) for each in found], path)  # whether two carry one material
+    return tuple(found)
+
+
+def _one(path: Path, table: checks.Table) -> DispenserSettings:
+    preset = table.get("preset", "")
+    if "preset" in table and preset not in PRESET_NAMES:
+        raise InputError(path, "dispenser.preset", preset, checks.one_of_text(str(preset), PRESET_NAMES))
+    special = PWM_KEYS if preset == ARM_PWM else (*LINE_KEYS,)
+    required = (*NEEDED, *(PWM_KEYS if preset == ARM_PWM else ("port",)))
+    checks.check_keys(path, "dispenser.", table, required, [*PROFILE_KEYS, *special])
+    if preset == ARM_PWM:
+        for key in ("metered", "temperature_range_c", "watchdog_s", "prime_mm3", "retract_mm3"):
+            if table.get(key):
+                raise InputError(path, f"dispenser.{key}", table[key], "left out of arm_pwm, which can only switch")
+        pwm_on, pwm_off = (_within(path, key, table[key], *PWM_RANGE) for key in PWM_KEYS)
+        if pwm_on == pwm_off:
+            raise InputError(path, "dispenser.pwm_on", table["pwm_on"], "another number than pwm_off")
+        return DispenserSettings(_profile(path, table, None), preset, None, (pwm_on, pwm_off))
+    kind = PRESETS[preset]
+    profile, line = _profile(path, table, kind), _line(path, table, kind)
+    _check_both(path, table, kind, profile, line)
+    return DispenserSettings(profile, preset, line)
+
+
+def _profile(path: Path, table: checks.Table, preset: Preset | None) -> DispenserProfile:
+    values: dict[str, object] = {}
+    for key, name in PROFILE_KEYS.items():
+        where = f"dispenser.{key}"
+        if key not in table:
+            continue
+        if key == "materials":
+            values[name] = _materials(path, table[key])
+        elif key == "metered":
+            if not isinstance(table[key], bool):
+                raise InputError(path, where, table[key], "true or false")
+            values[name] = table[key]
+        elif key == "nozzle_offset_mm":
+            values[name] = checks.numbers(path, where, table[key], (3,), "mm")
+        elif key in PAIR_KEYS:
+            values[name] = tuple(checks.numbers(path, where, table[key], (2,)).tolist())
+        else:
+            values[name] = checks.number(path, where, table[key])
+    if preset is not None:
+        values = {"metered": preset.metered, "watchdog": preset.watchdog, "flow_range": preset.flow_range} | values
+    values["watchdog"] = values.get("watchdog") or None
+    try:
+        return DispenserProfile(checks.text(path, "dispenser.name", table["name"]), **values)  # type: ignore[arg-type]
+    except InputError as error:
+        if error.where == str(path):
+            raise
+        keys = {name: key for key, name in PROFILE_KEYS.items()}
+        raise InputError(path, f"dispenser.{keys.get(error.what, error.what)}", error.got, error.allowed) from None
+
+
+def _materials(path: Path, value: object) -> tuple[str, ...]:
+    words = value if isinstance(value, list) else []
+    if not words or not all((isinstance(w, str) and w) or type(w) is int for w in words):
+        raise InputError(path, "dispenser.materials", value, "a list of names or whole numbers, one or more")
+    return tuple(map(str, words))
+
+
+def _line(path: Path, table: checks.Table, preset: Preset) -> DispenserLine:
+    changes: dict[str, object] = {"port": checks.text(path, "dispenser.port", table["port"])}
+    if "baud" in table:
+        changes["baud"] = checks.integer(path, "dispenser.baud", table["baud"], 300)
+    for key, (name, low, high) in LINE_RANGES.items():
+        if key in table:
+            changes[name] = _within(path, key, table[key], low, high)
+    for key in preset.settings:
+        if key not in table:
+            raise InputError(path, f"dispenser.{key}", "missing", f"this key, which the preset {table['preset']} needs")
+    line = replace(preset.line, messages=_messages(path, table, preset.line.messages), **changes)  # type: ignore[arg-type]
+    try:
+        line.messages.check(MessageValues(plunger=line.plunger))
+    except InputError as error:
+        raise InputError(path, f"dispenser.messages.{error.what}", error.got, error.allowed) from None
+    try:
+        opener_for(line).release()
+    except InputError as error:
+        raise InputError(path, "dispenser.port", error.got, error.allowed) from None
+    return line
+
+
+def _messages(path: Path, table: checks.Table, preset: DispenserMessages) -> DispenserMessages:
+    own = table.get("messages", {})
+    if not isinstance(own, dict):
+        raise InputError(path, "dispenser.messages", own, "a table [dispenser.messages]")
+    checks.check_keys(path, "dispenser.messages.", own, (), [f.name for f in fields(DispenserMessages)])
+    for key, value in own.items():
+        if not isinstance(value, str):
+            raise InputError(path, f"dispenser.messages.{key}", value, "a text")
+    try:
+        return replace(preset, **own)
+    except InputError as error:
+        raise InputError(path, f"dispenser.messages.{error.what}", error.got, error.allowed) from None
+
+
+def _check_both(
+    path: Path, table: checks.Table, preset: Preset, profile: DispenserProfile, line: DispenserLine
+) -> None:
+    """That the messages can do what the profile says."""
+    messages, (low, high) = line.messages, preset.flow_range
+    if profile.metered and not low <= profile.flow_range[0] < profile.flow_range[1] <= high:
+        allowed = f"within {low:g} to {high:g} mm^3/s, what the messages of {table['preset']} can say"
+        raise InputError(path, "dispenser.flow_range_mm3_s", list(profile.flow_range), allowed)
+    if profile.metered and "{flow" not in messages.on and "{step" not in messages.on:
+        raise InputError(path, "dispenser.messages.on", messages.on, "a text with a flow in it, as it is metered")
+    for key, value, name in (
+        ("temperature_range_c", profile.temperature_range, "temperature"),
+        ("watchdog_s", profile.watchdog, "keepalive"),
+        ("retract_mm3", profile.retract_volume, "retract"),
+        ("prime_mm3", profile.prime_volume, "prime"),
+    ):
+        if value and not getattr(messages, name):
+            raise InputError(path, f"dispenser.{key}", table.get(key), f"left out, or messages.{name} for it")
+    if (
+        profile.watchdog
+        and line.keepalive > KEEPALIVE_SHARE * profile.watchdog * (1 + 1e-9)
+        and "{step" not in messages.on
+    ):
+        allowed = f"at most {KEEPALIVE_SHARE * profile.watchdog:g} s, {KEEPALIVE_SHARE:g} of watchdog_s"
+        raise InputError(path, "dispenser.keepalive_s", line.keepalive, allowed)
+
+
+def _within(path: Path, key: str, value: object, low: float, high: float) -> float:
+    number = checks.number(path, f"dispenser.{key}", value)
+    if not low <= number <= high:
+        raise InputError(path, f"dispenser.{key}", value, f"{low:g} to {high:g}")
+    return number
+
+
+HEADER = re.compile(r"^\s*\[")
+
+
+def write_delays(path: str | Path, name: str, delays: DispenserProfile) -> None:
+    """Write the four delays of a profile into the table of dispenser `name`; all else in the file stays as it is.
+
+    InputError where there is no such table. The file is whole at every instant.
+    """
+    path = Path(path)
+    names = [each.profile.name for each in read_dispensers(path)]
+    if name not in names:
+        raise InputError(path, "dispenser.name", name, checks.one_of_text(name, names))
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    heads = [i for i, line in enumerate(lines) if re.match(r"\s*\[\[\s*dispenser\s*\]\]", line)]
+    if len(heads) != len(names):
+        raise InputError(path, "dispenser", f"{len(heads)} of {len(names)} tables", "[[dispenser]], each on its line")
+    start = heads[names.index(name)] + 1
+    end = next((i for i in range(start, len(lines)) if HEADER.match(lines[i])), len(lines))
+    body, new = lines[start:end], []
+    for key, field_name in DELAY_KEYS.items():
+        value = checks.toml_number(round(getattr(delays, field_name), 6))
+        at = next((i for i, line in enumerate(body) if re.match(rf"\s*{key}\s*=", line)), None)
+        if at is None:
+            new.append(f"{key} = {value}")
+        else:
+            body[at] = re.sub(r"=\s*[^#\s]+", f"= {value}", body[at], count=1)
+    text = "\n".join([*lines[:start], *new, *body, *lines[end:]]) + "\n"
+    dispensers_from_text(text, path)
+    beside = path.with_name(path.name + ".new")
+    beside.write_text(text, encoding="utf-8")
+    os.replace(beside, path)

@@ -1,0 +1,307 @@
+"""A virtual dispenser: bytes in, the true flow at any instant out, in virtual time or on a pseudo-terminal.
+
+It switches late and not at once: after a dead time the flow goes to its new value exponentially. After it is switched
+off it oozes a volume, also exponentially. Without a message for the time of its watchdog it switches itself off.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.process.checks import error_text
+from hardware.process.clock import Clock, WallClock
+from hardware.simulator.arm.ports import device_link, open_pty, stop_on_signals
+
+DISPENSER_POLL = 0.001  # s between looks at the line
+DISPENSER_LOG_STEP = 0.001  # s
+DISPENSER_LOG_PERIOD = 0.1  # s between two writes of the log
+MAX_LINE = 200  # bytes: what is longer without an end is dropped
+
+ON, OFF, RATE, KEEPALIVE, HEAT, QUERY, SETUP = "on", "off", "rate", "keepalive", "heat", "query", "setup"
+
+
+@dataclass(frozen=True, slots=True)
+class DispenserDialect:
+    """How a kind of device reads lines: patterns in order, each with what it does; their group is its number."""
+
+    actions: tuple[tuple[str, str], ...]
+    end: bytes = b"\n"
+    unit: float = 1.0  # mm^3/s of a rate of 1
+    done: str = "ok"  # answer to a line that it knows
+    heat: str = "T {0:.2f}"  # answer to a question for the temperature
+
+
+NUMBER = r"(-?\d+\.?\d*)"
+DIALECTS = {
+    "arduino": DispenserDialect(
+        ((rf"ON(?: {NUMBER})?", ON), ("OFF", OFF), ("K", KEEPALIVE), (rf"T {NUMBER}", HEAT), (r"T\?", QUERY))
+    ),
+    "new_era": DispenserDialect(
+        ((rf"RAT ?{NUMBER} ?UM", RATE), ("RUN", ON), ("STP", OFF), ("DIR INF|VOL ?0|DIA.*", SETUP)),
+        end=b"\r",
+        unit=1 / 60,
+        done="\x0200{1}\x03",
+    ),
+    "gcode_valve": DispenserDialect(
+        (("M106(?: S255)?", ON), ("M107", OFF), (rf"M104 S{NUMBER}", HEAT), ("M105", QUERY)),
+        heat="ok T:{0:.2f} /{2:.2f}",
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualDispenserSettings:
+    """What it does. InputError names a setting that makes no sense."""
+
+    preset: str = "arduino"
+    on_dead_time: float = 0.03  # s
+    on_lag: float = 0.02  # s
+    off_dead_time: float = 0.02  # s
+    off_lag: float = 0.04  # s
+    ooze: float = 0.0  # mm^3 that follow after off
+    ooze_lag: float = 0.5  # s in which it falls to 37 %
+    flow: float = 1.0  # mm^3/s, where it is told none
+    watchdog: float = 0.1  # s, infinite for none
+    ambient: float = 22.0  # degrees C at first
+    heat_lag: float = 5.0  # s, time constant of its temperature
+
+    def __post_init__(self) -> None:
+        if self.preset not in DIALECTS:
+            raise InputError("virtual dispenser", "preset", self.preset, f"one of {', '.join(DIALECTS)}")
+        for name in (f.name for f in fields(self) if f.name not in ("preset", "ambient")):
+            value, positive = getattr(self, name), name in ("ooze_lag", "flow", "watchdog", "heat_lag")
+            if not (value > 0 if positive else 0 <= value < math.inf):
+                raise InputError("virtual dispenser", name, value, "above 0" if positive else "0 or more")
+
+
+class DispenserModel:
+    """One device from `start` s on; it knows the time from its caller alone, which never goes back.
+
+    switches: (stamp, flow) of each, when the device obeyed: mm^3/s, 0 for off.
+    unknown: lines that it does not know. closed_itself: instants at which its watchdog switched it off.
+    """
+
+    def __init__(self, settings: VirtualDispenserSettings | None = None, start: float = 0.0) -> None:
+        self.settings = VirtualDispenserSettings() if settings is None else settings
+        self.now = start
+        self.switches: list[tuple[float, float]] = []
+        self.unknown: list[bytes] = []
+        self.closed_itself: list[float] = []
+        self._dialect = DIALECTS[self.settings.preset]
+        self._actions = [(re.compile(pattern), action) for pattern, action in self._dialect.actions]
+        self._rest, self._out = b"", bytearray()
+        self._rate, self._on, self._fed = self.settings.flow, 0.0, start
+        self._knots: deque[tuple[float, float, float, float, float]] = deque([(start, 0.0, 0.0, 1.0, 0.0)])
+        self._heat = (start, self.settings.ambient, self.settings.ambient)  # since, from, to
+
+    @property
+    def on(self) -> bool:
+        """Whether it was told last to let material out, and has not switched itself off."""
+        return self._on > 0
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes that have arrived at `now`, s, in any split."""
+        self.advance(now)
+        *lines, rest = (self._rest + data).split(self._dialect.end)
+        self._rest = rest[-MAX_LINE:]
+        for line in lines:
+            self._take(line.decode("ascii", "replace").strip())
+
+    def advance(self, now: float) -> None:
+        """Let time pass until `now`, s."""
+        assert now >= self.now
+        self.now = now
+        if self._on and now > self._fed + self.settings.watchdog:
+            self.closed_itself.append(self._fed + self.settings.watchdog)
+            self._switch(0.0, self.closed_itself[-1])
+
+    def transmit(self, now: float) -> bytes:
+        """What it has answered since the last call."""
+        self.advance(now)
+        data, self._out = bytes(self._out), bytearray()
+        return data
+
+    def flow_at(self, instants: Array) -> Array:
+        """The true flow (N,), mm^3/s, at instants (N,), s; what is after `now` may still change."""
+        knots = np.array(self._knots)
+        knot = knots[np.maximum(np.searchsorted(knots[:, 0], instants, "right") - 1, 0)]
+        since = np.maximum(instants - knot[:, 0], 0.0)
+        lag, ooze_lag = knot[:, 3], self.settings.ooze_lag
+        decay = np.where(lag > 0, np.exp(-since / np.where(lag > 0, lag, 1.0)), 0.0)
+        flow = knot[:, 2] + (knot[:, 1] - knot[:, 2]) * decay
+        return np.asarray(flow + knot[:, 4] / ooze_lag * np.exp(-since / ooze_lag))
+
+    def temperature_at(self, instant: float) -> float:
+        """Degrees C."""
+        since, start, target = self._heat
+        return target + (start - target) * math.exp(-(instant - since) / self.settings.heat_lag)
+
+    def _take(self, line: str) -> None:
+        for pattern, action in self._actions:
+            if found := pattern.fullmatch(line):
+                self._fed = self.now
+                self._do(action, float(found[1]) if pattern.groups and found[1] else None)
+                return
+        if line:
+            self.unknown.append(line.encode("ascii", "replace"))
+            self._answer("?")
+
+    def _do(self, action: str, number: float | None) -> None:
+        dialect = self._dialect
+        if action == RATE or (action == ON and number is not None):
+            assert number is not None
+            self._rate = number * dialect.unit
+        if action == ON or (action == RATE and self._on):
+            self._switch(self._rate, self.now)
+        elif action == OFF:
+            self._switch(0.0, self.now)
+        elif action == HEAT:
+            assert number is not None
+            self._heat = (self.now, self.temperature_at(self.now), number)
+        self._answer(dialect.heat if action == QUERY else dialect.done)
+
+    def _answer(self, form: str) -> None:
+        text = form.format(self.temperature_at(self.now), "I" if self._on else "S", self._heat[2])
+        self._out += text.encode("ascii") + (b"" if text.endswith("\x03") else b"\n")
+
+    def _switch(self, flow: float, instant: float) -> None:
+        """Told `flow` at `instant`: it acts a dead time later, unless an earlier order would act after that."""
+        if flow == self._on:
+            return
+        settings, off = self.settings, flow == 0
+        self._on = flow
+        self.switches.append((instant, flow))
+        acts = instant + (settings.off_dead_time if off else settings.on_dead_time)
+        while len(self._knots) > 1 and self._knots[-1][0] >= acts:
+            self._knots.pop()
+        at, before = float(self.flow_at(np.array([acts]))[0]), self._knots[-1][2]
+        ooze = settings.ooze * min(at / before, 1.0) if off and before > 0 else 0.0
+        self._knots.append((acts, at, flow, settings.off_lag if off else settings.on_lag, ooze))
+
+
+class DispenserPort:
+    """A line to a model in virtual time; an opener of itself."""
+
+    def __init__(self, model: DispenserModel, clock: Clock) -> None:
+        self.model, self._clock = model, clock
+
+    def __call__(self) -> DispenserPort:
+        """Open it."""
+        return self
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+    def write(self, data: bytes) -> int:
+        """The model has bytes at once."""
+        self.model.receive(data, self._clock.now())
+        return len(data)
+
+    def read(self) -> bytes:
+        """What the model has answered."""
+        return self.model.transmit(self._clock.now())
+
+    def waiting(self) -> int:
+        """Nothing is under way."""
+        return 0
+
+    def close(self) -> None:
+        """The model goes on."""
+
+
+_print_line = partial(print, flush=True)
+
+
+def run_virtual_dispenser(
+    settings: VirtualDispenserSettings,
+    log: Path | None = None,
+    link: Path | None = None,
+    clock: Clock | None = None,
+    stop: threading.Event | None = None,
+    say: Callable[[str], None] = _print_line,
+) -> DispenserModel:
+    """Serve a virtual dispenser on a new pty until `stop` is set, Ctrl-C or SIGTERM; say its device, then a summary.
+
+    log: a new CSV of the true flow, a row a millisecond, stamped by the machine's monotonic clock. link: a symbolic
+    link to the device, removed at the end. InputError where either would overwrite something. Returns the device as it
+    was at the end.
+    """
+    clock, stop = clock or WallClock(), stop or threading.Event()
+    model = DispenserModel(settings, clock.now())
+    ours, theirs, device = open_pty()
+    file = None
+    try:
+        file = _log_file(log)
+        os.set_blocking(ours, False)
+        with device_link(link, device), stop_on_signals(stop):
+            say(device)
+            _serve(ours, model, clock, stop, file)
+    finally:
+        for each in (theirs, ours):
+            os.close(each)
+        if file is not None:
+            file.close()
+    say(summary_of(model))
+    return model
+
+
+def summary_of(model: DispenserModel) -> str:
+    """What it was told and what became of it, in a few lines."""
+    switched_on = sum(flow > 0 for _, flow in model.switches)
+    unknown = f", the first {model.unknown[0]!r}" if model.unknown else ""
+    return (
+        f"switched on or to another flow {switched_on} times, now {'on' if model.on else 'off'}\n"
+        f"{len(model.closed_itself)} times its watchdog switched it off\n"
+        f"{len(model.unknown)} lines that it does not know{unknown}"
+    )
+
+
+def _serve(port: int, model: DispenserModel, clock: Clock, stop: threading.Event, file: TextIO | None) -> None:
+    logged = model.now
+    while not stop.is_set():
+        clock.wait_until(model.now + DISPENSER_POLL)
+        data, now = b"", clock.now()
+        with suppress(BlockingIOError):
+            data = os.read(port, MAX_LINE)
+        model.receive(data, now)
+        with suppress(BlockingIOError):
+            os.write(port, model.transmit(now))
+        if file is not None and now >= logged + DISPENSER_LOG_PERIOD:
+            logged = _log(file, model, logged, now)
+    if file is not None:
+        _log(file, model, logged, model.now)
+
+
+def _log_file(log: Path | None) -> TextIO | None:
+    if log is None:
+        return None
+    try:
+        file = log.open("x", encoding="utf-8")
+    except OSError as error:
+        raise InputError(log, "log", error_text(error), "a new file in a folder that can be written to") from error
+    file.write("stamp_s,flow_mm3_s,switched\n")
+    return file
+
+
+def _log(file: TextIO, model: DispenserModel, start: float, end: float) -> float:
+    """Write the rows from `start` on and before `end`; where the next one begins. switched: 1 after an on, by then."""
+    stamps = np.float64(start) + DISPENSER_LOG_STEP * np.arange(max(int((end - start) / DISPENSER_LOG_STEP), 0))
+    told = np.array([0.0, *(flow for _, flow in model.switches)])
+    on = told[np.searchsorted(np.array([stamp for stamp, _ in model.switches]), stamps, "right")] > 0
+    np.savetxt(file, np.column_stack([stamps, model.flow_at(stamps), on]), ["%.6f", "%.6f", "%d"], delimiter=",")
+    file.flush()
+    return start + DISPENSER_LOG_STEP * len(stamps)
