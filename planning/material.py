@@ -35,7 +35,7 @@ class SwitchDelay:
     def __post_init__(self) -> None:
         for name, value in (("on", self.on), ("off", self.off)):
             if not 0 <= value <= MAX_DELAY:
-                raise InputError("dispenser", f"delay {name}", value, f"0 to {MAX_DELAY:g} s: dead time and 0.69 lag")
+                raise InputError("dispenser", f"delay {name}", value, f"0 to {MAX_DELAY:g} s")
 
     def leads(self, lag: float) -> tuple[float, float]:
         """How long, s, before the planned instant a switch is due, where the arm is late by `lag` s; below 0: after."""

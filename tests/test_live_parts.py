@@ -281,7 +281,7 @@ def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_
 
 
 def test_what_is_begun_is_what_the_recording_holds() -> None:
-    begin = BeginPrint(raster(), replace(PROFILE, lag=0.1 / 3), 0.0, "x")
+    begin = BeginPrint(raster(), replace(PROFILE, lag=0.1 / 3), 0.0, {}, "x")
     texts, used = recorded_begin(begin)
     again, same = recorded_begin(used)
     assert used.profile.lag == begin.profile.lag

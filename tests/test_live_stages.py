@@ -52,7 +52,7 @@ class Staged:
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
         tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, Reason())
         progress = None if self.phase is None else PrintProgress(self.phase, 1, 6, self.fraction, 9.0, self.fraction)
-        self.seen.motion = LiveMotionReport(tick, progress, (), (), 0, 0, None, 0, "ordinary")
+        self.seen.motion = LiveMotionReport(tick, progress, None, (), (), 0, 0, None, 0, "ordinary")
         self.orders += self.conductor(self.now, self.seen, asked)
         return self.conductor.stage
 

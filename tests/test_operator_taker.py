@@ -179,7 +179,7 @@ def reports(now: float, off: float, extrude: bool) -> tuple[TrackingReport, Live
     status = ArmStatus(now, ArmState.ARMED, "", axes, None, 0.0, nan, nan, 0.0, 0, 0, 0, 0)
     tick = Tick(now, Move(now, axes, 5.0, 1, extrude), b"", 0.0, status, Reason())
     progress = PrintProgress(PrintPhase.PRINTING, 1, len(path), 1.0, 9.0, fraction)
-    motion = LiveMotionReport(tick, progress, (), (), 0, 0, None, 0, "ordinary")
+    motion = LiveMotionReport(tick, progress, None, (), (), 0, 0, None, 0, "ordinary")
     pose: SurfacePose = replace(pose_at(breathing, now - 0.03))
     return TrackingReport(now, ("a", "b"), pose=pose, truth=breathing(now - 0.03)), motion
 

@@ -246,7 +246,11 @@ class ArmDevice:
         if frame is None:
             shifted = instruction
             if isinstance(instruction, G1) and self.origin.any():  # the arm counts from its origin
-                shifted = G1(instruction.axes - np.concatenate([self.origin, np.zeros(3)]), instruction.feed)
+                shifted = G1(
+                    instruction.axes - np.concatenate([self.origin, np.zeros(3)]),
+                    instruction.feed,
+                    instruction.material,
+                )
             frame = encode(shifted, self.profile.dialect)
 
         def sent(at: float, share: float) -> None:

@@ -18,10 +18,10 @@ from hardware.arm.device import BY_OPERATOR, DONE, ArmDevice, ArmState, ArmStatu
 from hardware.arm.jog import AbortRecovery, OwnMoves, RecalledMoves
 from hardware.arm.port import ArmLine, Opener, PortOpener, UnpluggedError
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.arm.protocol import G54, Pause, Reply, encode, frame_from_command, motion_from_frame
+from hardware.arm.protocol import G1, G54, Pause, Reply, encode, frame_from_command, motion_from_frame
 from hardware.arm.queue import ArmQueue, FlowControl
 from hardware.process.clock import Clock, WallClock
-from planning.command import Command
+from planning.command import MIN_FEED, Command, Hold, Move
 
 DEFAULT_SETTINGS = LinkSettings()
 RECALLED = Reason("what was queued is called back", LinkCode.RECALLED)
@@ -48,6 +48,7 @@ class Arm(ArmDevice):
         self._recovery = AbortRecovery(self._flow.flight - profile.tick, settings.speed, profile.lag)
         self._doubt_since: float | None = None
         self.command_frame = b""
+        self._material = False  # whether the last frame let material flow
         super().__init__(opener, profile, now, settings)
 
     # -- an operator's orders
@@ -176,6 +177,8 @@ class Arm(ArmDevice):
         rounded to binary32. InputError for what no frame holds.
         """
         dialect = self.profile.dialect
+        if isinstance(command, Hold) and self._material and self._queue is not None:  # a pause switches nothing
+            command = Move(command.stamp, np.array(self._queue.target), MIN_FEED, 0, extrude=False)
         self.command_frame = frame_from_command(command, dialect)
         instruction = motion_from_frame(self.command_frame, dialect)
         if reason := self.hold(now):
@@ -185,6 +188,7 @@ class Arm(ArmDevice):
             self.stop(words, now)
             return Reason(words, LinkCode.LIMIT)
         self._own.last = None
+        self._material = dialect.pwm_on is not None and isinstance(instruction, G1) and instruction.material
         self._give(instruction, now, self.command_frame if not self.origin.any() else None)
         return DONE
 

@@ -33,6 +33,7 @@ _MOTION, _MOTION_END, _SYSTEM, _SYSTEM_END = 238, 239, 252, 253
 _MOVE, _WAIT = ord("1"), ord("6")  # byte 1 of a motion frame
 FRAME_TAILS = {_MOTION: _MOTION_END, _SYSTEM: _SYSTEM_END}  # last byte of a frame by its first
 
+MAX_PWM = 20_000.0  # ten times a hobby servo's pulse in microseconds
 ANGLE_JOINTS = ("J4", "J5", "J6")  # the machine axes A B C
 
 
@@ -44,6 +45,7 @@ class Dialect:
     slots: tuple[str, str, str] = ANGLE_JOINTS  # the three angles; J5 first in the thesis's appendix and both drivers
     origin_scale: int = 1  # what a G54 frame multiplies mm by; 1 in the thesis, 10 in a driver
     pwm: float = 0.0  # after the angles of a G1 frame, its use not known; 0 in thesis and one driver, 1500 in another
+    pwm_on: float | None = None  # there instead while material is to flow, where that switches a dispenser
 
     def __post_init__(self) -> None:
         if self.motion_byte not in (0, 1):
@@ -52,8 +54,13 @@ class Dialect:
             raise InputError("dialect", "slots", self.slots, "J4, J5 and J6, each once")
         if self.origin_scale not in (1, 10):
             raise InputError("dialect", "origin_scale", self.origin_scale, "1 or 10")
-        if self.pwm not in (0, 1500):
+        if self.pwm_on is None and self.pwm not in (0, 1500):
             raise InputError("dialect", "pwm", self.pwm, "0 or 1500")
+        for name, value in (("pwm", self.pwm), ("pwm_on", self.pwm if self.pwm_on is None else self.pwm_on)):
+            if not 0 <= value <= MAX_PWM:
+                raise InputError("dialect", name, value, f"0 to {MAX_PWM:g}")
+        if self.pwm_on == self.pwm:
+            raise InputError("dialect", "pwm_on", self.pwm_on, "another number than pwm, which is off")
 
 
 THESIS_DIALECT = Dialect()
@@ -65,6 +72,7 @@ class G1:
 
     axes: Array  # (6,) X Y Z A B C, mm and rad
     feed: float  # mm/s
+    material: bool = False  # whether it is to flow; says nothing in a dialect without pwm_on
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +133,8 @@ def encode(instruction: Instruction, dialect: Dialect = THESIS_DIALECT) -> bytes
     if isinstance(instruction, G1):
         angles = dict(zip(ANGLE_JOINTS, np.rad2deg(instruction.axes[3:]), strict=True))
         turns = (angles[joint] for joint in dialect.slots)
-        body = _singles([*instruction.axes[:3], *turns, dialect.pwm, instruction.feed * 60], "G1")
+        pwm = dialect.pwm if dialect.pwm_on is None or not instruction.material else dialect.pwm_on
+        body = _singles([*instruction.axes[:3], *turns, pwm, instruction.feed * 60], "G1")
         if not body[7] > 0:
             raise InputError("G1", "feed", body[7], "> 0 mm/min")
         return _G1.pack(_MOTION, b"1", dialect.motion_byte, *body, _MOTION_END)
@@ -144,8 +153,9 @@ def encode(instruction: Instruction, dialect: Dialect = THESIS_DIALECT) -> bytes
 
 def frame_from_command(command: Command, dialect: Dialect = THESIS_DIALECT) -> bytes:
     """The frame of a command, G1 of a move and G4 of a hold; InputError as `encode`."""
-    motion = G1(command.axes, command.feed) if isinstance(command, Move) else G4(command.duration)
-    return encode(motion, dialect)
+    if isinstance(command, Move):
+        return encode(G1(command.axes, command.feed, command.flow > 0), dialect)
+    return encode(G4(command.duration), dialect)
 
 
 def motion_from_frame(frame: bytes, dialect: Dialect = THESIS_DIALECT) -> G1 | G4:
@@ -177,7 +187,8 @@ def _decode_move(frame: bytes, dialect: Dialect) -> G1:
     fields = _G1.unpack(frame)
     angles = dict(zip(dialect.slots, fields[6:9], strict=True))
     axes = np.array([*fields[3:6], *np.deg2rad([angles[joint] for joint in ANGLE_JOINTS])])
-    return G1(axes, fields[10] / 60)
+    on = dialect.pwm_on
+    return G1(axes, fields[10] / 60, on is not None and fields[9] == _SINGLE.unpack(_SINGLE.pack(on))[0])
 
 
 def _decode_pause(frame: bytes) -> G4:

@@ -8,6 +8,7 @@ motion_byte = 1                               # byte 2 of a G1 frame, 1 or 0
 slots = ["J4", "J5", "J6"]                    # which joint stands in each angle slot
 origin_scale = 1                              # 10: the origin is sent in tenths of a millimetre
 pwm = 0                                       # bytes 27 to 30 of a G1 frame: 0, or 1500 as one driver sends
+pwm_on = 1500                                 # optional, in its place while material is to flow: switches a dispenser
 baud = 115200                                 # or 9600, at which a frame takes 50 ms
 tick_s = 0.02                                 # at least a frame's time on the wire, which is the default where longer
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
@@ -163,7 +164,7 @@ _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are s
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
 _ARRAYS = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)}  # shapes
 ARM_KEYS = (
-    *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "baud", "tick_s", "lag_s", "tool_mm"),
+    *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
     *("limits", "no_go", "kinematics"),
 )
 # of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
@@ -228,6 +229,7 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         f"slots = {json.dumps(dialect.slots)}",
         f"origin_scale = {dialect.origin_scale}",
         f"pwm = {checks.toml_number(dialect.pwm)}",
+        *([] if dialect.pwm_on is None else [f"pwm_on = {checks.toml_number(dialect.pwm_on)}"]),
         f"baud = {profile.baud}",
         f"tick_s = {checks.toml_number(profile.tick)}",
         f"lag_s = {checks.toml_number(profile.lag)}",
@@ -301,4 +303,5 @@ def _dialect(path: Path, table: checks.Table) -> Dialect:
         tuple(slots),
         checks.integer(path, "origin_scale", table.get("origin_scale", default.origin_scale), 1),
         checks.number(path, "pwm", table.get("pwm", default.pwm)),
+        checks.number(path, "pwm_on", table["pwm_on"]) if "pwm_on" in table else None,
     )

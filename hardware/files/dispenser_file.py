@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -41,6 +42,7 @@ from hardware.dispenser.dispenser import ArmPwmDispenser, Dispenser, DispenserPr
 from hardware.dispenser.line_dispenser import LineDispenser, opener_for
 from hardware.dispenser.messages import PRESETS, DispenserLine, DispenserMessages, MessageValues, Preset
 from hardware.process import checks
+from planning.material import Outlet, Outlets, SwitchDelay
 
 ARM_PWM = "arm_pwm"
 PRESET_NAMES = (*PRESETS, ARM_PWM)
@@ -91,6 +93,21 @@ def dispenser_from_settings(settings: DispenserSettings) -> Dispenser:
         assert settings.pwm is not None
         return ArmPwmDispenser(settings.profile, *settings.pwm)
     return LineDispenser(settings.profile, settings.line)
+
+
+def outlets_from(settings: Sequence[DispenserSettings], where: object = "dispenser") -> Outlets:
+    """The outlet of each material; InputError (where) for a delay that is too long to be led."""
+    outlets: dict[str, Outlet] = {}
+    for each in settings:
+        profile = each.profile
+        try:
+            delay = SwitchDelay(profile.on_delay, profile.off_delay, with_moves=each.line is None)
+        except InputError as error:
+            what = f"{profile.name}: {error.what}"
+            raise InputError(where, what, error.got, f"{error.allowed} (dead time + 0.69 lag)") from None
+        x, y, z = profile.nozzle_offset.tolist()
+        outlets |= {material: Outlet(delay, (x, y, z)) for material in profile.materials}
+    return outlets
 
 
 def open_dispensers(path: str | Path) -> Dispensers:

@@ -16,6 +16,7 @@ from hardware.operator.view import Check, CheckVerdict
 from hardware.process.progress import count_text
 from planning.kinematics import axes_from_nozzle, joints_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN
+from planning.material import Outlets, with_offsets
 from planning.path import Path
 
 MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
@@ -31,11 +32,21 @@ class PlacedPath:
     unreachable: str  # why the arm cannot print the path where the surface is now, "" if it can
 
 
-def place_path(path: Path, surface_from_path: Array, pose: SurfacePose, profile: ArmProfile, place: bool) -> PlacedPath:
-    """The path on the surface as it is now. place: put the arm where the surface lies below its home, level."""
+def place_path(
+    path: Path,
+    surface_from_path: Array,
+    pose: SurfacePose,
+    profile: ArmProfile,
+    place: bool,
+    outlets: Outlets | None = None,
+) -> PlacedPath:
+    """The path on the surface as it is now.
+
+    place: put the arm where the surface lies below its home, level. outlets: of the path's materials.
+    """
     path = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
     profile = placed(profile, pose.base_from_surface) if place else profile
-    return PlacedPath(path, profile, reach_problem(path, pose, profile))
+    return PlacedPath(path, profile, reach_problem(with_offsets(path, outlets or {}), pose, profile))
 
 
 def raised_path(path: Path, lift: float) -> Path:
@@ -78,6 +89,7 @@ def run_checks(
         *_camera_checks(reports.tracking, now),
         _arm_check(reports.motion, stands_home),
         Check("path", PASS, f"{len(path)} checkpoints, {layers}{begun}"),
+        *_material_check(reports.motion),
         _reach_check(placed_path),
         _recorder_check(reports.recorder),
     )
@@ -112,6 +124,15 @@ def _arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
     known = "answers" if status.answered is not None else "stands at home by the operator's word"
     lag = f", lag {1000 * status.lag:.0f} ms" if np.isfinite(status.lag) else ""
     return Check("arm", PASS, f"{known}{lag}; {report.priority}")
+
+
+def _material_check(report: LiveMotionReport | None) -> tuple[Check, ...]:
+    """Whether the dispenser is ready; nothing of a run without one."""
+    if report is None or report.material is None:
+        return ()
+    material = report.material
+    verdict = FAIL if material.failed else PASS if material.ready else BUSY
+    return (Check("material", verdict, material.text, "see to the dispenser and its line"),)
 
 
 def _reach_check(placed_path: PlacedPath | None) -> Check:

@@ -20,6 +20,8 @@ from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
 from hardware.arm.port import Port, PortOpener
 from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.dispenser.dispenser import Dispensers
+from hardware.files.dispenser_file import dispenser_from_settings, dispensers_from_text
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender
@@ -28,6 +30,7 @@ from hardware.live.records import (
     FRAMES_TO_WIRE_STAGE,
     LATE_TICK_STAGE,
     BeginPrint,
+    EventEntry,
     LiveMotionReport,
     MotionChannels,
     PauseOrder,
@@ -37,11 +40,14 @@ from hardware.live.records import (
     WireEntry,
 )
 from hardware.motion.loop import MotionLoop, Order, RecordedTick, Tick
+from hardware.motion.material import MaterialControl
 from hardware.motion.step import MotionStep
 from hardware.process.clock import WallClock
 from hardware.process.system import ask_for_real_time, set_up_process, take_messages
 from hardware.process.ticks import PoseLockedSchedule
+from hardware.recording.schemas import WARNING
 from planning.command import Command, Hold
+from planning.path import Path
 from planning.progress import PrintProgress
 
 PAUSED_REASON = "paused by the operator"
@@ -53,15 +59,20 @@ INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what s
 class LiveMotion:
     """The motion of a live run: holds until a path is begun, then a MotionStep that can be paused, or begun at home.
 
+    Where material cannot flow, the nozzle waits above the surface as in a pause.
+
     last: the last command.
     asked: whether planner and guard made it.
     begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
+    waits: whether they were told to wait above the surface.
+    material_in: whether the material that was wanted was put in since this was last reset.
     """
 
     last: Command
 
-    def __init__(self, profile: ArmProfile, place: c_double) -> None:
-        self._profile, self._place = profile, place
+    def __init__(self, profile: ArmProfile, place: c_double, material: MaterialControl | None = None) -> None:
+        self._profile, self._place, self._material = profile, place, material
+        self.waits = self.material_in = False
         self._step: MotionStep | None = None
         self._order: BeginPrint | None = None
         self.paused = self.asked = False
@@ -76,6 +87,18 @@ class LiveMotion:
         """Begin anew at the same place of the path, as the arm stands at home."""
         if self._step is not None:
             self._make(self._step.progress.fraction)
+
+    def resume(self) -> None:
+        """Go on after a pause, with the dispenser made ready again."""
+        self.paused = False
+        self._prepare_material()
+
+    def put_in(self) -> None:
+        """The operator has put in the material that was wanted."""
+        if self._step is not None and self._step.progress.wanted:
+            self._step.material_in()
+            self.material_in = True
+            self._prepare_material()
 
     def recalled(self, place: Array, stands: Array) -> None:
         """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
@@ -93,17 +116,24 @@ class LiveMotion:
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
             return self.last
-        self._step.paused = self.paused
+        dry = "" if self._material is None else self._material.reason
+        self._step.paused = self.waits = self.paused or bool(dry)
         self.last = self._step(pose, now)
-        if self.paused and isinstance(self.last, Hold):
-            self.last = replace(self.last, reason=PAUSED_REASON)
+        if self.waits and isinstance(self.last, Hold):
+            self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last
 
     def _make(self, start: float) -> None:
         assert self._order is not None
-        self._step = MotionStep(self._order.path, self._order.profile, start)
+        self._step = MotionStep(self._order.path, self._order.profile, start, self._order.outlets)
         self._place.value = self.begun = start
+        self.material_in = False
+        self._prepare_material()
+
+    def _prepare_material(self) -> None:
+        if self._step is not None and self._material is not None and not self._step.progress.wanted:
+            self._material.begin(self._step.progress.fraction, WallClock().now())
 
 
 ByteListener = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
@@ -154,8 +184,12 @@ class _OrderReceiver:
             elif isinstance(order, BeginPrint):
                 self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
                 self._motion.begin(order)
+            elif order is PauseOrder.MATERIAL_IN:
+                self._motion.put_in()
+            elif order is PauseOrder.RESUME:
+                self._motion.resume()
             else:
-                self._motion.paused = order is PauseOrder.PAUSE
+                self._motion.paused = True
         self.alone |= closed
         return [*orders, Order.QUIT] if self.alone or self._ended else orders
 
@@ -208,13 +242,27 @@ class _TickReporter:
             asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
             motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            inputs = stamp, asked, begun, motion.paused
+            inputs = stamp, asked, begun, motion.waits, motion.material_in
+            motion.material_in = False
             self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached))
+        for record in () if loop.material is None else loop.material.records():
+            self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
         events, timings, stops = tuple(self._events), (*self.times.timings(), lateness), loop.arm.stops
         last_stop = stops[-1] if stops else None
         counts = loop.skipped, len(stops), last_stop, self._sender.dropped
-        self._reports.put(LiveMotionReport(tick, progress, events, timings, *counts, self._priority))
+        material = None if loop.material is None else loop.material.status
+        self._reports.put(LiveMotionReport(tick, progress, material, events, timings, *counts, self._priority))
+
+
+def material_control(path: Path, dispensers: str, start: float, now: float) -> MaterialControl | None:
+    """The dispensers of a path, by the text of their file, made ready for `start`, in checkpoints; None without one."""
+    if not dispensers:
+        return None
+    drivers = [dispenser_from_settings(each) for each in dispensers_from_text(dispensers, "dispenser.toml")]
+    control = MaterialControl(Dispensers(drivers), path)
+    control.begin(start, now)
+    return control
 
 
 def move(prepared: Prepared, channels: MotionChannels) -> None:
@@ -227,7 +275,8 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     clock, device, sender = WallClock(), PortOpener(channels.url, profile.baud), RecorderSender(channels.recorder)
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
-    motion = LiveMotion(profile, channels.place)
+    material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
+    motion = LiveMotion(profile, channels.place, material)
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     reporter = _TickReporter(channels, sender, ticks, priority)
     orders = _OrderReceiver(channels, motion, ticks)
@@ -235,12 +284,14 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         arm = Arm(lambda: _LoggedPort(device(), reporter.bytes_passed), profile, clock.now(), link_settings)
         reporter.motion = motion
         poses, report = reporter.newest_pose, reporter.report
-        loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks)
+        loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks, material)
         try:
             loop.run()
         finally:
             reporter.loop = None
             arm.close()
+            for words in [] if material is None else material.close(clock):
+                sender.put(EventEntry(clock.now(), f"could not be switched off: {words}", WARNING, "dispenser"))
     except InputError as error:
         channels.trouble.put(str(error))
     finally:

@@ -27,7 +27,14 @@ from estimation.errors import InputError, StillbedError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
+from hardware.dispenser.dispenser import Dispensers, check_path_materials
 from hardware.files.arm_file import read_arm
+from hardware.files.dispenser_file import (
+    dispenser_from_settings,
+    dispensers_from_text,
+    outlets_from,
+    read_dispensers,
+)
 from hardware.files.path_file import read_path, read_progress, write_progress_durably
 from hardware.files.rig_file import read_rig
 from hardware.live.settings import (
@@ -44,6 +51,8 @@ from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import cache_error, cache_folder
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
+from planning.material import Outlets, with_offsets
+from planning.path import Path
 
 RIG_FILE = "rig.toml"
 PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
@@ -192,8 +201,13 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
         profile, path = profile or rendered / "arm.toml", path or rendered / "path.csv"
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
+    printed_path = read_path(path)
+    dispensers, outlets = _dispensers(settings, printed_path, path)
+    notes += _dispenser_notes(settings, dispensers)
     task = PrintTask(
-        path=read_path(path),
+        path=printed_path,
+        dispensers=dispensers,
+        outlets=outlets,
         profile=ArmProfile() if profile is None else read_arm(profile),
         place=profile is None,
         stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
@@ -203,6 +217,36 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
     )
     rig, again = rig_from_session(session), scenario is not None
     return Prepared(settings, session, rig, again, virtual, task, placement, files, tuple(notes))
+
+
+def _dispensers(settings: LiveSettings, path: Path, where: File) -> tuple[str, Outlets]:
+    """The text of the dispenser file and the outlets of the path's materials; nothing in a dry run or without a file.
+
+    InputError where the path needs what no dispenser can do.
+    """
+    file = settings.dispensers
+    if file is None or settings.dry_run:
+        return "", {}
+    read = read_dispensers(file)
+    dispensers = Dispensers([dispenser_from_settings(each) for each in read], file)
+    check_path_materials(dispensers, path, where)
+    outlets = outlets_from(read, file)
+    with_offsets(path, outlets)
+    carried = [dispensers.for_material(name) for name in dict.fromkeys(path.material[path.extrude].tolist())]
+    if settings.unattended and len(set(map(id, carried))) < len(carried):
+        allowed = "an operator, or a dispenser for each material: one carries several of this path's"
+        raise InputError(file, "print.unattended", "true", allowed)
+    return file.read_text(encoding="utf-8-sig"), outlets
+
+
+def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
+    if settings.dry_run:
+        return []
+    if not dispensers:
+        return [] if settings.simulated is not None else ["no dispenser is given: nothing is extruded"]
+    names = [each.profile.name for each in dispensers_from_text(dispensers, "") if each.profile.watchdog is None]
+    why = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
+    return [f"dispenser {name} {why}" for name in names]
 
 
 def rig_from_session(session: File) -> Rig:

@@ -17,7 +17,6 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import frame_from_command
 from hardware.files.arm_file import read_arm
 from hardware.files.folder_tables import trajectory_from_rows
@@ -34,10 +33,9 @@ from hardware.recording.messages import (
     pose_from_message,
     row_from_message,
 )
-from hardware.recording.session_reader import PATH_ATTACHMENT, inputs_from_texts
+from hardware.recording.session_reader import PATH_ATTACHMENT, PrintInputs, inputs_from_texts
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold
-from planning.path import Path
 from planning.progress import PrintPhase, PrintProgress
 
 RUN_REQUIRED = "the recording of a run that began to print, or give --path"
@@ -93,16 +91,16 @@ class ReplayedTick:
 def replay_run(record: File) -> Iterator[ReplayedTick]:
     """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
     run = _read_run(record, "/tick", "/pose")
-    return _replay_ticks(run.messages["/tick"], run.poses, *inputs_from_texts(run.texts, record), record)
+    return _replay_ticks(run.messages["/tick"], run.poses, inputs_from_texts(run.texts, record), record)
 
 
 def _replay_ticks(
-    ticks: list[Message], poses: dict[float, SurfacePose], path: Path, profile: ArmProfile, record: File
+    ticks: list[Message], poses: dict[float, SurfacePose], inputs: PrintInputs, record: File
 ) -> Iterator[ReplayedTick]:
-    step: MotionStep | None = None
+    step, profile = None, inputs.profile
     for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
-            step = MotionStep(path, profile, float(tick["begun"][0]))
+            step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets)
         if step is not None and tick.get("recalled"):
             step.recalled(*np.array(tick["recalled"], float).reshape(2, 6))
         if step is None or not tick["asked"]:
@@ -111,6 +109,8 @@ def _replay_ticks(
         if stamp and stamp[0] not in poses:
             raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
         now = float(tick["stamp"])
+        if tick.get("material_in"):
+            step.material_in()
         step.paused = bool(tick.get("paused"))
         command = step(poses[stamp[0]] if stamp else None, now)
         frame = frame_from_command(command, profile.dialect)
@@ -128,11 +128,11 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     poses = run.poses
     if PATH_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no path", RUN_REQUIRED)
-    path, profile = inputs_from_texts(run.texts, record)
+    inputs = inputs_from_texts(run.texts, record)
     prepare_out(out, force)
     frames = other = 0
     with CommandWriter(out) as writer:
-        for tick in _replay_ticks(run.messages["/tick"], poses, path, profile, record):
+        for tick in _replay_ticks(run.messages["/tick"], poses, inputs, record):
             writer.write(tick.command, tick.frame)
             frames += 1
             other += tick.frame != tick.recorded
@@ -180,7 +180,7 @@ def nozzle_errors(record: File, path: File, arm: File) -> NozzleErrors:
     run = _read_run(record, "/tick", "/move", "/truth")
     if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
-    true, profile = read_arm(arm), inputs_from_texts(run.texts, record)[1]  # ticks and lag are as the run took them
+    true, profile = read_arm(arm), inputs_from_texts(run.texts, record).profile  # tick and lag as the run took them
     rows = np.unique(np.array([row_from_message(message) for message in run.messages["/truth"]]), axis=0)
     rising = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
     truth = Truth(np.eye(4), _TrueMotion(rows[rising]))

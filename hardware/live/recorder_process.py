@@ -38,6 +38,7 @@ from hardware.live.records import (
 )
 from hardware.live.settings import LiveSettings
 from hardware.motion.loop import RecordedTick
+from hardware.motion.material import DispenserRecord
 from hardware.process.clock import ProcessorClock, WallClock
 from hardware.process.shared_latest import SharedLatest
 from hardware.process.system import set_up_process
@@ -265,7 +266,7 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.attach(entry.name, entry.text.encode())
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
-    elif isinstance(entry, Roi):
+    elif isinstance(entry, Roi | DispenserRecord):
         recorder.write(entry)
 
 

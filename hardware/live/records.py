@@ -21,10 +21,12 @@ from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
 from hardware.motion.loop import RecordedTick, Tick
+from hardware.motion.material import DispenserRecord, MaterialStatus
 from hardware.operator.shared_state import OperatorLink, RequestLine
 from hardware.process.shared_latest import SharedLatest
 from hardware.process.ticks import Histogram
 from perception.frames import Frame, PrintHead, Roi
+from planning.material import Outlets
 from planning.path import Path
 from planning.progress import PrintProgress
 
@@ -81,6 +83,7 @@ class BeginPrint:
     path: Path  # in the tracker's surface frame
     profile: ArmProfile  # with the arm's place and lag as they are now known
     start: float  # place on the path, counted in checkpoints
+    outlets: Outlets  # of its materials
     fingerprint: str  # of the path as its file has it
 
 
@@ -89,6 +92,7 @@ class PauseOrder(Enum):
 
     PAUSE = "pause"
     RESUME = "resume"
+    MATERIAL_IN = "material in"  # what the motion asked for was put in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +101,7 @@ class LiveMotionReport:
 
     tick: Tick  # the last one
     progress: PrintProgress | None  # None before a path was begun
+    material: MaterialStatus | None  # None where nothing is extruded
     events: tuple[ArmEvent, ...]  # the last ones
     timings: tuple[StageTiming, ...]  # from frames to the wire, and how late ticks were
     skipped: int  # ticks that were not made
@@ -192,7 +197,8 @@ class UsedEntry:
 
 
 # the rig comes first: nothing is written before the cameras are known
-Entry = Rig | ScanEntry | Roi | UsedEntry | SetEntry | PoseEntry | RecordedTick | WireEntry | EventEntry | LatencyEntry
+Record = Roi | RecordedTick | DispenserRecord
+Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | EventEntry | LatencyEntry
 
 
 class StageHistograms:

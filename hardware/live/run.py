@@ -22,6 +22,8 @@ from estimation.errors import InputError
 from hardware.arm.device import ArmState
 from hardware.arm.link import emergency_stop
 from hardware.arm.profile import ArmProfile
+from hardware.dispenser.dispenser import Dispensers, close_dispensers
+from hardware.files.dispenser_file import dispenser_from_settings, dispensers_from_text
 from hardware.live.checklist import PlacedPath, checks_table
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
@@ -164,12 +166,24 @@ class LiveRun:
         if self._arm_halted:
             return
         self._arm_halted = True
+        self._switch_off_material()
         decided = self._clock.now()
         sent, reason = emergency_stop(self._channels.url, self._prepared.task.profile)
         if reason:
             self._log(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
         else:
             self._statistics.times.add("motion process gone to stop on the wire", sent - decided)
+
+    def _switch_off_material(self) -> None:
+        """Switch the dispensers off in place of the motion process; those with a watchdog did it themselves."""
+        if not (text := self._prepared.task.dispensers):
+            return
+        drivers = Dispensers([dispenser_from_settings(each) for each in dispensers_from_text(text, "dispenser.toml")])
+        for each in drivers:
+            each.prepare(self._clock.now())
+            each.off(self._clock.now())
+        for words in close_dispensers(drivers, self._clock):
+            self._log(f"a dispenser could not be switched off: {words}: switch it off by hand", WARNING)
 
     def _send(self, orders: Orders) -> None:
         for order in orders:
@@ -188,7 +202,7 @@ class LiveRun:
 
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""
-        texts, order = recorded_begin(order)
+        texts, order = recorded_begin(order, self._prepared.task.dispensers)
         for name, text in texts.items():
             self._channels.sender.put(UsedEntry(name, text))
         self._profile = order.profile
@@ -319,8 +333,11 @@ def _signal_wakeup(run: LiveRun) -> Iterator[socket.socket]:
         theirs.close()
 
 
-def recorded_begin(order: BeginPrint) -> tuple[dict[str, str], BeginPrint]:
-    """Path and arm of an order as texts for the recording, and the order with what is read of those texts."""
-    texts = input_texts(order.path, order.profile)
-    path, profile = inputs_from_texts(texts, File("kept"))
-    return texts, replace(order, path=path, profile=profile)
+def recorded_begin(order: BeginPrint, dispensers: str = "") -> tuple[dict[str, str], BeginPrint]:
+    """Path, arm and dispensers of an order as texts for the recording, and the order with what is read of those texts.
+
+    dispensers: text of their file, "" without one.
+    """
+    texts = input_texts(order.path, order.profile, dispensers)
+    inputs = inputs_from_texts(texts, File("kept"))
+    return texts, replace(order, path=inputs.path, profile=inputs.profile, outlets=inputs.outlets)

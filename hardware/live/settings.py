@@ -61,6 +61,9 @@ class LiveSettings:
     stands_home: bool = _key("arm.stands_home", "false", "an arm that does not answer stands at its home now", False)
     pause_frame: bool = _key("arm.pause_frame", "true", "its controller knows the frame that stops it at once", True)
     real_time: bool = _key("arm.real_time", "true", "ask the system for real-time priority", True)
+    dispensers: Path | None = _key(
+        "material.dispensers", '"dispenser.toml"', "what lets material out; left out: nothing is extruded"
+    )
     record: Path | None = _key("record.file", '"run.mcap"', "the recording; what else a run leaves stands beside it")
     jpeg_quality: int = _key(  # three cameras' exact pictures take three cores to encode
         "record.jpeg_quality", "90", "of pictures that come unencoded, 1 to 100; 0: exact", 90
@@ -153,7 +156,7 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
             raise InputError(where, f"cores.{key}", list(cores), allowed)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
-    for name in ("rig", "simulated", "path", "profile"):
+    for name in ("rig", "simulated", "path", "profile", "dispensers"):
         file = getattr(s, name)
         if file is not None and not file.exists():
             raise InputError(where, name, file, "a file that exists")

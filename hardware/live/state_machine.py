@@ -7,7 +7,7 @@ the motion process that follow from them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
@@ -27,6 +27,7 @@ from hardware.operator.view import (
     refusal,
 )
 from hardware.process.ticks import tick_in_step
+from planning.material import Outlets
 from planning.path import Path
 from planning.progress import PrintPhase, fingerprint
 
@@ -66,6 +67,8 @@ class PrintTask:
     lift: float | None = None  # mm above the path in a dry run; None for a real one
     unattended: bool = False  # nobody confirms and nobody resumes: what stops such a run ends it
     patience: float = 10.0  # s without pictures, after which the arm is stopped
+    dispensers: str = ""  # text of the dispenser file; "": nothing is extruded
+    outlets: Outlets = field(default_factory=dict)  # of the path's materials
 
     @property
     def fingerprint(self) -> str:
@@ -97,6 +100,7 @@ class RunStateMachine:
     _homed: bool = False  # whether the arm was armed since it was ordered home
     _armed: bool = False  # whether it was armed since that was ordered
     _after_homing: RunStage = RunStage.APPROACH
+    _wanted: str = ""  # material that the operator was asked for in this pause
 
     @property
     def offers(self) -> tuple[Wish, ...]:
@@ -157,9 +161,10 @@ class RunStateMachine:
             return [PauseOrder.PAUSE, *self._home(RunStage.STOPPED, now)]
         elif wish is Wish.RESUME:
             resting = self.stage is RunStage.STOPPED
+            material: Orders = [PauseOrder.MATERIAL_IN] if self._wanted else []
             self._enter(RunStage.APPROACH, "", now)
             self._ordered, self._armed = now, not resting
-            return [PauseOrder.RESUME, *([Order.ARM] if resting else [])]
+            return [*material, PauseOrder.RESUME, *([Order.ARM] if resting else [])]
         return []
 
     def _home(self, after: RunStage, now: float) -> Orders:
@@ -224,7 +229,8 @@ class RunStateMachine:
                     why = "no pictures" if tracking.pose is None else tracking.pose.reason
                     return self.end(f"the surface was not found: {why}", now)
                 return []
-            placed = place_path(task.path, tracking.surface_from_path, tracking.pose, task.profile, task.place)
+            by = task.profile, task.place, task.outlets
+            placed = place_path(task.path, tracking.surface_from_path, tracking.pose, *by)
             self.placed_path = placed
             if placed.unreachable:
                 return self.end(f"out of reach: {placed.unreachable}", now) if task.unattended else []
@@ -280,7 +286,8 @@ class RunStateMachine:
         if 0 < status.lag < MAX_SERVO_LAG:  # measured from set-point to answer, NaN where it does not answer
             lag = status.lag + task.profile.frame_time
         tick = tick_in_step(profile.tick, interval, max(profile.tick / 2, 2 * profile.frame_time))
-        return [BeginPrint(path, replace(profile, lag=lag, tick=tick), task.start, task.fingerprint)]
+        profile = replace(profile, lag=lag, tick=tick)
+        return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint)]
 
     def _follow_print(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress
@@ -292,9 +299,21 @@ class RunStateMachine:
             return []
         if progress.phase is PrintPhase.FINISHED or tracking.ended:
             return self._home(RunStage.DONE, now)
+        if progress.wanted:
+            return self._ask_for(progress.wanted, now)
+        if motion.material is not None and motion.material.failed:
+            return self.pause(motion.material.text, now)
         if self.stage is RunStage.APPROACH and progress.phase is PrintPhase.PRINTING:
             self._enter(RunStage.PRINT, "", now)
         return []
+
+    def _ask_for(self, material: str, now: float) -> Orders:
+        """Have the operator put in another material; an unattended run has a dispenser for each."""
+        if self.task.unattended:
+            return [PauseOrder.MATERIAL_IN]
+        orders = self.pause(f"put in the material {material}, then resume", now)
+        self._wanted = material
+        return orders
 
     def _arm_again(self, motion: LiveMotionReport, now: float) -> Orders:
         """Order again, for a while, to arm an arm that still moved."""
@@ -322,4 +341,6 @@ class RunStateMachine:
     def _enter(self, stage: RunStage, reason: str, now: float) -> None:
         if (stage, reason) != (self.stage, self.reason):
             self.turn += 1
+        if stage is not RunStage.PAUSED:
+            self._wanted = ""
         self.stage, self.reason, self._since = stage, reason, now

@@ -172,6 +172,7 @@ class ViewBuilder:
             base_from_nozzle=base_from_nozzle,
             arm=f"{status.state.value}: {status.reason}",
             speed=command.feed if isinstance(command, Move) else 0.0,
+            material="" if motion.material is None else motion.material.text,
         )
 
     def _progress(self, motion: LiveMotionReport, statistics: RunStatistics) -> ProgressView | None:

@@ -22,6 +22,7 @@ from hardware.arm.device import BY_OPERATOR, DONE, ArmState, ArmStatus, LinkCode
 from hardware.arm.jog import RecalledMoves
 from hardware.arm.link import Arm, shut_down
 from hardware.arm.profile import ArmProfile
+from hardware.motion.material import MaterialControl
 from hardware.process.clock import Clock
 from hardware.process.ticks import Histogram, TickSchedule
 from perception.frames import PrintHead
@@ -83,17 +84,19 @@ class MotionLoop:
         report: Callable[[Tick], None] = lambda tick: None,
         homed: Callable[[], None] = lambda: None,
         schedule: TickSchedule | None = None,
+        material: MaterialControl | None = None,
     ) -> None:
         """pose: gives the newest. orders: gives those since the last call. report: called after each tick.
 
         homed: called when the arm has gone home, so that the motion begins from there. schedule: of the ticks; without
-        one they run freely, the profile's tick and the link's ease apart.
+        one they run freely, the profile's tick and the link's ease apart. material: dispensers; None: nothing flows.
         """
         self.motion, self.arm = motion, arm
         self.lateness = Histogram()
         self.skipped = 0
         self._clock, self._pose, self._orders, self._report, self._homed = clock, pose, orders, report, homed
         profile, settings = arm.profile, arm.settings
+        self.material = material
         self._hold_time, self._poll_period = profile.limits.pause, settings.poll
         self._schedule = TickSchedule(profile.tick, settings.ease, clock.now()) if schedule is None else schedule
         self._last_pose: SurfacePose | None = None  # of the last tick
@@ -110,6 +113,7 @@ class MotionLoop:
             while not self._quit and (now := self._clock.now()) < until:
                 self._follow_orders(now)
                 self.arm.poll(now)
+                self._poll_material(now)
                 pose = self._pose()
                 if now >= schedule.opens(pose is not self._last_pose):
                     self._last_pose = pose
@@ -117,7 +121,16 @@ class MotionLoop:
                     self.skipped += schedule.advance(self._clock.now())
                 self._clock.wait_until(min(schedule.due, self._clock.now() + self._poll_period))
         finally:
+            if self.material is not None:
+                self.material.off(self._clock.now())
             shut_down(self.arm, "the motion has ended", self._clock, self._poll_period)
+
+    def _poll_material(self, now: float) -> None:
+        """Close what is open where the arm is not armed, and give the dispensers their turn."""
+        if self.material is not None:
+            if self.arm.state is not ArmState.ARMED:
+                self.material.off(now)
+            self.material.poll(now)
 
     def _follow_orders(self, now: float) -> None:
         for order in self._orders():
@@ -133,6 +146,8 @@ class MotionLoop:
         """Follow an order; why it cannot be followed, or ""."""
         arm = self.arm
         if order is Order.STOP:
+            if self.material is not None:
+                self.material.off(now)
             arm.stop(BY_OPERATOR, now)
         elif order is Order.DISARM:
             arm.disarm(now)
@@ -166,6 +181,8 @@ class MotionLoop:
                 command = Hold(instant, self._hold_time, str(hold))
             else:
                 frame = self.arm.command_frame
+        if self.material is not None:  # what was not sent is a Hold here
+            self.material.follow(command, now)
         self._report(Tick(instant, command, frame, late, self.arm.status(now), self._answer, recalled, hold.code))
 
 
@@ -178,6 +195,7 @@ class RecordedTick:
     asked: bool  # whether planner and guard were called
     begun: float  # place, in checkpoints, at which they were begun anew before the tick; NaN: they were not
     paused: bool  # whether they were to wait above the surface
+    material_in: bool  # whether the material that they had asked for was put in before the tick
     command: Command  # of the loop
     frame: bytes  # of planner's and guard's command
     fraction: float  # place on the path after it, in checkpoints

@@ -25,6 +25,7 @@ from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
 from hardware.process.system import ask_for_real_time, take_messages
 from planning.command import Command, Hold, Move
+from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path
@@ -34,12 +35,16 @@ from planning.progress import PrintProgress
 class MotionStep:
     """One arm printing one path; call it once a tick."""
 
-    def __init__(self, path: Path, profile: ArmProfile | None = None, start: float = 0.0) -> None:
-        """start: place on the path where printing begins, in checkpoints."""
+    def __init__(
+        self, path: Path, profile: ArmProfile | None = None, start: float = 0.0, outlets: Outlets | None = None
+    ) -> None:
+        """start: place on the path where printing begins, in checkpoints. outlets: of the path's materials."""
         self.profile = ArmProfile() if profile is None else profile
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
-        self._planner, self._guard = Planner(path, *settings, lag, start), Guard(*settings, path.zone, lag)
+        path = with_offsets(path, outlets or {})
+        self._planner = Planner(path, *settings, lag, start, outlets)
+        self._guard = Guard(*settings, path.zone, lag)
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s, as the guard lets it pass. pose: the newest there is."""
@@ -53,6 +58,10 @@ class MotionStep:
         """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
         self._planner.recalled(place, stands)
         self._guard.stands(stands)
+
+    def material_in(self) -> None:
+        """Note that the material that `progress.wanted` asks for is in."""
+        self._planner.material_in()
 
     @property
     def paused(self) -> bool:

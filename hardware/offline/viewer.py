@@ -173,7 +173,7 @@ def _off(stamps: Array, poses: tuple[SurfacePose | None, ...], session: Session)
 def _toolpath(session: Session) -> Toolpath | None:
     """The recording's path; None where it has none."""
     with suppress(InputError):
-        return used_inputs(session.path)[0] if session.path.is_file() else None
+        return used_inputs(session.path).path if session.path.is_file() else None
     return None
 
 

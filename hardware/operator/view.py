@@ -145,6 +145,7 @@ class MotionView:
     base_from_nozzle: Array | None = None  # (4, 4) mm, z from the tip into the tool
     arm: str = ""  # its state in words
     speed: float = nan  # mm/s of the nozzle over the surface
+    material: str = ""  # what the dispenser does, in words; "" where nothing is extruded
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from estimation.se3 import Array
 from estimation.surface_map import Warp
 from hardware.files.rig_file import rig_from_table, table_from_rig
 from hardware.motion.loop import RecordedTick
+from hardware.motion.material import DispenserRecord
 from hardware.recording.schemas import camera_frame
 from perception.frames import Roi
 from planning.command import Hold, Move
@@ -177,13 +178,16 @@ def message_from_move(move: Move) -> Message:
         "checkpoint": int(move.checkpoint),
         "extrude": bool(move.extrude),
         "reason": move.reason,
+        "flow": move.flow,
+        "flow_after": move.flow_after,
     }
 
 
 def move_from_message(message: Message) -> Move:
     """A move from its message."""
     axes, reason = np.array(message["axes"], float), message.get("reason", "")
-    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"], reason)
+    told = message.get("flow", 0.0), message.get("flow_after", 0.0)
+    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"], reason, *told)
 
 
 def message_from_hold(hold: Hold) -> Message:
@@ -205,10 +209,17 @@ def message_from_tick(tick: RecordedTick) -> Message:
         "begun": _flat(np.array([tick.begun])),
         "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
         "paused": tick.paused,
+        "material_in": tick.material_in,
         "fraction": tick.fraction,
         "phase": tick.phase.value,
         "frame": base64.b64encode(tick.frame).decode("ascii"),
     }
+
+
+def message_from_dispenser(record: DispenserRecord) -> Message:
+    """What a dispenser did as a message."""
+    flow = [] if record.flow is None else [record.flow]
+    return {"stamp": record.stamp, "name": record.name, "text": record.text, "flow": flow}
 
 
 def message_from_bytes(stamp: float, data: bytes) -> Message:

@@ -22,6 +22,7 @@ from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.images import IMAGE_CHANNEL, check_size, encode, pack_image
 from hardware.files.session import SURFACE_SUFFIXES
 from hardware.motion.loop import RecordedTick
+from hardware.motion.material import DispenserRecord
 from hardware.process.checks import read_bytes
 from hardware.recording import messages
 from hardware.recording.mcap_file import McapWriter
@@ -40,6 +41,7 @@ RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic a
     Observations: ("/observations", messages.message_from_observations),
     Roi: ("/roi", messages.message_from_roi),
     RecordedTick: ("/tick", messages.message_from_tick),
+    DispenserRecord: ("/dispenser", messages.message_from_dispenser),
     Move: ("/move", messages.message_from_move),
     Hold: ("/hold", messages.message_from_hold),
 }
@@ -97,7 +99,9 @@ class Recorder:
             if error is None:
                 raise
 
-    def write(self, record: Frame | Observations | SurfacePose | Command | Roi | RecordedTick) -> None:
+    def write(
+        self, record: Frame | Observations | SurfacePose | Command | Roi | RecordedTick | DispenserRecord
+    ) -> None:
         """Write a record to its channel at its own stamp."""
         if isinstance(record, Frame):
             self.frame(record)

@@ -175,7 +175,9 @@ TOPICS: dict[str, Schema] = {
         feed=_described(NUMBER, "mm/s"),
         checkpoint={"type": "integer"},
         extrude=FLAG,
-        reason=_described(TEXT, "why it brakes; empty of a move along the path"),
+        reason=_described(TEXT, "why it brakes or rests; empty of a move along the path"),
+        flow=_described(NUMBER, "mm^3/s that the dispenser is told; 0: off"),
+        flow_after=_described(NUMBER, "s into the tick at which it is told"),
     ),
     "/hold": _message(
         "stillbed.Hold", "Stay, because of the reason", stamp=STAMP, duration=_described(NUMBER, "s"), reason=TEXT
@@ -191,9 +193,18 @@ TOPICS: dict[str, Schema] = {
         begun=_array(NUMBER, None, "where on the path they were begun anew before it; empty: they were not"),
         recalled=_array(NUMBER, None, "12, mm and rad: where the arm rested and stands, if moves were called back"),
         paused=_described(FLAG, "whether they were told to wait above the surface"),
+        material_in=_described(FLAG, "whether the material that they had asked for was put in before it"),
         fraction=_described(NUMBER, "place on the path, counted in checkpoints"),
         phase=TEXT,
         frame=BASE64,
+    ),
+    "/dispenser": _message(
+        "stillbed.Dispenser",
+        "What a dispenser did",
+        stamp=STAMP,
+        name=TEXT,
+        text=TEXT,
+        flow=_array(NUMBER, None, "mm^3/s told from here on; empty: as before"),
     ),
     "/latency": _message(
         "stillbed.Latency",

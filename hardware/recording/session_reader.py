@@ -24,6 +24,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.files.arm_file import arm_from_text, arm_text
+from hardware.files.dispenser_file import dispensers_from_text, outlets_from
 from hardware.files.folder_tables import check_polygon, checked_rows, trajectory_from_rows
 from hardware.files.images import IMAGE_ENCODING, check_size, decode, unpack_image
 from hardware.files.path_file import path_from_text, path_text
@@ -35,6 +36,7 @@ from hardware.recording.messages import Message
 from hardware.recording.schemas import image_topic
 from perception.frames import Image, PrintHead, Roi
 from planning.command import Command
+from planning.material import Outlets
 from planning.path import Path as PrintPath
 
 CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
@@ -278,23 +280,36 @@ def read_channels(path: str | Path, decoders: Mapping[str, Callable[[Message], T
                 yield _decoded(path, stored, decoders[stored.topic])
 
 
-PATH_ATTACHMENT, ARM_ATTACHMENT = "path.csv", "arm.toml"
+PATH_ATTACHMENT, ARM_ATTACHMENT, DISPENSER_ATTACHMENT = "path.csv", "arm.toml", "dispenser.toml"
 
 
-def input_texts(path: PrintPath, profile: ArmProfile) -> dict[str, str]:
-    """Path and arm as texts, by the names of the recording's attachments."""
-    return {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it")}
+@dataclass(frozen=True, slots=True, eq=False)
+class PrintInputs:
+    """What a run printed: path, arm, and the outlets of its materials."""
+
+    path: PrintPath
+    profile: ArmProfile
+    outlets: Outlets
 
 
-def used_inputs(record: Path) -> tuple[PrintPath, ArmProfile]:
-    """Path and arm that a recorded run used; InputError where it did not begin to print."""
+def input_texts(path: PrintPath, profile: ArmProfile, dispensers: str = "") -> dict[str, str]:
+    """Path, arm and dispenser file as texts, by the names of the recording's attachments. dispensers: "" without."""
+    texts = {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it")}
+    return texts | ({DISPENSER_ATTACHMENT: dispensers} if dispensers else {})
+
+
+def used_inputs(record: Path) -> PrintInputs:
+    """What a recorded run printed; InputError where it did not begin to print."""
     attached = (part for part in walk(record) if isinstance(part, AttachedFile))
     return inputs_from_texts({part.name: part.data.decode("utf-8", "replace") for part in attached}, record)
 
 
-def inputs_from_texts(texts: Mapping[str, str], record: Path) -> tuple[PrintPath, ArmProfile]:
-    """Path and arm in the attached texts of a recording; InputError where they are missing."""
+def inputs_from_texts(texts: Mapping[str, str], record: Path) -> PrintInputs:
+    """What is printed by the attached texts of a recording; InputError where they are missing."""
     if PATH_ATTACHMENT not in texts or ARM_ATTACHMENT not in texts:
         raise InputError(record, "recording", "no path", "the recording of a run that began to print")
     path = path_from_text(texts[PATH_ATTACHMENT], record / PATH_ATTACHMENT)
-    return path, arm_from_text(texts[ARM_ATTACHMENT], record / ARM_ATTACHMENT)
+    where = record / DISPENSER_ATTACHMENT
+    dispensers = texts.get(DISPENSER_ATTACHMENT, "")
+    outlets = outlets_from(dispensers_from_text(dispensers, where), where) if dispensers else {}
+    return PrintInputs(path, arm_from_text(texts[ARM_ATTACHMENT], record / ARM_ATTACHMENT), outlets)

@@ -23,9 +23,9 @@ class RestsAhead:
     """
 
     def __init__(self, plan: MaterialPlan, place: float) -> None:
-        """place: mm, where printing begins; a rest there is over."""
+        """place: mm, where printing begins; a rest there is still to come."""
         self._plan, self.wanted = plan, ""
-        self._number = sum(rest.place <= place + ROUNDING for rest in plan.rests)
+        self._number = sum(rest.place < place - ROUNDING for rest in plan.rests)
         self._until = math.nan  # s, until when it lasts; NaN: it is not reached
 
     @property

@@ -154,7 +154,7 @@ function doing(seen) {
   const motion = seen.motion;
   if (motion.activity === "resting") return motion.arm ? `arm ${motion.arm}` : motion.reason;
   const speed = motion.speed ? `${motion.speed.toFixed(1)} mm/s` : "", arm = motion.arm.split(":")[0];
-  return [held(seen) ? "" : motion.reason, speed, arm && `arm ${arm}`].filter(Boolean).join(" · ");
+  return [held(seen) ? "" : motion.reason, speed, arm && `arm ${arm}`, motion.material].filter(Boolean).join(" · ");
 }
 
 function events(all) {
