@@ -69,7 +69,7 @@ class MaterialControl:
         current, reason = self._current, self.reason
         if current is None:
             return MaterialStatus("no material is needed", True, False)
-        failed = bool(self._refused) or current.status.state is DispenserState.FAILED
+        failed = bool(self._refused) or current.status.state in (DispenserState.FAILED, DispenserState.CLOSED)
         flow = f"on, {self._told:.3g} mm^3/s" if self._told else "off"
         return MaterialStatus(reason or f"{current.profile.name}: {flow}", not reason, failed)
 
