@@ -14,6 +14,7 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "SHEET.jpg": "sheet.jpg",
     "RIG.toml": "live.toml",
     "ARM.toml": "arm.toml",
+    "DISPENSER.toml": "dispenser.toml",
     "PATH.csv": "path.csv",
     "B.toml": "board.toml",
     "X.mcap": "run.mcap",
@@ -31,7 +32,14 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "F": "kalibr",
 }
 NAMES = {  # named in passing, without what it needs; each is run as a part of a longer one
-    *("stillbed arm", "stillbed calibrate cameras", "stillbed live", "stillbed plan", "stillbed reach"),
+    *(
+        "stillbed arm",
+        "stillbed calibrate cameras",
+        "stillbed dispenser",
+        "stillbed live",
+        "stillbed plan",
+        "stillbed reach",
+    ),
     *("stillbed replay", "stillbed segment", "stillbed simulate", "stillbed track", "stillbed train"),
 }
 TRACKED = "stillbed track sessions/monday -o out/new --record new.mcap --arm arm.toml --prefilter bilateral --wound"

@@ -35,6 +35,7 @@ from tests.shown_commands import MADE, to_run
 from tests.streams import HttpCamera, served
 from tests.synthetic import write_session
 from tests.test_arm_port import serving
+from tests.test_dispenser import served as dispensing
 from tests.workspace import left_by, prepare
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -72,6 +73,15 @@ def test_another_arm_is_sent_its_own_words(tmp_path: Path, capsys: pytest.Captur
     words = [text.split("p[")[1].split("]")[0] for text in lines if "p[" in text]
     moves = np.array([[float(number) for number in one.split(",")] for one in words])
     assert len(moves) > 500 and np.abs(moves[-1, :3] - [0.2, 0.225, 0.05]).max() < 0.02  # m: it is on the wound
+
+
+def test_another_dispenser_is_opened_and_closed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "pin").write_text("")
+    run("other_dispenser.py", tmp_path / "pin", 0.05)
+    said = [line.split(" s: ")[-1] for line in capsys.readouterr().out.splitlines()]
+    assert said[1:] == ["ready: prepared", "on: on", "closed: closed, off"] and (tmp_path / "pin").read_text() == "0"
+    run("other_dispenser.py", tmp_path / "none" / "pin", 0.05)
+    assert "No such file" in capsys.readouterr().out
 
 
 def test_a_predictor_of_ones_own_is_compared(capsys: pytest.CaptureFixture[str]) -> None:
@@ -136,7 +146,12 @@ UNFINISHED = (  # may end with exit code 1
     *("stillbed calibrate cameras", "stillbed calibrate arm"),  # so short, it is not good enough to print with
     "stillbed live --rig",  # the session is over before the path is printed
 )
-UNTIL_CTRL_C = ("stillbed arm --virtual", "stillbed view", "python -m hardware.operator.demo")
+UNTIL_CTRL_C = (
+    "stillbed arm --virtual",
+    "stillbed dispenser virtual",
+    "stillbed view",
+    "python -m hardware.operator.demo",
+)
 LONGEST = 300.0  # s: a live run whose pictures are rendered first, on a busy machine
 READY = re.compile(r"http://\S+/|/dev/pts/\d+")  # where they can be found
 
@@ -241,6 +256,8 @@ def test_a_documented_command_leaves_what_it_says(text: str, here: Path, cameras
     with ExitStack() as stack:
         if "./serving" in text:
             stack.enter_context(serving(here / "serving", ArmSettings(replies=ReplyMode.STREAM)))
+        if "dispenser.toml" in text:
+            stack.enter_context(dispensing(here, "dispensing"))
         code = every_command_run(text.replace("http://CAMERA", cameras[0]), workspace.parent / "cache")
     if text.startswith(UNTIL_CTRL_C):
         assert code in (0, INTERRUPTED)

@@ -39,6 +39,14 @@ PATH = """x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temper
 6,1,0,0,0,0,5,1,20,0,1
 -6,1,0,0,0,0,5,1,20,0,1
 """  # 26 mm: 5 s
+DISPENSER = """[[dispenser]]
+name = "syringe"
+materials = [1]
+preset = "arduino"
+port = "./dispensing"
+start_s = 0.0
+kept_at_c = 20
+"""
 LEFT = re.compile(r"(?:-o|--record|--link|--picture|--log|--gcode) (\S+)")  # what a command says it leaves
 MORE_LEFT = {
     "stillbed init monday": "monday/session.toml",
@@ -60,6 +68,7 @@ def prepare(folder: Path, sources: Sequence[str]) -> None:
         (folder / name).mkdir()
     (folder / "path.csv").write_text(PATH, encoding="utf-8")
     write_progress_durably(folder / "progress.toml", fingerprint(read_path(folder / "path.csv")), 1.5)
+    (folder / "dispenser.toml").write_text(DISPENSER, encoding="utf-8")
     (folder / "contour.csv").write_text("x_mm,y_mm\n0,0\n12,0\n12,8\n0,8\n", encoding="utf-8")
     (folder / "monday/session.toml").write_text(SESSION, encoding="utf-8")
     write_mesh(folder / "wound.stl", scan_from_triangles(*scan_of()))

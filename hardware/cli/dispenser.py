@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 VIRTUAL = "virtual"
 MAX_OPEN = 60.0  # s: longer than any test of a nozzle
 PREPARE_TIME = 600.0  # s to be ready: a heated syringe takes minutes
-POLL_PERIOD = 0.002  # s, as the motion loop
+DISPENSER_POLL = 0.002  # s, as the motion loop
 VIRTUAL_OPTIONS = ("preset", "log", "link", "delays", "ooze", "no_watchdog")
 DEVICE_OPTIONS = ("name", "seconds", "on", "flow", "celsius", "yes")
 
@@ -97,6 +97,8 @@ def _connect(a: argparse.Namespace) -> int:
             if getattr(a, option):
                 raise wrong_option(f"--{option}", getattr(a, option), "only with --on S")
         return max(listen(each, a.seconds or 5.0, WallClock()) for each in found)
+    if a.seconds is not None:
+        raise wrong_option("--seconds", a.seconds, "only without --on S")
     if len(found) > 1:
         raise wrong_option("--name", "missing", f"one of {', '.join(each.profile.name for each in found)}")
     if a.on > MAX_OPEN:
@@ -145,7 +147,7 @@ def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Calla
     dispenser.listen(start)
     while clock.now() < start + seconds and dispenser.status.state is DispenserState.CLOSED:
         dispenser.poll(clock.now())
-        clock.wait_until(clock.now() + POLL_PERIOD)
+        clock.wait_until(clock.now() + DISPENSER_POLL)
     status, heard = dispenser.status, list(dispenser.heard)
     dispenser.hang_up()
     if status.state is DispenserState.FAILED:
@@ -179,7 +181,7 @@ def open_for(
         while (now := clock.now()) < end and dispenser.status.state is state:
             dispenser.poll(now)
             _tell(dispenser, start, say)
-            clock.wait_until(now + POLL_PERIOD)
+            clock.wait_until(now + DISPENSER_POLL)
         return dispenser.status.state is not DispenserState.FAILED
 
     say(watchdog_text(profile))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
@@ -219,21 +219,13 @@ class EventLog:
         return events
 
 
-class ArmPwmDispenser:
-    """Material switched by the arm's own frames: it only holds the number that a G1 frame is to carry.
+class SwitchedDispenser:
+    """A dispenser without a line, such as a valve on a pin; see `Dispenser` for the calls."""
 
-    pwm: that number, bytes 27 to 30 of the frame; whoever sends the frames reads it.
-    """
-
-    def __init__(self, profile: DispenserProfile, pwm_on: float, pwm_off: float) -> None:
-        self.profile = profile
-        self._pwm_on, self._pwm_off = pwm_on, pwm_off
+    def __init__(self, profile: DispenserProfile, switch: Callable[[bool], str]) -> None:
+        """switch: lets material out (True) or stops it, at once; why it could not, "" where it could."""
+        self.profile, self._switch = profile, switch
         self._state, self._reason, self._log = DispenserState.CLOSED, "not prepared yet", EventLog()
-
-    @property
-    def pwm(self) -> float:
-        """The number for the next frame."""
-        return self._pwm_on if self._state is DispenserState.ON else self._pwm_off
 
     @property
     def status(self) -> DispenserStatus:
@@ -242,23 +234,22 @@ class ArmPwmDispenser:
         return DispenserStatus(self._state, self._reason, flow, None, None)
 
     def prepare(self, now: float, celsius: float | None = None) -> None:
-        """READY at once; the arm's line is no part of it."""
-        if self._state is DispenserState.CLOSED:
-            self._change(DispenserState.READY, "switched by the arm's frames", now)
+        """Off, and READY at once; FAILED where it is not kept at that temperature."""
+        if self._state in (DispenserState.CLOSED, DispenserState.FAILED):
+            self._go(DispenserState.READY, "prepared", now)
+        if celsius is not None and (reason := self.set_temperature(celsius, now)):
+            self._go(DispenserState.FAILED, reason, now)
 
     def on(self, flow: float, now: float) -> str:
-        """Have frames carry the number for on."""
-        if self._state is DispenserState.ON:
-            return ""
-        if self._state is not DispenserState.READY:
-            return f"{self.profile.name} is {self._state.value}: {self._reason}"
-        self._change(DispenserState.ON, "switched on", now, self.profile.flow)
-        return ""
+        """Switch it on; it gives what it gives."""
+        if self._state is DispenserState.READY:
+            self._go(DispenserState.ON, "on", now)
+        return "" if self._state is DispenserState.ON else f"{self.profile.name} is {self._state.value}: {self._reason}"
 
     def off(self, now: float) -> None:
-        """Have frames carry the number for off."""
-        if self._state is DispenserState.ON:
-            self._change(DispenserState.READY, "switched off", now, 0.0)
+        """Switch it off."""
+        was_on = self._state is DispenserState.ON
+        self._go(DispenserState.READY if was_on else self._state, "off" if was_on else self._reason, now)
 
     def retract(self, now: float) -> None:
         """It cannot."""
@@ -276,15 +267,34 @@ class ArmPwmDispenser:
         return self._log.take()
 
     def close(self, now: float) -> bool:
-        """Off for good; a frame has to carry that."""
-        self.off(now)
-        self._change(DispenserState.CLOSED, "closed", now)
+        """Off until it is prepared again."""
+        self._go(DispenserState.CLOSED, "closed, off", now)
         return True
 
-    def _change(self, state: DispenserState, reason: str, now: float, flow: float | None = None) -> None:
-        if state is not self._state:
-            self._log.add(now, reason, flow)
+    def _go(self, state: DispenserState, reason: str, now: float) -> None:
+        """Switch it as the state says; FAILED where that cannot be done."""
+        was_on, on = self._state is DispenserState.ON, state is DispenserState.ON
+        if error := self._switch(on):
+            state, reason, on = DispenserState.FAILED, error, False
+        if (state, reason) != (self._state, self._reason):
+            self._log.add(now, f"{state.value}: {reason}", self.profile.flow * on if on != was_on else None)
         self._state, self._reason = state, reason
+
+
+class ArmPwmDispenser(SwitchedDispenser):
+    """Material switched by the arm's own frames: it only holds the number that a G1 frame is to carry.
+
+    pwm: that number, bytes 27 to 30 of the frame; whoever sends the frames reads it.
+    """
+
+    def __init__(self, profile: DispenserProfile, pwm_on: float, pwm_off: float) -> None:
+        super().__init__(profile, self._hold)
+        self._numbers = {True: pwm_on, False: pwm_off}
+        self.pwm = pwm_off
+
+    def _hold(self, on: bool) -> str:
+        self.pwm = self._numbers[on]
+        return ""
 
 
 class Dispensers:

@@ -130,7 +130,7 @@ class LineDispenser:
 
     def on(self, flow: float, now: float) -> str:
         """Prime where material was drawn back, then on; while on, another flow alone."""
-        if self._state not in (DispenserState.READY, DispenserState.ON):
+        if self._closing is not None or self._state not in (DispenserState.READY, DispenserState.ON):
             return f"{self.profile.name} is {self._state.value}: {self._reason}"
         if reason := self.profile.wrong_flow(flow):
             return reason
@@ -272,14 +272,15 @@ class LineDispenser:
             self._port.close()
         self._port, self._reopen_at = None, now + REOPEN_PERIOD
         self._queue.restart(now)
-        self._fail(reason, now)
         self._lost = True
+        self._fail(reason, now)
 
     def _fail(self, reason: str, now: float) -> None:
         flow = 0.0 if self._state is DispenserState.ON else None
         self._stop(now)
         self._target, self._near, self._query_at = None, True, math.inf
         self._change(DispenserState.FAILED, reason, now, flow)
+        self.off(now)
 
     def _let_go(self) -> None:
         if self._port is not None:
@@ -298,9 +299,8 @@ class LineDispenser:
             self.off(now)
         blocked = self._queue.blocked_for(port, now)
         if blocked > 2 * self._line.timeout and self._state is not DispenserState.FAILED:
-            self._fail(f"its line took nothing for {blocked:.2f} s", now)
             self._lost = True
-            self.off(now)
+            self._fail(f"its line took nothing for {blocked:.2f} s", now)
         elif self._lost and MessageKind.OFF not in self._queue and self._queue.idle(port):
             self._lost = False
             self._change(DispenserState.CLOSED, "its line is back and it is off; it must be prepared", now)
@@ -317,7 +317,6 @@ class LineDispenser:
             active = self._state in (DispenserState.PREPARING, DispenserState.READY, DispenserState.ON)
             if active and self._alarm is not None and self._alarm.search(text):
                 self._fail(f"it says {text!r}", now)
-                self.off(now)
 
     def _take_temperature(self, text: str) -> None:
         found = self._answer.search(text) if self._line.messages.answer else None
