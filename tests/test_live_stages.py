@@ -15,6 +15,7 @@ from hardware.live.records import LiveMotionReport, PauseOrder, RecorderReport, 
 from hardware.live.state_machine import PrintTask, RunStateMachine
 from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
+from hardware.motion.material import MaterialStatus
 from hardware.operator.shared_state import OperatorRequest
 from hardware.operator.view import RunStage, Wish
 from planning.command import Hold
@@ -33,6 +34,7 @@ class Staged:
         self.now, self.arm = 0.0, ArmState.DISARMED
         self.phase: PrintPhase | None = None
         self.fraction = 1.0  # of 5 checkpoints
+        self.wanted, self.material = "", MaterialStatus("gel: off", True, False)
         self.seen, self.pose = RunReports(recorder=RecorderReport(0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
         self.orders: list[object] = []
@@ -51,8 +53,9 @@ class Staged:
         nan = float("nan")
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
         tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, Reason())
-        progress = None if self.phase is None else PrintProgress(self.phase, 1, 6, self.fraction, 9.0, self.fraction)
-        self.seen.motion = LiveMotionReport(tick, progress, None, (), (), 0, 0, None, 0, "ordinary")
+        place = 1, 6, self.fraction, 9.0, self.fraction, self.wanted
+        progress = None if self.phase is None else PrintProgress(self.phase, *place)
+        self.seen.motion = LiveMotionReport(tick, progress, self.material, (), (), 0, 0, None, 0, "ordinary")
         self.orders += self.conductor(self.now, self.seen, asked)
         return self.conductor.stage
 
@@ -264,3 +267,58 @@ def test_a_process_that_says_nothing_is_missed_after_two_of_its_words_and_back_w
 )
 def test_a_stage_and_why_are_said_once(stage: RunStage, reason: str, line: str) -> None:
     assert stage_line(stage, reason) == line
+
+
+def test_another_material_is_asked_for_and_only_the_one_who_was_asked_says_that_it_is_in() -> None:
+    run = Staged().to_print()
+    run.look(seconds=1.0)
+    run.wanted = "cells"
+    assert run.look() is RunStage.PAUSED and run.orders == [PauseOrder.PAUSE]
+    assert run.conductor.reason == "put in the material cells, then resume"
+    run.stays(RunStage.PAUSED)
+    run.orders.clear()
+    run.look(Wish.RESUME)
+    assert run.orders == [PauseOrder.MATERIAL_IN, PauseOrder.RESUME]
+
+
+def test_after_the_way_home_the_material_is_asked_for_again() -> None:
+    run = Staged().to_print()
+    run.wanted = "cells"
+    run.look(seconds=1.0)
+    run.look(Wish.HOME)
+    run.arm = ArmState.ARMED
+    run.look()
+    run.arm = ArmState.DISARMED
+    assert run.look() is RunStage.STOPPED
+    run.orders.clear()
+    run.look(Wish.RESUME)
+    assert PauseOrder.MATERIAL_IN not in run.orders
+    run.arm = ArmState.ARMED
+    run.look()
+    assert run.look(seconds=1.0) is RunStage.PAUSED and "cells" in run.conductor.reason
+
+
+def test_an_unattended_run_has_a_dispenser_for_each_material() -> None:
+    run = Staged(unattended=True).to_print()
+    run.wanted = "cells"
+    assert run.look(seconds=1.0) is RunStage.PRINT and run.orders == [PauseOrder.MATERIAL_IN]
+
+
+def test_a_dispenser_that_fails_pauses_the_print_and_one_that_gets_ready_does_not() -> None:
+    run = Staged().to_print()
+    run.material = MaterialStatus("dispenser gel is preparing: 31 of 37 degrees C", False, False)
+    run.stays(RunStage.PRINT)
+    run.material = MaterialStatus("dispenser gel is failed: unplugged", False, True)
+    assert run.look() is RunStage.PAUSED and run.conductor.reason == "dispenser gel is failed: unplugged"
+    assert run.orders == [PauseOrder.PAUSE]
+
+
+@pytest.mark.parametrize(("ready", "failed"), [(False, False), (False, True)])
+def test_nothing_begins_before_the_dispenser_is_ready(ready: bool, failed: bool) -> None:
+    run = Staged()
+    run.material = MaterialStatus("dispenser gel is preparing: its line is opened", ready, failed)
+    run.stays(RunStage.CHECK)
+    assert [check.found for check in run.conductor.checks if check.name == "material"] == [run.material.text]
+    run.material = MaterialStatus("gel: off", True, False)
+    run.look()
+    assert run.look() is not RunStage.CHECK

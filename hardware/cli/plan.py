@@ -118,7 +118,7 @@ def _add_way(command: argparse.ArgumentParser) -> None:
         ("--speed", 20.0, "MM/S", "of printing"),
         ("--travel", 60.0, "MM/S", "between beads"),
         ("--lift", 2.0, "MM", "along the tool, for travels"),
-        ("--wait", 0.0, "S", "before each layer"),
+        ("--wait", 0.0, "S", "before each further layer, lifted off the last"),
         ("--spacing", 1.0, "MM", "between checkpoints: the shortest length the ink can be laid over"),
         ("--chord", 0.02, "MM", "by which straight ways may depart from curves: where they would, nearer checkpoints"),
         ("--sideways", 200.0, "MM/S2", "acceleration in bends, which are slowed down to it"),

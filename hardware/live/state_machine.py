@@ -299,9 +299,10 @@ class RunStateMachine:
             return []
         if progress.phase is PrintPhase.FINISHED or tracking.ended:
             return self._home(RunStage.DONE, now)
-        if progress.wanted:
+        heeded = now - self._ordered > RESEND_AFTER  # the report is no longer from before the last order
+        if progress.wanted and heeded:
             return self._ask_for(progress.wanted, now)
-        if motion.material is not None and motion.material.failed:
+        if motion.material is not None and motion.material.failed and heeded:
             return self.pause(motion.material.text, now)
         if self.stage is RunStage.APPROACH and progress.phase is PrintPhase.PRINTING:
             self._enter(RunStage.PRINT, "", now)

@@ -146,8 +146,6 @@ class MotionLoop:
         """Follow an order; why it cannot be followed, or ""."""
         arm = self.arm
         if order is Order.STOP:
-            if self.material is not None:
-                self.material.off(now)
             arm.stop(BY_OPERATOR, now)
         elif order is Order.DISARM:
             arm.disarm(now)

@@ -70,7 +70,9 @@ class MaterialControl:
         if current is None:
             return MaterialStatus("no material is needed", True, False)
         failed = bool(self._refused) or current.status.state in (DispenserState.FAILED, DispenserState.CLOSED)
-        flow = f"on, {self._told:.3g} mm^3/s" if self._told else "off"
+        flow = (
+            f"on, {self._told:.3g} mm^3/s" if self._told and current.profile.metered else "on" if self._told else "off"
+        )
         return MaterialStatus(reason or f"{current.profile.name}: {flow}", not reason, failed)
 
     def begin(self, place: float, now: float) -> None:
@@ -102,6 +104,8 @@ class MaterialControl:
         if not self._told and now > self._closed_at + REPEAT_OFF and self._current is not None:
             self._close(now)
         self._dispensers.poll(now)
+        if self._told and self._current is not None and self._current.status.state is not DispenserState.ON:
+            self._close(now)  # its line was lost: it is told anew once it is ready
 
     def off(self, now: float) -> None:
         """Close at once; what was pending is dropped."""

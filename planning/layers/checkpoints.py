@@ -263,7 +263,7 @@ def _with_travels(ground: TipSurface, printed: Checkpoints, runs: BeadPoints, wa
     k = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
     part = np.where(of == 0, 1.0, k / (count[of] - 1 + (of == 0)))
     tip, tilt = _over(ground, printed, a[of], b[of], part, lift[of])
-    wait = np.where(new_layer[of] & (k == 0), way.wait, 0.0)
+    wait = np.where(new_layer[of] & (k == 1), way.wait, 0.0)  # lifted off the last bead
     none, zero = np.zeros(len(of), bool), np.zeros(len(of))
     layer, bead, speed = printed.layer[b[of]], printed.bead[b[of]], np.full(len(of), way.travel)
     travels = Checkpoints(tip, tilt, speed, none, zero, zero, zero, layer, bead, wait)
