@@ -167,6 +167,16 @@ def test_a_line_that_is_full_for_a_moment_still_gets_the_off_of_a_close() -> Non
     assert bench.driver.close(now()) and not bench.open
 
 
+def test_one_that_is_being_closed_is_not_switched_on() -> None:
+    bench = Bench().prepared()
+    bench.port.room = 0
+    assert not bench.driver.close(bench.clock.now()) and bench.on() != ""
+    bench.port.room = 100
+    assert bench.driver.close(bench.clock.now()) and not bench.open and bench.on() != ""
+    bench.prepared()
+    assert bench.on() == "" and bench.open
+
+
 def test_keepalives_come_evenly_while_it_is_on_and_only_then() -> None:
     bench = Bench().prepared()
     bench.on()
@@ -235,8 +245,10 @@ def test_what_starts_slowly_is_told_off_at_once_and_the_rest_later() -> None:
     assert bench.port.lines() == [b"OFF"] and bench.state is DispenserState.PREPARING
     bench.run(1.9)
     assert bench.port.lines() == [b"OFF"] and "preparing" in bench.on()
+    bench.off()
+    assert bench.port.lines() == [b"OFF"] * 2
     bench.run(0.2)
-    assert bench.state is DispenserState.READY and bench.port.lines()[:2] == [b"OFF", b"OFF"]
+    assert bench.state is DispenserState.READY and bench.port.lines() == [b"OFF"] * 3
 
 
 def test_temperature_is_reached_before_it_is_ready() -> None:
@@ -267,7 +279,11 @@ def test_what_the_device_says_of_its_failure_closes_it() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(
-    st.lists(st.one_of(st.binary(max_size=600), st.sampled_from([b"T nan\n", b"T 1e999\nT\n", b"T 36.5\r\n", b"\xff"])))
+    st.lists(
+        st.one_of(
+            st.binary(max_size=600), st.sampled_from([b"x" * 1000, b"T nan\n", b"T 1e999\nT\n", b"T 36.5\r\n", b"\xff"])
+        )
+    )
 )
 def test_no_answer_is_too_bad(answers: list[bytes]) -> None:
     bench = Bench().prepared()
@@ -409,11 +425,18 @@ def test_half_the_flow_comes_after_the_delay_and_the_ooze_is_a_volume(
 
 
 def test_an_off_that_acts_before_the_on_before_it_leaves_nothing() -> None:
-    model = DispenserModel(VirtualDispenserSettings(on_dead_time=0.2, off_dead_time=0.05))
+    model = DispenserModel(VirtualDispenserSettings(on_dead_time=0.2, off_dead_time=0.05, watchdog=math.inf))
     model.receive(b"ON\n", 0.0)
     model.receive(b"OFF\n", 0.1)
     model.advance(2.0)
     assert (model.flow_at(np.linspace(0, 2, 2001)) == 0).all()
+    model = DispenserModel(model.settings)
+    model.receive(b"ON 1\n", 2.0)
+    model.receive(b"ON 2\n", 3.0)
+    model.receive(b"OFF\n", 3.1)
+    model.advance(3.2)
+    for instant, flow in ((3.14, 1.0), (3.19, math.exp(-0.04 / 0.04))):
+        assert model.flow_at(np.array([instant])) == pytest.approx(flow, rel=1e-3)
 
 
 @pytest.mark.parametrize(("key", "value"), [("preset", "x"), ("on_lag", -1.0), ("flow", 0.0), ("watchdog", 0.0)])
@@ -626,6 +649,7 @@ def test_an_error_and_a_silent_server_are_failures_until_an_off_gets_through(web
     web.delay = 0.4
     driver.on(1.0, clock.now())
     until(driver, DispenserState.FAILED)
+    assert "timed out" in driver.status.reason
     web.delay = 0.0
     until(driver, DispenserState.CLOSED)
     assert not web.on

@@ -166,7 +166,7 @@ class LineDispenser:
             flowed = self._state is DispenserState.ON
             retract = flowed or self._queue.waits(MessageKind.RETRACT)
             self._queue.drop(MessageKind.ON, MessageKind.FLOW, MessageKind.KEEPALIVE, MessageKind.RETRACT)
-            if not self._queue.waits(MessageKind.OFF):
+            if not self._queue.waits(MessageKind.OFF, urgent=True):
                 self._put_off(now, flowed)
             if retract:
                 self._queue.put_first(self._retract_messages(), behind=MessageKind.OFF)
@@ -347,7 +347,7 @@ class LineDispenser:
             self._log.add(at, "off", 0.0)
 
         messages = self._messages(MessageKind.OFF, self._line.messages.off, taken if flowed else None)
-        if now < self._queue.sent + self._line.gap:
+        if now < self._queue.sent + self._line.gap and not self._queue.waits(MessageKind.OFF):
             messages += [replace(m, taken=None, urgent=False) for m in messages]
         self._queue.put_first(messages)
 

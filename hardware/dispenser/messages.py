@@ -170,9 +170,10 @@ class MessageQueue:
     def __contains__(self, kind: MessageKind) -> bool:
         return any(message.kind is kind for message in self._messages)
 
-    def waits(self, kind: MessageKind) -> bool:
-        """Whether there is one of this kind of which no byte is out."""
-        return any(message.kind is kind for message in list(self._messages)[self._begun :])
+    def waits(self, kind: MessageKind, urgent: bool = False) -> bool:
+        """Whether there is one of this kind of which no byte is out. urgent: and that waits for no gap."""
+        waiting = list(self._messages)[self._begun :]
+        return any(message.kind is kind and message.urgent >= urgent for message in waiting)
 
     def put(self, messages: Iterable[Message]) -> None:
         """Queue messages."""
