@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 SETTINGS_FLAGS = (
     "rig", "simulated", "path", "arm", "profile", "record", "dry_run", "lift", "stands_home", "jpeg_quality",
-    "page_address", "page_port", "page_certificate", "page_key",
+    "dispensers", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
@@ -50,6 +50,7 @@ def add_live(commands: Commands) -> None:
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
+    add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="what lets material out; else nothing does")
     add("--record", type=Path, metavar="X.mcap", help="the recording; other files stand beside it")
     add = add_how = command.add_argument_group("how").add_argument
     add("--resume", type=Path, metavar="X.mcap", help="go on where the run recorded there stopped")

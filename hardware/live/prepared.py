@@ -208,7 +208,7 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
         path=printed_path,
         dispensers=dispensers,
         outlets=outlets,
-        profile=ArmProfile() if profile is None else read_arm(profile),
+        profile=_switching(ArmProfile() if profile is None else read_arm(profile), dispensers),
         place=profile is None,
         stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
         lift=settings.lift if settings.dry_run else None,
@@ -237,6 +237,15 @@ def _dispensers(settings: LiveSettings, path: Path, where: File) -> tuple[str, O
         allowed = "an operator, or a dispenser for each material: one carries several of this path's"
         raise InputError(file, "print.unattended", "true", allowed)
     return file.read_text(encoding="utf-8-sig"), outlets
+
+
+def _switching(profile: ArmProfile, dispensers: str) -> ArmProfile:
+    """The profile with the numbers of its G1 frames by which they switch a dispenser, where one hangs there."""
+    for each in dispensers_from_text(dispensers, "dispenser.toml") if dispensers else ():
+        if each.pwm is not None:
+            on, off = each.pwm
+            profile = replace(profile, dialect=replace(profile.dialect, pwm=off, pwm_on=on))
+    return profile
 
 
 def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
