@@ -38,6 +38,7 @@ from hardware.live.settings import (
 )
 from hardware.live.state_machine import PrintTask
 from perception.frames import Frame, FrameSet
+from planning.material import Outlet, SwitchDelay
 from planning.progress import fingerprint
 from tests.moving import raster
 
@@ -288,6 +289,71 @@ def test_what_is_begun_is_what_the_recording_holds() -> None:
     assert (same.path.surface_from_nozzle == used.path.surface_from_nozzle).all()
     assert used.path.surface_from_nozzle == pytest.approx(begin.path.surface_from_nozzle, abs=1e-12)
     assert set(texts) == set(again)
+
+
+DISPENSER = """[[dispenser]]
+name = "syringe"
+materials = [{materials}]
+preset = "{preset}"
+port = "/dev/none"
+on_dead_time_s = {dead}
+nozzle_offset_mm = [0, 5, 0]
+kept_at_c = 20
+"""
+
+
+def dispensing(
+    folder: Path, materials: str = "1, 2", preset: str = "arduino", dead: float = 0.08, **settings: object
+) -> LiveSettings:
+    """A run with live cameras and a dispenser."""
+    rows = "size = [8, 6]\nmatrix = [[9, 0, 4], [0, 9, 3], [0, 0, 1]]\ndistortion = [0, 0, 0, 0, 0]\n"
+    place = f"base_from_camera = {np.eye(4).tolist()}\n"
+    (folder / "rig.toml").write_text(f'[[camera]]\nname = "a"\nsource = "usb:1"\n{rows}{place}')
+    (folder / "d.toml").write_text(DISPENSER.format(materials=materials, preset=preset, dead=dead))
+    path = raster()
+    write_path(folder / "path.csv", replace(path, material=np.where(np.arange(len(path)) < 3, 1, 2)))
+    files = {name: folder / f"{name}.{end}" for name, end in (("rig", "toml"), ("path", "csv"))}
+    rest = {"arm": "virtual", "record": folder / "run.mcap", "dispensers": folder / "d.toml"} | settings
+    return LiveSettings(**files, **rest)  # type: ignore[arg-type]
+
+
+def test_a_dispenser_without_a_watchdog_is_told_to_the_operator(tmp_path: Path) -> None:
+    assert prepare(dispensing(tmp_path), "here", False).notes == ()
+    notes = prepare(dispensing(tmp_path, preset="usb_relay"), "here", False).notes
+    assert len(notes) == 1 and notes[0].startswith("dispenser syringe has no watchdog")
+    (note,) = prepare(dispensing(tmp_path, dispensers=None), "here", False).notes
+    assert note == "no dispenser is given: nothing is extruded"
+
+
+def test_a_dry_run_opens_no_dispenser_and_asks_for_no_material(tmp_path: Path) -> None:
+    task = prepare(dispensing(tmp_path, dry_run=True), "here", False).task
+    assert task.dispensers == "" and task.outlets == {}
+    assert len(set(raised_path(task.path, 5.0).material.tolist())) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"unattended": True}, ["print.unattended", "a dispenser for each material"]),
+        ({"materials": "1"}, ["material", "2"]),
+        ({"dead": 0.5}, ["d.toml", "syringe: delay on", "0 to 0.4 s"]),
+    ],
+)
+def test_what_no_dispenser_can_do_is_refused_before_the_run(
+    tmp_path: Path, changes: dict[str, object], words: list[str]
+) -> None:
+    (tmp_path / "d.toml").touch()
+    with pytest.raises(InputError) as caught:
+        prepare(dispensing(tmp_path, **changes), "here", False)  # type: ignore[arg-type]
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_the_outlets_of_what_is_begun_are_in_the_recording(tmp_path: Path) -> None:
+    task = prepare(dispensing(tmp_path), "here", False).task
+    begin = BeginPrint(task.path, PROFILE, 0.0, {}, "x")
+    texts, used = recorded_begin(begin, task.dispensers)
+    assert texts["dispenser.toml"] == (tmp_path / "d.toml").read_text()
+    assert used.outlets == task.outlets == dict.fromkeys("12", Outlet(SwitchDelay(0.08, 0.0), (0.0, 5.0, 0.0)))
 
 
 TICK = 0.05  # s

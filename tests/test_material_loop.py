@@ -220,7 +220,7 @@ def test_a_dispenser_that_is_not_ready_or_fails_is_a_reason_and_nothing_is_told_
             run.material.begin(run.motion.progress.fraction, now)
 
     Printing(BEGIN, at=at).run(7.0)
-    assert heard[3.9] == ("", "gel: on", True)
+    assert heard[3.9] == ("", "1 by gel: on", True)
     assert heard[4.5][0] == heard[4.5][1] == "dispenser gel is failed: the cable is out"
     assert "gel is closed" in heard[5.9][0] and not heard[5.9][2]
     assert heard[6.6][0] == "" and heard[6.6][2]
@@ -266,3 +266,26 @@ def test_an_arm_switches_the_material_with_its_own_frames() -> None:
             state = getattr(frame, "material", state)
             if not isinstance(tick.command, Move):
                 assert not state
+
+
+def test_another_temperature_on_the_path_is_waited_for() -> None:
+    profile = replace(GEL, temperature_range=(4.0, 60.0))
+    bench, path = Bench(profile=profile), raster()
+    path = replace(path, temperature=np.array([20.0, 25, 25, 37, 37, 37]))
+    material = MaterialControl(Dispensers([bench.driver]), path)
+    material.begin(0.0, bench.clock.now())
+
+    def told(checkpoint: int, seconds: float) -> str:
+        for _ in range(round(seconds / 0.02)):
+            now = bench.clock.now()
+            material.follow(Move(now, np.zeros(6), 1.0, checkpoint, extrude=True, flow=2.0), now)
+            bench.run(0.02)
+            material.poll(bench.clock.now())
+        return material.reason
+
+    bench.run(30.0)
+    assert bench.model.temperature_at(bench.clock.now()) == pytest.approx(25.0, abs=1.0) and told(1, 0.1) == ""
+    assert bench.open
+    assert "preparing" in told(3, 0.1) and not bench.open
+    assert told(3, 30.0) == "" and bench.open
+    assert bench.model.temperature_at(bench.clock.now()) == pytest.approx(37.0, abs=1.0)

@@ -50,9 +50,10 @@ def place_path(
 
 
 def raised_path(path: Path, lift: float) -> Path:
-    """The path for a dry run: each checkpoint `lift` mm farther up along its own axis, nothing extruded."""
+    """The path for a dry run: each checkpoint `lift` mm farther up along its own axis, nothing extruded or put in."""
     up = se3.make(np.eye(3), np.array([0.0, 0.0, lift]))
-    return replace(path, surface_from_nozzle=path.surface_from_nozzle @ up, extrude=np.zeros(len(path), bool))
+    none, extrude = np.zeros(len(path), np.int64), np.zeros(len(path), bool)
+    return replace(path, surface_from_nozzle=path.surface_from_nozzle @ up, extrude=extrude, material=none)
 
 
 def reach_problem(path: Path, pose: SurfacePose, profile: ArmProfile) -> str:

@@ -51,6 +51,8 @@ class MaterialControl:
         self._pending: tuple[float, float] | None = None  # s, when a flow is told, and the flow
         self._closed_at = -math.inf  # s, when the last off was sent
         self._refused = ""
+        self._material = ""  # that is printed now, or comes next
+        self._celsius: float | None = None  # degrees C that were asked for; None: the dispenser sets none
 
     @property
     def reason(self) -> str:
@@ -70,30 +72,32 @@ class MaterialControl:
         if current is None:
             return MaterialStatus("no material is needed", True, False)
         failed = bool(self._refused) or current.status.state in (DispenserState.FAILED, DispenserState.CLOSED)
-        flow = (
-            f"on, {self._told:.3g} mm^3/s" if self._told and current.profile.metered else "on" if self._told else "off"
-        )
-        return MaterialStatus(reason or f"{current.profile.name}: {flow}", not reason, failed)
+        flow = f"{self._told:.3g} mm^3/s" if current.profile.metered else "on"
+        text = f"{self._material} by {current.profile.name}: {flow if self._told else 'off'}"
+        return MaterialStatus(reason or text, not reason, failed)
 
     def begin(self, place: float, now: float) -> None:
         """Make the dispenser ready whose material comes next at `place`, in checkpoints, and close the others."""
         ahead = [i for i in range(math.floor(place) + 1, len(self._extrude)) if self._extrude[i]]
         if not ahead:
             return
-        self._refused = ""
-        wanted = self._dispensers.for_material(self._materials[ahead[0]])
+        self._refused, self._material = "", self._materials[ahead[0]]
+        wanted = self._dispensers.for_material(self._material)
         if self._current is not wanted:
             self.off(now)
         self._current = wanted
         if wanted is not None:
-            celsius = self._temperatures[ahead[0]] if wanted.profile.temperature_range is not None else None
-            wanted.prepare(now, celsius)
+            sets = wanted.profile.temperature_range is not None
+            self._celsius = self._temperatures[ahead[0]] if sets else None
+            wanted.prepare(now, self._celsius)
 
     def follow(self, command: Command, now: float) -> None:
         """Do what a command that the arm was sent asks for; a hold closes."""
         if not isinstance(command, Move):
             self.off(now)
             return
+        if command.extrude:
+            self._heat(self._temperatures[command.checkpoint], now)
         at = command.stamp + command.flow_after
         self._pending = (at, command.flow) if command.flow or self._told else None
         self._switch(now)
@@ -123,12 +127,20 @@ class MaterialControl:
         self.off(clock.now())
         return close_dispensers(self._dispensers, clock)
 
+    def _heat(self, celsius: float, now: float) -> None:
+        """Have the dispenser go to another temperature, if the path asks for one that it was not told."""
+        if self._current is None or self._celsius is None or celsius == self._celsius:
+            return
+        self.off(now)
+        self._celsius = celsius
+        self._refused = self._current.set_temperature(celsius, now)
+
     def _switch(self, now: float) -> None:
         if self._pending is None or now < self._pending[0]:
             return
         flow, self._pending = self._pending[1], None
         current = self._current
-        if not flow or current is None:
+        if not flow or current is None or self.reason:
             self.off(now)
             return
         same = self._told and (not current.profile.metered or abs(flow - self._told) <= FLOW_STEP * self._told)
