@@ -116,6 +116,19 @@ def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
 
 
+@settings(max_examples=15)
+@given(st.lists(st.floats(0.0, 0.02), min_size=10, max_size=40), st.sampled_from([0.0, 0.3]))
+def test_what_the_link_does_not_hold_back_it_takes_and_never_has_to_stop_the_arm(
+    waits: list[float], partial: float
+) -> None:
+    link = linked(port=PortFaults(partial=partial))
+    for wait in waits:
+        if not link.arm.hold(link.clock.now()):
+            assert link.send(link.arm.target + [0.5, 0, 0, 0, 0, 0], link.arm.profile.tick) == ""
+        link.run(wait)
+    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
+
+
 def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
     link = linked()
     assert link.follow(2.0) == [] and not link.virtual.underruns

@@ -235,6 +235,25 @@ def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
     assert tally.twice < 1e-9
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_printed_farther_off_the_path_than_may_be(seed: int) -> None:
+    """Poses whose velocity is now and then off by some 12 mm/s, which no arm can follow at once."""
+    draw = np.random.default_rng(seed)
+    planner = Planner(raster(), LIMITS, CLOSE, TICK)
+    off = []
+    for k in range(300):
+        now = 10 + k * TICK
+        pose = pose_at(breathing, now)
+        if draw.random() < 0.2:
+            pose = replace(pose, twist=pose.twist + draw.normal(size=6) * [0.02, 0.02, 0.02, 12, 12, 12])
+        command = planner(pose, now)
+        if isinstance(command, Move) and command.extrude:
+            place = planner._curve.poses(np.array([planner.progress.place]))[0]
+            tip = nozzle_from_axes(CLOSE, command.axes)[:3, 3]
+            off.append(np.linalg.norm(tip - (pose.predict(now + TICK).base_from_surface @ place)[:3, 3]))
+    assert len(off) > 20 and 0.4 < max(off) <= LIMITS.on_path + 1e-9
+
+
 def test_what_is_out_of_reach_is_held_with_its_axis_and_bounds() -> None:
     def far(t: float) -> Array:
         return breathing(t) @ se3.exp([0, 0, 0, 300.0, 0, 0])
