@@ -205,6 +205,25 @@ def test_one_pose_that_is_worth_nothing_costs_a_fifth_of_a_second(motion: Motion
     assert over_limit(result.axes, LIMITS) <= 1
 
 
+@pytest.mark.parametrize("lacks", ["age", "error"])
+def test_what_a_pose_lacks_is_braked_for_before_the_guard_would_refuse(lacks: str) -> None:
+    def seen() -> Iterable[tuple[float, SurfacePose]]:
+        last = pose_at(breathing, 10.0)
+        for now, pose in exact(breathing, 9):
+            gone = now - 16.0
+            if not 0 < gone < 1:
+                last = pose
+            worse = 0.7 * max(gone, 0.0) if gone < 1 else 0.0  # mm, over a second
+            covariance = pose.covariance + worse**2 * np.diag([0, 0, 0, 1, 0, 0])
+            yield now, last if lacks == "age" else replace(pose, covariance=covariance)
+
+    result = run(raster(), seen())  # where the guard refuses nothing
+    stamps, printing = np.array([c.stamp for c in result.commands]), extruding(result)
+    assert printing[(stamps > 15.5) & (stamps <= 16.0)].all() and printing[stamps > 17.0].any()
+    assert not printing[(stamps > 16.75) & (stamps < 17.0)].any()
+    assert any(("old" if lacks == "age" else "is known to") in reason for reason in result.reasons)
+
+
 def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
     def jumping(t: float) -> Array:
         return REST @ se3.exp([0, 0, 0, 0, 0, 0 if t < 18.0 else -4.0])
