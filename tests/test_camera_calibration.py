@@ -280,7 +280,7 @@ def test_a_camera_that_sees_too_little_of_the_board_is_named(kept: Callable[[Boa
 
 def test_a_board_that_is_not_the_one_described_is_told_by_how_its_corners_scatter() -> None:
     views, _ = waved(np.random.default_rng(3), noise=4.0)
-    with pytest.raises(Undetermined, match="camera .*: corners scatter by .* px about the best lens, allowed 2 px"):
+    with pytest.raises(Undetermined, match=r"camera .*: corners scatter by .* px about the best lens, allowed 2 px"):
         calibrate(views)
 
 
