@@ -218,14 +218,14 @@ MUTANTS = (
         "hardware/motion/loop.py",
         "if self.arm.state is not ArmState.ARMED:\n                self.material",
         "if self.arm.state is None:\n                self.material",
-        ("test_material_loop.py",),
+        ("test_material_loop.py::test_what_ends_extrusion_ends_the_material",),
     ),
     Mutant(
         "a hold leaves the material on",
         "hardware/motion/material.py",
         "if not isinstance(command, Move):\n            self.off(now)",
         "if not isinstance(command, Move):\n            self.poll(now)",
-        ("test_material_loop.py",),
+        ("test_material_loop.py::test_what_ends_extrusion_ends_the_material",),
     ),
     Mutant(
         "a command that was not sent counts as sent",
