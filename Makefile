@@ -1,4 +1,4 @@
-# make demo | test | slow | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -9,7 +9,7 @@ DEMO   := demo
 # Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test slow bench check format install outages faults fuzz hazards references audit browser
+.PHONY: demo test slow mutants bench check format install outages faults fuzz hazards references audit browser
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -20,6 +20,9 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+mutants: $(STAMP)
+	$(BIN)/python -m tests.mutants
 
 bench: $(STAMP)
 	$(BIN)/stillbed bench --all

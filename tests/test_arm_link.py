@@ -116,6 +116,19 @@ def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
 
 
+@settings(max_examples=15)
+@given(st.lists(st.floats(0.0, 0.02), min_size=10, max_size=40), st.sampled_from([0.0, 0.3]))
+def test_what_the_link_does_not_hold_back_it_takes_and_never_has_to_stop_the_arm(
+    waits: list[float], partial: float
+) -> None:
+    link = linked(port=PortFaults(partial=partial))
+    for wait in waits:
+        if not link.arm.hold(link.clock.now()):
+            assert link.send(link.arm.target + [0.5, 0, 0, 0, 0, 0], link.arm.profile.tick) == ""
+        link.run(wait)
+    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
+
+
 def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
     link = linked()
     assert link.follow(2.0) == [] and not link.virtual.underruns
@@ -158,6 +171,20 @@ def test_a_stop_does_not_wait_for_the_queue() -> None:
     assert "stopped" in link.arm.send(moving(HOME, 50.0), 1.1)
 
 
+@pytest.mark.parametrize("end", ["stop", "disarm"])
+def test_a_frame_of_which_no_byte_is_gone_goes_out_no_more_once_the_arm_is_to_rest(end: str) -> None:
+    link = linked(port=PortFaults(blocked=[(0.0, 0.1)]))
+    assert link.arm.send(moving(HOME + [0.5, 0, 0, 0, 0, 0], 25.0), 0.0) == ""
+    link.run(0.05)
+    if end == "stop":
+        link.arm.stop("asked for", 0.05)
+    else:
+        link.arm.disarm(0.05)
+    link.run(0.5)
+    assert link.executed() == pytest.approx(HOME, abs=1e-9) and link.arm.target == pytest.approx(HOME)
+    assert link.arm.state is (ArmState.STOPPED if end == "stop" else ArmState.DISARMED)
+
+
 def test_an_arm_that_knows_no_pause_frame_stops_by_an_empty_queue() -> None:
     link = linked(link=LinkSettings(pause_frame=False))
     link.follow(0.5)
@@ -196,7 +223,8 @@ def test_home_is_reached_slowly_by_way_of_above_and_never_much_is_under_way() ->
 
 def test_a_place_out_of_bounds_is_not_gone_to() -> None:
     link = linked()
-    assert "out of bounds" in link.arm.go(HOME + [1000, 0, 0, 0, 0, 0], 0.0)
+    for side in (-1000, 1000):
+        assert "out of bounds" in link.arm.go(HOME + [side, 0, 0, 0, 0, 0], 0.0)
     assert "out of bounds" in link.arm.go(np.full(6, np.nan), 0.0) and not link.arm.travels
 
 
@@ -280,6 +308,14 @@ def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None
     assert link.virtual.held > 0.5  # nothing can tell
     link.run(30.0, each, tick=0.0201)
     assert link.virtual.held <= 0.05
+
+
+def test_faults_that_pass_each_in_time_do_not_add_up_to_a_stop() -> None:
+    stalls = [arm_fault(f"stall 500ms at {second}s") for second in (1, 3, 5)]
+    link = linked(ANSWERING, *stalls, link=LinkSettings(patience=1.0))
+    link.follow(7.0)
+    assert sum("called back" in event.text for event in link.arm.events()) >= 3
+    assert link.arm.state is ArmState.ARMED and link.arm.hold(link.clock.now()) == ""
 
 
 def test_an_arm_that_stays_behind_is_stopped() -> None:

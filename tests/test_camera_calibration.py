@@ -264,14 +264,24 @@ def test_lenses_of_webcams_that_were_measured_are_not_refused() -> None:
     [
         (lambda v: v.camera != 1, "camera side: never sees the board"),
         (lambda v: (v.camera == 2) == (v.instant % 2 == 0), "front: saw the board together with top, side in 0"),
+        (
+            lambda v: ((v.camera == 2) == (v.instant % 2 == 0)) | ((v.camera == 2) & (v.instant < 4)),
+            "front: saw the board together with top, side in 2 frame sets, allowed 3",
+        ),
         (lambda v: (v.camera != 0) | (v.instant < 6), "camera top: views of the board = 6, allowed 10"),
     ],
-    ids=["never", "never together", "too few"],
+    ids=["never", "never together", "hardly together", "too few"],
 )
 def test_a_camera_that_sees_too_little_of_the_board_is_named(kept: Callable[[BoardViews], Array], words: str) -> None:
     views, _ = waved(np.random.default_rng(3))
     with pytest.raises(Undetermined, match=words):
         calibrate(views.only(kept(views)))
+
+
+def test_a_board_that_is_not_the_one_described_is_told_by_how_its_corners_scatter() -> None:
+    views, _ = waved(np.random.default_rng(3), noise=4.0)
+    with pytest.raises(Undetermined, match=r"camera .*: corners scatter by .* px about the best lens, allowed 2 px"):
+        calibrate(views)
 
 
 def test_views_from_one_side_only_are_refused() -> None:

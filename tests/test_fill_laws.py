@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from planning.fill.bead import (
     travel_length,
     turn_angles,
 )
-from planning.fill.fill import fill, smooth_corners
+from planning.fill.fill import fill, settle_angle, smooth_corners
 from planning.fill.region import ROUNDING_GRID, Region, fill_coverage, region_of, roughness, union_of, without_bumps
 from planning.fill.spiral import order_runs
 
@@ -156,6 +157,40 @@ def test_the_shorter_of_horizontal_and_vertical_lines_wins(wound: Region) -> Non
     ways = [fill(wound, Pattern("zigzag", angle=angle), PACE) for angle in ANGLES]
     across, along, found = (sum(bead.length for bead in beads) + travel_length(beads) for beads in ways)
     assert found == pytest.approx(min(across, along), rel=0.01)
+
+
+LINES: tuple[PatternKind, ...] = "zigzag", "raster", "hybrid"
+
+
+def small(wound: Region) -> Region:
+    """The wound at a size of 60 mm2."""
+    share = (60 / wound.area) ** 0.5
+    return shapely.affinity.scale(wound, share, share)
+
+
+@few
+@given(WOUNDS.map(small), st.sampled_from(LINES), st.sampled_from([2, 3, 5]))
+def test_of_all_angles_that_are_tried_none_is_faster_than_the_one_chosen(
+    wound: Region, kind: PatternKind, count: int
+) -> None:
+    def seconds(pattern: Pattern) -> float:
+        return print_cost(fill(wound, pattern, PACE), PACE).seconds
+
+    fastest = Pattern(kind, angle="fastest", angles=count)
+    each = [seconds(replace(fastest, angle=np.pi * k / count)) for k in range(count)]
+    settled = settle_angle(wound, fastest, PACE)
+    assert seconds(settled) == min(each) and settled.angle == np.pi * np.argmin(each) / count
+    if kind != "hybrid":  # whose lines are chosen by themselves, without the way there from the rim
+        assert seconds(fastest) == min(each)
+
+
+@few
+@given(st.floats(1, 5), st.floats(1, 5))
+def test_of_closed_lines_and_a_spiral_the_faster_is_laid_where_both_fill_alike(width: float, height: float) -> None:
+    ellipse = shapely.affinity.scale(shapely.Point(0, 0).buffer(1, 64), width, height)
+    kinds: tuple[PatternKind, ...] = "best", "contour", "spiral"
+    best, *others = (print_cost(fill(ellipse, Pattern(kind), PACE), PACE).seconds for kind in kinds)
+    assert best == min(others)
 
 
 def test_a_plain_bead_covers_its_length_times_width_and_both_ends() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import Warp
 from hardware.bench.campaigns.guard import (
@@ -175,6 +175,34 @@ def test_a_late_arm_asks_more_of_a_pose() -> None:
     drifting = pose(1.0, twist_covariance=np.diag([0.0, 0, 0, 100, 0, 0]))  # 10 mm/s
     for lag, passes in ((0.0, True), (0.033, True), (0.034, False)):  # 0.5 mm after 49 ms, a tick of it
         assert isinstance(Guard(WIDE, ARM, TICK, lag=lag)(move(axes(0.5)), drifting, 1.0), Move) is passes
+
+
+@pytest.mark.parametrize("foreseen", [False, True])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_error_that_counts_is_the_one_the_pose_itself_foretells(seed: int, foreseen: bool) -> None:
+    """A surface at rest: the guard's own arithmetic leaves out how motion turns a covariance."""
+    draw = np.random.default_rng(seed)
+    root, drift, ahead = draw.normal(size=(3, 6, 6)) * np.array([0.01, 0.01, 0.01, 0.5, 0.5, 0.5])[:, None]
+    unsure = pose(1.0, covariance=root @ root.T, twist_covariance=30 * drift @ drift.T)
+    if foreseen:
+        grown = np.stack([share * ahead @ ahead.T + unsure.covariance for share in (1.0, 2.0)])
+        unsure = replace(unsure, forecast=Forecast(np.array([0.05, 0.15]), np.zeros((2, 6)), grown))
+    else:
+        unsure = replace(unsure, acceleration_psd=draw.uniform(10, 100, 6) * [0.01, 0.01, 0.01, 9, 9, 9])
+    begin, lag = axes(*draw.uniform(-30, 30, 3)), 0.3 * draw.random()
+    guard = Guard(replace(WIDE, pose_error=1e-6), replace(ARM, home=begin), TICK, lag=lag)
+    now = 1.0 + 0.2 * draw.random()
+    answer = guard(move(begin, now, extrude=True), unsure, now)
+    assert isinstance(answer, Refusal) and answer.code is RefusalCode.POSE_ERROR
+    assert answer.got == pytest.approx(unsure.error_ahead(now + TICK + lag, begin[None, :3])[0], rel=1e-9)
+
+
+def test_after_moves_were_called_back_a_step_counts_from_where_the_arm_stands() -> None:
+    guard = Guard(WIDE, ARM, TICK)
+    assert isinstance(guard(move(axes(1.5), 1.0), pose(1.0), 1.0), Move)
+    guard.stands(axes(-1.5))
+    assert refused(guard(move(axes(1.5), 1.1), pose(1.1), 1.1), "X at")
+    assert isinstance(guard(move(axes(-3), 1.2), pose(1.2), 1.2), Move)
 
 
 def test_a_turning_surface_is_fast_far_from_its_axis() -> None:

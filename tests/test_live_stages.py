@@ -11,13 +11,14 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.live.checklist import run_checks
 from hardware.live.records import LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
 from hardware.live.state_machine import PrintTask, RunStateMachine
 from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
 from hardware.motion.material import MaterialStatus
 from hardware.operator.shared_state import OperatorRequest
-from hardware.operator.view import RunStage, Wish
+from hardware.operator.view import CheckVerdict, RunStage, Wish
 from planning.command import Hold
 from planning.progress import PrintPhase, PrintProgress
 from tests.moving import raster
@@ -322,3 +323,29 @@ def test_nothing_begins_before_the_dispenser_is_ready(ready: bool, failed: bool)
     run.material = MaterialStatus("gel: off", True, False)
     run.look()
     assert run.look() is not RunStage.CHECK
+
+
+@pytest.mark.parametrize("state", [state for state in TrackState if not state.measured])
+def test_a_surface_that_is_not_measured_is_not_found(state: TrackState) -> None:
+    run = Staged()
+    run.pose = replace(SURFACE, state=state)
+    assert [run.look() for _ in range(5)][-1] is RunStage.FIND
+    run.pose = SURFACE
+    assert run.look() is RunStage.CONFIRM
+
+
+@pytest.mark.parametrize(
+    ("age", "delivering", "verdict"),
+    [
+        (0.99, (0, 1, 2), CheckVerdict.PASS),
+        (1.01, (0, 1, 2), CheckVerdict.FAIL),
+        (0.1, (0, 2), CheckVerdict.WARN),
+        (0.1, (1,), CheckVerdict.FAIL),
+    ],
+)
+def test_cameras_pass_that_deliver_now_and_one_alone_does_not(
+    age: float, delivering: tuple[int, ...], verdict: CheckVerdict
+) -> None:
+    tracking = TrackingReport(5.0, ("a", "b", "c"), delivering, replace(SURFACE, stamp=5.0 - age))
+    checks = run_checks(RunReports(tracking=tracking), raster(), 0.0, None, True, 5.0)
+    assert {check.name: check.verdict for check in checks}["cameras"] is verdict

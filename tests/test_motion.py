@@ -80,6 +80,36 @@ def test_after_a_refusal_the_planner_knows_where_the_arm_stands() -> None:
     assert np.linalg.norm(np.diff(np.array(axes)[:, :3], axis=0), axis=1).max() <= wide.jump
 
 
+def test_its_guard_knows_the_arms_lag_and_where_is_printed() -> None:
+    lag, error = 0.2, MotionLimits().pose_error
+    motion = MotionStep(raster(), ArmProfile(lag=lag))
+    tick, home = motion.profile.tick, motion.profile.arm.home
+    stay = Move(1.0, home, 5.0, 0, True)
+    for seconds, passes in ((tick + lag, True), (tick + lag - 0.02, False)):  # in which the error grows to the limit
+        rate = 0.99 * error / seconds
+        drifting = replace(pose_at(still, 1.0), covariance=np.zeros((6, 6)))
+        drifting = replace(drifting, twist_covariance=np.diag([0, 0, 0, rate**2, 0, 0]))
+        assert isinstance(MotionStep(raster(), ArmProfile(lag=lag))._guard(stay, drifting, 1.0), Move) is passes
+    speed = 0.9 * motion.profile.limits.surface_turn * 1e3  # mm/s, a metre away
+    assert speed > motion.profile.limits.surface_speed
+    far = ArmProfile(arm=replace(ArmProfile().arm, home=home + [300.0, 0, 0, 0, 0, 0]))
+    turning = replace(pose_at(still, 1.0), twist=np.array([0, 0, 0.9 * far.limits.surface_turn, 0, 0, 0]))
+    guard = MotionStep(raster(), far)._guard
+    assert isinstance(guard(replace(stay, axes=far.arm.home), turning, 1.0), Move)
+
+
+def test_after_moves_were_called_back_planner_and_guard_go_on_from_where_the_arm_stands() -> None:
+    motion = MotionStep(raster(speed=10.0))
+    moved = [motion(pose_at(breathing, 1 + k * 0.02), 1 + k * 0.02) for k in range(60)]
+    back, last = moved[49], moved[-1]
+    assert isinstance(back, Move) and isinstance(last, Move)
+    limits, tick = motion.profile.limits, motion.profile.tick
+    assert np.linalg.norm((last.axes - back.axes)[:3]) > limits.jump
+    motion.recalled(back.axes, back.axes)
+    again = motion(pose_at(breathing, 2.3), 2.3)
+    assert isinstance(again, Move) and np.abs(again.axes - back.axes)[:3].max() <= limits.acceleration[0] * tick**2
+
+
 def test_the_bytes_depend_on_the_input_only() -> None:
     def frames() -> bytes:
         motion, out = MotionStep(raster()), b""

@@ -11,11 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm.device import BLIND_RESENDS, ArmState
+from estimation.se3 import Array
+from hardware.arm.device import BLIND_RESENDS, ArmState, LinkCode
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.motion.loop import CommandedPose, MotionLoop, Order, Tick, TickMotion
 from hardware.motion.step import MotionPlan, MotionReport, MotionStep, motion_process
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.shared_latest import SharedLatest
@@ -23,10 +26,11 @@ from hardware.process.ticks import Histogram
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move
+from planning.kinematics import nozzle_from_axes
 from tests.linked import Linked, linked
 from tests.moving import breathing, pose_at, raster
 from tests.test_arm_port import serving
-from tests.virtual_arm import HOME
+from tests.virtual_arm import HOME, arm_fault
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,11 +38,25 @@ ROOT = Path(__file__).parents[1]
 class Looping:
     """A motion loop on a virtual arm in virtual time; orders are given by instant."""
 
-    def __init__(self, orders: dict[float, Order], link: Linked, pose: Callable[[float], SurfacePose | None]) -> None:
+    def __init__(
+        self,
+        orders: dict[float, Order],
+        link: Linked,
+        pose: Callable[[float], SurfacePose | None],
+        motion: TickMotion | None = None,
+    ) -> None:
         self.link, self.ticks, self._orders = link, list[Tick](), dict(orders)
         self.motion = MotionStep(raster(speed=10.0), link.arm.profile)
-        clock = link.clock
-        self.loop = MotionLoop(self.motion, link.arm, clock, lambda: pose(clock.now()), self._due, self.ticks.append)
+        clock, report = link.clock, self.ticks.append
+        self.homed = list[float]()  # s, when the arm had come home
+        self.loop = MotionLoop(
+            motion or self.motion, link.arm, clock, lambda: pose(clock.now()), self._due, report, self._begin_anew
+        )
+
+    def _begin_anew(self) -> None:
+        self.homed.append(self.link.clock.now())
+        begun = self.motion.progress.fraction
+        self.loop.motion = self.motion = MotionStep(raster(speed=10.0), self.link.arm.profile, begun)
 
     def _due(self) -> list[Order]:
         due = [at for at in self._orders if at <= self.link.clock.now()]
@@ -53,6 +71,7 @@ def seen(now: float) -> SurfacePose:
     return pose_at(breathing, round(now - 0.02, 2))
 
 
+ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 START = {0.0: Order.AT_HOME, 0.1: Order.ARM}
 
 
@@ -111,6 +130,74 @@ def test_an_arm_far_from_home_is_not_armed_before_it_went_there() -> None:
     assert any("from where the motion left off" in t.answer for t in ticks)
     assert {t.status.state for t in ticks if 4.5 < t.stamp < 5.0} == {ArmState.DISARMED}
     assert next(t for t in ticks if isinstance(t.command, Move)).stamp > 5.0
+
+
+def test_at_home_the_motion_begins_anew_and_the_arm_is_armed_from_there() -> None:
+    looping = Looping({**START, 2.0: Order.HOME, 8.0: Order.ARM}, linked(stand=False), seen)
+    ticks = looping.run(8.05)
+    moved = [t.command for t in ticks if isinstance(t.command, Move) and t.stamp < 2.0]
+    assert np.linalg.norm((moved[-1].axes - HOME)[:3]) > 10  # farther than an arm goes back by itself
+    assert len(looping.homed) == 1 and 2.0 < looping.homed[0] < 8.0
+    assert {t.status.state for t in ticks if looping.homed[0] + 0.03 < t.stamp < 8.0} == {ArmState.DISARMED}
+    assert looping.ticks[-1].answer == "" and looping.ticks[-1].status.state is ArmState.ARMED
+    assert looping.link.executed() == pytest.approx(HOME, abs=3.0)
+
+
+def test_an_arm_armed_again_stays_where_it_came_to_rest_when_moves_were_called_back() -> None:
+    def gone(now: float) -> SurfacePose | None:
+        return seen(now) if now < 1.3 else None
+
+    link = linked(ANSWERING, arm_fault("stall 600ms at 1.2s"), stand=False)
+    ticks = Looping({0.0: Order.AT_HOME, 0.5: Order.ARM, 3.0: Order.STOP, 3.5: Order.ARM}, link, gone).run(4.5)
+    (stands,) = [t.recalled.stands for t in ticks if t.recalled is not None]
+    sent = [t.command.axes for t in ticks if isinstance(t.command, Move)][-1]
+    assert np.linalg.norm((sent - stands)[:3]) > 1.0
+    assert ticks[-1].status.state is ArmState.ARMED and link.executed() == pytest.approx(stands, abs=0.01)
+
+
+def test_what_the_link_does_not_send_is_told_as_a_hold() -> None:
+    class Lunge:
+        def __call__(self, pose: SurfacePose | None, now: float) -> Move:
+            return Move(now, HOME + [20.0, 0, 0, 0, 0, 0], 100.0, 0, True)  # 0.2 s under way
+
+        def recalled(self, place: Array, stands: Array) -> None: ...
+
+    ticks = Looping(START, linked(stand=False), seen, Lunge()).run(0.3)
+    assert ticks and all(isinstance(t.command, Hold) and t.frame == b"" for t in ticks)
+    assert LinkCode.LIMIT in {t.hold for t in ticks} and ticks[-1].status.state is ArmState.STOPPED
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.01, 0.05), st.booleans(), st.integers(0, 3)), min_size=1, max_size=12),
+    st.floats(-0.2, 1.2),
+    st.floats(0.0, 0.3),
+)
+def test_the_head_is_at_each_commands_end_a_tick_and_the_lag_after_it_was_sent(
+    commands: list[tuple[float, bool, int]], share: float, lag: float
+) -> None:
+    profile = ArmProfile(lag=lag)
+    commanded, now, place = CommandedPose(profile), 1.0, HOME
+    due, places, flows = [], [], []
+    for gap, extrude, kind in commands:
+        now += gap
+        move = bool(kind) or not due
+        place = place + [0.3 * kind, -0.2, 0.1, 0, 0, 0] if move else place
+        commanded.add(Move(now, place, 5.0, 0, extrude) if move else Hold(now, 0.001, ""), now)
+        due.append(now + profile.tick + lag)
+        places.append(place)
+        flows.append(extrude and move)
+    stamp = due[0] + share * (due[-1] - due[0]) + (share - 0.5) * 0.01
+    head = commanded.at(stamp)
+    if stamp < due[0]:
+        assert head is None
+        return
+    assert head is not None
+    axes = [np.interp(stamp, due, np.array(places)[:, k]) for k in range(3)]
+    assert head.base_from_nozzle[:3, 3] == pytest.approx(
+        nozzle_from_axes(profile.arm, np.array([*axes, 0, 0, 0]))[:3, 3]
+    )
+    under_way = int(np.searchsorted(due, stamp))
+    assert head.extruding == (under_way < len(due) and flows[under_way])
 
 
 def test_while_the_arm_is_held_the_motion_is_not_asked() -> None:

@@ -17,7 +17,7 @@ from perception.frames import Image
 from perception.lens import BILATERAL_PREFILTER, NO_PREFILTER, PREFILTERS, Lenses
 from perception.mapping import features
 from perception.mapping.alignment_kernels import CONVERGED_STEP
-from perception.mapping.features import grey, match
+from perception.mapping.features import grey, match, sift
 from perception.mapping.matcher import optical_flow
 from perception.mapping.patches import (
     RELIEF_PX,
@@ -274,6 +274,33 @@ def test_a_guess_that_is_far_off_is_mended_where_the_pyramid_reaches() -> None:
     before, pixels = texture(0), grid()
     found, ok = optical_flow(before, shifted(before, (20.0, 0.0)), pixels, pixels + [8.0, 6.0])
     assert ok.mean() > 0.9 and np.abs(found - pixels - (20.0, 0.0))[ok].max() < 0.3
+
+
+def blobs(rng: np.random.Generator) -> tuple[Image, Array]:
+    """A picture of round spots, and their middles (N, 2), px."""
+    middles = grid()[::2] + rng.uniform(-3, 3, (len(grid()[::2]), 2))
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    picture = np.full(x.shape, 60.0)
+    for (right, down), radius in zip(middles, rng.uniform(2.0, 3.5, len(middles)), strict=True):
+        picture += 140 * np.exp(-((x - right) ** 2 + (y - down) ** 2) / (2 * radius**2))
+    return np.asarray(np.clip(np.round(picture), 0, 255), np.uint8), middles
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("window", [None, (37, 21)])
+def test_sift_finds_the_middle_of_a_spot_to_a_tenth_of_a_pixel(seed: int, window: tuple[int, int] | None) -> None:
+    picture, middles = blobs(np.random.default_rng(seed))
+    mask = None
+    if window is not None:
+        mask = np.zeros_like(picture)
+        mask[window[1] :, window[0] :] = 255
+    pixels, _ = sift(picture, mask)
+    apart = pixels[:, None] - middles  # (N, M, 2)
+    nearest = np.linalg.norm(apart, axis=2).argmin(1)
+    off = apart[np.arange(len(pixels)), nearest]
+    of_spots = np.abs(off).max(1) < 2  # not between them
+    assert len(np.unique(nearest[of_spots])) > 0.7 * len(middles)
+    assert np.abs(off[of_spots]).max() < 0.1 and np.abs(off[of_spots].mean(0)).max() < 0.01
 
 
 def descriptors(count: int, seed: int) -> NDArray[np.float32]:

@@ -205,6 +205,25 @@ def test_one_pose_that_is_worth_nothing_costs_a_fifth_of_a_second(motion: Motion
     assert over_limit(result.axes, LIMITS) <= 1
 
 
+@pytest.mark.parametrize("lacks", ["age", "error"])
+def test_what_a_pose_lacks_is_braked_for_before_the_guard_would_refuse(lacks: str) -> None:
+    def seen() -> Iterable[tuple[float, SurfacePose]]:
+        last = pose_at(breathing, 10.0)
+        for now, pose in exact(breathing, 9):
+            gone = now - 16.0
+            if not 0 < gone < 1:
+                last = pose
+            worse = 0.7 * max(gone, 0.0) if gone < 1 else 0.0  # mm, over a second
+            covariance = pose.covariance + worse**2 * np.diag([0, 0, 0, 1, 0, 0])
+            yield now, last if lacks == "age" else replace(pose, covariance=covariance)
+
+    result = run(raster(), seen())  # where the guard refuses nothing
+    stamps, printing = np.array([c.stamp for c in result.commands]), extruding(result)
+    assert printing[(stamps > 15.5) & (stamps <= 16.0)].all() and printing[stamps > 17.0].any()
+    assert not printing[(stamps > 16.75) & (stamps < 17.0)].any()
+    assert any(("old" if lacks == "age" else "is known to") in reason for reason in result.reasons)
+
+
 def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
     def jumping(t: float) -> Array:
         return REST @ se3.exp([0, 0, 0, 0, 0, 0 if t < 18.0 else -4.0])
@@ -233,6 +252,25 @@ def test_no_stream_of_poses_breaks_a_limit(seed: int) -> None:
     assert tally.samples == 200 and tally.worst.max() <= 1 + 1e-6
     assert (tally.refused, tally.errors) == (0, [])
     assert tally.twice < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_printed_farther_off_the_path_than_may_be(seed: int) -> None:
+    """Poses whose velocity is now and then off by some 12 mm/s, which no arm can follow at once."""
+    draw = np.random.default_rng(seed)
+    planner = Planner(raster(), LIMITS, CLOSE, TICK)
+    off = []
+    for k in range(300):
+        now = 10 + k * TICK
+        pose = pose_at(breathing, now)
+        if draw.random() < 0.2:
+            pose = replace(pose, twist=pose.twist + draw.normal(size=6) * [0.02, 0.02, 0.02, 12, 12, 12])
+        command = planner(pose, now)
+        if isinstance(command, Move) and command.extrude:
+            place = planner._curve.poses(np.array([planner.progress.place]))[0]
+            tip = nozzle_from_axes(CLOSE, command.axes)[:3, 3]
+            off.append(np.linalg.norm(tip - (pose.predict(now + TICK).base_from_surface @ place)[:3, 3]))
+    assert len(off) > 20 and 0.4 < max(off) <= LIMITS.on_path + 1e-9
 
 
 def test_what_is_out_of_reach_is_held_with_its_axis_and_bounds() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -94,6 +95,31 @@ def test_the_predicted_covariance_is_that_of_predicted_samples() -> None:
     found = np.cov(se3.log(se3.inverse(later.base_from_surface) @ moved).T)
     scale = np.sqrt(np.outer(np.diag(later.covariance), np.diag(later.covariance)))
     assert (np.abs(found - later.covariance) / scale).max() < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("dt", [0.15, 0.4])
+def test_velocity_and_acceleration_widen_a_prediction_as_they_scatter_samples(seed: int, dt: float) -> None:
+    """Samples of pose and twist, under white noise on acceleration; none of the three is small beside the others."""
+    draw, start, steps, count = np.random.default_rng(seed), pose(seed), 30, 20_000
+    start = replace(
+        start,
+        covariance=1e-2 * start.covariance,
+        twist=0.1 * start.twist,
+        twist_covariance=0.01 * start.twist_covariance / dt**2,
+        acceleration_psd=draw.uniform(1, 4, 6) * [1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4] / dt**3,
+    )
+    later = start.predict(start.stamp + dt)
+    places = start.base_from_surface @ se3.exp(draw.multivariate_normal(np.zeros(6), start.covariance, count))
+    twists = start.twist + draw.multivariate_normal(np.zeros(6), start.twist_covariance, count)
+    for _ in range(steps):
+        jolts = np.sqrt(start.acceleration_psd * dt / steps) * draw.normal(size=(count, 6))
+        places = places @ se3.exp((twists + jolts / 2) * dt / steps)
+        twists = twists + jolts
+    scattered = se3.log(se3.inverse(later.base_from_surface) @ places)
+    for claimed, found in ((later.covariance, scattered), (later.twist_covariance, twists)):
+        sigma = np.sqrt(np.diag(claimed))
+        assert (np.abs(np.cov(found.T) - claimed) / np.outer(sigma, sigma)).max() < 0.05
 
 
 def test_the_error_at_a_point_is_that_of_samples() -> None:
