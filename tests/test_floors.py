@@ -66,7 +66,7 @@ OWNERS = {  # library: the files that may import it
     "distributed": ("hardware/offline/smooth.py",),
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
-    "mcap": ("hardware/recording/mcap_file.py", "hardware/offline/trajectory_files.py"),
+    "mcap": ("hardware/recording/mcap_*.py", "hardware/offline/trajectory_files.py"),
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
@@ -81,7 +81,7 @@ OWNERS = {  # library: the files that may import it
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
     "yaml": ("hardware/calibration/*.py",),
-    "zstandard": ("hardware/recording/mcap_file.py",),
+    "zstandard": ("hardware/recording/mcap_writer.py",),
 }
 ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
 FREE = {"numpy", "scipy"}  # arrays are everywhere

@@ -22,7 +22,7 @@ from hardware.arm.profile import ArmProfile
 from hardware.cli.main import main
 from hardware.files.arm_file import write_arm
 from hardware.recording import session_reader as channels
-from hardware.recording.mcap_file import ChunkMessages, walk
+from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, walk
 from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.session_reader import open_session
 from tests.recorded import whole_recording, write_frames
@@ -93,6 +93,40 @@ def test_a_flipped_bit_never_gives_a_wrong_image(whole: Path, where: float, bit:
     original = {3 * stamp: number for number, stamp in enumerate(stamps(24, 0.0))}
     assert all(np.array_equal(i, image(c, original[s])) for (c, s), i in frames.items())
     assert len(frames) == 48 or session.damage
+
+
+@settings(max_examples=150)
+@given(where=st.floats(0, 1), near=st.integers(0, 40) | st.none(), pick=st.integers(0, 9), flip=st.integers(1, 255))
+def test_one_wrong_byte_costs_one_chunk_and_is_told(
+    whole: Path, where: float, near: int | None, pick: int, flip: int
+) -> None:
+    """near: bytes behind the beginning of a chunk, where its kind, length, times and check sum stand."""
+    data, parts = bytearray(whole.read_bytes()), list(walk(whole))
+    chunks = {part.offset: part for part in parts if isinstance(part, ChunkMessages)}
+    at = int(where * (len(data) - 1)) if near is None else list(chunks)[pick % len(chunks)] + near
+    data[at] ^= flip
+    struck = whole.parent / "struck.mcap"
+    struck.write_bytes(data)
+    found = list(walk(struck))
+    read = {part.offset: part for part in found if isinstance(part, ChunkMessages)}
+    attached = [part for part in found if isinstance(part, AttachedFile)]
+    assert read.items() <= chunks.items()
+    lost = len(chunks) - len(read) + 1 - len(attached)
+    assert lost == 0 or (lost == 1 and any(isinstance(part, Damage) for part in found))
+
+
+def test_behind_a_broken_chunk_all_is_read_and_the_seconds_that_are_lost_are_told(whole: Path) -> None:
+    starts = [part.offset for part in walk(whole) if isinstance(part, ChunkMessages)]
+    data = bytearray(whole.read_bytes())
+    data[starts[2] + 3000] ^= 4
+    struck = whole.parent / "middle.mcap"
+    struck.write_bytes(data)
+    session = open_session(struck)
+    held = sum(map(len, session.sets))
+    assert 30 <= held < 48 == sum(map(len, open_session(whole).sets))
+    assert sum(len(s.frames) for s in session.frame_sets()) == held
+    assert session.damage.endswith("what was recorded from 1.10 to 1.80 s is lost")
+    assert main(["export", str(struck), "-o", str(whole.parent / "exported")]) == 1
 
 
 KILLED = """
@@ -167,5 +201,5 @@ def test_what_damage_leaves_says_so(flags: list[str], tmp_path: Path, capsys: py
     cut.write_bytes(whole.read_bytes()[:-100])
     assert main([*flags, str(whole), "-o", str(tmp_path / "whole")]) == 0
     assert "is damaged" not in capsys.readouterr().out
-    assert main([*flags, str(cut), "-o", str(tmp_path / "cut")]) == 0
+    assert main([*flags, str(cut), "-o", str(tmp_path / "cut")]) == 1
     assert capsys.readouterr().out.startswith(f"The recording is damaged: {open_session(cut).damage}.\n")

@@ -84,15 +84,17 @@ def add_export(commands: Commands) -> None:
     add("-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write, new or empty")
 
 
-def _track(a: argparse.Namespace) -> None:
+def _track(a: argparse.Namespace) -> int:
     from hardware.files.arm_file import read_arm
     from hardware.offline.track import run_track
 
     tool = None if a.arm is None else read_arm(a.arm).tool
-    print(run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound))
+    text, damage = run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound)
+    print(text)
+    return FAILED if damage else 0
 
 
-def _replay(a: argparse.Namespace) -> int | None:
+def _replay(a: argparse.Namespace) -> int:
     from hardware.files.arm_file import read_arm
     from hardware.files.path_file import read_path, read_progress
     from hardware.offline.replay import replay_session
@@ -112,9 +114,9 @@ def _replay(a: argparse.Namespace) -> int | None:
     prepare_out(a.out, a.force)
     with progress_bar("replay", "frame sets") as progress:
         moves, holds = replay_session(session, a.path, a.out, progress, profile, a.resume, faults)
-    _print_damage(session.damage)
+    code = _damage_code(session.damage)
     print(f"{moves} moves and {holds} holds: commands.csv and frames.bin in {a.out}")
-    return None
+    return code
 
 
 def _replay_run(a: argparse.Namespace) -> int:
@@ -122,9 +124,9 @@ def _replay_run(a: argparse.Namespace) -> int:
 
     count = write_replay(a.session, a.out, a.force)
     same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
-    _print_damage(count.damage)
+    code = _damage_code(count.damage)
     print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {a.out}")
-    return FAILED if count.other else 0
+    return FAILED if count.other else code
 
 
 def _import(a: argparse.Namespace) -> None:
@@ -135,21 +137,23 @@ def _import(a: argparse.Namespace) -> None:
     print(f"{a.out}: {a.out.stat().st_size / 1e6:.1f} MB")
 
 
-def _export(a: argparse.Namespace) -> None:
+def _export(a: argparse.Namespace) -> int:
     from hardware.offline.convert import export_recording
 
     with progress_bar("export", "images") as progress:
         damage = export_recording(a.mcap, a.out, progress)
-    _print_damage(damage)
+    code = _damage_code(damage)
     print(f"a session folder is in {a.out}")
+    return code
 
 
-def _print_damage(damage: str) -> None:
-    """Print what is damaged in a recording, where something is."""
+def _damage_code(damage: str) -> int:
+    """Print what is damaged in a recording, where something is; the exit code of a command that used it."""
     from hardware.files.session import damage_text
 
     if text := damage_text(damage):
         print(text)
+    return FAILED if damage else 0
 
 
 def add_smooth(commands: Commands) -> None:
@@ -196,7 +200,7 @@ def _smooth(a: argparse.Namespace) -> int:
     options, failed = SmoothOptions(a.rate, a.refine_cameras, relink=not a.no_relink), 0
     for outcome in run_smooth(a.sessions, a.out, options, cluster):
         print(f"{outcome.job.session}: not smoothed: {outcome.text}" if outcome.failed else outcome.text, flush=True)
-        failed += outcome.failed
+        failed += outcome.failed or bool(outcome.damage)
     return FAILED if failed else 0
 
 
@@ -218,10 +222,12 @@ def add_compare(commands: Commands) -> None:
     add("-o", "--out", type=Path, help="folder to write report.html and compare.json to")
 
 
-def _compare(a: argparse.Namespace) -> None:
+def _compare(a: argparse.Namespace) -> int:
     from hardware.offline.compare import run_compare
+    from hardware.offline.trajectory_files import poses_damage
 
     print(run_compare(a.estimated, a.reference, a.delta, a.out))
+    return max(_damage_code(poses_damage(name)) for name in (a.estimated, a.reference) if name is not None)
 
 
 def add_view(commands: Commands) -> None:

@@ -25,7 +25,7 @@ from hardware.live.prepared import RunFiles
 from hardware.motion.step import MotionStep
 from hardware.offline.replay import CommandWriter
 from hardware.process.progress import prepare_out
-from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, parse, walk
+from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, damage_words, parse, walk
 from hardware.recording.messages import (
     Message,
     bytes_from_message,
@@ -56,16 +56,17 @@ class _RecordedRun:
 
 
 def _read_run(record: File, *topics: str) -> _RecordedRun:
-    run = _RecordedRun({}, {topic: [] for topic in topics})
+    run, damages = _RecordedRun({}, {topic: [] for topic in topics}), list[Damage]()
     for part in walk(record):
         if isinstance(part, Damage):
-            run.damage = part.text
+            damages.append(part)
         elif isinstance(part, AttachedFile):
             run.texts[part.name] = part.data.decode("utf-8", "replace")
         elif isinstance(part, ChunkMessages):
             for stored in part.messages:
                 if stored.topic in run.messages:
                     run.messages[stored.topic].append(parse(record, stored))
+    run.damage = damage_words(damages)
     return run
 
 
@@ -91,12 +92,12 @@ class ReplayedTick:
 def replay_run(record: File) -> Iterator[ReplayedTick]:
     """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
     run = _read_run(record, "/tick", "/pose")
-    return _replay_ticks(run.messages["/tick"], run.poses, inputs_from_texts(run.texts, record), record)
+    return _replay_ticks(run, inputs_from_texts(run.texts, record), record)
 
 
-def _replay_ticks(
-    ticks: list[Message], poses: dict[float, SurfacePose], inputs: PrintInputs, record: File
-) -> Iterator[ReplayedTick]:
+def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Iterator[ReplayedTick]:
+    """Where the file is damaged, ticks are left out whose pose is lost; those behind it may come out another way."""
+    ticks, poses = run.messages["/tick"], run.poses
     step, profile = None, inputs.profile
     for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
@@ -107,6 +108,8 @@ def _replay_ticks(
             continue
         stamp = tick["pose_stamp"]
         if stamp and stamp[0] not in poses:
+            if run.damage:
+                continue
             raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
         now = float(tick["stamp"])
         if tick.get("material_in"):
@@ -125,14 +128,13 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     if record.is_dir():
         raise InputError(record, "recording", "a session folder", RUN_REQUIRED)
     run = _read_run(record, "/tick", "/pose")
-    poses = run.poses
     if PATH_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no path", RUN_REQUIRED)
     inputs = inputs_from_texts(run.texts, record)
     prepare_out(out, force)
     frames = other = 0
     with CommandWriter(out) as writer:
-        for tick in _replay_ticks(run.messages["/tick"], poses, inputs, record):
+        for tick in _replay_ticks(run, inputs, record):
             writer.write(tick.command, tick.frame)
             frames += 1
             other += tick.frame != tick.recorded

@@ -236,6 +236,7 @@ class SmoothOutcome:
     state: str  # SMOOTHED, ALREADY_DONE or FAILED
     text: str  # the summary, or why the job failed
     spent: float  # s
+    damage: str = ""  # what was lost of the session's file, "" if nothing
 
     @property
     def failed(self) -> bool:
@@ -321,7 +322,8 @@ def _outcome(job: SmoothJob, options: SmoothOptions, stream: TextIO | None) -> S
     clock = WallClock()
     start = clock.now()
     done, text = smooth_session(job.session, job.out, options, stream)
-    return SmoothOutcome(job, ALREADY_DONE if done else SMOOTHED, text, clock.now() - start)
+    damage = str(_summary(job.out).get("damage", ""))
+    return SmoothOutcome(job, ALREADY_DONE if done else SMOOTHED, text, clock.now() - start, damage)
 
 
 def _names(sessions: Sequence[Path]) -> list[str]:

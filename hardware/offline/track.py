@@ -140,8 +140,8 @@ def run_track(
     tool: Array | None = None,
     prefilter: str = "none",
     wound: bool = False,
-) -> str:
-    """Track the session at `path` into the folder `out`; returns the summary as text.
+) -> tuple[str, str]:
+    """Track the session at `path` into the folder `out`; returns the summary, and what was lost of the file, as texts.
 
     method, tool, prefilter: as `step_by` takes them. wound: whether the wound is segmented as well, into wound.csv.
     An early end, by an error of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
@@ -169,7 +169,7 @@ def run_track(
             complete = True
         finally:
             text = _write_report(out, session, complete, method)
-    return f"{text}\nreport: {out / 'report.html'}"
+    return f"{text}\nreport: {out / 'report.html'}", session.damage
 
 
 def follow(

@@ -32,7 +32,7 @@ from hardware.process.checks import read_csv
 from hardware.recording.mcap_file import Damage, record_groups
 from hardware.recording.messages import message_from_pose
 from hardware.recording.schemas import TOPICS
-from hardware.recording.session_reader import open_session, read_poses, read_smoothed
+from hardware.recording.session_reader import open_session, read_poses, read_smoothed, recording_damage
 from perception.frames import Image
 
 POSE_COLUMNS = ("stamp_s", *TRANSFORM_COLUMNS)
@@ -164,6 +164,11 @@ def read_truth_series(text: str) -> PoseSeries:
     if path.suffix == ".mcap" and not path.is_dir():
         return _of_recording(path, ("truth",))
     raise InputError(path, "truth", "none", "a session with its truth or reference; else name what it is compared with")
+
+
+def poses_damage(text: str) -> str:
+    """What was lost of the .mcap file that such an argument names; "" if nothing, or if it names no such file."""
+    return recording_damage(_path_and_channel(text)[0])
 
 
 def _path_and_channel(text: str) -> tuple[Path, str]:

@@ -27,7 +27,7 @@ from estimation.se3 import Array
 from estimation.triangulation import triangulated_map
 from hardware.files.images import small_jpeg
 from hardware.files.path_file import read_path
-from hardware.files.session import FrameReader, Session
+from hardware.files.session import FrameReader, Session, damage_text
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series
 from hardware.operator.broadcast import pictures_bytes, scene_text, text
 from hardware.operator.process import THUMBNAIL_QUALITY, THUMBNAIL_WIDTH
@@ -337,6 +337,8 @@ def run_view(session: Path, poses: str | None, toolpath: Path | None, port: int)
     with socket.create_server((settings.host, settings.port)) as listener:
         port = listener.getsockname()[1]
         seconds = playback.stamps[-1] - playback.stamps[0]
+        if playback.session.damage:
+            print(damage_text(playback.session.damage))
         print(f"{len(playback)} frame sets over {seconds:.1f} s, poses: {playback.source or 'none'}")
         print(f"open http://{settings.host}:{port}/{settings.token}/ in a browser; Ctrl-C ends", flush=True)
         asyncio.run(serve(playback, settings, listener))

@@ -1,40 +1,33 @@
-"""MCAP files: read record by record, whole or damaged, every checksum checked; and written with a packed index.
+"""MCAP files: read record by record, whole or damaged, every checksum checked.
 
-A file is read from its start and never through its index: the same code reads a file whose end is missing, and a wrong
-index does no harm.
+A file is read from its start, not through its index: the same code reads a file whose end is missing, and a wrong
+index does no harm. Behind a broken record reading goes on at the next whole one. Only where the chunk that names the
+channels is broken are they taken from the file's summary.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
     McapRecord,
     Message,
-    MessageIndex,
     Metadata,
-    MetadataIndex,
     Schema,
-    Statistics,
-    SummaryOffset,
 )
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -43,6 +36,11 @@ from estimation.errors import InputError
 from hardware.process.checks import error_text
 
 _RECORD_HEAD = struct.Struct("<BQ")  # opcode and length in front of every record
+_DATA_END_LENGTH, _FOOTER_LENGTH = 4, 20
+_SHAPE_BYTES = 512  # of a record, in which its inner lengths stand
+_RECORD_START = re.compile(rb"(?s)(?=[\x02\x06\x09\x0c\x0f].{5}\0\0\0)")  # kinds to go on at, of less than 2**40 bytes
+SCAN_BYTES = 2**22  # read at once in search of a whole record
+MAX_TOLD_DAMAGES = 5  # in one text
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +71,16 @@ class AttachedFile:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Why and where the file cannot be read further."""
+    """A stretch of the file that cannot be read: why, where, and from when to when records are lost."""
 
     text: str
+
+
+def damage_words(damages: Sequence[Damage]) -> str:
+    """All damages of a file in one text, "" if there are none."""
+    words = [damage.text for damage in damages[:MAX_TOLD_DAMAGES]]
+    more = [f"and {len(damages) - len(words)} more"] if len(damages) > len(words) else []
+    return "; ".join(words + more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +92,7 @@ class RecordGroup:
 
 
 def walk(path: Path) -> Iterator[ChunkMessages | AttachedFile | Damage]:
-    """The parts of a recording in the order of the file; a Damage, if any, is the last one."""
+    """The parts of a recording in the order of the file; a Damage stands where a stretch of it cannot be read."""
     channels: dict[int, Channel] = {}
     for group in record_groups(path):
         if isinstance(group, Damage):
@@ -105,7 +110,6 @@ def walk(path: Path) -> Iterator[ChunkMessages | AttachedFile | Damage]:
 
 def record_groups(path: Path) -> Iterator[RecordGroup | Damage]:
     """The same parts as the MCAP library's records, and the metadata."""
-    known: set[int] = set()  # channels so far
     try:
         file = open(path, "rb")  # noqa: SIM115  (closed by the block below)
     except OSError as error:
@@ -113,52 +117,179 @@ def record_groups(path: Path) -> Iterator[RecordGroup | Damage]:
     with file:
         size = path.stat().st_size
         magic = file.read(len(MCAP0_MAGIC))
-        if magic != MCAP0_MAGIC:
+        if sum(a != b for a, b in zip(magic, MCAP0_MAGIC, strict=False)) > 1 or len(magic) < len(MCAP0_MAGIC):
             raise InputError(path, "recording", f"{size} bytes that begin with {magic!r}", "an MCAP file")
-        while True:
-            offset = file.tell()
-            head = file.read(_RECORD_HEAD.size)
-            if len(head) < _RECORD_HEAD.size:
-                yield _damage(offset, size, "the file was not closed")
-                return
-            opcode, length = _RECORD_HEAD.unpack(head)
-            if opcode == 0 or file.tell() + length > size:
-                yield _damage(offset, size, "a record is cut short or broken")
-                return
-            if opcode == Opcode.FOOTER:
-                file.seek(length, 1)
-                if file.read() != MCAP0_MAGIC:
-                    yield _damage(offset, size, "the end is not an MCAP file's")
-                return
-            if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA):
-                file.seek(length, 1)
+        if magic != MCAP0_MAGIC:
+            yield Damage(f"its first bytes are {magic!r}, not an MCAP file's; nothing else is lost")
+        yield from _RecordWalk(file, size).groups()
+
+
+@dataclass(frozen=True, slots=True)
+class _Whole:
+    """A record that can be read. records: of a chunk, an attachment or metadata; end: the byte behind it."""
+
+    opcode: int
+    end: int
+    records: tuple[McapRecord, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Break:
+    """Where reading broke off."""
+
+    offset: int
+    opcode: int  # of what stands there
+    indexed: bool  # whether in the index, behind the data
+
+
+class _RecordWalk:
+    """One pass over the records of a file, from behind its magic to its end; what is broken is skipped."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._size = file, size
+        self._known: set[int] = set()  # channels so far
+        self._epoch = 0  # s that log times are ahead of stamps, by the metadata
+        self._last: float | None = None  # s, last stamp of the newest chunk so far
+        self._indexed = False  # behind the data: only the index follows
+        self._broken: _Break | None = None  # not told yet
+
+    def groups(self) -> Iterator[RecordGroup | Damage]:
+        """What `record_groups` gives."""
+        offset, opcode = len(MCAP0_MAGIC), 0
+        checked = offset  # behind the last record that was checked; a broken length of another leads anywhere
+        while offset < self._size and opcode != Opcode.FOOTER:
+            found = self._record(offset)
+            if found is None:
+                self._broken = self._broken or _Break(offset, self._opcode(offset), self._indexed)
+                offset = self._next_whole(checked)
+                checked = offset + 1  # from here on it only goes forward
                 continue
-            records = _records(opcode, file.read(length), known)
-            if records is not None:
-                yield RecordGroup(offset, records)
-            elif opcode != Opcode.METADATA:
-                yield _damage(offset, size, "a record is broken")
-                return
+            self._known |= {r.id for r in found.records if isinstance(r, Channel)}
+            stamps = [r.log_time / 1e9 - self._epoch for r in found.records if isinstance(r, Message)]
+            if stamps:
+                if self._broken is not None:
+                    yield self._damage(self._broken, min(stamps))
+                self._last, self._broken = max(stamps), None
+            for metadata in (r for r in found.records if isinstance(r, Metadata)):
+                epoch = metadata.metadata.get("epoch_s", "")
+                self._epoch = int(epoch) if epoch.isdecimal() else self._epoch
+            if found.records:
+                yield RecordGroup(offset, found.records)
+            opcode, offset = found.opcode, found.end
+            checked = offset if found.records or opcode == Opcode.DATA_END else checked
+            self._indexed |= opcode == Opcode.DATA_END
+        if self._broken is not None and (opcode == Opcode.FOOTER or self._broken.indexed):
+            yield self._damage(self._broken, None)
+        elif self._broken is not None:
+            yield Damage(f"a record is cut short or broken: read up to byte {self._broken.offset} of {self._size}")
+        elif opcode != Opcode.FOOTER:
+            yield Damage(f"the file was not closed: read up to byte {offset} of {self._size}")
+
+    def _damage(self, broken: _Break, until: float | None) -> Damage:
+        """until: s, first stamp behind it; None if there is none."""
+        lost = "is lost" if broken.opcode == Opcode.CHUNK else "may be lost"
+        if broken.indexed:
+            words = "nothing is lost but the index"
+        elif until is None:
+            words = "what was recorded " + ("" if self._last is None else f"after {self._last:.2f} s ") + "may be lost"
+        elif self._last is None:
+            words = f"what was recorded before {until:.2f} s {lost}"
+        else:
+            words = f"what was recorded from {min(self._last, until):.2f} to {max(self._last, until):.2f} s {lost}"
+        return Damage(f"a record is broken at byte {broken.offset} of {self._size}: {words}")
+
+    def _opcode(self, offset: int) -> int:
+        self._file.seek(offset)
+        return (self._file.read(1) or b"\0")[0]
+
+    def _record(self, offset: int) -> _Whole | None:
+        """The record at `offset`; None if it is broken."""
+        self._file.seek(offset)
+        head = self._file.read(_RECORD_HEAD.size)
+        if len(head) < _RECORD_HEAD.size:
+            return None
+        opcode, length = _RECORD_HEAD.unpack(head)
+        end = offset + _RECORD_HEAD.size + length
+        if opcode == 0 or end > self._size:
+            return None
+        if opcode == Opcode.FOOTER:
+            self._file.seek(end)
+            return _Whole(opcode, end) if self._file.read() == MCAP0_MAGIC else None
+        if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA):
+            return None if _holds_data(self._file.read(min(length, _SHAPE_BYTES)), length) else _Whole(opcode, end)
+        records = self._records(opcode, self._file.read(length))
+        return None if records is None else _Whole(opcode, end, records)
+
+    def _records(self, opcode: int, data: bytes) -> tuple[McapRecord, ...] | None:
+        """The records in a record, its checksum checked; None if it is broken."""
+        stream = ReadDataStream(BytesIO(data))
+        try:
+            if opcode == Opcode.METADATA:
+                metadata = Metadata.read(stream)
+                return (metadata,) if stream.count == len(data) else None
+            if opcode == Opcode.ATTACHMENT:
+                (crc,) = struct.unpack("<I", data[-4:])
+                return (Attachment.read(stream),) if crc in (0, zlib.crc32(data[:-4])) else None
+            records = tuple(breakup_chunk(Chunk.read(stream), validate_crc=True))
+        except Exception:  # of broken bytes the library, its decompressors and struct raise many kinds
+            return None
+        named = {r.id for r in records if isinstance(r, Channel)}
+        used = {r.channel_id for r in records if isinstance(r, Message)}
+        if not used <= self._known | named:  # the chunk that names them is broken
+            records = (*_summary_channels(self._file, self._size), *records)
+            named = {r.id for r in records if isinstance(r, Channel)}
+        return records if used <= self._known | named else None
+
+    def _next_whole(self, offset: int) -> int:
+        """Where the next record of data, or the end of the data, begins from `offset` on; the file's size if none."""
+        while offset < self._size:
+            self._file.seek(offset)
+            block = self._file.read(SCAN_BYTES + _RECORD_HEAD.size)
+            for match in _RECORD_START.finditer(block):
+                if self._is_whole(offset + match.start()):
+                    return offset + match.start()
+            offset += SCAN_BYTES
+        return self._size
+
+    def _is_whole(self, offset: int) -> bool:
+        self._file.seek(offset)
+        opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
+        if opcode == Opcode.DATA_END:
+            return bool(length == _DATA_END_LENGTH)
+        if opcode in (Opcode.CHUNK, Opcode.ATTACHMENT) and not _holds_data(self._file.read(_SHAPE_BYTES), length):
+            return False
+        return self._record(offset) is not None
 
 
-def _damage(offset: int, size: int, reason: str) -> Damage:
-    return Damage(f"{reason}: read up to byte {offset} of {size}")
+def _holds_data(head: bytes, length: int) -> bool:
+    """Whether a record of `length` bytes that begin with `head` has the lengths of a chunk or of an attachment inside.
+
+    A chunk that is taken for another kind of record would be skipped without a word.
+    """
+    with suppress(struct.error):
+        (name,) = struct.unpack_from("<I", head, 28)
+        if name in (0, 3, 4):  # none, lz4, zstd
+            return bool(struct.unpack_from("<Q", head, 32 + name)[0] + 40 + name == length)
+    with suppress(struct.error):
+        (name,) = struct.unpack_from("<I", head, 16)
+        (media,) = struct.unpack_from("<I", head, 20 + name)
+        (size,) = struct.unpack_from("<Q", head, 24 + name + media)
+        return bool(36 + name + media + size == length)
+    return False
 
 
-def _records(opcode: int, data: bytes, known: set[int]) -> tuple[McapRecord, ...] | None:
-    """The records in a record, its checksum checked; None if it is broken. known: channels so far, added to."""
-    stream = ReadDataStream(BytesIO(data))
-    try:
-        if opcode == Opcode.METADATA:
-            return (Metadata.read(stream),)
-        if opcode == Opcode.ATTACHMENT:
-            (crc,) = struct.unpack("<I", data[-4:])
-            return (Attachment.read(stream),) if crc in (0, zlib.crc32(data[:-4])) else None
-        records = tuple(breakup_chunk(Chunk.read(stream), validate_crc=True))
-    except Exception:  # of broken bytes the library, its decompressors and struct raise many kinds
-        return None
-    known.update(r.id for r in records if isinstance(r, Channel))
-    return records if all(r.channel_id in known for r in records if isinstance(r, Message)) else None
+def _summary_channels(file: BinaryIO, size: int) -> tuple[McapRecord, ...]:
+    """Schemas and channels by the summary at the end of the file; none where it is missing or its checksum is wrong."""
+    with suppress(Exception):  # of broken bytes the library and struct raise many kinds
+        end = size - len(MCAP0_MAGIC) - _RECORD_HEAD.size - _FOOTER_LENGTH
+        file.seek(end + _RECORD_HEAD.size)
+        start, _, crc = struct.unpack("<QQI", file.read(_FOOTER_LENGTH))
+        file.seek(start)
+        data = file.read(size - len(MCAP0_MAGIC) - start)
+        if zlib.crc32(data[:-4]) == crc:
+            records = breakup_chunk(Chunk("", data[: end - start], 0, 0, 0, 0))
+            return tuple(r for r in records if isinstance(r, Schema | Channel))
+    return ()
 
 
 def chunk_messages(file: BinaryIO, offset: int) -> list[bytes]:
@@ -178,145 +309,3 @@ def parse(path: Path, stored: StoredMessage) -> dict[str, Any]:
     if not isinstance(message, dict):
         raise InputError(path, stored.topic, f"message of {len(stored.data)} bytes", "a JSON object")
     return message
-
-
-_FOOTER_HEAD = struct.Struct("<BQQQ")  # the footer without its checksum, which covers it
-_FOOTER_LENGTH = 20
-
-
-class McapWriter:
-    """Writes an MCAP file, the same bytes as the library's Writer, and keeps its index as packed records.
-
-    The library's Writer keeps an object for each chunk until the file is closed: 7 to 10 MB an hour of a live run. The
-    packed records take a tenth of that.
-    """
-
-    def __init__(self, file: BinaryIO, chunk_size: int, compress: bool) -> None:
-        """chunk_size: bytes at which a chunk is closed. compress: whether chunks are."""
-        self._file, self._chunk_size, self._compress = file, chunk_size, compress
-        self._chunk, self._span = RecordBuilder(), (0, 0)  # the open chunk, and its first and last log time, ns
-        self._messages: dict[int, MessageIndex] = {}  # of the open chunk, by channel
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
-        self._chunk_index = bytearray()
-        self._chunks = 0
-        self._first, self._last = 0, 0  # log times of the file, ns
-        self._counts: dict[int, int] = {}  # messages of each channel
-
-    def start(self, library: str) -> None:
-        """Write the head of the file."""
-        self._file.write(MCAP0_MAGIC + _bytes(Header("", library)))
-
-    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """The number of a new schema."""
-        self._schemas.append(Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name))
-        self._add(self._schemas[-1])
-        return len(self._schemas)
-
-    def register_channel(self, topic: str, encoding: str, schema: int) -> int:
-        """The number of a new channel."""
-        number = len(self._channels) + 1
-        self._channels.append(Channel(number, topic, message_encoding=encoding, metadata={}, schema_id=schema))
-        self._add(self._channels[-1])
-        return number
-
-    def add_message(self, channel: int, log_time: int, data: bytes, sequence: int) -> None:
-        """Add a message to the open chunk. log_time: ns."""
-        first, last = self._span if self._messages else (log_time, 0)
-        self._span = min(first, log_time), max(last, log_time)
-        self._first = min(self._first, log_time) if self._counts else log_time
-        self._last = max(self._last, log_time)
-        self._counts[channel] = self._counts.get(channel, 0) + 1
-        index = self._messages.setdefault(channel, MessageIndex(channel_id=channel, records=[]))
-        index.records.append((log_time, self._chunk.count))
-        self._add(Message(channel, log_time=log_time, data=data, publish_time=log_time, sequence=sequence))
-
-    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Write an attached file."""
-        record = _bytes(Attachment(0, 0, name, media_type, data))
-        self._attachments.append(AttachmentIndex(self._file.tell(), len(record), 0, 0, len(data), name, media_type))
-        self._file.write(record)
-
-    def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write a table about the whole file."""
-        record = _bytes(Metadata(name, data))
-        self._metadata.append(MetadataIndex(self._file.tell(), len(record), name))
-        self._file.write(record)
-
-    def flush(self) -> None:
-        """Close the open chunk and hand everything to the system."""
-        self._close_chunk()
-        self._file.flush()
-
-    def finish(self) -> None:
-        """Close the open chunk, and write the summary and the end of the file."""
-        self._close_chunk()
-        self._file.write(_bytes(DataEnd(0)))
-        start = self._file.tell()
-        groups = (
-            (Opcode.SCHEMA, _bytes(*self._schemas)),
-            (Opcode.CHANNEL, _bytes(*self._channels)),
-            (Opcode.STATISTICS, _bytes(self._statistics())),
-            (Opcode.CHUNK_INDEX, bytes(self._chunk_index)),
-            (Opcode.ATTACHMENT_INDEX, _bytes(*self._attachments)),
-            (Opcode.METADATA_INDEX, _bytes(*self._metadata)),
-        )
-        summary, offsets = b"", []
-        for opcode, records in groups:
-            offsets.append(SummaryOffset(opcode, start + len(summary), len(records)))
-            summary += records
-        offset_start = start + len(summary)
-        summary += _bytes(*offsets)
-        head = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, offset_start)
-        footer = Footer(start, offset_start, zlib.crc32(head, zlib.crc32(summary)))
-        self._file.write(summary + _bytes(footer) + MCAP0_MAGIC)
-
-    def _add(self, record: McapRecord) -> None:
-        record.write(self._chunk)
-        if self._chunk.count > self._chunk_size:
-            self._close_chunk()
-
-    def _close_chunk(self) -> None:
-        """Write the open chunk and its message index; one without messages stays open."""
-        if not self._messages:
-            return
-        data = _ended(self._chunk)
-        packed = zstandard.compress(data) if self._compress else data
-        (first, last), kind = self._span, "zstd" if self._compress else ""
-        record = _bytes(Chunk(kind, packed, last, first, zlib.crc32(data), len(data)))
-        start, offsets, indexes = self._file.tell(), {}, b""
-        for channel, index in self._messages.items():
-            offsets[channel] = start + len(record) + len(indexes)
-            indexes += _bytes(index)
-        entry = ChunkIndex(len(record), start, kind, len(packed), last, len(indexes), offsets, first, len(data))
-        self._chunk_index += _bytes(entry)
-        self._file.write(record)
-        self._file.write(indexes)
-        self._chunks += 1
-        self._messages.clear()
-
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=self._counts,
-            chunk_count=self._chunks,
-            message_count=sum(self._counts.values()),
-            message_end_time=self._last,
-            message_start_time=self._first,
-            metadata_count=len(self._metadata),
-            schema_count=len(self._schemas),
-        )
-
-
-def _bytes(*records: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return _ended(builder)
-
-
-def _ended(builder: RecordBuilder) -> bytes:
-    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -25,7 +25,7 @@ from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
 from hardware.process.checks import read_bytes
 from hardware.recording import messages
-from hardware.recording.mcap_file import McapWriter
+from hardware.recording.mcap_writer import McapWriter
 from hardware.recording.messages import SURFACE_FRAME, Message
 from hardware.recording.schemas import CALIBRATION, INFO, TOPICS, Schema, calibration_topic, camera_frame, image_topic
 from perception.frames import Frame, Roi

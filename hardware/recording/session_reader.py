@@ -1,6 +1,6 @@
 """Recordings read back: as a session, as the records of one channel, and as the path and arm that a run used.
 
-A damaged file is read up to its damage. `open_session` opens both containers, session folder and MCAP file.
+Of a damaged file all but the damaged chunks is read. `open_session` opens both containers, folder and MCAP file.
 """
 
 from __future__ import annotations
@@ -31,7 +31,16 @@ from hardware.files.path_file import path_from_text, path_text
 from hardware.files.session import SURFACE_SUFFIXES, FrameRef, PrintHeadLog, Session, head_from_row, pair_refs
 from hardware.files.session_folder import open_folder
 from hardware.recording import messages
-from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, StoredMessage, chunk_messages, parse, walk
+from hardware.recording.mcap_file import (
+    AttachedFile,
+    ChunkMessages,
+    Damage,
+    StoredMessage,
+    chunk_messages,
+    damage_words,
+    parse,
+    walk,
+)
 from hardware.recording.messages import Message
 from hardware.recording.schemas import image_topic
 from perception.frames import Image, PrintHead, Roi
@@ -100,17 +109,30 @@ def open_recording(path: Path) -> Session:
 
 
 def _contents(path: Path) -> RecordingContents:
-    contents = RecordingContents()
+    contents, damages = RecordingContents(), list[Damage]()
     for part in walk(path):
         if isinstance(part, Damage):
-            contents.damage = part.text
+            damages.append(part)
         elif isinstance(part, AttachedFile):
             if part.name in SURFACE_NAMES:
                 contents.surface = part
         else:
             for index, stored in enumerate(part.messages):
                 _take(path, contents, (part.offset, index), stored)
+    contents.damage = damage_words(damages)
+    if damages:  # an image may be lost with another chunk than its entry
+        names = [] if contents.rig is None else [camera.name for camera in contents.rig.cameras]
+        refs = [(key, ref) for key, ref in contents.frames.items() if 0 <= ref.camera < len(names)]
+        held = ((key, ref) for key, ref in refs if (image_topic(names[ref.camera]), ref.number) in contents.places)
+        contents.frames = dict(held)
     return contents
+
+
+def recording_damage(path: Path) -> str:
+    """What of an .mcap file cannot be read, "" if nothing or where `path` is no .mcap file."""
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return ""
+    return damage_words([part for part in walk(path) if isinstance(part, Damage)])
 
 
 def _take(path: Path, contents: RecordingContents, place: tuple[int, int], stored: StoredMessage) -> None:
