@@ -9,14 +9,15 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm.device import ArmState
+from hardware.arm.port import ArmLine
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.protocol import G1, G4, Dialect, Pause, Reply, ReplyKind, decode, encode
-from hardware.arm.queue import ArmQueue
+from hardware.arm.queue import ArmQueue, FlowControl
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
-from tests.linked import circle, linked, moving, waiting
+from tests.linked import Linked, circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault, virtual_arm
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
@@ -461,3 +462,40 @@ def test_the_last_passage_of_a_place_is_its_set_points(moves: list[tuple[float, 
         near = instants[np.abs(places - place) <= 0.1]
         assert passed == pytest.approx(near[-1], abs=2 * until / 2000 + 1e-9)
     assert np.isnan(queue.passed([HOME[0] + 100, *HOME[1:3]], 0.1, until))
+
+
+def stalled_on_its_way_home(seconds: float, start: float) -> Linked:
+    fault = arm_fault(f"stall {1000 * seconds:.0f}ms at {start}s")
+    link = linked(ANSWERING, fault, begin=HOME + np.array([60.0, -40, 20, 0, 0, 0]))
+    assert link.arm.home(0.0) == ""
+    link.run(6.0)
+    assert link.arm.arrived(6.0)
+    return link
+
+
+@settings(max_examples=8)
+@given(seconds=st.floats(0.02, 0.08), start=st.floats(0.8, 2.0))
+def test_a_stall_on_the_way_home_is_not_taken_for_the_lag(seconds: float, start: float) -> None:
+    link = stalled_on_its_way_home(seconds, start)
+    assert link.arm.lag == pytest.approx(0.02, abs=0.004)
+
+
+def test_a_lag_that_was_learned_of_a_stalled_arm_alone_is_learned_anew() -> None:
+    link = stalled_on_its_way_home(0.06, 0.05)  # before its first answer: nothing tells it from a slow servo
+    assert link.arm.lag > 0.05
+    link.follow(3.0)
+    assert link.arm.lag == pytest.approx(0.02, abs=0.004)
+
+
+def test_what_a_stall_piled_up_counts_as_motion_under_way() -> None:
+    flow, queue = FlowControl(ArmProfile(), LinkSettings()), ArmQueue(HOME.tolist(), 0.004, 0.0)
+    line = ArmLine(linked().device())
+    assert flow.full(line, queue, 0.02, 0.0) == flow.full(line, queue, 0.02, 0.0, 0.02) == ""
+    assert "under way" in flow.full(line, queue, 0.02, 0.0, 0.03)
+    link = linked(ANSWERING, arm_fault("stall 28ms at 2s"))  # less than what is called back
+    assert link.follow(2.0) == []
+    assert link.follow(0.15) == []
+    assert 0.02 < link.arm._feedback.backlog < 0.035
+    assert "under way" in str(link.follow(0.3)) and link.arm.lag == pytest.approx(0.02, abs=0.004)
+    link.follow(1.0)
+    assert link.arm._feedback.backlog < 0.022  # with a tick of 24 ms no more than 50 ms are under way

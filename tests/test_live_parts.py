@@ -6,6 +6,7 @@ import itertools
 import os
 import pickle
 import threading
+from ctypes import c_double
 from dataclasses import replace
 from multiprocessing import Pipe
 from pathlib import Path
@@ -19,11 +20,14 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.arm.protocol import frame_from_command
 from hardware.files.path_file import read_progress, write_path, write_progress_durably
 from hardware.live.checklist import place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
+from hardware.live.motion_process import LAG_STEP, LiveMotion
 from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
 from hardware.live.prepared import RunFiles, SurfacePlacement, prepare, prepare_resumed, read_placement, write_placement
+from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
 from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry
 from hardware.live.run import recorded_begin
@@ -37,10 +41,14 @@ from hardware.live.settings import (
     settings_text,
 )
 from hardware.live.state_machine import PrintTask
+from hardware.motion.loop import RecordedTick
+from hardware.recording.recorder import Recorder
+from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet
 from planning.material import Outlet, SwitchDelay
 from planning.progress import fingerprint
-from tests.moving import raster
+from tests.moving import breathing, pose_at, raster
+from tests.session_files import rig
 
 THERE = available_cores()
 PROFILE = ArmProfile()
@@ -379,3 +387,36 @@ def test_the_largest_error_and_the_time_of_holds_stay_where_they_were(seconds: f
         assert where == pytest.approx(stamps[largest] - stamps[0], abs=course.width)
     else:
         assert np.isnan(course.error).all()
+
+
+def test_a_lag_that_is_learned_anew_during_a_run_is_recorded_and_replayed_byte_by_byte(tmp_path: Path) -> None:
+    """The lag was taken for 80 ms at the start, is known better after a while, and is lost and found again."""
+    lags = {0: 0.076, 40: 0.05, 41: 0.02, 80: float("nan"), 90: 0.0205}
+    now_known = lags[0]
+    begin = BeginPrint(raster(), replace(PROFILE, lag=0.076 + PROFILE.frame_time), 0.0, "x")
+    motion = LiveMotion(PROFILE, c_double(), None, lambda: now_known)
+    motion.begin(begin)
+    changed, frames = [], []
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        for name, text in input_texts(begin.path, begin.profile).items():
+            recorder.attach(name, text.encode())
+        for k in range(120):
+            now, now_known = 10 + 0.02 * k, lags.get(k, now_known)
+            pose = pose_at(breathing, now)
+            command = motion(pose, now)
+            assert motion.progress is not None
+            frames.append(frame_from_command(command, PROFILE.dialect))
+            begun, motion.begun = motion.begun, float("nan")
+            inputs, reached = (now, True, begun, False, False), (motion.progress.fraction, motion.progress.phase)
+            recorder.write(pose)
+            recorder.write(RecordedTick(now, *inputs, command, frames[-1], *reached, None, motion.lag))
+            changed += [] if np.isnan(motion.lag) else [(k, motion.lag)]
+    assert [k for k, _ in changed] == [40, 41] and LAG_STEP > 0.001
+    replayed = [tick.frame for tick in replay_run(tmp_path / "x.mcap")]
+    assert replayed == frames == [tick.recorded for tick in replay_run(tmp_path / "x.mcap")]
+    unchanged = LiveMotion(PROFILE, c_double(), None, lambda: 0.076)
+    unchanged.begin(begin)
+    others = [
+        frame_from_command(unchanged(pose_at(breathing, t), t), PROFILE.dialect) for t in 10 + 0.02 * np.arange(120)
+    ]
+    assert others[:40] == frames[:40] and others != frames

@@ -2,11 +2,16 @@
 
 An arm that does not answer leaves all of this unknown. Answers have no checksum, so a single one proves nothing: the
 deviation is the smaller one of the last two answers, which one garbled answer cannot raise.
+
+The lag is learned as long as the arm answers. What piles up in the arm's queue, as after a stall, only ever makes it
+later, until the queue runs empty. So the lag is what the quickest tenth of the last stretches of motion say; the rest
+of a delay is a backlog, and counts as motion that is under way.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +23,10 @@ from hardware.arm.queue import ArmQueue
 
 MIN_ANSWERS = 3  # answers before their absence means anything, as noise that looks like one comes alone
 SPEED_SPAN = 0.05  # s over which the set-point's speed is taken, and the slowest answers of a public driver come
-LAG_MEMORY = 0.98  # decay of the lag's sums with each answer: two or three seconds of them
+LAG_BLOCK = 1600.0  # (mm/s)^2, sum of a stretch of motion: four answers at 20 mm/s, whose rounding gives 1 to 2 ms
+MAX_LAG_BLOCKS = 64  # remembered: 10 to 15 s of motion at 20 mm/s
+QUICK_SHARE = 0.1  # of the stretches: a motion without backlog is known by so many
+LAG_SPREAD = 0.006  # s: a stretch that is later than the quick ones by more has a backlog; some times the rounding
 REST_TOLERANCE = 0.15, float(np.deg2rad(0.015))  # mm and rad between answers of an arm at rest: one count of rounding
 ANSWER_ROUNDING = 0.5001 * np.repeat([unit(ReplyKind.PLACE), unit(ReplyKind.TOOL)], 3)  # mm and rad, by which it rounds
 ON_WAY_TOLERANCE = 0.07  # mm: a little more than rounding puts an answer beside its way; a wider one detects later
@@ -63,7 +71,9 @@ class ArmFeedback:
     _period: float = math.nan  # s between places, smoothed
     _place: _AnsweredAxes = field(default_factory=_AnsweredAxes)
     _turn: _AnsweredAxes = field(default_factory=_AnsweredAxes)
-    _sums: tuple[float, float] = (0.0, 0.0)
+    _delays: tuple[float, float] = (0.0, 0.0)  # s, at least, of the last two answers; 0: it hardly moved
+    _sums: tuple[float, float] = (0.0, 0.0)  # of the open stretch: (mm/s)^2 s and (mm/s)^2
+    _stretches: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_LAG_BLOCKS))
 
     def take(self, reply: Reply, queue: ArmQueue, origin: Array, now: float) -> None:
         """Take an answer that came at `now`, s. origin: (3,) mm, from which the arm counts its place."""
@@ -83,9 +93,23 @@ class ArmFeedback:
 
     @property
     def lag(self) -> float:
-        """Measured s from set-point to answer; NaN until known."""
-        product, square = self._sums
-        return product / square if square >= MIN_LAG_INFORMATION else math.nan
+        """Measured s from set-point to answer, without what the arm's queue has piled up; NaN until known."""
+        if not self._stretches:
+            product, square = self._sums
+            return product / square if square >= MIN_LAG_INFORMATION else math.nan
+        lags = sorted(product / square for product, square in self._stretches)
+        quick = lags[int(QUICK_SHARE * (len(lags) - 1))]
+        near = [lag for lag in lags if lag <= quick + LAG_SPREAD]
+        return sum(near) / len(near)
+
+    @property
+    def backlog(self) -> float:
+        """Seconds of motion that the arm has yet to do beside what the model says, by its last two answers; 0 or more.
+
+        It is never taken for more than it is, as far as rounding goes; 0 while the lag is not known.
+        """
+        delay = min(self._delays) - self.lag
+        return delay if delay > LAG_SPREAD else 0.0
 
     @property
     def off(self) -> float:
@@ -140,6 +164,7 @@ class ArmFeedback:
     def forgive(self) -> None:
         """Forget deviations and delays: it counts as standing where it should."""
         self.behind = self.lasting = 0.0
+        self._delays = 0.0, 0.0
         for part in (self._place, self._turn):
             part.off = part.before = 0.0
 
@@ -165,6 +190,8 @@ class ArmFeedback:
     def restart(self) -> None:
         """Forget all answers: the device was away, or the operator said where the arm stands."""
         self.count, self.behind, self.lasting, self._period, self._sums = 0, 0.0, 0.0, math.nan, (0.0, 0.0)
+        self._stretches.clear()
+        self._delays = 0.0, 0.0
         self._place, self._turn = _AnsweredAxes(), _AnsweredAxes()
 
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
@@ -184,15 +211,21 @@ class ArmFeedback:
             self.behind = behind
 
     def _learn(self, place: Array, queue: ArmQueue, now: float) -> None:
-        """Least squares of the lag: the set-point leads the answer by its speed times the lag."""
+        """Least squares of the lag of a stretch: the set-point leads the answer by its speed times the lag."""
         ahead, before = (np.asarray(queue.at(t)[:3]).tolist() for t in (now, now - SPEED_SPAN))
         speed = [(a - b) / SPEED_SPAN for a, b in zip(ahead, before, strict=True)]
         lead = [a - p for a, p in zip(ahead, place.tolist(), strict=True)]
-        if math.hypot(*speed) < MIN_LAG_SPEED or self.off > self.settings.off:
+        fast = math.hypot(*speed)
+        if fast < MIN_LAG_SPEED or self._place.before > self.settings.off:
+            self._delays = 0.0, 0.0
             return
         product = sum(v * e for v, e in zip(speed, lead, strict=True))
         square = sum(v * v for v in speed)
-        self._sums = LAG_MEMORY * self._sums[0] + product, LAG_MEMORY * self._sums[1] + square
+        self._delays = self._delays[1], product / square - float(ANSWER_ROUNDING[0]) / fast
+        self._sums = self._sums[0] + product, self._sums[1] + square
+        if self._sums[1] >= LAG_BLOCK:
+            self._stretches.append(self._sums)
+            self._sums = 0.0, 0.0
 
 
 def near(answered: Array | None, axes: Array | None) -> bool:

@@ -201,6 +201,11 @@ class Arm(ArmDevice):
         return RecalledMoves(place, np.array(queue.target))
 
     @property
+    def lag(self) -> float:
+        """Measured s from set-point to answer; NaN until known."""
+        return self._feedback.lag
+
+    @property
     def travels(self) -> bool:
         """Whether the link makes a move of its own: home, or back to where the arm was stopped."""
         return self._own.step is not None
@@ -250,7 +255,7 @@ class Arm(ArmDevice):
     def _wait(self, now: float) -> Reason:
         """Why no command of a tick may go out now."""
         assert self._line is not None and self._queue is not None
-        if words := self._flow.full(self._line, self._queue, self.profile.tick, now):
+        if words := self._flow.full(self._line, self._queue, self.profile.tick, now, self._feedback.backlog):
             return Reason(words, LinkCode.FLOW_CONTROL)
         return Reason(self._feedback.doubt(now), LinkCode.FEEDBACK)
 

@@ -17,6 +17,7 @@ from planning.limits import MotionLimits
 from planning.motion.follow import LOOKAHEAD
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
+MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
 AXIS_LETTERS = "XYZABC"
 DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
@@ -73,6 +74,11 @@ def at_baud(profile: ArmProfile, baud: int) -> ArmProfile:
     """
     wire = FRAME_LENGTH * BITS_PER_BYTE / baud if baud > 0 else 0.0
     return replace(profile, baud=baud, tick=max(profile.tick, wire), lag=profile.lag - profile.frame_time + wire)
+
+
+def measured_lag(profile: ArmProfile, lag: float) -> float:
+    """The profile's lag, s, or the measured one where that is known. lag: s from set-point to answer, NaN: unknown."""
+    return lag + profile.frame_time if 0 < lag < MAX_SERVO_LAG else profile.lag
 
 
 def _check_joints(arm: SimpleArm, model: JointModel, limits: MotionLimits) -> None:

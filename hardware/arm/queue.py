@@ -170,8 +170,8 @@ class FlowControl:
         slow = self.profile.frame_time * (1 + WIRE_ROUNDING_BYTES / FRAME_LENGTH) + self.profile.tick
         return max(self.settings.flight, slow)
 
-    def full(self, line: ArmLine, queue: ArmQueue, more: float, now: float) -> str:
-        """Why a frame of `more` s must wait; "" where it need not."""
+    def full(self, line: ArmLine, queue: ArmQueue, more: float, now: float, backlog: float = 0.0) -> str:
+        """Why a frame of `more` s must wait; "" where it need not. backlog: s that the arm is behind the model."""
         if line.blocked:
             return f"the port has taken no bytes for {line.blocked_for(now):.3f} s"
         passing = max(queue.wire_free - now, 0.0) / self.profile.frame_time * FRAME_LENGTH
@@ -182,8 +182,8 @@ class FlowControl:
             return f"{waiting:.0f} bytes wait in the port"
         if (count := queue.frames(now)) >= self.settings.frames:
             return f"{count} frames are under way, limit {self.settings.frames}"
-        if queue.in_flight_with(more, now) > self.flight:
-            return f"{1000 * queue.in_flight(now):.0f} ms are under way, limit {1000 * self.flight:g} ms"
+        if queue.in_flight_with(more, now) + backlog > self.flight:
+            return f"{1000 * (queue.in_flight(now) + backlog):.0f} ms are under way, limit {1000 * self.flight:g} ms"
         return ""
 
     def excess(self, instruction: G1 | G4, queue: ArmQueue, now: float) -> str:

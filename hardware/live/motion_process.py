@@ -19,7 +19,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
 from hardware.arm.port import Port, PortOpener
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag
 from hardware.dispenser.dispenser import Dispensers
 from hardware.files.dispenser_file import dispenser_from_settings, dispensers_from_text
 from hardware.files.path_file import write_progress_durably
@@ -53,6 +53,7 @@ from planning.progress import PrintProgress
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"
 MAX_REPORTED_EVENTS = 50  # the last ones
+LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
 
 
@@ -66,17 +67,26 @@ class LiveMotion:
     begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
     waits: whether they were told to wait above the surface.
     material_in: whether the material that was wanted was put in since this was last reset.
+    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
+        tick, so that a replay is equal byte by byte.
     """
 
     last: Command
 
-    def __init__(self, profile: ArmProfile, place: c_double, material: MaterialControl | None = None) -> None:
-        self._profile, self._place, self._material = profile, place, material
+    def __init__(
+        self,
+        profile: ArmProfile,
+        place: c_double,
+        material: MaterialControl | None = None,
+        measured: Callable[[], float] = lambda: math.nan,
+    ) -> None:
+        """measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps."""
+        self._profile, self._place, self._material, self._measured = profile, place, material, measured
         self.waits = self.material_in = False
         self._step: MotionStep | None = None
         self._order: BeginPrint | None = None
         self.paused = self.asked = False
-        self.begun = math.nan
+        self.begun = self.lag = math.nan
 
     def begin(self, order: BeginPrint) -> None:
         """Print this path from now on."""
@@ -118,6 +128,11 @@ class LiveMotion:
             return self.last
         dry = "" if self._material is None else self._material.reason
         self._step.paused = self.waits = self.paused or bool(dry)
+        measured = self._measured()
+        lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
+        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
+        if not math.isnan(self.lag):
+            self._step.lag = lag
         self.last = self._step(pose, now)
         if self.waits and isinstance(self.last, Hold):
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
@@ -243,8 +258,8 @@ class _TickReporter:
             motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
             inputs = stamp, asked, begun, motion.waits, motion.material_in
-            motion.material_in = False
-            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached))
+            motion.material_in, lag = False, motion.lag if asked else math.nan
+            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
@@ -276,7 +291,8 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
-    motion = LiveMotion(profile, channels.place, material)
+    lag = lambda: math.nan if reporter.loop is None else reporter.loop.arm.lag  # noqa: E731
+    motion = LiveMotion(profile, channels.place, material, lag)
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     reporter = _TickReporter(channels, sender, ticks, priority)
     orders = _OrderReceiver(channels, motion, ticks)

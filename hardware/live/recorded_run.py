@@ -102,6 +102,8 @@ def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Itera
     for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
             step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets)
+        if step is not None and tick.get("lag"):
+            step.lag = float(tick["lag"][0])
         if step is not None and tick.get("recalled"):
             step.recalled(*np.array(tick["recalled"], float).reshape(2, 6))
         if step is None or not tick["asked"]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, measured_lag
 from hardware.live.checklist import PlacedPath, place_path, raised_path, run_checks
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
 from hardware.motion.loop import Order
@@ -35,7 +35,6 @@ SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many o
 HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
 ARMING_TIMEOUT = 5.0  # s until a stopped arm is at rest and can be armed
 RESEND_AFTER = 0.3  # s between orders to an arm that was not ready for the last one
-MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
 SEARCH_TIMEOUT = 180.0  # s in which an unattended run must pass its checks and find the surface
 ARM_BACK_TEXT = "the arm is back: resume, or go home first"
 ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
@@ -275,16 +274,17 @@ class RunStateMachine:
         return [*self._begin(tracking.interval, motion), PauseOrder.RESUME, Order.ARM]
 
     def _begin(self, interval: float, motion: LiveMotionReport) -> Orders:
-        """The order to print, once. interval: s between two poses, with which the ticks are to be in step."""
+        """The order to print, once. interval: s between two poses, with which the ticks are to be in step.
+
+        The lag is what is known of it by now; the motion process goes on learning it.
+        """
         if self._begun:
             return []
         assert self.placed_path is not None
         self._begun = True
         task, profile, status = self.task, self.placed_path.profile, motion.tick.status
         path = self.placed_path.path if task.lift is None else raised_path(self.placed_path.path, task.lift)
-        lag = task.profile.lag
-        if 0 < status.lag < MAX_SERVO_LAG:  # measured from set-point to answer, NaN where it does not answer
-            lag = status.lag + task.profile.frame_time
+        lag = measured_lag(task.profile, status.lag)
         tick = tick_in_step(profile.tick, interval, max(profile.tick / 2, 2 * profile.frame_time))
         profile = replace(profile, lag=lag, tick=tick)
         return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint)]

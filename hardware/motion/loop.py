@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import nan
 from typing import Protocol
 
 import numpy as np
@@ -199,6 +200,7 @@ class RecordedTick:
     fraction: float  # place on the path after it, in checkpoints
     phase: PrintPhase
     recalled: Array | None = None  # (2, 6) mm and rad: where the arm rested and stands, where moves were called back
+    lag: float = nan  # s, the arm's lag from this tick on; NaN: as before
 
 
 MAX_COMMANDS = 256  # commands, five seconds of them: frames are never that late

@@ -64,6 +64,18 @@ class MotionStep:
         self._planner.material_in()
 
     @property
+    def lag(self) -> float:
+        """Seconds from one tick after a command was sent until the arm is at its axes: the profile's until it is set.
+
+        Whoever sets it records it with the tick, as the commands from then on depend on it.
+        """
+        return self._planner.lag
+
+    @lag.setter
+    def lag(self, value: float) -> None:
+        self._planner.lag = self._guard.lag = value
+
+    @property
     def paused(self) -> bool:
         """Whether the nozzle is to retract from the surface and wait there; it then goes on where it left off."""
         return self._planner.paused

@@ -208,6 +208,7 @@ def message_from_tick(tick: RecordedTick) -> Message:
         "asked": tick.asked,
         "begun": _flat(np.array([tick.begun])),
         "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
+        "lag": _flat(np.array([tick.lag])),
         "paused": tick.paused,
         "material_in": tick.material_in,
         "fraction": tick.fraction,

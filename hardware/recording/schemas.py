@@ -192,6 +192,7 @@ TOPICS: dict[str, Schema] = {
         asked=_described(FLAG, "whether planner and guard were asked, and gave the frame"),
         begun=_array(NUMBER, None, "where on the path they were begun anew before it; empty: they were not"),
         recalled=_array(NUMBER, None, "12, mm and rad: where the arm rested and stands, if moves were called back"),
+        lag=_array(NUMBER, None, "s, the arm's, by which they went from this tick on; empty: as before"),
         paused=_described(FLAG, "whether they were told to wait above the surface"),
         material_in=_described(FLAG, "whether the material that they had asked for was put in before it"),
         fraction=_described(NUMBER, "place on the path, counted in checkpoints"),

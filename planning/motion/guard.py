@@ -35,7 +35,7 @@ class Guard:
         error and speed are taken at the zone's place nearest to the nozzle: far from it, on the way from home, a small
         turn of the surface is no reason to stop.
         """
-        self._limits, self._arm, self._tick, self._lag = limits, arm, tick, lag
+        self._limits, self._arm, self._tick, self.lag = limits, arm, tick, lag
         self._zone = np.array([[-np.inf] * 3, [np.inf] * 3]) if zone is None else zone
         self._axes = arm.home.copy()  # of the last move that was let through
         self._stamp = -math.inf
@@ -176,7 +176,7 @@ class Guard:
         if (turn := math.hypot(*pose.twist[:3])) > (limit := limits.surface_turn):
             text = f"the surface turns at {np.rad2deg(turn):.2f} degrees/s, limit {np.rad2deg(limit):g}"
             return Breach(RefusalCode.SURFACE_TURN, turn, limit, text)
-        error = _error(pose, place, age + self._tick + self._lag)
+        error = _error(pose, place, age + self._tick + self.lag)
         if not error <= (limit := limits.pose_error):
             text = f"the place under the nozzle is known to {error:.3f} mm, limit {limit:g} mm"
             return Breach(RefusalCode.POSE_ERROR, error, limit, text)

@@ -79,7 +79,7 @@ class Planner:
         start: how much of the path is printed already, in checkpoints (PrintProgress.fraction). outlets: of materials;
         one that is not among them leaves at once.
         """
-        self._path, self._limits, self._arm, self._tick, self._lag = check_path(path), limits, arm, tick, lag
+        self._path, self._limits, self._arm, self._tick, self.lag = check_path(path), limits, arm, tick, lag
         self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
         self._zone = path.zone
         self._follower = AxisFollower(arm.home, limits, tick)
@@ -110,8 +110,8 @@ class Planner:
             return self._stop(now, "no pose yet")
         if reason := self._pose_fault(pose, now):
             return self._stop(now, reason)
-        if self._lag:  # as the arm, late by the lag, will meet it, under its own stamp
-            pose = replace(pose.predict(pose.stamp + self._lag), stamp=pose.stamp)
+        if self.lag:  # as the arm, late by the lag, will meet it, under its own stamp
+            pose = replace(pose.predict(pose.stamp + self.lag), stamp=pose.stamp)
         if self.paused or self._rests.wanted:
             return self._retreat(pose, now)
         if self._pause_pose is not None:  # after a pause the way back to the path begins anew
@@ -162,7 +162,7 @@ class Planner:
 
     def _pose_fault(self, pose: SurfacePose, now: float) -> str:
         """Why the pose must not be followed, "" if it may."""
-        limits, then = self._limits, now + self._tick + self._lag
+        limits, then = self._limits, now + self._tick + self.lag
         if not _finite(pose):
             return "the pose is not finite"
         if not pose.state.measured:
