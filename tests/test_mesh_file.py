@@ -15,8 +15,8 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from hardware.files import mesh_file
-from hardware.files.mesh_file import read_mesh, read_raw_mesh
-from hardware.files.ply_file import MAX_LINE_BYTES, RawMesh, fans, write_ply
+from hardware.files.mesh_file import STL_HEADER_BYTES, in_mm, read_mesh, read_raw_mesh
+from hardware.files.ply_file import MAX_LINE_BYTES, MAX_MESH_ROWS, RawMesh, fans, write_ply
 from tests import scans
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
 
@@ -299,7 +299,7 @@ BIG = HEAD.replace(b"ascii", b"binary_big_endian")
         (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"3 0 1 " + b"9" * 5000), "line 13"),
         (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"3 0 1 " + b"9" * 30), "line 13"),
         (HEAD + FACE + b"end_header\n" + ROWS + b"1 2 3", "nothing behind"),
-        (BIG.replace(b"vertex 3", b"vertex 1" + b"0" * 17) + b"end_header\n" + bytes(36), "rows of vertex = 3"),
+        (BIG.replace(b"vertex 3", b"vertex 1" + b"0" * 17) + b"end_header\n" + bytes(36), "rows of vertex = 100000000000000000"),
         (BIG + FACE.replace(b"uchar", b"uint") + b"end_header\n" + bytes(36) + b"\xff" * 8, "rows of face = 0"),
         (BIG + FACE.replace(b"uchar", b"char") + b"end_header\n" + bytes(36) + b"\xff" * 8, "length of vertex_indices"),
         (
@@ -341,3 +341,37 @@ def test_what_is_wrong_in_an_obj_file_is_said(line: str, said: str, tmp_path: Pa
 def test_what_is_wrong_in_an_stl_file_is_said(old: str, new: str, said: str, tmp_path: Path) -> None:
     text = text_stl([(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (0.0, 20.0, 0.0)], [[0, 1, 2]]).decode()
     assert said in refused(tmp_path, "x.stl", text.replace("  vertex", "vertex").replace(old, new).encode())
+
+
+def test_a_mesh_of_too_many_rows_is_refused_by_its_header_alone(tmp_path: Path) -> None:
+    """The rows are not there: whoever read them would say so instead."""
+    count = MAX_MESH_ROWS + 1
+    for element, rows in (("vertex", "property float x"), ("face", "property list uchar int vertex_indices")):
+        text = f"ply\nformat binary_little_endian 1.0\nelement {element} {count}\n{rows}\nend_header\n"
+        (tmp_path / "x.ply").write_text(text)
+        assert f"rows of {element} = {count}, allowed {MAX_MESH_ROWS} or fewer" in refusal(tmp_path / "x.ply")
+    with (tmp_path / "x.stl").open("wb") as file:  # a hole of so many zeros takes no disk
+        file.write(bytes(80) + count.to_bytes(4, "little"))
+        file.truncate(STL_HEADER_BYTES + 50 * count)
+    assert f"triangles = {count}" in refusal(tmp_path / "x.stl")
+
+
+def test_text_of_too_many_rows_is_refused_as_soon_as_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hardware.files.ply_file.MAX_MESH_ROWS", 10)
+    (tmp_path / "x.obj").write_text("v 0 0 0\n" * 11 + "this is never read\n")
+    assert "vertices = 11" in refusal(tmp_path / "x.obj")
+    (tmp_path / "x.obj").write_text("v 0 0 0\n" * 3 + "f 1 2 3\n" * 11 + "this is never read\n")
+    assert "faces = 11" in refusal(tmp_path / "x.obj")
+    facet = "facet\nouter\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    (tmp_path / "x.stl").write_text("solid x\n" + facet * 11 + "this is never read\n")
+    assert "triangles = 11" in refusal(tmp_path / "x.stl")
+
+
+@pytest.mark.parametrize("far", [1e7, 1e38, -1e300])
+def test_a_vertex_that_is_kilometres_away_is_named(far: float) -> None:
+    vertices = BALL.vertices.copy()
+    vertices[5, 1] = far
+    with pytest.raises(InputError, match=r"x.ply: vertex 5 = .* allowed coordinates within 1e\+06 mm"):
+        in_mm(vertices, BALL.triangles, "mm", "x.ply")
+    vertices[5, 1] = np.nan  # is left out, and counted
+    assert in_mm(vertices, BALL.triangles, "mm", "x.ply").shape == vertices.shape

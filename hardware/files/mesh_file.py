@@ -16,7 +16,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.scans.scan import Scan, open_edges, scan_from_triangles
 from estimation.se3 import Array
-from hardware.files.ply_file import RawMesh, fans, read_ply, text_rows, wrong_line
+from hardware.files.ply_file import RawMesh, check_rows, fans, read_ply, text_rows, wrong_line
 
 STL_HEADER_BYTES = 84  # bytes: eighty of anything, and the number of triangles
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -30,6 +30,7 @@ def read_stl(path: Path) -> RawMesh:
         size, head = path.stat().st_size, file.read(STL_HEADER_BYTES)
         count = int.from_bytes(head[80:], "little")
         if len(head) == STL_HEADER_BYTES and size == STL_HEADER_BYTES + STL_TRIANGLE.itemsize * count:
+            check_rows(path, "triangles", count)
             corners = np.fromfile(file, STL_TRIANGLE)["corners"].astype(np.float64).reshape(-1, 3)
         elif head.lstrip()[:5].lower() == b"solid":
             file.seek(0)
@@ -55,6 +56,7 @@ def _text_corners(file: BinaryIO, path: Path) -> array[float]:
             if word == b"vertex":
                 x, y, z = words[1:]
                 corners.extend((float(x), float(y), float(z)))
+                check_rows(path, "triangles", len(corners) // 9)
         except ValueError:
             allowed = expected.decode() + STL_FACET_REST.get(expected, "") if solid else "solid"
             raise wrong_line(path, number, words, allowed) from None
@@ -84,10 +86,12 @@ def read_obj(path: Path) -> RawMesh:
                 if word == b"v":
                     x, y, z = words[1:4]
                     places.extend((float(x), float(y), float(z)))
+                    check_rows(path, "vertices", len(places) // 3)
                 else:
                     face = _face(words[1:], len(places) // 3)
                     counts.append(len(face))
                     corners.extend(face)
+                    check_rows(path, "faces", len(counts))
             except (ValueError, OverflowError):
                 raise wrong_line(path, number, words, OBJ_VERTEX if word == b"v" else OBJ_FACE) from None
     triangles = fans(np.array(counts, np.int64), np.array(corners, np.int64))
@@ -168,6 +172,7 @@ def _check_size(path: Path, vertices: Array) -> None:
 
 
 SCAN_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}  # mm of each
+MAX_COORDINATE = 1e6  # mm: a kilometre; beyond it a scan has lost the hundredth of a millimetre, and sums overflow
 MIN_SCAN_WITH_SKIN, MAX_SCAN_WITH_SKIN = 20.0, 1000.0  # mm, longest side: from a finger to a leg
 
 
@@ -177,6 +182,11 @@ def in_mm(vertices: Array, triangles: Array, unit: str, where: object) -> Array:
     used = used[np.isfinite(used).all(axis=1)]
     if not len(used):
         raise InputError(where, "vertices", "none that is finite", "a scan with finite coordinates")
+    away = (np.abs(vertices) > MAX_COORDINATE / SCAN_UNITS[unit]).any(axis=1) & np.isfinite(vertices).all(axis=1)
+    far = np.flatnonzero(away)
+    if len(far):
+        allowed = f"coordinates within {MAX_COORDINATE:g} mm, or not finite ones, which are left out"
+        raise InputError(where, f"vertex {far[0]}", vertices[far[0]].tolist(), allowed)
     low, high = np.percentile(used, [1, 99], axis=0)  # without stray vertices
     longest = float((high - low).max())
     size = longest * SCAN_UNITS[unit]

@@ -20,6 +20,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 
 MAX_LINE_BYTES = 1 << 16  # bytes of a line of text: a triangle takes some fifty
+MAX_MESH_ROWS = 2_000_000  # vertices, and faces: a plan of so many takes 1 GB, and a minute or two
 Numbers = np.ndarray[Any, Any]
 
 
@@ -44,6 +45,12 @@ def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int,
 def wrong_line(path: Path, number: int, words: list[bytes], allowed: str) -> InputError:
     """The error about a line of a text file."""
     return InputError(path, f"line {number}", b" ".join(words).decode("utf-8", "replace"), allowed)
+
+
+def check_rows(path: Path, what: str, count: int) -> None:
+    """InputError where a mesh has more vertices or faces, which is known before they are read, than can be used."""
+    if count > MAX_MESH_ROWS:
+        raise InputError(path, what, count, f"{MAX_MESH_ROWS} or fewer: make the mesh coarser")
 
 
 def fans(counts: Numbers, corners: Numbers) -> Numbers:
@@ -114,6 +121,8 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
                 elements[-1].properties.append(declared)
             case [b"end_header"]:
                 _check(path, number, elements)
+                for element in elements:
+                    check_rows(path, f"rows of {element.name}", element.rows)
                 return PlyHeader(order, elements, number)
             case _:
                 raise wrong_line(path, number, words, PLY_HEADER_LINES)

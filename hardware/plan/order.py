@@ -15,6 +15,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.files.mesh_file import in_mm, read_raw_mesh
 from hardware.files.path_file import read_contour
+from hardware.process.progress import ProgressReport, no_progress
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits
@@ -200,6 +201,9 @@ def _number(text: str, word: str, low: float, high: float) -> float:
     return value
 
 
+SCAN_STEPS = 3  # a mesh is read, repaired, and its wound found
+
+
 def check_out(out: Path, gcode: Path | None, force: bool) -> None:
     """Make the folder of the file that is written; InputError where it stands there already and `force` is not set."""
     if out.suffix.lower() != ".csv":
@@ -211,8 +215,8 @@ def check_out(out: Path, gcode: Path | None, force: bool) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
 
 
-def subject_of(request: PlanRequest, flat: bool) -> PlanSubject:
-    """The wound that is to be planned, read and found. flat: the scan is a contour."""
+def subject_of(request: PlanRequest, flat: bool, progress: ProgressReport = no_progress) -> PlanSubject:
+    """The wound that is to be planned, read and found. flat: the scan is a contour. progress: of a mesh's steps."""
     step = float(np.clip(GRID_PER_BEAD * request.settings.bead, MIN_GRID_STEP, MAX_GRID_STEP))
     if request.example is not None and request.scan is not None:
         raise InputError(COMMAND_LINE, "SCAN", request.scan, "none beside --example")
@@ -229,10 +233,14 @@ def subject_of(request: PlanRequest, flat: bool) -> PlanSubject:
             raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
         return PlanSubject(request.scan.name, flat_wound(contour, height, request.scan), None)
     raw = read_raw_mesh(request.scan)
+    progress(1, SCAN_STEPS)
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
     scan, repairs = repair_mesh(vertices, raw.triangles, request.scan, request.flip)
+    progress(2, SCAN_STEPS)
     outline = None if request.outline is None else _outline(request.outline, scan.vertices)
-    return PlanSubject(request.scan.name, find_wound(scan, step, request.scan, outline, request.flip), repairs)
+    wound = find_wound(scan, step, request.scan, outline, request.flip)
+    progress(SCAN_STEPS, SCAN_STEPS)
+    return PlanSubject(request.scan.name, wound, repairs)
 
 
 def _outline(file: Path, vertices: Array) -> Array:

@@ -60,7 +60,8 @@ def run_plan(request: PlanRequest) -> str:
             raise InputError("command line", "--session", request.session, allowed)
         open_session(request.session)  # what is wrong with it is reported before anything is written
     check_out(request.out, request.gcode, request.force)
-    subject = subject_of(request, flat)
+    with _progress("scan", "steps (read, repaired, wound found)") as progress:
+        subject = subject_of(request, flat, progress)
     with _progress("plan", "layers") as progress:
         plan = make_plan(subject.wound, order, subject.name, progress)
     path, arm = (plan.path, NO_ARM_GIVEN) if request.arm is None else with_feasible(plan.path, request.arm)
