@@ -283,7 +283,7 @@ BIG = HEAD.replace(b"ascii", b"binary_big_endian")
         (HEAD.replace(b"vertex 3", b"vertex " + b"9" * 5000) + FACE + b"end_header\n" + ROWS, "line 3"),
         (HEAD.replace(b"vertex 3", b"vertex") + FACE + b"end_header\n" + ROWS, "line 3"),
         (HEAD.replace(b"vertex 3", b"vertex -1") + FACE + b"end_header\n" + ROWS, "line 3"),
-        (HEAD.replace(b"vertex 3", b"vertex 99999999999999") + FACE + b"end_header\n" + ROWS, "line 13"),
+        (HEAD.replace(b"vertex 3", b"vertex 999999") + FACE + b"end_header\n" + ROWS, "line 13"),
         (HEAD.replace(b"ascii", b""), "line 2"),
         (HEAD + FACE.replace(b"uchar", b"[" * 400) + b"end_header\n" + ROWS, "line 8"),
         (HEAD + FACE.replace(b"uchar", b"float") + b"end_header\n" + ROWS, "line 8"),
@@ -299,7 +299,10 @@ BIG = HEAD.replace(b"ascii", b"binary_big_endian")
         (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"3 0 1 " + b"9" * 5000), "line 13"),
         (HEAD + FACE + b"end_header\n" + ROWS.replace(b"3 0 1 2", b"3 0 1 " + b"9" * 30), "line 13"),
         (HEAD + FACE + b"end_header\n" + ROWS + b"1 2 3", "nothing behind"),
-        (BIG.replace(b"vertex 3", b"vertex 1" + b"0" * 17) + b"end_header\n" + bytes(36), "rows of vertex = 100000000000000000"),
+        (
+            BIG.replace(b"vertex 3", b"vertex 1" + b"0" * 17) + b"end_header\n" + bytes(36),
+            "rows of vertex = 100000000000000000",
+        ),
         (BIG + FACE.replace(b"uchar", b"uint") + b"end_header\n" + bytes(36) + b"\xff" * 8, "rows of face = 0"),
         (BIG + FACE.replace(b"uchar", b"char") + b"end_header\n" + bytes(36) + b"\xff" * 8, "length of vertex_indices"),
         (

@@ -26,7 +26,7 @@ from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, wa
 from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.session_reader import open_session
 from tests.recorded import whole_recording, write_frames
-from tests.session_files import image, rig, stamps
+from tests.session_files import image, make_folder, rig, stamps
 from tests.started import ROOT
 
 SQUARE = ROOT / "data" / "paths" / "square_10mm.csv"
@@ -181,6 +181,41 @@ def test_a_full_disk_is_one_error_and_what_was_written_stays_readable(tmp_path: 
     assert not isinstance(caught.value, InputError)
     session = open_session(path)
     assert len(session) > 10 and len(list(session.frame_sets())) == len(session)
+
+
+def test_a_disk_that_is_full_at_once_leaves_nothing_and_that_is_said(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "x.mcap", rig(2))
+    with disk_of(2000), pytest.raises(StillbedError, match=r"x\.mcap: recording stopped.*; nothing of it can be read"):
+        write_frames(recorder, 10_000)
+    recorder.close()
+    with pytest.raises(InputError):
+        open_session(tmp_path / "x.mcap")
+
+
+def test_an_import_onto_a_full_disk_names_its_file_and_keeps_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_folder(tmp_path / "folder", 20)
+    target = tmp_path / "out" / "y.mcap"
+    with disk_of(20_000):
+        assert main(["import", str(tmp_path / "folder"), "-o", str(target)]) == 2
+    told = capsys.readouterr().err
+    assert f"stillbed: {target}: cannot write: recording stopped, " in told and "; nothing is kept of it\n" in told
+    assert not list(target.parent.iterdir())
+
+
+def test_a_full_disk_is_told_with_the_file_that_it_struck_and_what_is_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_folder(tmp_path / "folder", 20)
+    (tmp_path / "folder" / "surface.ply").unlink()  # it is none
+    out = tmp_path / "out"
+    with disk_of(800):
+        assert main(["replay", str(tmp_path / "folder"), "--path", str(SQUARE), "-o", str(out)]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "Errno" not in told and str(out) in told
+    kept = sorted(file.name for file in out.iterdir()) if out.is_dir() else []
+    assert all(name in told for name in kept) and (kept or "nothing was written" in told)
 
 
 def test_an_error_inside_the_block_is_not_hidden_and_the_file_is_closed(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Pars
 from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
-from hardware.process.progress import left_files_text, prepare_out
+from hardware.process.progress import left_files_text, prepare_out, write_error_text
 from hardware.process.system import fill_standard_streams
 from perception.package_data import named_path
 
@@ -159,7 +159,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
-        print(f"stillbed: {error_text(error)}", file=sys.stderr)
+        nameless = isinstance(error, OSError) and error.filename is None and error.strerror
+        print(f"stillbed: {write_error_text(error, out) if nameless else error_text(error)}", file=sys.stderr)
         if out is not None and not was_there:
             with suppress(OSError):
                 out.rmdir()  # made for what was not done; what holds anything stays

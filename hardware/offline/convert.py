@@ -33,8 +33,9 @@ from hardware.files.folder_tables import (
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.files.session import HEAD_STAMP_TOLERANCE, FrameRef, Session
 from hardware.files.session_folder import TRUTH_FILES, truth_file
+from hardware.process.checks import error_text
 from hardware.process.progress import ProgressReport, no_progress
-from hardware.recording.recorder import Recorder
+from hardware.recording.recorder import NOT_KEPT, Recorder
 from hardware.recording.schemas import INFO, WARNING
 from hardware.recording.session_reader import open_session, read_truth_rows
 from perception.frames import Frame, FrameSet, Roi
@@ -64,11 +65,14 @@ def import_folder(
     part = _part_name(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with Recorder(part, session.rig, jpeg_quality, overwrite=True) as recorder:
+        with Recorder(part, session.rig, jpeg_quality, overwrite=True, kept=False) as recorder:
             _record(session, folder, recorder, progress, jpeg_quality is None)
         os.replace(part, target)
-    except OSError as error:
-        raise StillbedError(f"{target}: cannot write: {error}") from error
+    except (StillbedError, OSError) as error:
+        if isinstance(error, InputError):
+            raise
+        why = error_text(error) if isinstance(error, OSError) else str(error).replace(f"{part}: ", "")
+        raise StillbedError(f"{target}: cannot write: {why.removesuffix(NOT_KEPT)}{NOT_KEPT}") from error
     finally:
         with contextlib.suppress(OSError):  # it is renamed, or was never there
             part.unlink()
@@ -94,7 +98,7 @@ def export_recording(mcap_path: str | Path, folder: str | Path, progress: Progre
             target.rmdir()  # empty, or this fails
         os.replace(part, target)
     except OSError as error:
-        raise StillbedError(f"{target}: cannot write: {error}") from error
+        raise StillbedError(f"{target}: cannot write: {error_text(error)}{NOT_KEPT}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return session.damage

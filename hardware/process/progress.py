@@ -118,6 +118,15 @@ def left_files_text(out: Path | None) -> str:
     return f"kept {out}" if out.exists() else "nothing was written"
 
 
+def write_error_text(error: Exception, out: Path | None) -> str:
+    """An error of the system that names no file, as those of a full disk do: where it struck, and what is left there."""
+    why = str(getattr(error, "strerror", None) or error).lower()
+    if out is None:
+        return why
+    cut = ", of which what was written last may end early" if out.is_dir() and any(out.iterdir()) else ""
+    return f"{out}: {why}; {left_files_text(out)}{cut}"
+
+
 def cache_folder() -> Path:
     """Where it is, as the XDG rules have it; it may not be there yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"

@@ -25,6 +25,7 @@ from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
 from hardware.process.checks import read_bytes
 from hardware.recording import messages
+from hardware.recording.mcap_file import ChunkMessages, walk
 from hardware.recording.mcap_writer import McapWriter
 from hardware.recording.messages import SURFACE_FRAME, Message
 from hardware.recording.schemas import CALIBRATION, INFO, TOPICS, Schema, calibration_topic, camera_frame, image_topic
@@ -35,6 +36,7 @@ MAX_CHUNK_SECONDS = 0.5  # s of stamps that a killed run may lose: half of the s
 MAX_CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
 LOG_EPOCH = 1_000_000_000  # s added to log times where stamps do not count from 1970: MCAP has none below zero
 MIN_WALL_CLOCK_STAMP = 1e8  # s: a first stamp above it counts from 1970
+NOT_KEPT = "; nothing is kept of it"
 MAX_LOG_TIME = 2**63 - 1  # ns
 
 RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic and encoder of each kind of record
@@ -64,13 +66,15 @@ class Recorder:
         jpeg_quality: int | None = None,
         overwrite: bool = False,
         compress: bool = True,
+        kept: bool = True,
     ) -> None:
         """Create the file at `path`; images are stored as PNG, or as JPEG of `jpeg_quality` (0-100).
 
         compress: whether chunks are compressed, which saves a quarter of the file and costs a third of the time.
+        kept: whether the caller leaves the file where it stands after a failure; said in the error.
         """
         self.path, self.rig = Path(path), rig
-        self._jpeg_quality = jpeg_quality
+        self._jpeg_quality, self._kept = jpeg_quality, kept
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._numbers = [0] * len(rig)  # next frame number per camera
@@ -274,5 +278,15 @@ class Recorder:
         try:
             return action()
         except OSError as error:
-            self._failed = f"{self.path}: recording stopped, {error.strerror or error}; what was written before is kept"
+            self._failed = f"{self.path}: recording stopped, {(error.strerror or str(error)).lower()}{self._left()}"
             raise StillbedError(self._failed) from error
+
+    def _left(self) -> str:
+        """What a failed write leaves, by a look at the file."""
+        if not self._kept:
+            return NOT_KEPT
+        try:
+            readable = any(isinstance(part, ChunkMessages) and part.messages for part in walk(self.path))
+        except (InputError, OSError):
+            readable = False
+        return "; what was written before is kept" if readable else "; nothing of it can be read"
