@@ -368,3 +368,23 @@ def test_a_pipe_of_jpegs_is_a_camera(tmp_path: Path) -> None:
 def test_every_camera_needs_a_source() -> None:
     with pytest.raises(InputError, match="one per camera of the rig, 2"):
         LiveCameras(rig_of(2), [], CLOCK)
+
+
+def test_a_driver_that_raises_counts_as_gone_is_told_and_opened_again() -> None:
+    """Its thread goes on: the picture comes with the third opening."""
+    clock, out, ways = SimClock(), list[Arrival](), iter(range(3))
+
+    class Raising(ListedCapture):
+        def grab(self) -> bool:
+            raise RuntimeError("driver bug")
+
+    def opener(*_: object) -> ListedCapture:
+        if next(ways) < 2:
+            return Raising(shots(3), clock, True, LOCKED)
+        feed.close()  # after the step that this is part of, and the next
+        return ListedCapture(shots(3), clock, True, LOCKED)
+
+    feed = Feed(CameraPlace(0, "cam", SIZE, 0.5), DEVICE, clock, out.append, opener)
+    feed.run()
+    assert "cannot be opened" in feed.state().trouble and feed.state().trouble.endswith("RuntimeError: driver bug")
+    assert next(ways, None) is None

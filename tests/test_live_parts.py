@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
@@ -26,7 +26,15 @@ from hardware.live.checklist import place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.motion_process import LAG_STEP, LiveMotion
 from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
-from hardware.live.prepared import RunFiles, SurfacePlacement, prepare, prepare_resumed, read_placement, write_placement
+from hardware.live.prepared import (
+    ProgressWriter,
+    RunFiles,
+    SurfacePlacement,
+    prepare,
+    prepare_resumed,
+    read_placement,
+    write_placement,
+)
 from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
 from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry
@@ -420,3 +428,53 @@ def test_a_lag_that_is_learned_anew_during_a_run_is_recorded_and_replayed_byte_b
         frame_from_command(unchanged(pose_at(breathing, t), t), PROFILE.dialect) for t in 10 + 0.02 * np.arange(120)
     ]
     assert others[:40] == frames[:40] and others != frames
+
+
+class Broken:
+    """Stands for a place, or for a pipe, of which the use fails in a way that nobody thought of."""
+
+    def __init__(self) -> None:
+        self.asked = threading.Event()
+
+    @property
+    def value(self) -> float:
+        self.asked.set()
+        raise RuntimeError("out of its mind")
+
+    def fileno(self) -> int:
+        raise RuntimeError("out of its mind")
+
+    def close(self) -> None:
+        self.asked.set()
+
+
+def test_whatever_ends_the_thread_that_keeps_the_place_is_told(tmp_path: Path) -> None:
+    place = Broken()
+    writer = ProgressWriter(tmp_path / "progress.toml", "x", place)
+    assert place.asked.wait(5)
+    writer.close()
+    assert writer.failed == f"{tmp_path / 'progress.toml'}: RuntimeError: out of its mind"
+
+
+def test_whatever_ends_the_thread_that_sends_to_the_recorder_is_told() -> None:
+    pipe = Broken()
+    sender = RecorderSender(pipe)
+    sender.check()
+    for _ in range(2):
+        sender.put(EventEntry(0.0, "x", 2, "y"))
+    assert pipe.asked.wait(5)
+    sender.close()
+    assert sender.failed == "RuntimeError: out of its mind" and sender.dropped == 1  # the other one was being sent
+    with pytest.raises(StillbedError, match="nothing is recorded any more: RuntimeError: out of its mind"):
+        sender.check()
+    sender.put(EventEntry(0.0, "x", 2, "y"))
+    assert sender.dropped == 2
+
+
+def test_a_sender_whose_recorder_has_ended_is_no_failure_of_its_own() -> None:
+    ours, theirs = Pipe(duplex=False)
+    sender = RecorderSender(theirs)
+    ours.close()
+    sender.put(EventEntry(0.0, "x", 2, "y"))
+    sender.close()
+    sender.check()

@@ -6,6 +6,7 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
@@ -96,6 +97,7 @@ class CameraState:
     reopened: int  # number of times the camera came back
     controls: tuple[Control, ...]
     newest: Image | None  # its last picture, faulty or not
+    error: str = ""  # the last one that its driver raised
 
     @property
     def trouble(self) -> str:
@@ -103,7 +105,8 @@ class CameraState:
         if self.phase is CameraPhase.ENDED:
             return f"{self.name} has been played to its end"
         if self.phase is not CameraPhase.OPEN:
-            return f"{self.name} cannot be opened since {self.since:.1f} s ({self.source})"
+            why = f": {self.error}" if self.error else ""
+            return f"{self.name} cannot be opened since {self.since:.1f} s ({self.source}){why}"
         if self.age > STALL_AFTER:
             why = "delivers nothing" if self.fault is None else self.fault.value
             return f"{self.name} {why} since {self.age:.1f} s ({self.source})"
@@ -173,6 +176,7 @@ class Feed:
         self._controls: tuple[Control, ...] = ()
         self._stamped: FrameStamp | None = None
         self._newest: Image | None = None
+        self._error = ""
         self._begin()
 
     def _begin(self) -> None:
@@ -183,7 +187,10 @@ class Feed:
     def run(self) -> None:
         """Step until closed, or the file has ended."""
         while not self._closing.is_set() and self._phase is not CameraPhase.ENDED:
-            self.step()
+            try:
+                self.step()
+            except Exception as error:  # of a driver: the camera counts as gone, and is opened again
+                self._fail(error)
         self._release()
 
     def close(self) -> None:
@@ -262,6 +269,15 @@ class Feed:
             self._release()
             self._enter(CameraPhase.GONE)
 
+    def _fail(self, error: Exception) -> None:
+        with suppress(Exception):
+            self._release()
+        self._capture = None
+        with self._lock:
+            self._error = f"{type(error).__name__}: {error}"
+        self._enter(CameraPhase.GONE)
+        self._wait(self._back_off)
+
     def _enter(self, phase: CameraPhase) -> None:
         with self._lock:
             if phase is not self._phase:
@@ -299,4 +315,5 @@ class Feed:
                 reopened=max(0, self._opened - 1),
                 controls=self._controls,
                 newest=self._newest,
+                error=self._error,
             )

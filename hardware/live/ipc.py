@@ -161,9 +161,11 @@ def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
 
 def _stop_after(lifeline: Connection, stop: threading.Event) -> None:
     """Set `stop` some time after the other end of the lifeline is gone."""
-    lifeline.poll(None)
-    stop.wait(ARM_AFTERLIFE)
-    stop.set()
+    try:
+        lifeline.poll(None)
+        stop.wait(ARM_AFTERLIFE)
+    finally:
+        stop.set()
 
 
 @dataclass(slots=True)

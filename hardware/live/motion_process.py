@@ -13,7 +13,7 @@ from ctypes import c_double
 from dataclasses import replace
 from types import FrameType
 
-from estimation.errors import InputError
+from estimation.errors import StillbedError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
@@ -247,7 +247,8 @@ class _TickReporter:
         self._sender.put(WireEntry(now, data, sent))
 
     def report(self, tick: Tick) -> None:
-        """Record and report a tick that is done."""
+        """Record and report a tick that is done; StillbedError, which ends the loop, where recording has failed."""
+        self._sender.check()
         loop, motion = self.loop, self.motion
         assert loop is not None and motion is not None
         self._events.extend(loop.arm.events())
@@ -308,7 +309,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
             arm.close()
             for words in [] if material is None else material.close(clock):
                 sender.put(EventEntry(clock.now(), f"could not be switched off: {words}", WARNING, "dispenser"))
-    except InputError as error:
+    except StillbedError as error:  # the arm cannot be used, or nothing is recorded any more
         channels.trouble.put(str(error))
     finally:
         device.release()

@@ -319,7 +319,7 @@ def add_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
 class ProgressWriter:
     """Writes progress.toml in a thread whenever the place has changed, as the disk may take its time.
 
-    failed: the error of the disk, "" if there is none.
+    failed: the error of the disk, or what ended the thread; "" if there is none.
     """
 
     def __init__(self, file: File, fingerprint: str, place: c_double) -> None:
@@ -337,9 +337,12 @@ class ProgressWriter:
         self._thread.join()
 
     def _keep(self) -> None:
-        while not self._closed.wait(PROGRESS_PERIOD):
+        try:
+            while not self._closed.wait(PROGRESS_PERIOD):
+                self._write()
             self._write()
-        self._write()
+        except Exception as error:  # whatever ends this thread ends the run
+            self.failed = f"{self._file}: {type(error).__name__}: {error}"
 
     def _write(self) -> None:
         fraction = self._place.value

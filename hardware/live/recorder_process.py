@@ -59,10 +59,15 @@ RECORDER_NICENESS = 10  # below all that moves the arm
 
 
 class RecorderSender:
-    """One process's queue to the recorder. dropped: entries without room, or after the recorder has ended."""
+    """One process's queue to the recorder.
+
+    dropped: entries without room, or after the recorder has ended.
+    failed: what ended the thread that sends, other than the recorder's end; "" while all is well. Who owns the sender
+        looks at it, and ends the run.
+    """
 
     def __init__(self, connection: Connection) -> None:
-        self.dropped = 0
+        self.dropped, self.failed = 0, ""
         self._connection = connection
         self._waiting: deque[bytes] = deque()
         self._size, self._closed, self._gone = 0, False, False
@@ -97,12 +102,20 @@ class RecorderSender:
                 while left:
                     left = left[os.write(pipe, left) :]
         except (OSError, ValueError):  # nobody is there any more
+            pass
+        except Exception as error:
+            self.failed = f"{type(error).__name__}: {error}"
+        finally:
             with self._changed:
                 self._gone = True
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
-        finally:
             self._connection.close()
+
+    def check(self) -> None:
+        """StillbedError where the thread that sends has failed."""
+        if self.failed:
+            raise StillbedError(f"nothing is recorded any more: {self.failed}")
 
     def _next(self) -> bytes | None:
         """The next entry, waited for; None once this is closed and empty."""

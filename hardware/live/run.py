@@ -81,7 +81,7 @@ class LiveRun:
             files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
             channels.sender.put(UsedEntry("session.toml", settings_text(prepared.settings)))
             progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)
-            stack.callback(progress_writer.close)
+            stack.callback(self._close_progress, progress_writer)
             self._open_page(stack)
             address = "" if self._page is None else self._page.address
             processes = channels.processes
@@ -152,6 +152,8 @@ class LiveRun:
                 recorder = self._channels.recorder.get()
                 why = f": {recorder.failed}" if name == RECORDER and recorder is not None and recorder.failed else ""
                 return machine.end(f"the {name} process {processes.ending(name)}{why}", now)
+        if self._channels.sender.failed:
+            return machine.end(f"this process records nothing any more: {self._channels.sender.failed}", now)
         if progress_writer.failed:
             return machine.end(f"the place on the path cannot be kept: {progress_writer.failed}", now)
         motion = self._reports.motion
@@ -160,6 +162,11 @@ class LiveRun:
             self._halt_arm()
             return machine.end(f"the motion process said nothing for {MOTION_HANG_TIMEOUT:g} s and was ended", now)
         return []
+
+    def _close_progress(self, progress_writer: ProgressWriter) -> None:
+        progress_writer.close()
+        if progress_writer.failed and not self._channels.processes.alive(MOTION):  # the last place was not told yet
+            self._console.say(f"the place on the path was not kept: {progress_writer.failed}")
 
     def _halt_arm(self) -> None:
         """Stop the arm in place of the motion process."""

@@ -305,6 +305,7 @@ class _TrackingLoop:
     def _record(self, arrived: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
         stamps = {frame.camera: frame.stamp for frame in frames.frames}
         unencoded = tuple(frame for frame in frames.frames if frame.camera not in arrived.encoded)
+        self._sender.check()
         self._sender.put(SetEntry(stamps, arrived.encoded, unencoded))
         self._sender.put(PoseEntry(pose, self._step.last.observations, frames.head, self.report.truth))
         if (now := self._clock.now()) > self._histograms_recorded + HISTOGRAM_PERIOD:

@@ -119,7 +119,7 @@ def left_files_text(out: Path | None) -> str:
 
 
 def write_error_text(error: Exception, out: Path | None) -> str:
-    """An error of the system that names no file, as those of a full disk do: where it struck, and what is left there."""
+    """An error of the system that names no file, as of a full disk: where it struck, and what is left there."""
     why = str(getattr(error, "strerror", None) or error).lower()
     if out is None:
         return why

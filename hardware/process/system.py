@@ -25,8 +25,10 @@ def exit_with_parent() -> None:
     sentinel = parent.sentinel
 
     def exit_after() -> None:
-        wait([sentinel])
-        os._exit(1)
+        try:
+            wait([sentinel])
+        finally:
+            os._exit(1)
 
     Thread(target=exit_after, daemon=True).start()
 

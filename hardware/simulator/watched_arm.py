@@ -90,8 +90,13 @@ def serve_arm(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[ServedA
     stop, since, result = threading.Event(), WatchedClock(clock), ServedArm(str(link))
     standing = replace(watched.profile, arm=replace(watched.profile.arm, home=watched.begin))
 
+    failures: list[BaseException] = []
+
     def serve() -> None:
-        result.arm = run_virtual_arm(watched.settings, standing, (), link, None, since, stop, lambda text: None)
+        try:
+            result.arm = run_virtual_arm(watched.settings, standing, (), link, None, since, stop, lambda text: None)
+        except BaseException as error:  # raised where the context ends
+            failures.append(error)
 
     thread = threading.Thread(target=serve, name="virtual arm", daemon=True)
     thread.start()
@@ -104,6 +109,8 @@ def serve_arm(watched: WatchedArm, link: Path, clock: Clock) -> Iterator[ServedA
         stop.set()
         thread.join()
         result.begun = since.begun or 0.0
+        if failures:
+            raise failures[0]
 
 
 def take_pictures(
