@@ -15,7 +15,6 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
 
@@ -25,7 +24,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
-from hardware.process.system import exit_with_parent
+from hardware.process.system import SPAWN, exit_with_parent
 
 Item = TypeVar("Item")
 
@@ -271,7 +270,7 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
     Where the block is left early, what has not begun is left out; Ctrl-C ends what has, too.
     """
-    with ProcessPoolExecutor(count, get_context("spawn"), _end_with_parent) as pool:
+    with ProcessPoolExecutor(count, SPAWN, _end_with_parent) as pool:
         try:
             yield pool
         finally:

@@ -6,7 +6,6 @@ Each process is spawned and runs one of the functions `run_*` below, which impor
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import signal
 import threading
@@ -39,9 +38,8 @@ from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock, WatchedClock
 from hardware.process.faults import Fault
 from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import ask_for_real_time, blocked_sigint, set_up_process
+from hardware.process.system import SPAWN, ask_for_real_time, blocked_sigint, set_up_process
 
-SPAWN = multiprocessing.get_context("spawn")  # a forked child would have loaded all that its parent has
 EXIT_TIMEOUT = 10.0  # s that a process gets to close its files, on a busy machine
 ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device
 ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy machine
@@ -141,7 +139,7 @@ def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
     from hardware.simulator.arm.ports import run_virtual_arm
     from hardware.simulator.arm.settings import ArmSettings, ReplyMode, read_virtual_arm
 
-    set_up_process("arm")
+    set_up_process("arm", outlives=True)
     settings, faults = ArmSettings(replies=ReplyMode.STREAM), tuple[Fault, ...]()
     if prepared.virtual is not None:
         settings, faults = read_virtual_arm(prepared.virtual)

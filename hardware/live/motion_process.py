@@ -287,7 +287,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     Then the arm is stopped; in the second case the place on the path is kept here.
     """
     settings, profile = prepared.settings, prepared.task.profile
-    set_up_process("motion", settings.cores_motion)
+    set_up_process("motion", settings.cores_motion, outlives=True)
     clock, device, sender = WallClock(), PortOpener(channels.url, profile.baud), RecorderSender(channels.recorder)
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())

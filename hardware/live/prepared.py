@@ -12,7 +12,6 @@ run.report.html, run.summary.json
 from __future__ import annotations
 
 import math
-import multiprocessing
 import re
 import shutil
 import threading
@@ -49,6 +48,7 @@ from hardware.live.state_machine import PrintTask
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import cache_error, cache_folder
+from hardware.process.system import SPAWN
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
 from planning.material import Outlets, with_offsets
@@ -274,9 +274,8 @@ def rig_from_session(session: File) -> Rig:
 
 def _rendered(scenario: File) -> File:
     """The folder of the scenario's pre-rendered session; rendering is done by a process that ends before the run."""
-    spawn = multiprocessing.get_context("spawn")
-    answer, theirs = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_render, args=(scenario, theirs))
+    answer, theirs = SPAWN.Pipe(duplex=False)
+    process = SPAWN.Process(target=_render, args=(scenario, theirs))
     process.start()
     theirs.close()
     try:

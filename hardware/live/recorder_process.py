@@ -178,7 +178,7 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
 
     A fault of the disk ends it, and is named in the last report.
     """
-    set_up_process("recorder", settings.cores_recorder, RECORDER_NICENESS)
+    set_up_process("recorder", settings.cores_recorder, RECORDER_NICENESS, outlives=True)
     retain_freed_pages(FREE_PAGES_BYTES)
     writer = _EntryWriter(settings, reports)
     try:

@@ -42,7 +42,7 @@ from hardware.offline.track import FrameSetStep, tracker
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import ask_to_go_first, pipe_closed, set_up_process, settle_memory
+from hardware.process.system import ask_to_go_first, pipe_closed, set_up_process, settle_memory, signal_at_parents_end
 from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import FrameSet, PrintHead, Roi
@@ -134,6 +134,7 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
     use_one_arena()
     ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
     signal.signal(signal.SIGTERM, _terminate)
+    signal_at_parents_end(signal.SIGTERM)
     sender = RecorderSender(channels.recorder)
     try:
         with ExitStack() as stack:

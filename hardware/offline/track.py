@@ -10,12 +10,11 @@ import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from hardware.process.progress import Progress, ProgressReport, prepare_out
-from hardware.process.system import blocked_sigint, exit_with_parent
+from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
 
 if TYPE_CHECKING:
     from estimation.pose import SurfacePose
@@ -99,7 +98,7 @@ def tracker(
     from perception.tracking.wound_step import WoundTrackingStep
 
     scan = None if surface is None else read_mesh(surface).scan
-    with ProcessPoolExecutor(1, get_context("spawn"), _start_map_process) as executor:
+    with ProcessPoolExecutor(1, SPAWN, _start_map_process) as executor:
         with blocked_sigint():
             first = executor.submit(int)
         first.result()  # the process has started before the first frame set

@@ -25,6 +25,7 @@ from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_h
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
 from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SPAWN
 from perception.frames import Image
 
 PAGE_NICENESS = 5  # below the loops, above what may wait for minutes
@@ -70,8 +71,7 @@ class OperatorPage:
         self.restarts += self.process is not None
         self._started = now
         arguments = (self._link, self._settings, self._listener)
-        spawn = multiprocessing.get_context("spawn")
-        self.process = spawn.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
+        self.process = SPAWN.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
         self.process.start()
         return True
 

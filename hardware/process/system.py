@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import signal
@@ -10,9 +11,54 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from threading import Thread
 from typing import Any
+
+PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>: which signal the kernel sends when the thread that started this process ends
+
+
+def signal_at_parents_end(number: int) -> None:
+    """Have the kernel send this signal to this process once its parent has ended, however busy either is; 0: none.
+
+    Where the system knows no such thing, nothing happens, and pipes and sentinels alone tell.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
+
+
+def _bound_child(kind: type[BoundProcess], parent: int) -> BoundProcess:
+    """What a started process makes first, of what it is sent: before it loads its body and the body's libraries."""
+    signal_at_parents_end(signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before that
+        os._exit(1)
+    return kind.__new__(kind)
+
+
+class BoundProcess(SpawnProcess):
+    """A spawned process that the kernel kills once its parent has ended, also while it still loads its libraries.
+
+    It is to be started by a thread that lives as long as it. A body that has to end in order, as one that moves an arm,
+    calls `outlive_parent`, and looks at its pipes.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _bound_child, (type(self), os.getpid()), self.__dict__
+
+
+class BoundContext(SpawnContext):
+    """multiprocessing's spawn context, of bound processes, for pools as well."""
+
+    Process = BoundProcess  # type: ignore[assignment]
+
+
+SPAWN = BoundContext()  # a forked child would have loaded all that its parent has
+
+
+def outlive_parent() -> None:
+    """From now on this bound process ends by itself: its pipes tell it when its parent has ended."""
+    signal_at_parents_end(0)
 
 
 def exit_with_parent() -> None:
@@ -23,6 +69,9 @@ def exit_with_parent() -> None:
     parent = parent_process()
     assert parent is not None
     sentinel = parent.sentinel
+    signal_at_parents_end(signal.SIGKILL)
+    if wait([sentinel], 0):
+        os._exit(1)
 
     def exit_after() -> None:
         try:
@@ -86,11 +135,14 @@ def ask_to_go_first() -> str:
         return NO_PRIORITY
 
 
-def set_up_process(name: str, cores: Sequence[int] = (), nice: int = 0) -> None:
+def set_up_process(name: str, cores: Sequence[int] = (), nice: int = 0, outlives: bool = False) -> None:
     """Be a process group of one's own and leave Ctrl-C and a closed terminal to whoever conducts the run.
 
     name: by which ps and top show the process. cores: to run on, all without any. nice: to be added to the priority.
+    outlives: whether it ends by itself, in order, once its parent has ended; else the kernel kills it then.
     """
+    if outlives:
+        outlive_parent()
     with suppress(OSError):
         Path("/proc/self/comm").write_text(f"sb-{name}", encoding="ascii")
         os.setpgid(0, 0)
