@@ -200,6 +200,30 @@ def test_the_head_is_at_each_commands_end_a_tick_and_the_lag_after_it_was_sent(
     assert head.extruding == (under_way < len(due) and flows[under_way])
 
 
+def test_it_goes_on_from_the_last_move_that_was_sent_and_not_from_one_that_was_refused() -> None:
+    looping = Looping({**START, 3.0: Order.ARM}, linked(stand=False), seen)
+    motion, sent = looping.loop.motion, list[np.ndarray]()
+
+    class Leaping:
+        """Asks once for a move that the link refuses: 40 mm on, faster than any arm may go."""
+
+        recalled = motion.recalled
+
+        def __call__(self, pose: SurfacePose | None, now: float) -> Move | Hold:
+            command = motion(pose, now)
+            if 2.0 < now < 2.1 and isinstance(command, Move):
+                return replace(command, axes=command.axes + [40.0, 0, 0, 0, 0, 0], feed=1e4)
+            sent.append(command.axes if isinstance(command, Move) else sent[-1])
+            return command
+
+    looping.loop.motion = Leaping()
+    ticks = looping.run(4.0)
+    assert "feed of" in looping.link.arm.reason or any("feed of" in t.status.reason for t in ticks)
+    again = [t for t in ticks if t.stamp > 3.0]
+    assert not any("from where the motion left off" in t.answer for t in again)
+    assert again[-1].status.state is ArmState.ARMED and isinstance(again[-1].command, Move)
+
+
 def test_while_the_arm_is_held_the_motion_is_not_asked() -> None:
     link = linked(port=PortFaults(blocked=[(1.0, 1.15)]), stand=False)
     ticks = Looping(START, link, seen).run(2.0)

@@ -101,7 +101,8 @@ class MotionLoop:
         self._hold_time, self._poll_period = profile.limits.pause, settings.poll
         self._schedule = TickSchedule(profile.tick, settings.ease, clock.now()) if schedule is None else schedule
         self._last_pose: SurfacePose | None = None  # of the last tick
-        self._left_off: Array = profile.arm.home  # where planner and guard take the arm to be
+        self._left_off: Array = profile.arm.home  # where the last move that was sent leads
+        self._refused: RecalledMoves | None = None  # where planner and guard have to go back to: a command was not sent
         self._homing = False
         self._answer = DONE
         self._quit = False
@@ -167,19 +168,21 @@ class MotionLoop:
         late = max(now - self._schedule.due, 0.0)
         self.lateness.add(late)
         frame = b""
-        if recalled := self.arm.take_up():
+        if recalled := self.arm.take_up() or self._refused:
+            self._refused = None
             self._left_off = recalled.stands
             self.motion.recalled(recalled.place, recalled.stands)
         if hold := GOING_HOME if self._homing else self.arm.hold(now):
             command: Command = Hold(instant, self._hold_time, str(hold))
         else:
             command = self.motion(pose, instant)
-            if isinstance(command, Move):
-                self._left_off = command.axes
             if hold := self.arm.send(command, now):
+                self._refused = RecalledMoves(self._left_off, self._left_off)
                 command = Hold(instant, self._hold_time, str(hold))
             else:
                 frame = self.arm.command_frame
+                if isinstance(command, Move):
+                    self._left_off = command.axes
         if self.material is not None:  # what was not sent is a Hold here
             self.material.follow(command, now)
         self._report(Tick(instant, command, frame, late, self.arm.status(now), self._answer, recalled, hold.code))
