@@ -18,7 +18,12 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from hardware.bench.pictures import judged_by, run_segmentation
 from hardware.bench.subjects import SUBJECTS
+from hardware.cli.main import main
+from hardware.files.images import encode
+from hardware.files.path_file import write_path
 from hardware.files.pose_file import WOUND_FILE_NAME, WoundFile
+from hardware.live.prepared import prepare
+from hardware.live.settings import LiveSettings
 from hardware.offline.segment import OVERLAY_FOLDER, WOUND_TABLE, SegmentOptions, input_files, run_segment
 from hardware.simulator.scene.ground_truth_views import WoundView, mask_from_outlines, wound_view
 from perception.frames import Frame, FrameSet
@@ -26,6 +31,8 @@ from perception.tracking.step import report_without_offsets
 from perception.training.dataset import Labelled, read_dataset
 from perception.wound.network import SHIPPED_MODEL, WoundNetwork, hash_of, read_settings, shipped_model
 from perception.wound.segmentation import NetworkSegmenter, Segmentation, centroid, dice
+from tests.moving import raster
+from tests.session_files import make_folder
 from tests.test_segmentation import SETTINGS, disc, picture, red_is_wound
 
 SEGMENTER = NetworkSegmenter(red_is_wound, SETTINGS)
@@ -249,3 +256,54 @@ def test_real_wounds_held_out_are_found(segmenter: NetworkSegmenter) -> None:
     some = [pictures[name] for name in names[::8]]
     reached = [dice(segmenter(np.ascontiguousarray(p.picture[..., ::-1])).mask, p.wound) for p in some]
     assert float(np.mean(reached)) > 0.7
+
+
+def test_the_network_says_its_name_licence_and_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["segment", "--version"])
+    told = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert "wound; licence: CC BY-NC" in told and "not commercial" in told and "Foot Ulcer" in told
+    assert "LicenseRef-CC-BY-NC" in shipped_model("LICENSE-wound", ".txt").read_text(encoding="utf-8")
+    own = tmp_path / "own.onnx"
+    shutil.copy(shipped_model(), own)
+    own.with_suffix(".toml").write_text(f'sha256 = "{hash_of(own)}"\nlicence = "mine"\n', encoding="utf-8")
+    with pytest.raises(SystemExit):
+        main(["segment", "--model", str(own), "--version"])
+    assert capsys.readouterr().out == "own; licence: mine; source: not stated\n"
+
+
+def test_own_weights_are_taken_by_segment_track_and_live_alike_and_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone, session = str(tmp_path / "gone.onnx"), make_folder(tmp_path / "session")
+    (session / "surface.ply").unlink()
+    (tmp_path / "x.png").write_bytes(encode(np.zeros((64, 64, 3), np.uint8))[1])
+    write_path(tmp_path / "p.csv", raster())
+    live = [
+        "live",
+        "--rig",
+        str(session),
+        "--arm",
+        "virtual",
+        "--path",
+        str(tmp_path / "p.csv"),
+        "--record",
+        str(tmp_path / "run.mcap"),
+        "--arm",
+        "virtual",
+    ]
+    out = ["-o", str(tmp_path / "out")]
+    for words in (["segment", str(tmp_path / "x.png"), *out], ["track", str(session), *out], live):
+        assert main([*words, "--model", gone]) == 2
+        assert "gone.onnx" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    own = tmp_path / "own.onnx"
+    for suffix in (".onnx", ".toml"):
+        shutil.copy(shipped_model(suffix=suffix), own.with_suffix(suffix))
+    assert main(["segment", str(tmp_path / "x.png"), *out, "--model", str(own)]) == 0
+    assert main(["track", str(session), "-o", str(tmp_path / "tracked"), "--wound", "--model", str(own)]) == 0
+    settings = LiveSettings(
+        rig=session, path=tmp_path / "p.csv", record=tmp_path / "run.mcap", arm="virtual", model=own
+    )
+    prepared = prepare(settings, "here", False)
+    assert prepared.settings.model == own

@@ -314,7 +314,8 @@ def network_check() -> Check:
         network = WoundNetwork(shipped_model())
     except StillbedError as error:
         return Check("wound network", CheckVerdict.FAIL, str(error), "install stillbed anew, with its data")
-    return Check("wound network", CheckVerdict.PASS, f"{network.size / 1e6:.1f} MB, its hash is right")
+    text = f"{network.size / 1e6:.1f} MB, its hash is right; licence: {network.terms.licence}"
+    return Check("wound network", CheckVerdict.PASS, text)
 
 
 def _access_check(name: str, nodes: list[tuple[str, str]], text: str, group: str) -> Check:

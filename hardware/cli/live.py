@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, Commands, add_fault, arm_profile, positive, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, arm_profile, positive, wrong_option
 from hardware.process.clock import WallClock
 from perception.package_data import named_path
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hardware.cameras.sources import CameraDevice
 
 SETTINGS_FLAGS = (
-    "rig", "simulated", "path", "arm", "profile", "record", "dry_run", "lift", "stands_home", "jpeg_quality",
+    "rig", "simulated", "model", "path", "arm", "profile", "record", "dry_run", "lift", "stands_home", "jpeg_quality",
     "dispensers", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
@@ -47,6 +47,7 @@ def add_live(commands: Commands) -> None:
     add = command.add_argument_group("what is printed where").add_argument
     add("--rig", type=Path, metavar="RIG", help="rig.toml of cameras, or a session shown in real time")
     add("--simulated", type=named_path, metavar="SCENARIO.toml", help="a scenario, rendered before the run")
+    add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")

@@ -7,7 +7,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware.cli.parser import FAILED, Commands, not_negative, wrong_option
+from estimation.errors import StillbedError
+from hardware.cli.parser import FAILED, MODEL_HELP, Commands, not_negative, wrong_option
 from perception.package_data import named_path
 
 if TYPE_CHECKING:
@@ -198,12 +199,27 @@ def add_segment(commands: Commands) -> None:
     add("-o", "--out", type=Path, required=True, metavar="MASKS", help="folder, new or empty")
     methods = "unet: a trained network; shape: outlines like the scan's"
     add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=methods)
-    add("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along")
+    add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
+    add("--version", action=_NetworkVersion, nargs=0, help="print the network's name, licence and source, and exit")
     add("--scan", type=Path, metavar="SCAN", help="with --method shape: of the wound, z upwards")
     add("--overlay", action="store_true", help="also write the pictures with the outlines drawn in")
     add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for areas in mm^2")
     add("--threads", type=int, default=2, metavar="N", help="of the network; results do not vary")
     add("--force", action="store_true", help="write into a folder that is not empty")
+
+
+class _NetworkVersion(argparse.Action):
+    """Prints what the network is: the shipped one, or that of a --model that stands before it."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: object) -> None:
+        from perception.wound.network import WoundNetwork, shipped_model
+
+        model = getattr(namespace, "model", None)
+        try:
+            print(WoundNetwork(shipped_model() if model is None else model).terms)
+        except StillbedError as error:
+            parser.error(str(error))
+        parser.exit()
 
 
 def add_train(commands: Commands) -> None:

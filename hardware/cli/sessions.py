@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hardware.cli.parser import FAILED, Commands, add_fault, progress_bar, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, progress_bar, wrong_option
 from hardware.offline.track import MAP_METHOD, TRACKING_METHODS
 from hardware.process.progress import prepare_out
 from perception.package_data import named_path
@@ -29,6 +29,7 @@ def add_track(commands: Commands) -> None:
     prefilter = "done to each picture first: the thesis's bilateral filter (4.6), 50 ms a picture"
     add("--prefilter", choices=("none", "bilateral"), default="none", help=prefilter)
     add("--wound", action="store_true", help="also segment the wound beside it, into wound.csv")
+    add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
@@ -89,7 +90,7 @@ def _track(a: argparse.Namespace) -> int:
     from hardware.offline.track import run_track
 
     tool = None if a.arm is None else read_arm(a.arm).tool
-    text, damage = run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound)
+    text, damage = run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound, a.model)
     print(text)
     return FAILED if damage else 0
 

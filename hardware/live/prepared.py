@@ -204,6 +204,10 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
     printed_path = read_path(path)
     dispensers, outlets = _dispensers(settings, printed_path, path)
     notes += _dispenser_notes(settings, dispensers)
+    if settings.model is not None:
+        from perception.wound.network import hash_of, read_settings  # loads onnxruntime
+
+        read_settings(settings.model.with_suffix(".toml"), hash_of(settings.model))
     task = PrintTask(
         path=printed_path,
         dispensers=dispensers,

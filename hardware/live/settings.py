@@ -50,6 +50,11 @@ class LiveSettings:
     patience: float = _key(  # s: somebody finds a loose cable in that
         "cameras.patience_s", "10.0", "without pictures, after which the arm is stopped; 1 to 600", 10.0
     )
+    model: Path | None = _key(
+        "cameras.model",
+        '"x.onnx"',
+        "network that finds the wound: your own; left out: the one that comes along",
+    )
     path: Path | None = _key("print.path", '"path.csv"', "checkpoints on the surface; a scenario has its own")
     dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
     lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under
@@ -156,7 +161,7 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
             raise InputError(where, f"cores.{key}", list(cores), allowed)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
-    for name in ("rig", "simulated", "path", "profile", "dispensers"):
+    for name in ("rig", "simulated", "model", "path", "profile", "dispensers"):
         file = getattr(s, name)
         if file is not None and not file.exists():
             raise InputError(where, name, file, "a file that exists")

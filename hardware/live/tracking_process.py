@@ -199,7 +199,7 @@ class _TrackingLoop:
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
         immediate = tuple(replace(roi, stamp=-np.inf) for roi in rois)
-        step = tracker(rig, immediate, surface, self._clock.now, profile.tool)
+        step = tracker(rig, immediate, surface, self._clock.now, profile.tool, model=prepared.settings.model)
         self._step = stack.enter_context(step)
         if placement is not None and earlier is not None:
             new_from_old = _restore_map(self._step, placement.map, earlier, placement.until, self._clock.now())

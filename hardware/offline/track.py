@@ -59,13 +59,14 @@ def step_by(
     now: Callable[[], float] = lambda: 0.0,
     tool: Array | None = None,
     prefilter: str = "none",
+    model: Path | None = None,
 ) -> Iterator[FrameSetStep]:
     """The tracker of a method, a key of TRACKING_METHODS, for these cameras; other arguments as `tracker` takes them.
 
     The thesis's methods make no use of scan and tool, and always apply the bilateral filter.
     """
     if method == MAP_METHOD:
-        with tracker(rig, roi, surface, now, tool, prefilter) as step:
+        with tracker(rig, roi, surface, now, tool, prefilter, model) as step:
             yield step
         return
     from perception.thesis.camera import Corners, KeyPoints
@@ -83,13 +84,14 @@ def tracker(
     now: Callable[[], float] = lambda: 0.0,
     tool: Array | None = None,
     prefilter: str = "none",
+    model: Path | None = None,
 ) -> Iterator[TrackingStep | WoundTrackingStep]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter lock.
 
-    roi: where the surface is at the start; without one the shipped network segments the wound first, and where it finds
-    none the whole pictures are the surface. surface: the scan's file, mm; InputError where it cannot be read. now: s,
-    by which the stages are timed. tool: (K, 2) mm, profile of the tool on the arm as `ArmProfile.tool`. prefilter: a
-    key of perception.lens.PREFILTERS.
+    roi: where the surface is at the start; without one a network segments the wound first, and where it finds none the
+    whole pictures are the surface. model: the network, an ONNX file; None: the one that comes along. surface: the
+    scan's file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm, profile
+    of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
@@ -110,7 +112,7 @@ def tracker(
         if roi:
             yield make_step(roi)
             return
-        segmenter = _network_segmenter()
+        segmenter = _network_segmenter(model)
         with ThreadPoolExecutor(1) as thread:
             yield WoundTrackingStep(rig, make_step, segmenter, thread)
 
@@ -122,11 +124,11 @@ def _start_map_process() -> None:
     os.nice(MAP_PROCESS_NICE)
 
 
-def _network_segmenter() -> NetworkSegmenter:
+def _network_segmenter(model: Path | None) -> NetworkSegmenter:
     from perception.wound.network import WoundNetwork, shipped_model
     from perception.wound.segmentation import NetworkSegmenter
 
-    network = WoundNetwork(shipped_model(), threads=1)  # the other core is the tracker's
+    network = WoundNetwork(shipped_model() if model is None else model, threads=1)  # the other core is the tracker's
     return NetworkSegmenter(network, network.settings)
 
 
@@ -139,10 +141,12 @@ def run_track(
     tool: Array | None = None,
     prefilter: str = "none",
     wound: bool = False,
+    model: Path | None = None,
 ) -> tuple[str, str]:
     """Track the session at `path` into the folder `out`; returns the summary, and what was lost of the file, as texts.
 
-    method, tool, prefilter: as `step_by` takes them. wound: whether the wound is segmented as well, into wound.csv.
+    method, tool, prefilter, model: as `step_by` takes them. wound: whether it is segmented as well,
+    into wound.csv.
     An early end, by an error of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
     """
     from hardware.files.pose_file import PoseWriter, WoundFile
@@ -152,15 +156,17 @@ def run_track(
     from perception.tracking.step import STAGES
 
     session = open_session(path)
+    if model is not None:
+        _network_segmenter(model)  # what is wrong with it is told before anything is written
     prepare_out(out, force)
     clock = WallClock()
     complete = False
     with ExitStack() as stack:
-        chosen = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter)
+        chosen = step_by(method, session.rig, session.roi, session.surface, clock.now, tool, prefilter, model)
         step = stack.enter_context(chosen)
         sinks = [] if record is None else [stack.enter_context(TrackRecorder(record, session, force)).write]
         if wound:
-            sinks.append(stack.enter_context(WoundFile(out, session.rig, _network_segmenter())).write)
+            sinks.append(stack.enter_context(WoundFile(out, session.rig, _network_segmenter(model))).write)
         writer = stack.enter_context(PoseWriter(out, [camera.name for camera in session.rig.cameras], STAGES))
         progress = stack.enter_context(Progress("track", "frame sets", clock.now))
         try:

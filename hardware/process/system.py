@@ -50,7 +50,7 @@ class BoundProcess(SpawnProcess):
 class BoundContext(SpawnContext):
     """multiprocessing's spawn context, of bound processes, for pools as well."""
 
-    Process = BoundProcess  # type: ignore[assignment]
+    Process = BoundProcess
 
 
 SPAWN = BoundContext()  # a forked child would have loaded all that its parent has

@@ -87,6 +87,7 @@ SHIPPED_MODEL = "wound"
 THESIS_MODEL = "thesis_unet"
 NETWORK_THREADS = 2
 MAX_SETTING = sys.float_info.max
+NOT_STATED = "not stated"
 OWN_NETWORK = "an ONNX file written by stillbed train"
 
 
@@ -102,6 +103,18 @@ class Settings:
     offset: float = 0.0  # of the same
 
 
+@dataclass(frozen=True, slots=True)
+class NetworkTerms:
+    """What a network is called, under which licence it may be used, and what it was made of, as its settings say."""
+
+    name: str
+    licence: str = NOT_STATED
+    source: str = NOT_STATED
+
+    def __str__(self) -> str:
+        return f"{self.name}; licence: {self.licence}; source: {self.source}"
+
+
 class WoundNetwork:
     """A session of onnxruntime; logits of pictures, from one thread at a time."""
 
@@ -109,6 +122,7 @@ class WoundNetwork:
         """file: NAME.onnx, beside it NAME.toml with its hash and settings. InputError: missing, damaged, not ours."""
         self.size = file.stat().st_size if file.is_file() else 0  # bytes
         self.settings = read_settings(file.with_suffix(".toml"), hash_of(file))
+        self.terms = read_terms(file.with_suffix(".toml"))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         # a pool that spins takes the core that the tracker runs on: two threads were then slower than one
@@ -140,8 +154,21 @@ def read_settings(file: Path, sha256: str) -> Settings:
     if table.get("sha256") != sha256:
         raise InputError(file.with_suffix(".onnx"), "sha256", sha256, f"{table.get('sha256')}, as {file.name} says")
     looks = Looks(**_checked_fields(file, Looks, table.get("looks", {})))
-    plain = {key: value for key, value in table.items() if key not in ("sha256", "looks")}
+    plain = {key: value for key, value in table.items() if key not in ("sha256", "looks", *TERMS_KEYS)}
     return Settings(looks=looks, **_checked_fields(file, Settings, plain))
+
+
+TERMS_KEYS = ("licence", "source")  # texts about the network, which may be left out
+
+
+def read_terms(file: Path) -> NetworkTerms:
+    """What a settings file that was read says of the network beside it; InputError where that is no text."""
+    table = tomllib.loads(file.read_text(encoding="utf-8"))
+    texts = {key: table[key] for key in TERMS_KEYS if key in table}
+    for key, value in texts.items():
+        if not isinstance(value, str):
+            raise InputError(file, key, value, "a text")
+    return NetworkTerms(file.stem, **texts)
 
 
 def _checked_fields(file: Path, kind: type, table: Any) -> dict[str, Any]:
