@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm.port import PortLock, lock_folder
+from hardware.arm.port import CLOSE_TIME, PortLock, SerialPort, lock_folder
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import ReplyKind, reply_stream
 from hardware.process.clock import WallClock
@@ -224,3 +225,34 @@ def test_a_link_to_a_device_is_locked_as_the_device(tmp_path: Path) -> None:
 
 def test_locks_are_kept_where_other_programs_look() -> None:
     assert lock_folder().is_dir() and os.access(lock_folder(), os.W_OK)
+
+
+class FullPort(SerialPort):
+    """A port that says what it holds, which the system does not say of a pseudo-terminal."""
+
+    taken: int | None = None  # bytes after which the line has taken all; None: it takes none
+
+    def waiting(self) -> int:
+        self.looks = getattr(self, "looks", 0) + 1
+        return 96 if self.taken is None or self.looks < self.taken else 0
+
+
+@pytest.mark.parametrize("taken", [None, 3])
+def test_a_line_that_takes_nothing_is_closed_soon_and_one_that_does_loses_nothing(taken: int | None) -> None:
+    master, slave = pty.openpty()
+    os.set_blocking(master, False)
+    port = FullPort(os.ttyname(slave), 115_200)
+    port.taken = taken
+    given = 0
+    while count := port.write(b"x" * 4096):  # until it is full
+        given += count
+    begun = CLOCK.now()
+    port.close()
+    assert CLOCK.now() - begun < 5 * CLOSE_TIME
+    left = 0
+    with suppress(OSError):
+        while data := os.read(master, 4096):
+            left += len(data)
+    assert left < given if taken is None else left == given
+    os.close(master)
+    os.close(slave)

@@ -21,6 +21,7 @@ import tempfile
 import termios
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -29,6 +30,7 @@ from serial.tools import list_ports
 
 from estimation.errors import InputError, StillbedError
 from hardware.arm.protocol import FRAME_LENGTH, Reply, reply_stream
+from hardware.process.clock import WallClock
 
 LOCK_FOLDERS = ("/run/lock", "/var/lock")  # of the Filesystem Hierarchy Standard, new and old
 LOCK_OWNER = "stillbed"
@@ -129,6 +131,9 @@ class Port(Protocol):
 Opener = Callable[[], Port]  # UnpluggedError where the device is not there
 
 
+CLOSE_TIME = 0.1  # s in which a line takes what was given to it: a stop's two frames at 9600 bits/s
+
+
 class SerialPort:
     """A pyserial port, 8N1: a device's path, socket://, loop:// or another URL of pyserial's."""
 
@@ -182,7 +187,17 @@ class SerialPort:
             return 0
 
     def close(self) -> None:
-        """Close the device."""
+        """Close the device; what the line has not taken after CLOSE_TIME is discarded.
+
+        The system would wait for it, 30 s by default, and nobody could stop the arm meanwhile.
+        """
+        clock = WallClock()
+        until = clock.now() + CLOSE_TIME
+        while self.waiting() and clock.now() < until:
+            clock.wait_until(clock.now() + CLOSE_TIME / 50)
+        if self._device and self._file is not None and self.waiting():
+            with suppress(OSError, termios.error):  # of a device that is gone
+                termios.tcflush(self._file, termios.TCOFLUSH)
         self._serial.close()
 
     def _queried_count(self, request: int) -> int:
