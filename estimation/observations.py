@@ -8,6 +8,8 @@ import numpy as np
 
 from estimation.se3 import Array, Index, Mask
 
+RAYLEIGH_MEDIAN = 1.1774  # sqrt(2 ln 2): median length of a vector whose two entries are normal, in their sigmas
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:

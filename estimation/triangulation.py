@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame
 
+MIN_MAP_LANDMARKS = 3  # landmarks: a plane's points, and no fewer span a frame
 MAX_RESIDUAL_SIGMAS = 4.0  # RMS over the sightings of a landmark: beyond, one of them is wrong
 MAX_LOOK_CHI2 = 16.0  # two degrees of freedom: beyond, it is another spot; one in three thousand by chance
 
@@ -74,14 +76,22 @@ class TriangulatedMap:
 
 
 def triangulated_map(rig: Rig, observations: Observations) -> TriangulatedMap:
-    """The map of landmarks that two cameras or more see alike, in a frame in their middle, z out of the surface."""
+    """The map of landmarks that two cameras or more see alike, in a frame in their middle, z out of the surface.
+
+    InputError where they are fewer than MIN_MAP_LANDMARKS, which span no frame.
+    """
     _, point, count = np.unique(observations.track, return_inverse=True, return_counts=True)
     several = count[point] > 1
+    allowed = f"{MIN_MAP_LANDMARKS} or more that two cameras see alike"
+    if int((count > 1).sum()) < MIN_MAP_LANDMARKS:
+        raise InputError("observations", "landmarks", int((count > 1).sum()), allowed)
     ids, point = np.unique(observations.track[several], return_inverse=True)
     camera, pixels, sigma = observations.camera[several], observations.pixels[several], observations.sigma[several]
     points, covariance, residual = triangulate(rig, point, camera, pixels, len(ids))
     off = np.bincount(point, ((residual / sigma[:, None]) ** 2).sum(1)) / np.bincount(point) / 2
     good = np.isfinite(points).all(1) & (off < MAX_RESIDUAL_SIGMAS**2)
+    if int(good.sum()) < MIN_MAP_LANDMARKS:
+        raise InputError("observations", "landmarks", int(good.sum()), allowed)
     widest = np.zeros(len(ids))
     np.maximum.at(widest, point, sigma)
     points, covariance = points[good], (covariance * widest[:, None, None] ** 2)[good]

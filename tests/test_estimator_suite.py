@@ -234,6 +234,18 @@ def test_landmarks_of_one_camera_and_wrong_matches_are_not_in_the_map() -> None:
     assert np.median(np.linalg.norm(off, axis=1)) < 0.3
 
 
+@pytest.mark.parametrize("shared", [0, 2])
+def test_landmarks_that_no_two_cameras_see_make_no_map_and_that_is_said(shared: int) -> None:
+    world = synthetic_world("still", seconds=0.05, seed=3)
+    seen = first(world)
+    mine = (seen.camera == 0) | (seen.track < shared)
+    alone = replace(
+        seen, camera=seen.camera[mine], track=seen.track[mine], pixels=seen.pixels[mine], sigma=seen.sigma[mine]
+    )
+    with pytest.raises(InputError, match=f"landmarks = {shared}, allowed 3 or more that two cameras see alike"):
+        triangulated_map(world.rig, alone)
+
+
 def test_errors_are_of_the_estimated_frame_and_nothing_is_fitted() -> None:
     world = synthetic_world("breathing", seconds=0.5, noise=0.02)
     for mapping in ("told", "seen"):

@@ -424,3 +424,9 @@ def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:
     tight = replace(rules, arm=replace(rules.arm, joints=slow))
     guard = Guard(rules.limits, rules.arm, rules.tick, rules.zone, rules.lag)
     assert judge_guard(random_log(0, COUNT, tight, guard), tight)[2] > 0
+
+
+def test_a_warp_whose_control_points_are_no_numbers_is_refused() -> None:
+    bell = np.full((1, 3), np.nan), np.zeros((1, 3)), np.zeros((3, 3)), np.zeros((3, 3)), 25.0, 0.0, 0.0
+    strange = pose(1.0, covariance=np.zeros((6, 6)), warp=Warp(*bell))
+    assert refused(judged(move(axes(0.5)), strange), "not finite")

@@ -17,13 +17,14 @@ from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from hardware.files.folder_tables import write_tum
+from hardware.files.folder_tables import SessionFolderWriter, write_tum
+from hardware.files.images import encode
 from hardware.files.rig_file import ImageSource, read_rig, rig_from_table, table_from_rig, write_rig
 from hardware.files.session import Session
 from hardware.offline.convert import export_recording, import_folder
 from hardware.recording.messages import message_from_rig, rig_from_message
 from hardware.recording.session_reader import open_session
-from tests.session_files import NAMES, camera, change, make_folder, rig, trajectory
+from tests.session_files import NAMES, camera, change, image, make_folder, rig, trajectory
 
 
 def assert_same(a: Session, b: Session) -> None:
@@ -345,3 +346,23 @@ def test_one_near_pair_in_a_wide_rig_and_a_single_camera_are_taken() -> None:
 def test_a_calibration_without_images_can_be_read(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.toml", rig(2), [None, None])
     assert read_rig(tmp_path / "rig.toml").sources == (None, None)
+
+
+def test_a_blank_line_does_not_shift_the_lines_that_errors_name(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a")
+    text = (folder / "frames.csv").read_text().splitlines()
+    (folder / "frames.csv").write_text("\n".join([*text[:2], "", "", "nobody,1,0.5", *text[2:]]) + "\n")
+    with pytest.raises(InputError, match="line 5: camera = 'nobody'"):
+        open_session(folder)
+
+
+def test_cameras_whose_names_look_like_patterns_come_back(tmp_path: Path) -> None:
+    """[a] is a pattern for a, and ? for any letter."""
+    named = replace(
+        rig(2), cameras=tuple(replace(c, name=n) for c, n in zip(rig(2).cameras, ("[ab]", "a?"), strict=True))
+    )
+    with SessionFolderWriter(tmp_path / "x", named, ()) as writer:
+        for number, stamp in enumerate((0.1, 0.2)):
+            for camera in range(2):
+                writer.picture(camera, stamp, *encode(image(camera, number)))
+    assert [len(one.frames) for one in open_session(tmp_path / "x").frame_sets()] == [2, 2]

@@ -140,7 +140,10 @@ def _first(rig: Rig, data: TrackArrays, points: Array, mapped: bool) -> tuple[in
         seen = _frame_observations(data, frame)
         if len(np.unique(seen.camera)) < 2 or len(seen) < 2 * MIN_FIT_LANDMARKS:
             continue
-        laid = triangulated_map(rig, seen)
+        try:
+            laid = triangulated_map(rig, seen)
+        except InputError:  # they see other landmarks
+            continue
         if len(laid.tracks) < MIN_FIT_LANDMARKS:
             continue
         if not mapped:

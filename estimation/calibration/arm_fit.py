@@ -26,6 +26,7 @@ from estimation.calibration.arm_model import (
 )
 from estimation.calibration.lens_model import CAMERA_PARAMETERS
 from estimation.errors import InputError
+from estimation.observations import RAYLEIGH_MEDIAN
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Mask
@@ -33,7 +34,6 @@ from estimation.se3 import Array, Mask
 REWEIGHT_ROUNDS = 6  # outliers are out after two or three
 TUKEY_CUTOFF = 5.0  # scatters at which a sighting's weight is zero (Tukey's biweight)
 MAX_SCATTERS = 4.0  # scatters beyond which a sighting is left out of the last fit: of pure noise one in 3000
-RAYLEIGH = 1.1774  # median length of a vector whose two entries are normal, in their sigmas
 TOOL_SIGMA, TIMING_SIGMA, BLUNT_SIGMA = 100.0, 0.2, 0.2  # mm, s, mm: one sigma of the priors
 ARM_KEY, TIMING_KEY, TOOL_KEY, BLUNT_KEY, CAMERAS_KEY = (gtsam.symbol(letter, 0) for letter in "ptxer")
 
@@ -211,7 +211,7 @@ def _reweighted_fit(problem: _ArmProblem, values: gtsam.Values) -> tuple[gtsam.V
     for _ in range(REWEIGHT_ROUNDS):
         values = _solve(problem.graph(weights, rows), values)
         away = np.linalg.norm(problem.predict(values)[1], axis=1) / sightings.sigma
-        scatter = max(median(away[weights > 0]) / RAYLEIGH, 1e-9)
+        scatter = max(median(away[weights > 0]) / RAYLEIGH_MEDIAN, 1e-9)
         weights = np.clip(1 - (away / (TUKEY_CUTOFF * scatter)) ** 2, 0.0, None) ** 2
     return values, away, scatter
 

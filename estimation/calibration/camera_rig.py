@@ -14,6 +14,7 @@ from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, MIN_VIEW_CORNERS,
 from estimation.calibration.lens_model import CAMERA_PARAMETERS, MODELS, BoardViews, KnownLenses, Undetermined
 from estimation.calibration.rig_fit import RigFit, RigState, RivalModel, fit_rig, free_numbers, with_rivals
 from estimation.calibration.validation import LensChoice, ModelScore, VolumeError
+from estimation.observations import RAYLEIGH_MEDIAN
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array, Index, Mask
 
@@ -25,7 +26,6 @@ MIN_VIEWS = 10  # of a camera: eight leave the distortion model to chance, and a
 OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 0.5  # both exceeded by an outlier: a corner nearer than half a pixel is a good one
 MAX_WRONG_SHARE = 0.5  # of a view's corners, beyond which the whole view is dropped
 INITIAL_SIGMA = 0.3  # px, of a corner, until the residuals show it
-RAYLEIGH = 1.18  # median length of a vector whose two entries are normal, in their sigmas
 MIN_CORNER_SIGMA = 0.01  # px: no corner is located better, whatever a few residuals say
 MAX_FIT_ERROR = 2.0  # px, of a camera's own views: beyond, the board differs from its description
 JITTER_ROUNDS = 6  # of expectation maximisation
@@ -187,7 +187,7 @@ def _with_sigma(views: BoardViews, sigma: float) -> BoardViews:
 
 
 def _median_sigma(fit: LensFit) -> float:
-    return max(float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1))) / RAYLEIGH, MIN_CORNER_SIGMA)
+    return max(float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1))) / RAYLEIGH_MEDIAN, MIN_CORNER_SIGMA)
 
 
 def _single_outliers(own: BoardViews, fit: LensFit) -> Mask:
@@ -199,7 +199,7 @@ def _single_outliers(own: BoardViews, fit: LensFit) -> Mask:
 def outliers(views: BoardViews, residuals: Array, scale: float) -> Mask:
     """(V, P) which corners are outliers by the median residual, which they do not pull."""
     away = np.linalg.norm(residuals, axis=-1)
-    usual = min(scale * float(np.median(views.sigma)), float(np.nanmedian(away)) / RAYLEIGH)
+    usual = min(scale * float(np.median(views.sigma)), float(np.nanmedian(away)) / RAYLEIGH_MEDIAN)
     return np.asarray(np.nan_to_num(away) > max(OUTLIER_SIGMAS * usual, OUTLIER_PX))
 
 

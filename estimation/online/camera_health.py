@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from estimation import se3
-from estimation.observations import Observations
+from estimation.observations import RAYLEIGH_MEDIAN, Observations
 from estimation.online.bump_detector import BumpDetector
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
@@ -25,7 +25,6 @@ from estimation.se3 import Array, Index, Mask
 
 MAX_OUTLIERS = 2  # cameras that may be wrong at once: exchanged cables
 MIN_DISORDER_PX = 1.5  # median residual; below, it is not asked how much of it a camera's own motion explains
-RAYLEIGH_MEDIAN = 1.18  # median length of a vector whose two entries are normal, in their sigmas
 MAX_MOTION_SIGMAS = 3.0  # beyond, a pose contradicts the motion; also by how much an outlier must be the clearest
 MIN_SHIFT_PX = 0.25  # by which lens, map and extrinsics may move all tracks of a camera, at least
 USUAL_MEMORY_S = 2.0  # over which it is learned what is usual for a camera

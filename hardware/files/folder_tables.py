@@ -7,6 +7,7 @@ image, head.csv the print head at each frame set, roi.toml polygons around the s
 from __future__ import annotations
 
 import csv
+import glob
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -131,7 +132,7 @@ def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str |
             reader = csv.DictReader(file, skipinitialspace=True)
             header = [name.strip() for name in reader.fieldnames or []]
             reader.fieldnames = header
-            rows = [(reader.line_num, row) for row in reader]
+            rows = [(reader.reader.line_num, row) for row in reader]  # its own count stays at a blank line
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, "file", checks.error_text(error), "a readable CSV file") from error
     for column in columns:
@@ -273,7 +274,7 @@ class SessionFolderWriter(ExitStack):
         self._heads: TextIO | None = None  # a session without an arm has no such file
         for camera in rig.cameras:
             (folder / camera.name).mkdir(parents=True, exist_ok=True)
-        write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{c.name}/*") for c in rig.cameras])
+        write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{glob.escape(c.name)}/*") for c in rig.cameras])
         if rois:
             write_roi(folder / "roi.toml", rig, rois, [0] * len(rois))
         write_frames(folder / "frames.csv", rig, [])

@@ -152,7 +152,10 @@ def _surface(rig: Rig, poses: tuple[SurfacePose | None, ...], tracks: tuple[Obse
     pose, seen = max(both, key=lambda pair: len(pair[1]))
     if len(seen) < MIN_SURFACE_TRACKS:
         return None
-    first = triangulated_map(rig, seen)
+    try:
+        first = triangulated_map(rig, seen)
+    except InputError:  # no two cameras see the same
+        return None
     return se3.transform_points(se3.inverse(pose.base_from_surface) @ first.base_from_surface, first.map.points)
 
 

@@ -194,7 +194,7 @@ class Breach(NamedTuple):
 
 def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:
     drift = (pose.twist_covariance, pose.acceleration_psd)
-    warp = () if pose.warp is None else (pose.warp.coefficients, pose.warp.covariance, pose.warp.growth)
+    warp = () if (w := pose.warp) is None else (w.control, w.coefficients, w.covariance, w.growth)
     ahead = () if (f := pose.forecast) is None else (f.horizons, f.increments, f.covariances)
     return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp, *ahead
 
