@@ -62,7 +62,7 @@ class FlowCommands:
 
     def __init__(self, plan: MaterialPlan, outlets: Outlets, lag: float, tick: float) -> None:
         """lag: s from one tick after a command until the arm is at its axes. tick: s between calls."""
-        self._plan, self._outlets, self._lag, self._tick = plan, outlets, lag, tick
+        self._plan, self._outlets, self.lag, self._tick = plan, outlets, lag, tick
         self._steps = np.arange(0.0, tick - SWITCH_STEP / 2, SWITCH_STEP)
         self._flow = 0.0  # mm^3/s last told
         self.begun = math.inf
@@ -73,7 +73,7 @@ class FlowCommands:
 
     def lead_on(self, place: float) -> float:
         """How long, s, an opening has to be told before the nozzle moves off from `place`, mm."""
-        return self.outlet(self._plan.material_at(place)).delay.leads(self._lag)[0]
+        return self.outlet(self._plan.material_at(place)).delay.leads(self.lag)[0]
 
     def closed(self) -> FlowOrder:
         """Tell the dispenser to close, at once."""
@@ -85,7 +85,7 @@ class FlowCommands:
 
         timing: of the printing that the nozzle follows. place: mm, where it is. end: mm, of the next rest.
         """
-        on, off = self.outlet(self._plan.material_at(place)).delay.leads(self._lag)
+        on, off = self.outlet(self._plan.material_at(place)).delay.leads(self.lag)
         times = now + self._steps
         led_on = timing.at(times + on)
         is_open = self._plan.open(led_on, timing.at(times + off), end)

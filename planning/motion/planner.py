@@ -110,6 +110,7 @@ class Planner:
             return self._stop(now, "no pose yet")
         if reason := self._pose_fault(pose, now):
             return self._stop(now, reason)
+        self._flow.lag = self.lag  # which whoever has learned it sets
         if self.lag:  # as the arm, late by the lag, will meet it, under its own stamp
             pose = replace(pose.predict(pose.stamp + self.lag), stamp=pose.stamp)
         if self.paused or self._rests.wanted:
