@@ -401,7 +401,7 @@ def test_a_lag_that_is_learned_anew_during_a_run_is_recorded_and_replayed_byte_b
     """The lag was taken for 80 ms at the start, is known better after a while, and is lost and found again."""
     lags = {0: 0.076, 40: 0.05, 41: 0.02, 80: float("nan"), 90: 0.0205}
     now_known = lags[0]
-    begin = BeginPrint(raster(), replace(PROFILE, lag=0.076 + PROFILE.frame_time), 0.0, "x")
+    begin = BeginPrint(raster(), replace(PROFILE, lag=0.076 + PROFILE.frame_time), 0.0, {}, "x")
     motion = LiveMotion(PROFILE, c_double(), None, lambda: now_known)
     motion.begin(begin)
     changed, frames = [], []
