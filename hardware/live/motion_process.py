@@ -236,6 +236,10 @@ class _TickReporter:
                 self._ticks.arrived(handover.sent)
         return None if handover is None else handover.pose
 
+    def arm_lag(self) -> float:
+        """The arm's lag from set-point to answer, s; NaN while unknown."""
+        return math.nan if self.loop is None else self.loop.arm.lag
+
     def bytes_passed(self, data: bytes, sent: bool) -> None:
         """Record bytes of the port, and time the first move made of a pose."""
         now, frame = self._clock.now(), b"" if self.loop is None else self.loop.arm.command_frame
@@ -292,10 +296,9 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
-    lag = lambda: math.nan if reporter.loop is None else reporter.loop.arm.lag  # noqa: E731
-    motion = LiveMotion(profile, channels.place, material, lag)
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     reporter = _TickReporter(channels, sender, ticks, priority)
+    motion = LiveMotion(profile, channels.place, material, reporter.arm_lag)
     orders = _OrderReceiver(channels, motion, ticks)
     try:
         arm = Arm(lambda: _LoggedPort(device(), reporter.bytes_passed), profile, clock.now(), link_settings)
