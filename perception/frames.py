@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -56,16 +56,29 @@ class Roi:
     polygon: Array  # (N, 2) px, may reach beyond the image
 
 
+ROI_LEAD = 0.1  # s before the stamp of a region from which it counts: cameras that run freely are less out of step
+ROI_SLACK = 1e-3  # s by which the set that a region counts from is safely later than that
+
+
+def region_since(roi: Roi, stamp: float) -> Roi:
+    """The region with the stamp by which it counts from the frame set at `stamp`, s, on, and from none before."""
+    return replace(roi, stamp=stamp + ROI_LEAD - ROI_SLACK)
+
+
+def whole_pictures(sizes: Sequence[tuple[int, int]], stamp: float) -> tuple[Roi, ...]:
+    """Every camera's whole picture as a region. sizes: (W, H) px by camera."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+    return tuple(Roi(camera, stamp, corners * size) for camera, size in enumerate(sizes))
+
+
 def region_polygons(roi: Sequence[Roi], frames: FrameSet, sizes: Sequence[tuple[int, int]]) -> dict[int, Array] | str:
     """The region of interest (N, 2) px in each image of the set, by camera, or why it is not known yet.
 
     Without any the whole images are taken. sizes: (W, H) px by camera.
     """
-    if not roi:
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
-        return {f.camera: corners * sizes[f.camera] for f in frames.frames}
+    roi = roi or whole_pictures(sizes, frames.stamp)
     start = max(r.stamp for r in roi)
-    if frames.stamp < start - 0.1:
+    if frames.stamp < start - ROI_LEAD:
         return f"waiting for the region of interest at {start:.3f} s"
     cameras = {f.camera for f in frames.frames}
     return {r.camera: r.polygon for r in sorted(roi, key=lambda r: r.camera) if r.camera in cameras}

@@ -145,8 +145,12 @@ class Page:
             f"(() => {{ const r = document.querySelector({json.dumps(selector)}).getBoundingClientRect();"
             " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
+        self.press(*place)
+
+    def press(self, x: float, y: float) -> None:
+        """Press at a place in the window, px."""
         for kind in ("mousePressed", "mouseReleased"):
-            self._tell("Input.dispatchMouseEvent", type=kind, x=place[0], y=place[1], button="left", clickCount=1)
+            self._tell("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def key(self, code: str, key: str) -> None:
         for kind in ("keyDown", "keyUp"):

@@ -38,6 +38,7 @@ NAMES = {  # named in passing, without what it needs; each is run as a part of a
         "stillbed dispenser",
         "stillbed live",
         "stillbed plan",
+        "stillbed record",
         "stillbed reach",
     ),
     *("stillbed replay", "stillbed segment", "stillbed simulate", "stillbed track", "stillbed train"),
@@ -66,6 +67,7 @@ PAGE = (
     "stillbed live monday/session.toml --page-address 0.0.0.0 --page-port 8443 --page-cert page.pem "
     "--page-key page.key --page-name printer.local"
 )
+RECORDED = "stillbed record live.toml -o out/recorded.mcap --seconds 3 --jpeg-quality 0 --no-page"
 MORE = "the same with more said"
 VIRTUAL = "stillbed calibrate arm --virtual --places 5 --swing-s 2 --record try -o arm.toml"
 WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 8 --no-page"
@@ -153,6 +155,11 @@ INSTEAD = {  # (what is run in its place, why)
         MORE,
     ),
     "stillbed replay run.mcap -o OUT": ("stillbed replay run.mcap -o out/replay", "the same to another folder"),
+    "stillbed live session.toml --region region.toml": (PAGE, "tests/test_region_live.py runs it with regions"),
+    "stillbed record RIG.toml -o X.mcap [--seconds S]": (RECORDED, "for some seconds"),
+    "stillbed record rig.toml -o try.mcap": (RECORDED, "for some seconds"),
+    "stillbed record rig.toml -o try.mcap --seconds 20 --jpeg-quality 0": (RECORDED, "the same with a page"),
+    "stillbed record live.toml -o waved.mcap": (RECORDED, "for some seconds"),
     "stillbed simulate SCENARIO.toml -o OUT": (SIMULATED, "the same to another folder"),
     "stillbed simulate data/scenarios/NAME.toml -o OUT": (SIMULATED, "the same to another folder"),
     "stillbed smooth DIR -o OUT --scheduler local": (CLUSTER, MORE),

@@ -17,7 +17,7 @@ from estimation.scans.scan import scan_from_triangles
 from perception.frames import FrameSet, Image, Roi
 from perception.mapping.features import polygon_mask
 from perception.tracking.step import TrackingStep
-from perception.tracking.wound_step import MAX_EMPTY_LOOKS, WoundTrackingStep
+from perception.tracking.wound_step import MAX_EMPTY_LOOKS, RegionSearch, RegionTrackingStep
 from perception.training.augmentation import Augmentation, cover_sample, draw_sample, relight, sample_pyramid
 from perception.training.dataset import (
     PIECE_SIDES_PX,
@@ -306,14 +306,14 @@ class Sees:
         return Segmentation(mask & found, float(found), 0.7 if found else np.nan)
 
 
-def first_step(sets: Sequence[FrameSet], cameras: Sequence[int]) -> tuple[WoundTrackingStep, list[tuple[Roi, ...]]]:
+def first_step(sets: Sequence[FrameSet], cameras: Sequence[int]) -> tuple[RegionTrackingStep, list[tuple[Roi, ...]]]:
     asked: list[tuple[Roi, ...]] = []
 
     def made(rois: Sequence[Roi]) -> TrackingStep:
         asked.append(tuple(rois))
         return TrackingStep(RIG, rois)
 
-    return WoundTrackingStep(RIG, made, Sees(sets, cameras)), asked
+    return RegionTrackingStep(RIG, made, RegionSearch(RIG, Sees(sets, cameras))), asked
 
 
 def test_the_surface_is_tracked_where_the_wound_was_seen() -> None:
@@ -340,7 +340,9 @@ def test_without_a_wound_in_two_cameras_the_whole_pictures_are_taken() -> None:
     step, asked = first_step(sets, (1,))
     for frames in sets:
         step(frames)
-    assert asked == [()]
+    (rois,) = asked
+    for roi, camera in zip(rois, RIG.cameras, strict=True):
+        assert np.ptp(roi.polygon, axis=0).tolist() == list(camera.size)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""`stillbed live`, `init`, `arm` and `cameras`: the commands on real or virtual devices. Imports lazily."""
+"""`stillbed live`, `record`, `init`, `arm` and `cameras`: the commands on real or virtual devices. Imports lazily."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
+REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
 
@@ -48,6 +49,7 @@ def add_live(commands: Commands) -> None:
     add("--rig", type=Path, metavar="RIG", help="rig.toml of cameras, or a session shown in real time")
     add("--simulated", type=named_path, metavar="SCENARIO.toml", help="a scenario, rendered before the run")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
+    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
@@ -71,6 +73,49 @@ def add_live(commands: Commands) -> None:
     add_how("--force", action="store_true", help="overwrite the recording")
 
 
+def add_record(commands: Commands) -> None:
+    """Add the sub-command `record`."""
+    add = commands.add(
+        "record",
+        _run_record,
+        "record live cameras, without an arm",
+        "Record the cameras of a rig.toml, or of a session.toml, as a live run would, with a page that shows their\n"
+        "pictures, rates and how sharp they are. Ctrl-C, the page or --seconds ends it; whatever ends it, what was\n"
+        "written before is kept. track, smooth, segment, plan --session and calibrate take the file. Exit code 1\n"
+        "where nothing came, or the recording ended by a fault.",
+        "stillbed record rig.toml -o try.mcap",
+        "stillbed record rig.toml -o try.mcap --seconds 20 --jpeg-quality 0",
+    ).add_argument
+    add("which", type=Path, metavar="RIG.toml", help="its cameras; or a session.toml, with its rig, region and quality")
+    add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
+    add("--seconds", type=positive, metavar="S", help="for so long; default: until Ctrl-C")
+    add("--jpeg-quality", type=int, metavar="Q", help="1 to 100, default 90; 0 keeps the pictures exactly")
+    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--no-page", action="store_true", help="without a page")
+    add("--force", action="store_true", help="overwrite the file")
+
+
+def _run_record(a: argparse.Namespace) -> int:
+    from hardware.files.region_table import read_region
+    from hardware.live.camera_recording import CameraRecording, RecordOrder, check_order
+    from hardware.live.settings import LiveSettings, read_settings
+    from hardware.process.checks import read_toml
+
+    settings = LiveSettings(rig=a.which)
+    if "camera" not in read_toml(a.which):
+        settings = read_settings(a.which)
+        if settings.rig is None or settings.rig.suffix != ".toml":
+            raise InputError(a.which, "cameras.rig", settings.rig or "missing", "a rig.toml of live cameras")
+    region = settings.region if a.region is None else read_region(a.region)
+    quality = settings.jpeg_quality if a.jpeg_quality is None else a.jpeg_quality
+    assert settings.rig is not None
+    order = RecordOrder(settings.rig, a.out, a.seconds, quality, region, not a.no_page)
+    recording = CameraRecording(check_order(order, a.force))
+    recording()
+    print(recording.words)
+    return FAILED if recording.failed else 0
+
+
 def add_init(commands: Commands) -> None:
     """Add the sub-command `init`."""
     add = commands.add(
@@ -84,6 +129,7 @@ def add_init(commands: Commands) -> None:
 
 
 def _run_live(a: argparse.Namespace) -> int:
+    from hardware.files.region_table import read_region
     from hardware.live.prepared import add_faults, prepare, prepare_resumed
     from hardware.live.run import LiveRun
     from hardware.live.settings import LiveSettings, override_settings, parse_host_names, read_settings
@@ -93,6 +139,8 @@ def _run_live(a: argparse.Namespace) -> int:
     faults = faults_from_texts("command line", "--fault", a.fault)
     flags = {name: getattr(a, name) for name in SETTINGS_FLAGS}
     flags |= {"unattended": a.yes, "page": False if a.no_page else None}
+    if a.region is not None:
+        flags["region"] = read_region(a.region)
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is None:

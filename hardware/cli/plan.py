@@ -188,14 +188,14 @@ def add_segment(commands: Commands) -> None:
     add = commands.add(
         "segment",
         _run_segment,
-        "find the wound in pictures or a video",
-        "Find the wound in pictures, folders of pictures or videos. Writes a PNG mask (0 or 255) of each\n"
+        "find the wound in pictures, a video or a recording",
+        "Find the wound in pictures, folders of pictures, videos or recordings. Writes a PNG mask (0 or 255) of each\n"
         "picture's own size and name, and wounds.csv: confidence, area, centroid, box and time of each. A picture\n"
         "without a wound gets an empty mask. Ctrl-C keeps what is done.",
         "stillbed segment photos/ -o masks --overlay",
         "stillbed segment ward.mp4 -o masks --method shape",
     ).add_argument
-    add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, or video")
+    add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, video, or .mcap recording")
     add("-o", "--out", type=Path, required=True, metavar="MASKS", help="folder, new or empty")
     methods = "unet: a trained network; shape: outlines like the scan's"
     add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=methods)

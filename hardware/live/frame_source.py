@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray, RawValue
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from estimation.se3 import Array
 from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet, Image, PrintHead, parallel_map
 from perception.pairing import frame_set
+
+if TYPE_CHECKING:
+    from hardware.cameras.feed import LiveHealth
 
 RING_SLOTS = 4  # sets: a reader that takes the newest one has 100 ms at 30 fps to copy it, which takes 2
 COLOUR_CHANNELS = 3
@@ -178,6 +181,10 @@ class LiveCameraSource:
         passed = self._cameras.health().passed_over
         dropped, self._passed = passed - self._passed, passed
         return TimedFrameSet(frames, handed=now, dropped=dropped)
+
+    def health(self) -> LiveHealth:
+        """The state of every camera now."""
+        return self._cameras.health()
 
     def learn(self, offsets: Array) -> None:
         """Pair frames as the cameras really expose: (C,) s later than their sets are stamped."""

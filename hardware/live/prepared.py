@@ -35,6 +35,7 @@ from hardware.files.dispenser_file import (
     read_dispensers,
 )
 from hardware.files.path_file import read_path, read_progress, write_progress_durably
+from hardware.files.region_table import check_region
 from hardware.files.rig_file import read_rig
 from hardware.live.settings import (
     VIRTUAL_ARM,
@@ -155,9 +156,11 @@ def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
         raise InputError(settings.record, "--record", "a file that exists", "a new file, or --force")
     if not settings.record.parent.is_dir():
         raise InputError(settings.record, "--record", "no such folder", "a file in a folder that exists")
+    prepared = _prepared(settings, files, None)
+    check_region(where, settings.region, prepared.rig)
     for file in (files.progress, files.surface):
         file.unlink(missing_ok=True)
-    return _prepared(settings, files, None)
+    return prepared
 
 
 def prepare_resumed(record: File, flags: dict[str, Any]) -> Prepared:
@@ -177,6 +180,7 @@ def prepare_resumed(record: File, flags: dict[str, Any]) -> Prepared:
     if settings.page:
         page_settings(settings, files.session)
     prepared = _prepared(settings, again, placement)
+    check_region(files.session, settings.region, prepared.rig)
     path = prepared.task.path
     start = read_progress(files.progress, path) if files.progress.exists() else 0.0
     if start >= len(path) - 1:

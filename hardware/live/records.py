@@ -74,6 +74,7 @@ class TrackingReport:
     ended: str = ""  # why there will be no more, "" while there are
     truth: Array | None = None  # (4, 4) mm, true base_from_surface at the pose's stamp, of a simulated world
     surface: Array | None = None  # (V, 3) mm, landmarks in the surface frame
+    draws: bool = False  # whether somebody has to draw the region first
 
 
 @dataclass(frozen=True, slots=True, eq=False)

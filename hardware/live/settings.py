@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from estimation.errors import InputError
+from hardware.files.region_table import ANY_REGION, RegionSettings, region_from_table, region_lines
 from hardware.operator.settings import OperatorSettings
 from hardware.process import checks
 
@@ -86,10 +87,11 @@ class LiveSettings:
     cores_tracking: tuple[int, ...] = _key("cores.tracking", "[0]", "processor cores to run on; left out: all", ())
     cores_motion: tuple[int, ...] = _key("cores.motion", "[1]", default=())
     cores_recorder: tuple[int, ...] = _key("cores.recorder", "[0]", default=())
+    region: RegionSettings = ANY_REGION  # a table of its own, whose keys are cameras
 
 
 SETTING_KEYS: dict[str, dict[str, Field[Any]]] = {}  # table and key in the file to the setting
-for _setting in fields(LiveSettings):
+for _setting in (each for each in fields(LiveSettings) if each.metadata):
     _table, _, _name = _setting.metadata["name"].partition(".")
     SETTING_KEYS.setdefault(_table, {})[_name] = _setting
 FILE_HEADER = "# A live run of stillbed: `stillbed live session.toml`. Lines that begin with # are examples.\n"
@@ -98,8 +100,8 @@ FILE_HEADER = "# A live run of stillbed: `stillbed live session.toml`. Lines tha
 def read_settings(file: Path) -> LiveSettings:
     """The settings in a session.toml; InputError names the key that makes no sense."""
     tables = checks.read_toml(file)
-    checks.check_keys(file, "", tables, (), SETTING_KEYS)
-    values: dict[str, Any] = {}
+    checks.check_keys(file, "", tables, (), [*SETTING_KEYS, "region"])
+    values: dict[str, Any] = {"region": region_from_table(file, tables.get("region", {}))}
     for name, settings in SETTING_KEYS.items():
         table = tables.get(name, {})
         if not isinstance(table, dict):
@@ -152,6 +154,10 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         raise InputError(where, "print.lift_mm", s.lift, f"0 to {MAX_LIFT_MM:g} mm")
     if not 1 <= s.patience <= MAX_PATIENCE:
         raise InputError(where, "cameras.patience_s", s.patience, f"1 to {MAX_PATIENCE:g} s")
+    if s.region.drawn and not s.page:
+        raise InputError(
+            where, "region", "no corners", "corners of two cameras or more, as no page is there to draw on"
+        )
     if not 0 <= s.jpeg_quality <= 100:
         raise InputError(where, "record.jpeg_quality", s.jpeg_quality, "0 to 100")
     usable = available_cores()
@@ -186,7 +192,7 @@ def settings_text(settings: LiveSettings | None = None) -> str:
             line = f"# {key} = {example}" if value is None else f"{key} = {value}"
             lines.append(f"{line}  # {about}" if about else line)
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join([*lines, *region_lines((settings or LiveSettings()).region), ""])
 
 
 def _toml_value(value: object) -> str | None:

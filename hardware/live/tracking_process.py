@@ -38,14 +38,14 @@ from hardware.live.records import (
     TrackingReport,
 )
 from hardware.motion.loop import CommandedPose
-from hardware.offline.track import FrameSetStep, tracker
+from hardware.offline.track import FrameSetStep, region_search, tracker
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock
 from hardware.process.shared_latest import SharedLatest
 from hardware.process.system import ask_to_go_first, pipe_closed, set_up_process, settle_memory, signal_at_parents_end
 from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
-from perception.frames import FrameSet, PrintHead, Roi
+from perception.frames import FrameSet, PrintHead, Roi, region_since
 from perception.lens import undistort
 from perception.tracking.step import STAGES
 
@@ -107,15 +107,16 @@ def _true_pose(truth: Trajectory, stamp: float) -> Array:
     return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
 
 
-def _restore_map(step: FrameSetStep, record: Path, session: Session, until: float, now: float) -> Array:
+def _restore_map(step: FrameSetStep, record: Path, session: Session, until: float, shift: float) -> Array:
     """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
+
+    shift: s, added to their stamps.
 
     Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
     runs' poses at the last of them. InputError where the surface is not found in its own pictures.
     """
     poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
     sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, session.frame_sets())
-    shift = now - until - SETTLING_TIME - 1.0  # the stamps end a second ago: the clock may have begun anew since
     new_from_old: Array | None = None
     for frames in sets:
         shifted = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
@@ -191,18 +192,25 @@ class _TrackingLoop:
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
         channels.reports.put(self.report)
         earlier = None if placement is None else open_session(placement.map)
-        source = session if earlier is None else earlier
+        source, region = session if earlier is None else earlier, prepared.settings.region
         rois = () if source is None else source.roi
+        if earlier is None and region.by is not None:
+            rois = region.rois(rig, self.report.stamp)
         sender.put(rig)
         if surface is not None:
             sender.put(ScanEntry(surface))
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
-        immediate = tuple(replace(roi, stamp=-np.inf) for roi in rois)
-        step = tracker(rig, immediate, surface, self._clock.now, profile.tool, model=prepared.settings.model)
+        self._region_recorded, self._drawn = bool(rois), region.drawn and not rois
+        # the stamps of earlier pictures are to end a second ago: the clock may have begun anew since
+        shift = 0.0 if placement is None else self._clock.now() - placement.until - SETTLING_TIME - 1.0
+        since = [-np.inf if earlier is None else roi.stamp + shift for roi in rois]
+        timed = tuple(replace(roi, stamp=stamp) for roi, stamp in zip(rois, since, strict=True))
+        find = region_search(rig, region, channels.link.regions, prepared.settings.model)
+        step = tracker(rig, timed, surface, self._clock.now, profile.tool, model=prepared.settings.model, find=find)
         self._step = stack.enter_context(step)
         if placement is not None and earlier is not None:
-            new_from_old = _restore_map(self._step, placement.map, earlier, placement.until, self._clock.now())
+            new_from_old = _restore_map(self._step, placement.map, earlier, placement.until, shift)
             self.report = replace(self.report, surface_from_path=new_from_old @ placement.surface_from_path)
 
     def __call__(self) -> None:
@@ -225,6 +233,7 @@ class _TrackingLoop:
         self._register(pose, arrived)
         self._report(arrived, pose)
         self._show(frames, pose)
+        self._record_region(frames.stamp)
         self._record(arrived, frames, pose)
         self._step.idle()
         self._source.learn(self._step.last.offsets)
@@ -271,6 +280,7 @@ class _TrackingLoop:
             used=tuple(int(n) for n in self._step.last.used),
             truth=None if self._truth is None else _true_pose(self._truth, arrived.source),
             surface=self._landmarks(pose),
+            draws=self._drawn and not self._step.roi,
         )
         self._channels.reports.put(self.report)
 
@@ -302,6 +312,14 @@ class _TrackingLoop:
             tracks = observations.pixels[observations.camera == frame.camera]
             shots.append(CameraShot(names[frame.camera], frame.image, outline, tracks))
         self._thumbnailer.offer(frames.stamp, shots, base_from_surface)
+
+    def _record_region(self, stamp: float) -> None:
+        """Record a region that was found or drawn, so that a tracker of the recording begins with this set as well."""
+        if self._region_recorded or not self._step.roi:
+            return
+        self._region_recorded = True
+        for roi in self._step.roi:
+            self._sender.put(region_since(roi, stamp))
 
     def _record(self, arrived: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
         stamps = {frame.camera: frame.stamp for frame in frames.frames}

@@ -24,6 +24,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import FRAMES_TO_WIRE_STAGE, LiveMotionReport, RunReports, TrackingReport
 from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import (
+    DRAW_QUESTION,
     STAGE_QUESTIONS,
     Activity,
     CameraView,
@@ -135,6 +136,7 @@ class ViewBuilder:
     ) -> OperatorView:
         """The view at `now`, s."""
         motion, tracking = reports.motion, reports.tracking
+        draws = tracking is not None and tracking.draws and machine.stage in (RunStage.CHECK, RunStage.FIND)
         estimate: TrackingView | None = None
         if tracking is not None and tracking.pose is not None:
             estimate = tracking_from_pose(tracking.pose, now, sum(tracking.used))
@@ -142,7 +144,7 @@ class ViewBuilder:
             stamp=now,
             turn=machine.turn,
             stage=machine.stage,
-            question=STAGE_QUESTIONS.get(machine.stage, ""),
+            question=DRAW_QUESTION if draws else STAGE_QUESTIONS.get(machine.stage, ""),
             reason=machine.silence or machine.reason,
             offers=machine.offers,
             checks=machine.checks,
@@ -154,6 +156,7 @@ class ViewBuilder:
             answer=machine.answer,
             notes=self.prepared.notes,
             events=() if motion is None else tuple(event.text for event in motion.events),
+            draws=draws,
         )
 
     def _motion(self, motion: LiveMotionReport, machine: RunStateMachine, statistics: RunStatistics) -> MotionView:

@@ -1,9 +1,10 @@
-"""`stillbed segment`: a PNG mask for each picture or frame of a video, and a table of all."""
+"""`stillbed segment`: a PNG mask for each picture, frame of a video or picture of a recording, and a table of all."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,14 @@ from estimation.errors import InputError
 from hardware.files.images import Video, decode, encode
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, prepare_out
+from hardware.recording.session_reader import open_session
 from perception.frames import Image
 from perception.wound.segmentation import Segmentation, Segmenter, box_of, centroid, draw_overlay
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
+RECORDING_SUFFIXES = (".mcap",)
+INPUT_SUFFIXES = PICTURE_SUFFIXES + VIDEO_SUFFIXES + RECORDING_SUFFIXES
 WOUND_TABLE = "wounds.csv"
 OVERLAY_FOLDER = "overlays"  # folder of the pictures with outlines
 OVERLAY_QUALITY = 90  # of JPEG
@@ -38,10 +42,11 @@ class SegmentOptions:
 
 
 def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: SegmentOptions) -> str:
-    """Segment pictures, folders of pictures and videos into the folder `out`; the result in two lines of text.
+    """Segment pictures, folders of pictures, videos and recordings into `out`; the result in two lines of text.
 
-    A mask is NAME.png (a video's NAME_000000.png and so on), 0 or 255, of the picture's own size. InputError for files
-    that cannot be read is raised at the end, when the masks of all others are written.
+    A mask is NAME.png (a video's NAME_000000.png and so on, a recording's NAME_CAMERA_000000.png), 0 or 255, of the
+    picture's own size. InputError for files that cannot be read is raised at the end, when the masks of all others are
+    written.
     """
     files = input_files(inputs)
     prepare_out(out, options.force)
@@ -79,9 +84,11 @@ def input_files(inputs: Sequence[Path]) -> list[Path]:
                 raise InputError(path, "pictures", "none", f"one at least, ending in {', '.join(PICTURE_SUFFIXES)}")
             files += inside
         elif not path.is_file():
-            raise InputError(path, "input", "no such file or folder", "a picture, a folder of pictures or a video")
-        elif path.suffix.lower() not in PICTURE_SUFFIXES + VIDEO_SUFFIXES:
-            raise InputError(path, "kind", path.suffix or "no suffix", ", ".join(PICTURE_SUFFIXES + VIDEO_SUFFIXES))
+            raise InputError(
+                path, "input", "no such file or folder", "a picture, a folder of pictures, a video or a recording"
+            )
+        elif path.suffix.lower() not in INPUT_SUFFIXES:
+            raise InputError(path, "kind", path.suffix or "no suffix", ", ".join(INPUT_SUFFIXES))
         else:
             files.append(path)
     first: dict[str, Path] = {}
@@ -97,6 +104,8 @@ def expected_count(file: Path) -> int:
     if file.suffix.lower() in PICTURE_SUFFIXES:
         return 1
     try:
+        if file.suffix.lower() in RECORDING_SUFFIXES:
+            return sum(map(len, open_session(file).sets))
         video = Video(file)
     except InputError:
         return 0
@@ -111,10 +120,21 @@ def read_pictures(files: Sequence[Path], errors: list[InputError]) -> Iterator[t
         try:
             if file.suffix.lower() in PICTURE_SUFFIXES:
                 yield file.stem, decode(file.read_bytes(), file, "picture")
+            elif file.suffix.lower() in RECORDING_SUFFIXES:
+                yield from _recorded(file)
             else:
                 yield from _frames(file)
         except InputError as error:
             errors.append(error)
+
+
+def _recorded(file: Path) -> Iterator[tuple[str, Image]]:
+    session = open_session(file)
+    with closing(session.open_reader()) as reader:
+        for ref in (ref for refs in session.sets for ref in refs):
+            yield f"{file.stem}_{session.rig.cameras[ref.camera].name}_{ref.number:06d}", reader.read(ref)
+    if session.damage:
+        raise InputError(file, "recording", session.damage, "one that is whole")
 
 
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from hardware.files.region_table import RegionBy, RegionSettings, check_region
 from hardware.process.progress import Progress, ProgressReport, prepare_out
 from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
 
@@ -22,9 +24,11 @@ if TYPE_CHECKING:
     from estimation.se3 import Array
     from hardware.files.pose_file import PoseWriter
     from hardware.files.session import Session
+    from hardware.operator.shared_state import DrawnRegion
+    from hardware.process.shared_latest import SharedLatest
     from perception.frames import FrameSet, Roi
     from perception.tracking.step import StepReport, TrackingStep
-    from perception.tracking.wound_step import WoundTrackingStep
+    from perception.tracking.wound_step import FindRegion, RegionTrackingStep
     from perception.wound.segmentation import NetworkSegmenter
 
     PoseSink = Callable[[FrameSet, SurfacePose, StepReport], None]  # takes each pose once it is written
@@ -85,11 +89,12 @@ def tracker(
     tool: Array | None = None,
     prefilter: str = "none",
     model: Path | None = None,
-) -> Iterator[TrackingStep | WoundTrackingStep]:
+    find: Callable[[Executor], FindRegion] | None = None,
+) -> Iterator[TrackingStep | RegionTrackingStep]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter lock.
 
-    roi: where the surface is at the start; without one a network segments the wound first, and where it finds none the
-    whole pictures are the surface. model: the network, an ONNX file; None: the one that comes along. surface: the
+    roi: where the surface is at the start; without one `find`, given one thread, makes what finds it, by default the
+    search of the wound by a network. model: the network, an ONNX file; None: the one that comes along. surface: the
     scan's file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm, profile
     of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
     """
@@ -97,7 +102,7 @@ def tracker(
     from perception.lens import PREFILTERS
     from perception.mapping.masks import Tool
     from perception.tracking.step import TrackingStep
-    from perception.tracking.wound_step import WoundTrackingStep
+    from perception.tracking.wound_step import RegionTrackingStep
 
     scan = None if surface is None else read_mesh(surface).scan
     with ProcessPoolExecutor(1, SPAWN, _start_map_process) as executor:
@@ -112,9 +117,9 @@ def tracker(
         if roi:
             yield make_step(roi)
             return
-        segmenter = _network_segmenter(model)
+        search = partial(network_search, rig, model) if find is None else find
         with ThreadPoolExecutor(1) as thread:
-            yield WoundTrackingStep(rig, make_step, segmenter, thread)
+            yield RegionTrackingStep(rig, make_step, search(thread))
 
 
 def _start_map_process() -> None:
@@ -122,6 +127,46 @@ def _start_map_process() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent()
     os.nice(MAP_PROCESS_NICE)
+
+
+DRAW_TEXT = "draw on the page where the surface is"
+
+
+def region_search(
+    rig: Rig, region: RegionSettings, drawn: SharedLatest[DrawnRegion], model: Path | None = None
+) -> Callable[[Executor], FindRegion] | None:
+    """What finds a region that is not known before the first picture, to be given one thread; None: nobody asks."""
+    if region.drawn:
+        return lambda thread: partial(_drawn_region, rig, drawn)
+    if region.by is RegionBy.COLOUR:
+        return partial(colour_search, rig, region.colour)
+    return partial(network_search, rig, model) if region.by is RegionBy.NETWORK else None
+
+
+def _drawn_region(rig: Rig, drawn: SharedLatest[DrawnRegion], frames: FrameSet) -> Sequence[Roi] | str:
+    """The region that somebody has drawn on the page; InputError where it is of other cameras."""
+    region = drawn.get()
+    if region is None:
+        return DRAW_TEXT
+    settings = RegionSettings(RegionBy.POLYGON, region.polygons)
+    check_region("the operator's page", settings, rig)
+    return settings.rois(rig, frames.stamp)
+
+
+def network_search(rig: Rig, model: Path | None, thread: Executor) -> FindRegion:
+    """Looks for the wound by a network, in one thread. model: an ONNX file; None: the one that comes along."""
+    from perception.tracking.wound_step import RegionSearch
+
+    return RegionSearch(rig, _network_segmenter(model), thread)
+
+
+def colour_search(rig: Rig, colour: str, thread: Executor) -> FindRegion:
+    """Looks for a printed frame or patch of a colour, "#rrggbb", in one thread."""
+    from perception.tracking.wound_step import RegionSearch
+    from perception.wound.segmentation import ColourSegmenter
+
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return RegionSearch(rig, ColourSegmenter((red, green, blue)), thread, patch=True)
 
 
 def _network_segmenter(model: Path | None) -> NetworkSegmenter:

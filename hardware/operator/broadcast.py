@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from estimation.rig import Camera
 from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene
-from hardware.operator.view import Activity, MotionView, OperatorView, WavingView, Wish
+from hardware.operator.view import Activity, MotionView, OperatorView, RecordingView, WavingView, Wish
 
 _HEAD_SIZE = struct.Struct("<I")
-JSON_DIGITS = 7  # significant ones: 0.1 um of a metre, more than a screen shows
+JSON_DIGITS = 7  # significant ones of a number below 1
+STAMP_DECIMALS = 6  # of all others: seven digits of a number would leave whole seconds of a stamp after 100 days
 PIXEL_DECIMALS = 1
 TIMELINE_SECONDS = 60.0  # of the error over time: a few breaths, and what led to the present hold
 TIMELINE_ROWS = 1200  # of it: at 20 views per second, which is more than are taken
@@ -51,8 +53,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
     if isinstance(value, float):
-        return float(f"{value:.{JSON_DIGITS}g}") if math.isfinite(value) else None
+        return rounded(value) if math.isfinite(value) else None
     return value.value if hasattr(value, "value") else value
+
+
+def rounded(value: float) -> float:
+    """A finite number to as many digits as are shown: of a stamp, a microsecond whatever the uptime."""
+    return round(value, STAMP_DECIMALS) if abs(value) >= 1.0 else float(f"{value:.{JSON_DIGITS}g}")
 
 
 def scene_text(scene: PageScene) -> str:
@@ -100,7 +107,7 @@ class Broadcast:
         self._pictures: PagePictures | None = None
         self._since = nan
         self._timeline: deque[tuple[float, float, float, float, bool]] = deque(maxlen=TIMELINE_ROWS)
-        self.view: OperatorView | WavingView | None = None
+        self.view: OperatorView | WavingView | RecordingView | None = None
         self.gone, self.refused = False, 0
         self.view_text, self.scene_text, self.pictures_bytes = "null", "", b""
         self.news = asyncio.Event()  # set, and replaced, when there is something new
@@ -123,6 +130,11 @@ class Broadcast:
         """Wake all windows."""
         self.news.set()
         self.news = asyncio.Event()
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of the scene, none before it is known."""
+        return () if self._scene is None else self._scene.cameras
 
     def age(self, now: float) -> float:
         """For how long, s, the newest view has been the newest; NaN before the first."""
@@ -151,13 +163,22 @@ class RequestMessage:
 
 
 @dataclass(frozen=True, slots=True)
+class RegionMessage:
+    """The region that a window has drawn; nothing of it is checked but that it is a table."""
+
+    region: dict[str, Any]  # corners by camera's name
+    turn: int  # of the view it was drawn under
+    tag: int  # the window's own number for it
+
+
+@dataclass(frozen=True, slots=True)
 class ShownMessage:
     """The window has shown the bundle of this number."""
 
     bundle: int
 
 
-def parse_message(text: str) -> RequestMessage | ShownMessage | None:
+def parse_message(text: str) -> RequestMessage | RegionMessage | ShownMessage | None:
     """The message in a text; None where it makes no sense."""
     try:
         message = json.loads(text)
@@ -167,6 +188,9 @@ def parse_message(text: str) -> RequestMessage | ShownMessage | None:
         return None
     if message.keys() == {"shown"}:
         return ShownMessage(message["shown"]) if _is_count(message["shown"]) else None
+    if message.keys() == {"region", "turn", "tag"}:
+        sound = isinstance(message["region"], dict) and _is_count(message["turn"]) and _is_count(message["tag"])
+        return RegionMessage(message["region"], message["turn"], message["tag"]) if sound else None
     if message.keys() != {"ask", "turn", "tag"} or not (_is_count(message["turn"]) and _is_count(message["tag"])):
         return None
     known = isinstance(message["ask"], str) and message["ask"] in Wish.__members__.values()

@@ -13,12 +13,24 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from importlib.resources import files
 from socket import socket as Listener
+from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from hardware.operator.broadcast import Broadcast, RateLimiter, RequestMessage, ShownMessage, parse_message, text
+from estimation.errors import InputError
+from estimation.rig import Camera, Rig
+from hardware.files.region_table import BY_KEY, RegionBy, check_region, region_from_table
+from hardware.operator.broadcast import (
+    Broadcast,
+    RateLimiter,
+    RegionMessage,
+    RequestMessage,
+    ShownMessage,
+    parse_message,
+    text,
+)
 from hardware.operator.settings import AccessControl, OperatorSettings, WindowLimits, response_headers
-from hardware.operator.shared_state import OperatorLink, RequestLine
+from hardware.operator.shared_state import DrawnRegion, OperatorLink
 from hardware.operator.view import CALMING_WISHES, Wish, refusal
 from hardware.process.clock import WallClock
 
@@ -36,9 +48,9 @@ class WindowSession:
     """Serves one web socket until either side ends it."""
 
     def __init__(
-        self, socket: web.WebSocketResponse, newest: Broadcast, requests: RequestLine, limits: WindowLimits
+        self, socket: web.WebSocketResponse, newest: Broadcast, link: OperatorLink, limits: WindowLimits
     ) -> None:
-        self._socket, self._newest, self._requests, self._limits = socket, newest, requests, limits
+        self._socket, self._newest, self._link, self._limits = socket, newest, link, limits
         self._clock = WallClock()
         now = self._clock.now()
         self._messages, self._asks = RateLimiter(limits.messages, now), RateLimiter(limits.asks, now)
@@ -63,6 +75,8 @@ class WindowSession:
                 self.dropped += 1
             elif isinstance(parsed, RequestMessage):
                 self._ask(parsed)
+            elif isinstance(parsed, RegionMessage):
+                self._draw(parsed)
             elif isinstance(parsed, ShownMessage):
                 if parsed.bundle == self._bundle:
                     self._shown.set()
@@ -73,10 +87,33 @@ class WindowSession:
 
     def _ask(self, ask: RequestMessage) -> None:
         number, words = None, self._refusal(ask)
-        if not words and (number := self._requests.ask(ask.wish, ask.turn)) is None:
+        if not words and (number := self._link.requests.ask(ask.wish, ask.turn)) is None:
             words = "the run has not yet taken what was asked before"
         self._replies.append(text(kind="asked", tag=ask.tag, wish=ask.wish, number=number, words=words))
         self._newest.wake()
+
+    def _draw(self, drawn: RegionMessage) -> None:
+        """Hand a drawn region to the run, or say why not."""
+        words = self._region_refusal(drawn)
+        if not words:
+            try:
+                self._link.regions.put(drawn_region(drawn.region, self._newest.cameras))
+            except InputError as error:
+                words = f"{error.what} = {error.got}, allowed {error.allowed}"
+        self._replies.append(text(kind="asked", tag=drawn.tag, wish="region", number=None, words=words))
+        self._newest.wake()
+
+    def _region_refusal(self, drawn: RegionMessage) -> str:
+        now, view = self._clock.now(), self._newest.view
+        if not self._asks.take(now):
+            return "that was too fast: ask again"
+        if view is None or self._newest.age(now) > self._limits.stale:
+            return "nothing is heard from the run"
+        if not getattr(view, "draws", False):
+            return "no region is asked for now"
+        if drawn.turn != view.turn:
+            return "the run has changed since this was shown: look again, then ask again"
+        return ""
 
     def _refusal(self, ask: RequestMessage) -> str:
         """Why a request is not even handed on, "" if it is; the run decides again, by newer knowledge."""
@@ -129,6 +166,16 @@ class WindowSession:
     async def _close(self, why: bytes) -> None:
         closing = self._socket.close(code=WSCloseCode.POLICY_VIOLATION, message=why)
         await asyncio.wait_for(closing, self._limits.patience)
+
+
+def drawn_region(region: dict[str, Any], cameras: Sequence[Camera]) -> DrawnRegion:
+    """The region in a window's message, checked as that of a session.toml is; InputError."""
+    where = "the page"
+    settings = region_from_table(where, {BY_KEY: RegionBy.POLYGON.value} | region)
+    if settings.by is not RegionBy.POLYGON or not settings.polygons:
+        raise InputError(where, "region", "no corners", "corners in two cameras or more")
+    check_region(where, settings, Rig(tuple(cameras)))
+    return DrawnRegion(settings.polygons)
 
 
 class OperatorServer:
@@ -197,7 +244,7 @@ class OperatorServer:
             await socket.send_str(text(kind="full", windows=len(self._windows)))
             await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=b"too many windows")
             return socket
-        window = WindowSession(socket, self.broadcast, self._link.requests, self._limits)
+        window = WindowSession(socket, self.broadcast, self._link, self._limits)
         self._windows[window] = request.transport
         try:
             await window.run()

@@ -42,7 +42,7 @@ class WindowLimits:
     """What windows may ask for. Far above what hands and screens do, far below what would be felt."""
 
     windows: int = 8  # at once: an operator's, a colleague's, and those that a browser has not closed yet
-    message: int = 512  # bytes: the longest that the page sends takes 60
+    message: int = 8192  # bytes: a region of 64 corners in each of six cameras; all else takes 60
     messages: float = 40.0  # per second: the page sends one for each view shown, and one for each press
     asks: float = 5.0  # requests per second but for stops, which are never too many
     malformed: int = 20  # messages that make no sense, after which a window is closed

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from hardware.operator.view import CALMING_WISHES, OperatorView, WavingView, Wish
+from hardware.files.region_table import Corners
+from hardware.operator.view import CALMING_WISHES, OperatorView, RecordingView, WavingView, Wish
 from hardware.process.shared_latest import SharedLatest
 from planning.path import Path
 
@@ -131,6 +132,13 @@ class PagePictures:
     base_from_surface: Array | None = None  # (4, 4) mm at that instant, None while it is unknown
 
 
+@dataclass(frozen=True, slots=True)
+class DrawnRegion:
+    """Where the surface is, as somebody drew it over the pictures; checked by the page against the scene's cameras."""
+
+    polygons: tuple[tuple[str, Corners], ...]  # px, by camera's name
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PageScene:
     """What stands still in the view: cameras, and path and surface in the surface frame. Sent when it changes."""
@@ -192,10 +200,11 @@ def _coarser_mesh(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, N
 class OperatorLink:
     """All that joins a run and its page, handed to each process that takes part when it is started.
 
-    Of `views`, `pictures` and `scene` each has one process that puts; the page gets.
+    Of `views`, `pictures` and `scene` each has one process that puts; the page gets. It puts `regions`.
     """
 
-    views: SharedLatest[OperatorView | WavingView] = field(default_factory=SharedLatest)
+    views: SharedLatest[OperatorView | WavingView | RecordingView] = field(default_factory=SharedLatest)
     pictures: SharedLatest[PagePictures] = field(default_factory=lambda: SharedLatest(PICTURES_CAPACITY))
     scene: SharedLatest[PageScene] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))
     requests: RequestLine = field(default_factory=RequestLine)
+    regions: SharedLatest[DrawnRegion] = field(default_factory=SharedLatest)  # from the page

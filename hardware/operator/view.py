@@ -72,6 +72,7 @@ STAGE_QUESTIONS = {
     RunStage.ENDED: "The run was ended; what is left can be resumed",
     RunStage.FAILED: "The run cannot go on; what is left can be resumed",
 }
+DRAW_QUESTION = "Click round what is to be followed, in two pictures or more"
 
 
 def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> str:
@@ -179,6 +180,7 @@ class CameraView:
     rate: float = nan  # pictures per second that arrive
     tracks: int = 0  # in use
     words: str = ""  # what is wrong, or ""
+    sharpness: float = nan  # of the newest picture, as a share of the sharpest so far
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,12 +212,39 @@ class OperatorView:
     answer: RequestAnswer | None = None
     notes: tuple[str, ...] = ()  # what one should know all the time, such as "dry run" or "simulated"
     events: tuple[str, ...] = ()  # the last ones, newest last
+    draws: bool = False  # whether the region has to be drawn now, by whoever sees the newest view
 
 
 def tracking_from_pose(pose: SurfacePose, now: float, tracks: int = 0) -> TrackingView:
     """The estimate as it is shown at `now`, s. tracks: in use."""
     sigma, place = position_sigma(pose.covariance), pose.covariance[3:, 3:]
     return TrackingView(pose.state, pose.reason, now - pose.stamp, sigma, pose.base_from_surface, place, tracks)
+
+
+class RecordingStage(StrEnum):
+    """Where a recording is."""
+
+    RECORD = "record"
+    ENDED = "ended"  # what is on the disk is whole
+    FAILED = "failed"  # what was written before is kept
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingView:
+    """The state of a recording without an arm."""
+
+    stamp: float  # s
+    turn: int
+    stage: RecordingStage
+    seconds: float  # of it so far
+    size: int  # bytes on the disk
+    sets: int  # frame sets taken
+    dropped: int  # of them, for which the recorder had no room
+    cameras: tuple[CameraView, ...] = ()
+    words: str = ""  # what ended it
+    offers: tuple[Wish, ...] = ()
+    answer: RequestAnswer | None = None
+    draws: bool = False  # whether a region may be drawn now
 
 
 class WavingStage(StrEnum):

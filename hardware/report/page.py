@@ -144,9 +144,12 @@ def stretches(usable: NDArray[np.bool_]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
+LARGE_TICK = 1e5  # from which six digits may be those that all ticks have in common: s of an uptime of days
+
+
 def number(value: float) -> str:
     """A tick's label: short, without noise digits."""
-    text = f"{value:.6g}"
+    text = f"{value:.6g}" if abs(value) < LARGE_TICK else f"{value:.12g}"
     return "0" if text == "-0" else text.replace("-", "\N{MINUS SIGN}")
 
 

@@ -13,7 +13,7 @@ from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.frames import FrameSet, Image, Roi
+from perception.frames import FrameSet, Image, Roi, whole_pictures
 from perception.tracking.step import STAGES, StepReport, TrackingStep, empty_report
 from perception.wound.segmentation import (
     Box,
@@ -22,6 +22,7 @@ from perception.wound.segmentation import (
     WoundMask,
     box_of,
     centroid,
+    hull_of,
     largest_part,
     polygon,
     region,
@@ -115,34 +116,74 @@ def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, 
 
 
 MAX_EMPTY_LOOKS = 2  # without a wound in two cameras; then the whole pictures are taken for the surface
+MAX_PARTIAL_LOOKS = 5  # at a frame or patch that some camera does not see, as the first sets lack cameras
 SKIN_MARGIN_SHARE = 0.6  # of the wound's box on every side: the skin beside it moves with it, and has more to track
+WOUND_SOUGHT, PATCH_SOUGHT = "the wound is being looked for", "the coloured frame is being looked for"
+
+FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, known from this frame set on, or why it is not
 
 
-class WoundTrackingStep:
-    """TrackingStep on the region where a segmenter sees the wound; on whole pictures where it sees none."""
+class RegionSearch:
+    """Looks for the region by a segmenter, once a frame set, until it is found."""
+
+    def __init__(self, rig: Rig, segmenter: Segmenter, executor: Executor | None = None, patch: bool = False) -> None:
+        """executor: one thread, as `AsyncSegmentation` takes it.
+
+        patch: the segmenter sees a printed frame or patch, whose outline is the region, and which is waited for. Else
+        it sees a wound, the region has skin beside it, and whole pictures are the region where no wound is seen.
+        """
+        self._rig, self._patch = rig, patch
+        self._segmentation = AsyncSegmentation(rig, segmenter, executor)
+        self._looks = 0
+
+    def __call__(self, frames: FrameSet) -> Sequence[Roi] | str:
+        """The region in each camera; two cameras or more see it."""
+        due = self._segmentation(frames)
+        if due is None:
+            return self._sought
+        self._looks += 1
+        stamp, sights = due
+        seen = sum(sight.box is not None for sight in sights.values())
+        if seen == len(self._rig) or (seen >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS)):
+            return self._rois(stamp, sights)
+        if self._patch or self._looks < MAX_EMPTY_LOOKS:
+            return self._sought
+        return whole_pictures([camera.size for camera in self._rig.cameras], stamp)
+
+    @property
+    def _sought(self) -> str:
+        return PATCH_SOUGHT if self._patch else WOUND_SOUGHT
+
+    def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> Sequence[Roi]:
+        """Round each camera's wound, the whole picture of a camera that sees none; or round the patch where it is."""
+        if self._patch:
+            return [Roi(c, stamp, hull_of(sight.mask)) for c, sight in sights.items() if sight.box is not None]
+        rois = []
+        for camera, sight in sights.items():
+            size = self._rig.cameras[camera].size
+            side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
+            rois.append(Roi(camera, stamp, polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))))
+        return rois
+
+
+class RegionTrackingStep:
+    """TrackingStep that begins once the region is known."""
 
     last: StepReport
 
-    def __init__(
-        self,
-        rig: Rig,
-        make_step: Callable[[Sequence[Roi]], TrackingStep],
-        segmenter: Segmenter,
-        executor: Executor | None = None,
-    ) -> None:
-        """make_step: the step for a region, or for none. executor: one thread, as `AsyncSegmentation` takes it."""
-        self._rig, self._make_step = rig, make_step
-        self._segmentation: AsyncSegmentation | None = AsyncSegmentation(rig, segmenter, executor)
+    def __init__(self, rig: Rig, make_step: Callable[[Sequence[Roi]], TrackingStep], find: FindRegion) -> None:
+        """make_step: the step for a region. find: asked with each frame set until it knows the region."""
+        self._rig, self._make_step, self._find = rig, make_step, find
         self._step: TrackingStep | None = None
-        self._looks = 0
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
-        """The pose at `frames.stamp`; INITIALISING while the wound is looked for."""
+        """The pose at `frames.stamp`; INITIALISING while the region is looked for."""
         if self._step is None:
-            self._step = self._start(frames)
-        if self._step is None:
-            self.last = empty_report(frames.stamp, len(self._rig), np.zeros(len(STAGES)))
-            return identity_pose(frames.stamp, "the wound is being looked for")
+            found = self._find(frames)
+            if isinstance(found, str):
+                self.last = empty_report(frames.stamp, len(self._rig), np.zeros(len(STAGES)))
+                return identity_pose(frames.stamp, found)
+            self._step = self._make_step(found)
         pose = self._step(frames)
         self.last = self._step.last
         return pose
@@ -154,34 +195,10 @@ class WoundTrackingStep:
 
     @property
     def roi(self) -> tuple[Roi, ...]:
-        """Where the surface was at the start, none before it was found."""
+        """Where the surface was at the start, none before that is known."""
         return () if self._step is None else self._step.roi
 
     def idle(self) -> None:
         """Work that no pose waits for."""
         if self._step is not None:
             self._step.idle()
-
-    def _start(self, frames: FrameSet) -> TrackingStep | None:
-        assert self._segmentation is not None
-        due = self._segmentation(frames)
-        if due is None:
-            return None
-        self._looks += 1
-        stamp, sights = due
-        rois = self._rois(stamp, sights)
-        if len([s for s in sights.values() if s.box is not None]) < 2:
-            if self._looks < MAX_EMPTY_LOOKS:
-                return None
-            rois = ()
-        self._segmentation = None
-        return self._make_step(rois)
-
-    def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> tuple[Roi, ...]:
-        """Round each camera's wound; the whole picture of a camera that sees none."""
-        rois = []
-        for camera, sight in sights.items():
-            size = self._rig.cameras[camera].size
-            side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
-            rois.append(Roi(camera, stamp, polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))))
-        return tuple(rois)

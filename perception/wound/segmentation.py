@@ -85,6 +85,39 @@ class NetworkSegmenter:
         return out
 
 
+HUE_REACH = 18  # of OpenCV's 180: cameras and printers shift a hue by some 30 degrees
+MIN_PATCH_SATURATION, MIN_PATCH_VALUE = 70, 40  # of 255: paler is paper, darker is shade
+MIN_PATCH_SHARE = 5e-4  # of the picture: a smaller part is no frame round anything
+
+
+class ColourSegmenter:
+    """Finds a printed frame or patch by its hue: the largest part of that colour, with all that it encloses."""
+
+    def __init__(self, colour: tuple[int, int, int]) -> None:
+        """colour: red, green and blue, 0..255, as printed; its hue alone counts."""
+        self._hue = int(cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_RGB2HSV)[0, 0, 0])
+
+    def __call__(self, image: Image) -> Segmentation:
+        """The frame and its inside, hull and all: what lies over it hides no part of the region."""
+        hsv = cv2.cvtColor(rgb(image), cv2.COLOR_RGB2HSV).astype(np.int16)
+        off = np.abs((hsv[..., 0] - self._hue + 90) % 180 - 90)
+        coloured = (off <= HUE_REACH) & (hsv[..., 1] >= MIN_PATCH_SATURATION) & (hsv[..., 2] >= MIN_PATCH_VALUE)
+        mask = largest_part(coloured)
+        found = mask.mean() >= MIN_PATCH_SHARE
+        inside = np.zeros(mask.shape, np.uint8)
+        if found:
+            cv2.fillConvexPoly(inside, hull_of(mask).astype(np.int32), 1)
+        return Segmentation(inside > 0, float(found), float("nan"))
+
+
+def hull_of(mask: WoundMask) -> Array:
+    """(N, 2) px corners of the convex hull round a mask (H, W) that is not empty, to half a percent of its length."""
+    rows, columns = np.nonzero(mask)
+    hull = cv2.convexHull(np.column_stack([columns, rows]).astype(np.int32))
+    even = cv2.approxPolyDP(hull, 0.005 * cv2.arcLength(hull, True), True)
+    return np.asarray(even.reshape(-1, 2), float)
+
+
 def segmentation_from_logits(logits: NDArray[np.float32], settings: Settings) -> Segmentation:
     """The wound by (H, W) logits.
 

@@ -16,7 +16,9 @@ export class CameraPane {
     this.fare.className = "fare";
     caption.append(this.title, this.fare);
     this.root.append(this.canvas, caption);
-    this.root.addEventListener("click", () => chosen(name));
+    this.root.addEventListener("click", (event) => this.clicked(event) || chosen(name));
+    this.corners = []; // of the region, [x, y] px
+    this.drawing = this.place = null; // takes a corner while a region is drawn; where the picture lies on the canvas
     this.image = this.close = this.found = this.lens = null;
     this.title.textContent = name;
     this.fare.hidden = true;
@@ -27,6 +29,15 @@ export class CameraPane {
   show(image, close, found) {
     for (const each of [this.image, this.close]) if (each) each.close();
     [this.image, this.close, this.found, this.since] = [image, close, found, performance.now()];
+  }
+  // whether a click was a corner of the region: in a picture that is not small beside another
+  clicked(event) {
+    const small = document.body.dataset.large === "yes" && !this.root.classList.contains("chosen");
+    if (!this.drawing || !this.place || small) return false;
+    const { x0, y0, scale, size, ratio } = this.place, box = this.canvas.getBoundingClientRect();
+    const pixel = [(event.clientX - box.left) * ratio - x0, (event.clientY - box.top) * ratio - y0];
+    this.drawing(pixel.map((p, k) => Math.round(10 * Math.min(Math.max(p / scale - 0.5, 0), size[k] - 1)) / 10));
+    return true;
   }
   // a picture that stands still must not be taken for a live one
   tick() {
@@ -41,6 +52,7 @@ export class CameraPane {
     else if (view) {
       if (view.rate !== null) parts.push(`${view.rate.toFixed(0)} Hz`);
       if (view.tracks) parts.push(`${view.tracks} tracks`);
+      if (view.sharpness !== null) parts.push(`sharp ${(100 * view.sharpness).toFixed(0)} %`);
     }
     this.fare.textContent = parts.join(" · ");
     this.fare.hidden = !parts.length;
@@ -54,8 +66,9 @@ export class CameraPane {
     g.clearRect(0, 0, w, h);
     const size = this.lens ? this.lens.camera.size : this.image ? [this.image.width, this.image.height] : null;
     if (!size) return;
-    const crop = near && this.close && this.found.crop, [left, top, across, down] = crop || [0, 0, ...size];
+    const crop = near && !this.drawing && this.close && this.found.crop, [left, top, across, down] = crop || [0, 0, ...size];
     const scale = Math.min(w / across, h / down), x0 = (w - scale * across) / 2, y0 = (h - scale * down) / 2;
+    this.place = { x0, y0, scale, size, ratio };
     this.canvas.dataset.drawn = !this.image ? "" : scene && pose && this.lens ? "path" : "picture";
     if (this.image) g.drawImage(crop ? this.close : this.image, x0, y0, scale * across, scale * down);
     if (!this.lens) return;
@@ -65,6 +78,7 @@ export class CameraPane {
     g.clip();
     const on = (p) => p && [x0 + scale * (p[0] - left + 0.5), y0 + scale * (p[1] - top + 0.5)];
     this.found && this.overlay(g, on, ratio);
+    this.region(g, on, ratio);
     if (scene && pose) {
       const pixel = this.lens.from(pose);
       const line = this.line(on(pixel(0, 0, 0)), on(pixel(1, 0, 0)), on(pixel(0, 1, 0)), ratio);
@@ -101,6 +115,23 @@ export class CameraPane {
       if (p) g.rect(p[0] - dot / 2, p[1] - dot / 2, dot, dot);
     }
     g.fill();
+  }
+  // the region as it has been drawn so far
+  region(g, on, ratio) {
+    this.canvas.dataset.corners = this.corners.length;
+    if (!this.corners.length) return;
+    const at = this.corners.map(on);
+    g.beginPath();
+    for (const p of at) g.lineTo(...p);
+    g.closePath();
+    g.fillStyle = "rgb(255 215 94 / .18)";
+    g.fill();
+    for (const [colour, width] of [["rgb(10 18 28 / .7)", 4], ["#ffd75e", 2]]) {
+      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
+      g.stroke();
+    }
+    g.fillStyle = "#ffffff";
+    for (const [x, y] of at) g.fillRect(x - 3 * ratio, y - 3 * ratio, 6 * ratio, 6 * ratio);
   }
   ring(g, [x, y], ratio) {
     g.beginPath();

@@ -1,6 +1,7 @@
 // The operator's page: hears the run, shows it, and asks. The newest wins; nothing is kept but the last minute's error.
 import { Buttons } from "./buttons.js";
 import { Course } from "./course.js";
+import { Drawing } from "./draw.js";
 import { Panes } from "./panes.js";
 import { SceneView } from "./scene.js";
 import { Line } from "./socket.js";
@@ -19,6 +20,7 @@ async function hear(message) {
   if (message instanceof ArrayBuffer) return pictures(message);
   if (message.kind === "scene") scene(message);
   else if (message.kind === "course") course.begin(message.rows);
+  else if (message.kind === "asked" && message.wish === "region") drawing.asked(message);
   else if (message.kind === "asked") buttons.asked(message);
   else if (message.kind === "full") state.full = true;
   else if (message.kind === "view" || message.kind === "gone") view(message);
@@ -66,6 +68,7 @@ function show() {
   alarm(news, age);
   if (seen) stage(seen);
   buttons.show(seen, news === "live");
+  drawing.show(seen, news === "live");
   if (seen) {
     checks(seen.checks);
     states(seen);
@@ -223,6 +226,7 @@ space.changed = refresh;
 window.addEventListener("resize", refresh);
 const line = new Line(hear);
 const buttons = new Buttons((wish, turn) => line.ask(wish, turn));
+const drawing = new Drawing(by("draw"), panes, line, (words, bad) => buttons.say(words, bad));
 setInterval(() => {
   for (const each of panes.values()) each.tick();
   show();

@@ -31,6 +31,12 @@ export class Line {
     await this.hear(message);
     if (message.bundle && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ shown: message.bundle }));
   }
+  // send a region, corners by camera, drawn under the turn that was shown; its tag, or null where there is no connection
+  draw(region, turn) {
+    if (!this.connected) return null;
+    this.socket.send(JSON.stringify({ region, turn, tag: ++this.tag }));
+    return this.tag;
+  }
   // ask for a wish under the turn that was shown; its tag, or null where nobody can be asked
   ask(wish, turn) {
     const tag = ++this.tag;

@@ -1,0 +1,320 @@
+"""`stillbed record`: live cameras recorded as a run records them, and shown on a page, without an arm or a path.
+
+Pictures go through the feeds and the recorder process of a live run. Whatever ends it, what was written before is a
+recording: Ctrl-C, the page, the end of the time, a disk that is full. A lost camera is left out until it is back.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from math import isnan, nan
+from pathlib import Path
+from types import FrameType
+from typing import TextIO
+
+from estimation.errors import InputError
+from estimation.rig import Rig
+from hardware.cameras.feed import CameraPhase, CameraState
+from hardware.cameras.inspection import sharpness
+from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
+from hardware.live.frame_source import LiveCameraSource, SourceEnded, TimedFrameSet
+from hardware.live.ipc import ProcessGroup
+from hardware.live.recorder_process import RecorderSender, record
+from hardware.live.records import RecorderReport, SetEntry
+from hardware.live.settings import LiveSettings
+from hardware.offline.track import region_search
+from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
+from hardware.operator.settings import OperatorSettings
+from hardware.operator.shared_state import DrawnRegion, OperatorLink, scene_from
+from hardware.operator.view import CameraView, CheckVerdict, RecordingStage, RecordingView, RequestAnswer, Wish, refusal
+from hardware.process.clock import Clock, WallClock
+from hardware.process.progress import Progress
+from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SPAWN
+from perception.frames import FrameSet, region_since
+from perception.tracking.wound_step import FindRegion
+
+PICTURE_WAIT = 0.1  # s of a wait for pictures, after which signals and the page are looked at
+VIEW_PERIOD = 0.3  # s between views for the page
+SHARPNESS_PERIOD = 1.0  # s between looks at the pictures' sharpness, which takes some ms each
+LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
+WRITE_TIMEOUT = 30.0  # s in which the recorder writes what waits
+BLUNT_SHARE = 0.6  # of the sharpest picture so far, below which a camera is perhaps out of focus
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+MEGABYTE = 1e6
+RECORDER = "recorder"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOrder:
+    """What is to be recorded."""
+
+    rig: Path  # rig.toml of live cameras
+    out: Path  # .mcap
+    seconds: float | None = None  # None: until somebody ends it
+    jpeg_quality: int = 90  # 1 to 100; 0: exact
+    region: RegionSettings = ANY_REGION
+    page: bool = True
+
+
+def check_order(order: RecordOrder, force: bool) -> RecordOrder:
+    """The order; InputError where it cannot be followed, or would overwrite a file and `force` is not set."""
+    where = "command line"
+    if order.out.suffix != ".mcap":
+        raise InputError(where, "--out", order.out, "a file that ends in .mcap")
+    if order.out.exists() and (order.out.is_dir() or not force):
+        raise InputError(order.out, "--out", "a file that exists", "a new file, or --force")
+    if not order.out.parent.is_dir():
+        raise InputError(order.out, "--out", "no such folder", "a file in a folder that exists")
+    if order.seconds is not None and not 0 < order.seconds < float("inf"):
+        raise InputError(where, "--seconds", order.seconds, "above 0")
+    if not 0 <= order.jpeg_quality <= 100:
+        raise InputError(where, "--jpeg-quality", order.jpeg_quality, "1 to 100, 0: exact")
+    if order.region.drawn and not order.page:
+        raise InputError(where, "--no-page", "no corners", "a region with corners, or a page to draw them on")
+    return order
+
+
+class RecordingPage:
+    """The page beside a recording; `address` is for the browser. Nothing here waits for it."""
+
+    def __init__(self, clock: Clock, rig: Rig) -> None:
+        self._clock, self.link = clock, OperatorLink()
+        self._page = OperatorPage(self.link, OperatorSettings(page="recording.html"))
+        self._taker = Thumbnailer(self.link.pictures, self.link.requests, near=False)
+        self._names = [camera.name for camera in rig.cameras]
+        self._view = RecordingView(clock.now(), 1, RecordingStage.RECORD, 0.0, 0, 0, 0)
+        self.link.scene.put(scene_from(rig))
+        self.address = self._page.address
+
+    def show(self, view: RecordingView) -> bool:
+        """Show the state, but for turn and answer, which are kept here; whether somebody asked to end."""
+        before, asked = self._view, False
+        turn = before.turn + ((before.stage, before.draws) != (view.stage, view.draws))
+        offers = (Wish.END,) if view.stage is RecordingStage.RECORD else ()
+        self._view = replace(view, turn=turn, answer=before.answer, offers=offers)
+        for request in self.link.requests.take():
+            why = refusal(request.wish, request.turn, offers, turn)
+            asked |= not why and request.wish in (Wish.STOP, Wish.END)
+            self._view = replace(self._view, answer=RequestAnswer(request.number, request.wish, not why, why))
+        self.link.views.put(self._view)
+        self._page.tend(self._clock.now())
+        return asked
+
+    def pictures(self, frames: FrameSet) -> None:
+        """Offer the pictures, where anybody has the page open."""
+        if self.link.requests.windows:
+            shots = [CameraShot(self._names[frame.camera], frame.image) for frame in frames.frames]
+            self._taker.offer(frames.stamp, shots)
+
+    def close(self) -> None:
+        """End the page, once its windows had time for the last view."""
+        if self.link.requests.windows:
+            self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
+        self._taker.close()
+        self._page.close()
+
+
+@dataclass(slots=True)
+class Sharpness:
+    """How sharp a camera's pictures are, as compared with its sharpest so far."""
+
+    newest: float = nan
+    best: float = nan
+
+    def add(self, value: float) -> None:
+        """Take the sharpness of one picture."""
+        self.newest, self.best = value, value if isnan(self.best) else max(self.best, value)
+
+    @property
+    def share(self) -> float:
+        """0 to 1; NaN before the first picture."""
+        return self.newest / self.best if self.best > 0 else nan
+
+
+class CameraRecording:
+    """One recording. Call it; then `words` says what became of it, and `failed` whether that is not what was asked."""
+
+    def __init__(self, order: RecordOrder, stream: TextIO | None = None) -> None:
+        """stream: for progress, by default stderr."""
+        self.words, self.failed = "", False
+        self._order, self._clock, self._stream = order, WallClock(), stream
+        self._signal = 0
+        self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
+        self._begun, self._first, self._last = self._clock.now(), nan, nan
+        self._sets = self._passed = 0
+        self._lost: dict[str, None] = {}  # names of cameras that were without pictures for a while, in that order
+        self._viewed = self._looked = -1e9
+        self._page: RecordingPage | None = None
+        self._find: FindRegion | None = None
+
+    def __call__(self) -> None:
+        """Record until the time is over or somebody ends it."""
+        with ExitStack() as stack:
+            stack.enter_context(self._signals())
+            self._source = LiveCameraSource(self._order.rig)
+            stack.callback(self._source.close)
+            rig = self._source.rig
+            check_region(self._order.rig, self._order.region, rig)
+            self._sharp = [Sharpness() for _ in rig.cameras]
+            self._start_recorder(stack)
+            self._sender.put(rig)
+            if self._order.page:
+                self._open_page(stack, rig)
+            self._seek_region(stack, rig)
+            progress = stack.enter_context(Progress("record", "frame sets", self._clock.now, self._stream))
+            why = ""
+            while not (why := self._ended()):
+                self._cycle(progress)
+            self._finish(why)
+
+    def on_signal(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal that asks the recording to end."""
+        self._signal = number
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        before = [signal.signal(number, self.on_signal) for number in ENDING_SIGNALS]
+        try:
+            yield
+        finally:
+            for number, handler in zip(ENDING_SIGNALS, before, strict=True):
+                signal.signal(number, handler)
+
+    def _start_recorder(self, stack: ExitStack) -> None:
+        settings = LiveSettings(record=self._order.out, jpeg_quality=self._order.jpeg_quality)
+        theirs, ours = SPAWN.Pipe(duplex=False)
+        stack.callback(self._processes.kill_all)
+        self._processes.start(RECORDER, record, (settings, [theirs], self._reports), [theirs])
+        self._sender = RecorderSender(ours)
+
+    def _open_page(self, stack: ExitStack, rig: Rig) -> None:
+        self._page = RecordingPage(self._clock, rig)
+        stack.callback(self._page.close)
+        self._say(f"open {self._page.address} to see what is recorded")
+
+    def _seek_region(self, stack: ExitStack, rig: Rig) -> None:
+        """Record the region, or prepare to find it in the pictures."""
+        for roi in self._order.region.rois(rig, self._begun):
+            self._sender.put(roi)
+        drawn = SharedLatest[DrawnRegion]() if self._page is None else self._page.link.regions
+        search = region_search(rig, self._order.region, drawn)
+        if search is not None:
+            self._find = search(stack.enter_context(ThreadPoolExecutor(1)))
+
+    def _ended(self) -> str:
+        """Why it is over, "" while it is not."""
+        now, report = self._clock.now(), self._reports.get()
+        if self._signal:
+            return f"ended by {signal.Signals(self._signal).name}"
+        if report is not None and report.failed:
+            self.failed = True
+            return report.failed
+        if not self._processes.alive(RECORDER):
+            self.failed = True
+            return f"the recorder {self._processes.ending(RECORDER)}; what was written before is kept"
+        if self._order.seconds is not None and now - self._begun >= self._order.seconds:
+            return "the time is over"
+        return self.words
+
+    def _cycle(self, progress: Progress) -> None:
+        try:
+            arrived = self._source.take(PICTURE_WAIT)
+        except SourceEnded:
+            self.words = "all cameras have ended"
+            return
+        if arrived is not None:
+            self._take(arrived)
+        now = self._clock.now()
+        if now > self._viewed + VIEW_PERIOD:
+            self._viewed = now
+            self._show(RecordingStage.RECORD)
+            progress.note = "; ".join([f"{self._size() / MEGABYTE:.1f} MB", *self._now_wrong()])
+        progress(self._sets, 0)
+
+    def _take(self, arrived: TimedFrameSet) -> None:
+        frames = arrived.frames
+        if isnan(self._first):
+            self._first = frames.stamp
+        self._last, self._sets = frames.stamp, self._sets + 1
+        self._passed += arrived.dropped
+        self._sender.put(SetEntry({frame.camera: frame.stamp for frame in frames.frames}, {}, frames.frames))
+        if self._page is not None:
+            self._page.pictures(frames)
+        if frames.stamp > self._looked + SHARPNESS_PERIOD:
+            self._looked = frames.stamp
+            for frame in frames.frames:
+                self._sharp[frame.camera].add(sharpness(frame.image))
+        if self._find is not None and not isinstance(found := self._find(frames), str):
+            self._find = None
+            for roi in found:
+                self._sender.put(region_since(roi, frames.stamp))
+
+    # -- what is said of it
+
+    def _size(self) -> int:
+        """Bytes on the disk."""
+        report = self._reports.get()
+        return 0 if report is None else report.written
+
+    def _now_wrong(self) -> list[str]:
+        """What is wrong with cameras now; who was lost after its first picture is remembered for the end."""
+        states = [state for state in self._source.health().cameras if state.trouble]
+        lost = (state.name for state in states if state.given and state.phase is not CameraPhase.ENDED)
+        self._lost |= dict.fromkeys(lost)
+        return [state.trouble for state in states]
+
+    def _show(self, stage: RecordingStage, words: str = "") -> None:
+        """Show the page the state, and follow what it asks."""
+        if self._page is None:
+            return
+        cameras = tuple(map(self._camera, self._source.health().cameras, self._sharp))
+        seconds, dropped = self._clock.now() - self._begun, self._sender.dropped
+        draws = self._order.region.drawn and self._find is not None and stage is RecordingStage.RECORD
+        view = RecordingView(
+            self._clock.now(), 0, stage, seconds, self._size(), self._sets, dropped, cameras, words, draws=draws
+        )
+        if self._page.show(view):
+            self.words = "ended on the page"
+
+    def _camera(self, state: CameraState, sharp: Sharpness) -> CameraView:
+        verdict = CheckVerdict.FAIL if state.trouble else CheckVerdict.PASS
+        if not state.trouble and sharp.share < BLUNT_SHARE:
+            verdict = CheckVerdict.WARN
+        return CameraView(state.name, verdict, state.rate, 0, state.trouble, sharp.share)
+
+    def _finish(self, why: str) -> None:
+        """Have everything written, and say what there is."""
+        self._sender.close(WRITE_TIMEOUT)
+        self._processes.end(RECORDER, WRITE_TIMEOUT)
+        report = self._reports.get()
+        if report is not None and report.failed and not self.failed:  # the last of it found no place
+            self.failed, why = True, report.failed
+        wrong = self._now_wrong()
+        counts = ", ".join(f"{state.name} {state.given}" for state in self._source.health().cameras)
+        lines = [why, f"{self._order.out}: {self._sets} frame sets ({counts} pictures) {self._span()}"]
+        if self._sender.dropped:
+            lines.append(f"left out, as they found no room on their way to the disk: {self._sender.dropped}")
+        if self._passed:
+            lines.append(f"frame sets left out, as a newer one was there: {self._passed}")
+        if self._lost:
+            lines.append(f"without pictures for a while: {', '.join(self._lost)}")
+        lines += [f"never came: {state.name}" for state in self._source.health().cameras if not state.given]
+        if not self._sets:
+            self.failed = True
+            self._order.out.unlink(missing_ok=True)
+            lines = [why, "no pictures came, and no file is kept", *wrong]
+        self.words = "\n".join(lines)
+        self._show(RecordingStage.FAILED if self.failed else RecordingStage.ENDED, self.words)
+
+    def _span(self) -> str:
+        seconds = self._last - self._first
+        return f"of {seconds:.1f} s, {self._size() / MEGABYTE:.1f} MB"
+
+    def _say(self, text: str) -> None:
+        print(text, file=sys.stderr if self._stream is None else self._stream, flush=True)
