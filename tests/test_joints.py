@@ -34,7 +34,7 @@ from planning.kinematics import (
 )
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
-from planning.progress import PrintPhase
+from planning.path import PrintPhase
 from tests.moving import REST, breathing, pose_at, raster
 
 SEEDS = st.integers(0, 100_000)

@@ -20,8 +20,7 @@ from hardware.simulator.arm.serial_line import SerialWire
 from hardware.simulator.camera_pipeline import ARRIVAL_EVENT, EXPOSURE_EVENT, POSE_EVENT, TICK_EVENT, EventQueue
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold, Move
-from planning.path import Path
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import Path, PrintPhase, PrintProgress
 from tests.moving import path_through
 
 TICK, LAG = 0.02, 0.03

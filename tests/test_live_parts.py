@@ -54,7 +54,7 @@ from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet
 from planning.material import Outlet, SwitchDelay
-from planning.progress import fingerprint
+from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
 from tests.session_files import rig
 

@@ -20,7 +20,7 @@ from hardware.motion.material import MaterialStatus
 from hardware.operator.shared_state import OperatorRequest
 from hardware.operator.view import CheckVerdict, RunStage, Wish
 from planning.command import Hold
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import PrintPhase, PrintProgress
 from tests.moving import raster
 
 PROFILE = ArmProfile()

@@ -18,8 +18,7 @@ from planning.limits import MotionLimits
 from planning.material import MAX_DELAY, Outlet, Outlets, SwitchDelay, material_plan, with_offsets
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
-from planning.path import Path
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import Path, PrintPhase, PrintProgress
 from tests.moving import Motion, breathing, path_through, pose_at, raster, still
 
 TICK, LIMITS = 0.02, MotionLimits()

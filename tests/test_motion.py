@@ -19,7 +19,7 @@ from planning.command import Hold, Move, Refusal
 from planning.kinematics import axes_from_nozzle, nozzle_from_axes
 from planning.limits import MotionLimits
 from planning.motion.curve import APPROACH_HEIGHT
-from planning.progress import PrintPhase
+from planning.path import PrintPhase
 from tests.moving import REST, Motion, breathing, pose_at, raster, still
 from tests.slowly import slowly
 

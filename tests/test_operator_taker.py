@@ -22,11 +22,11 @@ from hardware.live.view import NozzleErrorEstimate
 from hardware.motion.loop import Tick
 from hardware.operator.process import THUMBNAIL_PERIOD, THUMBNAIL_WIDTH, CameraShot, Thumbnailer, crop_around
 from hardware.operator.shared_state import PICTURES_CAPACITY, PagePictures, RequestLine
-from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SharedLatest
 from perception.frames import Roi
 from planning.command import Move
 from planning.kinematics import axes_from_nozzle
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import PrintPhase, PrintProgress
 from tests.moving import breathing, pose_at, raster
 
 

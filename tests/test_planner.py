@@ -21,8 +21,7 @@ from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
 from planning.limits import MotionLimits
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
-from planning.path import Path
-from planning.progress import PrintPhase
+from planning.path import Path, PrintPhase
 from tests.moving import REST, Motion, breathing, pose_at, raster, still
 
 TICK, LIMITS, ARM = 0.02, MotionLimits(), SimpleArm()

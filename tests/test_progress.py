@@ -20,8 +20,7 @@ from planning.command import Move
 from planning.kinematics import SimpleArm
 from planning.limits import MotionLimits
 from planning.motion.planner import Planner
-from planning.path import Path
-from planning.progress import PrintPhase, fingerprint, progress_mark, resume_fraction
+from planning.path import Path, PrintPhase, fingerprint, progress_mark, resume_fraction
 from tests.moving import breathing, pose_at, raster
 
 TICK = 0.02

@@ -29,7 +29,7 @@ from hardware.files.region_table import (
 from hardware.live.settings import LiveSettings, check_settings, read_settings, settings_text
 from hardware.offline.track import DRAW_TEXT, region_search
 from hardware.operator.shared_state import DrawnRegion
-from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SharedLatest
 from perception.frames import FrameSet, Roi, region_polygons, region_since
 from perception.tracking.step import TrackingStep
 from perception.tracking.wound_step import PATCH_SOUGHT, RegionSearch, RegionTrackingStep

@@ -16,17 +16,22 @@ from estimation import se3
 from estimation.pose import TrackState, Trajectory
 from hardware.report.evaluation import (
     Evaluation,
+    as_dict,
     associate,
     best_constant,
     compare,
     evaluate,
     latency,
+    percent,
     spread,
     state_shares,
+    summary_text,
+    text_of,
+    verdict,
+    write_summary,
 )
 from hardware.report.page import Plot, Scale, round_step, spanning, stretches, thinned
 from hardware.report.report import track_page, write_report
-from hardware.report.summary import as_dict, percent, summary_text, text_of, verdict, write_summary
 from tests.runs import run
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.1])

@@ -14,7 +14,7 @@ from estimation.errors import InputError
 from hardware.cli import doctor
 from hardware.operator.view import CheckVerdict
 from hardware.process.clock import SimClock, WallClock
-from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SharedLatest
 from hardware.process.ticks import (
     EASE_RANGE,
     MAX_EARLY_SHARE,

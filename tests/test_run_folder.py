@@ -27,7 +27,7 @@ from hardware.simulator.scenario import Scenario, read_scenario
 from perception.frames import Frame, FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport, report_without_offsets
 from planning.command import Command, Hold, Move
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import PrintPhase, PrintProgress
 from tests.nozzle_logs import nozzle_log, part, read_nozzle, straight
 from tests.worlds import IDEAL, SMALL, write_scenario
 

@@ -16,7 +16,7 @@ from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.shape import Deformation
 from hardware.simulator.world import RUN_OUT
 from planning.command import TICK_FRACTION
-from planning.progress import PrintPhase
+from planning.path import PrintPhase
 from tests.slowly import slowly
 from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
 

@@ -20,7 +20,7 @@ from hardware.files.path_file import read_path, write_progress_durably
 from hardware.files.rig_file import ImageSource, write_board, write_rig
 from hardware.live.prerender import prerender
 from hardware.process.clock import WallClock
-from planning.progress import fingerprint
+from planning.path import fingerprint
 from tests.board_session import BOARD, rendered, small_rig
 from tests.live_runs import ROOT, SCENARIO, Running
 from tests.shown_commands import MADE

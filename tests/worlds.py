@@ -30,7 +30,7 @@ from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, PrintHead
 from perception.tracking.step import StepReport
 from planning.command import Command, Hold
-from planning.progress import PrintProgress
+from planning.path import PrintProgress
 
 HEADER = "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude"
 IDEAL = {  # nothing takes time

@@ -39,8 +39,7 @@ from perception.frames import FrameSet
 from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.limits import MotionLimits
-from planning.path import Path
-from planning.progress import PrintPhase
+from planning.path import Path, PrintPhase
 
 AXES_LIMITS = "speed", "acceleration", "jerk", "jump", "turn"
 LIMIT_SLACK = 1.001  # a sample counts as over a limit from 0.1 % on

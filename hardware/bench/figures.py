@@ -133,7 +133,7 @@ def save(
     folder: Path, subject: str, options: Mapping[str, object], figures: Sequence[Figure], machine: Machine
 ) -> None:
     """Write figures.json and figures.csv into an existing folder; a number that does not exist is null, or empty."""
-    from hardware.report.summary import finite
+    from hardware.report.evaluation import finite
 
     plain = {name: value if isinstance(value, (int, float, bool)) else str(value) for name, value in options.items()}
     table = {"subject": subject, "options": plain, "machine": asdict(machine), "figures": [*map(_row, figures)]}
@@ -162,7 +162,7 @@ def read_figures(file: Path) -> list[Figure]:
 
 def whole_text(parts: Mapping[str, Sequence[Figure]], machine: Machine) -> str:
     """The figures of several subjects as JSON, one figure a line, so that a new measurement changes only its lines."""
-    from hardware.report.summary import finite
+    from hardware.report.evaluation import finite
 
     subjects = []
     for name, figures in parts.items():
@@ -177,7 +177,7 @@ TABLE_HEADER = ("figure", "value", "unit", "target", "", "reference", "note")
 
 def table_text(figures: Sequence[Figure]) -> str:
     """The figures, a line each, and a line that counts the missed ones."""
-    from hardware.report.summary import figure as digits
+    from hardware.report.evaluation import figure as digits
 
     rows: list[tuple[str, ...]] = [TABLE_HEADER]
     for f in figures:

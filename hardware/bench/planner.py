@@ -27,8 +27,7 @@ from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle
 from planning.motion.guard import Guard
 from planning.motion.planner import STALL_TICKS, Planner
-from planning.path import MIN_SPACING, Path, way_lengths
-from planning.progress import progress_mark, resume_fraction
+from planning.path import MIN_SPACING, Path, progress_mark, resume_fraction, way_lengths
 
 Draw = np.random.Generator
 Tick = tuple[float, SurfacePose | None]  # now, s, and the newest pose

@@ -32,9 +32,8 @@ from hardware.offline.track import MAP_METHOD, step_by, tracker
 from hardware.process.checks import Table
 from hardware.process.clock import CpuClock, ProcessorClock, WallClock
 from hardware.recording.session_reader import open_session
-from hardware.report.evaluation import Evaluation, evaluate, spread
+from hardware.report.evaluation import Evaluation, evaluate, measured_share, percent, spread
 from hardware.report.page import Plot, document, legend, line_key, section, spanning
-from hardware.report.summary import measured_share, percent
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.scene.appearance import Appearance, Sensor

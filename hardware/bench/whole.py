@@ -25,8 +25,8 @@ from hardware.bench.figures import Figure, Machine, Target, read_figures, table_
 from hardware.process.checks import error_text
 from hardware.process.clock import WallClock
 from hardware.process.progress import duration_text
+from hardware.report.evaluation import figure as digits
 from hardware.report.page import document, row_of_tiles, section, tile
-from hardware.report.summary import figure as digits
 
 Parts = Mapping[str, Sequence[Figure]]  # by the name of the part
 MAX_MISSES_NAMED = 3  # figures of a part that are named where they miss their target; the others are counted

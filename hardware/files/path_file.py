@@ -30,8 +30,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process import checks
-from planning.path import Path, check_path
-from planning.progress import PrintProgress, ProgressMark, fingerprint, resume_fraction
+from planning.path import Path, PrintProgress, ProgressMark, check_path, fingerprint, resume_fraction
 
 POSE_COLUMNS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 SPEED_COLUMNS = {"speed_mm_s": 1.0, "speed_mm_min": 1 / 60}  # column: mm/s of its unit

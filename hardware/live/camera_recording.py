@@ -34,8 +34,7 @@ from hardware.operator.shared_state import DrawnRegion, OperatorLink, scene_from
 from hardware.operator.view import CameraView, CheckVerdict, RecordingStage, RecordingView, RequestAnswer, Wish, refusal
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import SPAWN
+from hardware.process.system import SPAWN, SharedLatest
 from perception.frames import FrameSet, region_since
 from perception.tracking.wound_step import FindRegion
 

@@ -37,8 +37,7 @@ from hardware.live.settings import VIRTUAL_ARM
 from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock, WatchedClock
 from hardware.process.faults import Fault
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import SPAWN, ask_for_real_time, blocked_sigint, set_up_process
+from hardware.process.system import SPAWN, SharedLatest, ask_for_real_time, blocked_sigint, set_up_process
 
 EXIT_TIMEOUT = 10.0  # s that a process gets to close its files, on a busy machine
 ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device

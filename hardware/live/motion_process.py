@@ -47,8 +47,7 @@ from hardware.process.system import ask_for_real_time, set_up_process, take_mess
 from hardware.process.ticks import PoseLockedSchedule
 from hardware.recording.schemas import WARNING
 from planning.command import Command, Hold
-from planning.path import Path
-from planning.progress import PrintProgress
+from planning.path import Path, PrintProgress
 
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"

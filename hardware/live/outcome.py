@@ -25,7 +25,7 @@ from hardware.operator.view import RunStage
 from hardware.process.ticks import Histogram
 from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.progress import PrintPhase
+from planning.path import PrintPhase
 
 TIMELINE_BINS = 600  # an even number: two bins become one
 FIRST_BIN_WIDTH = 0.1  # s of a bin at first
@@ -199,7 +199,7 @@ class RunOutcome:
 
     def summary(self) -> dict[str, Any]:
         """The figures as plain values."""
-        from hardware.report.summary import finite
+        from hardware.report.evaluation import finite
 
         statistics, reports, task = self.statistics, self.reports, self.prepared.task
         tracking, motion, recorder, errors = reports.tracking, reports.motion, reports.recorder, statistics.errors
@@ -236,8 +236,8 @@ class RunOutcome:
         return cleaned
 
     def _page(self, summary: dict[str, Any]) -> str:
+        from hardware.report.evaluation import figure, percent
         from hardware.report.page import document, figures_table, row_of_tiles, section, tile
-        from hardware.report.summary import figure, percent
 
         error, duty = summary["predicted_error_mm"], self.statistics.duty
         tiles = [

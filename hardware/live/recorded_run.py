@@ -36,7 +36,7 @@ from hardware.recording.messages import (
 from hardware.recording.session_reader import PATH_ATTACHMENT, PrintInputs, inputs_from_texts
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import PrintPhase, PrintProgress
 
 RUN_REQUIRED = "the recording of a run that began to print, or give --path"
 

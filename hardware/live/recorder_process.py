@@ -40,8 +40,7 @@ from hardware.live.settings import LiveSettings
 from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
 from hardware.process.clock import ProcessorClock, WallClock
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import set_up_process
+from hardware.process.system import SharedLatest, set_up_process
 from perception.frames import Roi
 
 if TYPE_CHECKING:

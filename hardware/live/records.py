@@ -23,12 +23,11 @@ from hardware.live.frame_source import Encoded, FrameRing
 from hardware.motion.loop import RecordedTick, Tick
 from hardware.motion.material import DispenserRecord, MaterialStatus
 from hardware.operator.shared_state import OperatorLink, RequestLine
-from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SharedLatest
 from hardware.process.ticks import Histogram
 from perception.frames import Frame, PrintHead, Roi
 from planning.material import Outlets
-from planning.path import Path
-from planning.progress import PrintProgress
+from planning.path import Path, PrintProgress
 
 FRAMES_TO_WIRE_STAGE = "frames handed over to move on the wire"  # as it stands in reports and recordings
 EXPOSURE_TO_WIRE_STAGE = "exposure to move on the wire"

@@ -28,8 +28,7 @@ from hardware.operator.view import (
 )
 from hardware.process.ticks import tick_in_step
 from planning.material import Outlets
-from planning.path import Path
-from planning.progress import PrintPhase, fingerprint
+from planning.path import Path, PrintPhase, fingerprint
 
 SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s
 HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s

@@ -41,8 +41,14 @@ from hardware.motion.loop import CommandedPose
 from hardware.offline.track import FrameSetStep, region_search, tracker
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import ask_to_go_first, pipe_closed, set_up_process, settle_memory, signal_at_parents_end
+from hardware.process.system import (
+    SharedLatest,
+    ask_to_go_first,
+    pipe_closed,
+    set_up_process,
+    settle_memory,
+    signal_at_parents_end,
+)
 from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import FrameSet, PrintHead, Roi, region_since

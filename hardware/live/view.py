@@ -40,8 +40,7 @@ from hardware.operator.view import (
 )
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
-from planning.path import Path, way_lengths
-from planning.progress import PrintPhase
+from planning.path import Path, PrintPhase, way_lengths
 
 MAX_COMMANDS_KEPT = 64  # a second of them
 MAX_COMMAND_GAP = 0.1  # s between two commands that a straight line joins

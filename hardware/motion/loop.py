@@ -29,7 +29,7 @@ from hardware.process.ticks import Histogram, TickSchedule
 from perception.frames import PrintHead
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
-from planning.progress import PrintPhase
+from planning.path import PrintPhase
 
 
 class TickMotion(Protocol):

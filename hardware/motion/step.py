@@ -22,14 +22,12 @@ from hardware.arm.port import PortOpener
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import WallClock
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import ask_for_real_time, take_messages
+from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
-from planning.path import Path
-from planning.progress import PrintProgress
+from planning.path import Path, PrintProgress
 
 
 class MotionStep:

@@ -20,10 +20,18 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series, read_truth_series
 from hardware.process.progress import prepare_out
-from hardware.report.evaluation import NEES_BOUND, PoseErrors, associate, best_constant, errors_under
+from hardware.report.evaluation import (
+    NEES_BOUND,
+    PoseErrors,
+    associate,
+    best_constant,
+    errors_under,
+    figure,
+    finite,
+    percent,
+)
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components
-from hardware.report.summary import figure, finite, percent
 
 ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
 FIXED_POSE_SIGMA_MM = 1e-3  # mm, of all axes: only the pose that a smoothed run holds fixed has a smaller one

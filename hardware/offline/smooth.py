@@ -32,7 +32,7 @@ from hardware.offline.trajectory_files import write_copy, write_instants, write_
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, prepare_out
 from hardware.recording.session_reader import open_session
-from hardware.report.summary import finite
+from hardware.report.evaluation import finite
 
 SUMMARY_FILE = "summary.json"
 EXPECTED_PASSES = 12  # of a long recording, by which the time left is estimated

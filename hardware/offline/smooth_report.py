@@ -12,10 +12,9 @@ from estimation.batch.smoothed import Smoothed
 from estimation.pose import Trajectory
 from estimation.se3 import Array
 from hardware.offline.smooth_tracks import SessionTracks
-from hardware.report.evaluation import PoseErrors, associate, best_constant, errors_under, spread
+from hardware.report.evaluation import PoseErrors, associate, best_constant, errors_under, figure, spread
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components, deviations
-from hardware.report.summary import figure
 
 BREATHING_BAND_HZ = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
 PULSE_BAND_HZ = (0.75, 3.0)  # Hz: 45 to 180 beats a minute

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hardware.files.pose_file import PoseWriter
     from hardware.files.session import Session
     from hardware.operator.shared_state import DrawnRegion
-    from hardware.process.shared_latest import SharedLatest
+    from hardware.process.system import SharedLatest
     from perception.frames import FrameSet, Roi
     from perception.tracking.step import StepReport, TrackingStep
     from perception.tracking.wound_step import FindRegion, RegionTrackingStep
@@ -251,9 +251,8 @@ def follow(
 def _write_report(out: Path, session: Session, complete: bool, method: str) -> str:
     """Evaluate the poses.csv in `out` into report.html and summary.json there; returns the summary as text."""
     from hardware.files.pose_file import read_poses
-    from hardware.report.evaluation import evaluate
+    from hardware.report.evaluation import evaluate, summary_text, write_summary
     from hardware.report.report import write_report
-    from hardware.report.summary import summary_text, write_summary
 
     since = min((roi.stamp for roi in session.roi), default=float("-inf"))
     table = read_poses(out / "poses.csv")

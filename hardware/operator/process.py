@@ -24,8 +24,7 @@ from estimation.se3 import Array
 from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
 from hardware.process.clock import WallClock
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import SPAWN
+from hardware.process.system import SPAWN, SharedLatest
 from perception.frames import Image
 
 PAGE_NICENESS = 5  # below the loops, above what may wait for minutes

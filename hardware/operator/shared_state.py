@@ -22,7 +22,7 @@ from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from hardware.files.region_table import Corners
 from hardware.operator.view import CALMING_WISHES, OperatorView, RecordingView, WavingView, Wish
-from hardware.process.shared_latest import SharedLatest
+from hardware.process.system import SharedLatest
 from planning.path import Path
 
 REQUEST_SLOTS = 16  # requests that wait; the run takes them every few ms and a hand gives a few in a second

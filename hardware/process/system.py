@@ -1,20 +1,26 @@
-"""What a process asks of the system: priority, cores, signals, standard streams, and to end with its parent."""
+"""What processes ask of the system: priority, cores, signals, to end with their parent, and memory that two share."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
+import pickle
 import signal
+import struct
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, Generic, TypeVar
+from zlib import crc32
+
+from estimation.errors import InputError
 
 PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>: which signal the kernel sends when the thread that started this process ends
 
@@ -172,3 +178,54 @@ def pipe_closed(lifeline: Connection) -> bool:
         return lifeline.poll()
     except OSError:
         return True
+
+
+Value = TypeVar("Value")
+
+DEFAULT_CAPACITY = 1 << 20  # bytes: fifty times a pose with its forecast and its warp
+MAX_READ_TRIES = 8  # by then the writer would have come twice within each reading, some of them microseconds
+_COUNT = struct.Struct("=Q")
+_SLOT_HEAD = struct.Struct("=QII")  # count, size, check sum
+
+
+class SharedLatest(Generic[Value]):
+    """The latest value of a stream, in memory that two processes share: one puts, the other gets.
+
+    It is handed to the other process when that is started. Neither side waits. Two slots take turns: one can be read
+    while the other is written. A reader that is overtaken sees it by the count and the checksum, and reads the newer.
+    """
+
+    def __init__(self, capacity: int = DEFAULT_CAPACITY) -> None:
+        self._capacity = capacity
+        self._memory: Any = RawArray("B", _COUNT.size + 2 * (_SLOT_HEAD.size + capacity))
+        self._seen, self._value = 0, None
+
+    def put(self, value: Value) -> None:
+        """Make `value` the newest; InputError where it is too large."""
+        data = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+        if len(data) > self._capacity:
+            raise InputError("shared memory", "size", len(data), f"at most {self._capacity} bytes")
+        memory = memoryview(self._memory).cast("B")
+        count = _COUNT.unpack_from(memory)[0] + 1
+        start = self._start(count)
+        memory[start + _SLOT_HEAD.size : start + _SLOT_HEAD.size + len(data)] = data
+        _SLOT_HEAD.pack_into(memory, start, count, len(data), crc32(data))
+        _COUNT.pack_into(memory, 0, count)
+
+    def get(self) -> Value | None:
+        """The newest value, the very object of the last call if there is no newer one; None before the first."""
+        memory = memoryview(self._memory).cast("B")
+        for _ in range(MAX_READ_TRIES):
+            count = _COUNT.unpack_from(memory)[0]
+            if count == self._seen:
+                break
+            start = self._start(count)
+            written, size, check = _SLOT_HEAD.unpack_from(memory, start)
+            data = bytes(memory[start + _SLOT_HEAD.size : start + _SLOT_HEAD.size + min(size, self._capacity)])
+            if written == count and crc32(data) == check:
+                self._seen, self._value = count, pickle.loads(data)
+                break
+        return self._value
+
+    def _start(self, count: int) -> int:
+        return _COUNT.size + (count % 2) * (_SLOT_HEAD.size + self._capacity)

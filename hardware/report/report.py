@@ -12,8 +12,18 @@ from estimation import se3
 from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.report import page
-from hardware.report.evaluation import MAX_TRACKING_ERROR_MM, NEES_BOUND, Comparison, Evaluation, spread
-from hardware.report.summary import clocks_learned, figure, measured_share, percent, verdict
+from hardware.report.evaluation import (
+    MAX_TRACKING_ERROR_MM,
+    NEES_BOUND,
+    Comparison,
+    Evaluation,
+    clocks_learned,
+    figure,
+    measured_share,
+    percent,
+    spread,
+    verdict,
+)
 
 PAGE_CHART_WIDTH = 1030  # px of a chart across the page
 HALF_CHART_WIDTH = 480  # px of one of two

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from hardware.report import page
+from hardware.report.evaluation import figure
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
-from hardware.report.summary import figure
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
 from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleLag
 from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share

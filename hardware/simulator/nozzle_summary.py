@@ -14,8 +14,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from hardware.process import checks
-from hardware.report.evaluation import Evaluation, Spread, spread
-from hardware.report.summary import figure, finite, percent
+from hardware.report.evaluation import Evaluation, Spread, figure, finite, percent, spread
 from hardware.simulator.deposit import (
     DepositFigures,
     DepositMap,

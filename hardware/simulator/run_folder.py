@@ -38,7 +38,7 @@ from hardware.simulator.scenario import Scenario
 from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport
 from planning.command import Command, Move
-from planning.progress import PrintProgress
+from planning.path import PrintProgress
 
 WATCH_INTERVAL = 0.5  # s of the run between two pictures
 MAIN_TILE, SIDE_TILE = (960, 540), (480, 270)  # px: the first camera's picture, and the others'

@@ -35,9 +35,8 @@ from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import Progress, prepare_out
-from hardware.report.evaluation import Evaluation, evaluate
+from hardware.report.evaluation import Evaluation, evaluate, write_summary
 from hardware.report.report import write_report
-from hardware.report.summary import write_summary
 from hardware.simulator.arm.ports import PtyLink
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras

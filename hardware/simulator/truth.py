@@ -19,8 +19,7 @@ from hardware.simulator.deposit import NozzleLog, planned_line
 from hardware.simulator.scene.shape import Deformation, Shape
 from planning.command import Command, Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.path import Path
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import Path, PrintPhase, PrintProgress
 
 GRADIENT_STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth over centimetres
 

@@ -53,8 +53,7 @@ from hardware.simulator.truth import Truth, TruthLog, row_instants
 from perception.frames import FrameSet
 from planning.command import Command
 from planning.kinematics import nozzle_from_axes
-from planning.path import Path
-from planning.progress import PrintPhase, PrintProgress
+from planning.path import Path, PrintPhase, PrintProgress
 
 ROW_BLOCK = 0.2  # s of truth rows handed to the sink at once
 RUN_OUT = 0.3  # s that the run goes on after the path is finished

@@ -39,8 +39,7 @@ from planning.motion.curve import (
 from planning.motion.flow import FlowCommands, FlowOrder, RestsAhead
 from planning.motion.follow import LOOKAHEAD, AxisFollower
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
-from planning.path import Path, check_path
-from planning.progress import PrintPhase, PrintProgress, check_start
+from planning.path import Path, PrintPhase, PrintProgress, check_path, check_start
 
 HORIZON_TIME = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second

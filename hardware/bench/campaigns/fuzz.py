@@ -60,7 +60,7 @@ from perception.tracking.step import STAGES, report_without_offsets
 from perception.wound.network import WoundNetwork, shipped_model
 from perception.wound.shape_matching import read_shape_model
 from planning.layers.repair import repair_mesh
-from planning.progress import fingerprint
+from planning.path import fingerprint
 
 PATH_TEXT = (
     "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude\n"

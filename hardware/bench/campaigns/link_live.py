@@ -31,8 +31,7 @@ from hardware.motion.loop import Order
 from hardware.motion.step import MotionPlan, MotionReport, motion_process
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
-from hardware.process.shared_latest import SharedLatest
-from hardware.process.system import ask_for_real_time
+from hardware.process.system import SharedLatest, ask_for_real_time
 from hardware.simulator.arm.ports import run_virtual_arm
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.path import Path as Toolpath
