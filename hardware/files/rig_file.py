@@ -13,6 +13,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from hardware.files.session import SURFACE_SUFFIXES
 from hardware.process import checks
 from hardware.process.checks import Table
 from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board
@@ -269,3 +270,27 @@ def _within(path: Path, key: str, value: object, low: float, high: float) -> flo
     if not low <= number <= high:
         raise InputError(path, key, number, f"{low:g} to {high:g}")
     return number
+
+
+def surface_of_rig(file: Path, surface: str | None) -> Path | None:
+    """The scan that a rig.toml names by `surface`; InputError where it is none."""
+    if surface is None:
+        return None
+    path = file.parent / surface
+    if path.suffix.lower() not in SURFACE_SUFFIXES:
+        raise InputError(file, "surface", surface, f"a file {', '.join(SURFACE_SUFFIXES)}")
+    if not path.is_file():
+        raise InputError(file, "surface", surface, "a file that is there")
+    return path
+
+
+def surface_of_folder(folder: Path, rig_file: RigFile) -> Path | None:
+    """The scan in a session folder, as its rig.toml names it or by its own name; InputError where it is none."""
+    named = surface_of_rig(folder / "rig.toml", rig_file.surface)
+    files = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()] if named is None else [named]
+    if len(files) > 1:
+        names = ", ".join(p.name for p in files)
+        raise InputError(folder, "surface", names, "one of them (or `surface = ` in rig.toml)")
+    if files and not files[0].stat().st_size:
+        raise InputError(files[0], "file", "empty", "a scan of the surface, mm")
+    return files[0] if files else None
