@@ -150,7 +150,8 @@ def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: St
     placed = read_placement(RunFiles(record).surface)
     assert placed.surface_from_path == pytest.approx(lies, abs=1e-9) and placed.certain
     assert "moved by hand" in placed.verdict and placed.map == record.resolve()
-    printed, profile = used_inputs(record)
+    inputs = used_inputs(record)
+    printed, profile = inputs.path, inputs.profile
     assert printed.surface_from_nozzle == pytest.approx(placed.surface_from_path @ path.surface_from_nozzle, abs=1e-6)
     assert any("moved by hand, move 1: x 3.00 mm" in str(m["message"]) for m in messages(record, "/events"))
     nozzle_lies_on(record, printed, profile)
@@ -163,7 +164,7 @@ def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: St
     again.press("q")
     again.end()
     second = RunFiles(record).next().record.with_name("run-2.mcap")
-    assert (used_inputs(second)[0].surface_from_nozzle == printed.surface_from_nozzle).all()
+    assert (used_inputs(second).path.surface_from_nozzle == printed.surface_from_nozzle).all()
     assert read_placement(RunFiles(second).surface).surface_from_path == pytest.approx(lies, abs=1e-9)
 
 

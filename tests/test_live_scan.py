@@ -140,7 +140,7 @@ def test_the_scan_lies_where_it_is_in_truth_and_where_plan_finds_it(start: Start
     again.press("q")
     again.end()
     second = RunFiles(record).next().record.with_name("run-2.mcap")
-    resumed, path = closed(second), used_inputs(second)[0].surface_from_nozzle
+    resumed, path = closed(second), used_inputs(second).path.surface_from_nozzle
     truth = dict(zip(resumed.truth.stamps, resumed.truth.base_from_surface, strict=True))
     wanted = se3.inverse(SCAN_FROM_TRUE) @ read_path(cache / "path_scan.csv").surface_from_nozzle
     seen = [pose for pose in read_poses(second) if pose.state.measured and pose.stamp in truth]
