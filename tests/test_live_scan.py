@@ -54,7 +54,7 @@ AGREEMENT_MM, MAX_ERROR_MM, MAX_ERROR_DEG = 0.05, 0.1, 0.1
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scenario rendered into a cache of its own; beside it a scan and a path in the scanner's frame, and flat.ply."""
+    """A scenario rendered into a cache of its own; a scan and a path in the scanner's frame; other scans."""
     folder = tmp_path_factory.mktemp("scan")
     (folder / "wound.toml").write_text(SCENARIO)
     (folder / "path.csv").write_text(PATH)
@@ -64,6 +64,9 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     vertices, triangles = shape.mesh(1.0)
     write_ply(folder / "scan.ply", vertices=se3.transform_points(SCAN_FROM_TRUE, vertices), triangles=triangles)
     write_ply(folder / "flat.ply", vertices=vertices * [1.0, 1.0, 0.0], triangles=triangles)
+    other = scene_from_table(scenario.file, scenario.scene, folder, scenario.seed + 1).shape
+    vertices, triangles = other.mesh(1.0)
+    write_ply(folder / "other.ply", vertices=vertices, triangles=triangles)
     path = read_path(rendered / "path.csv")
     moved = SCAN_FROM_TRUE @ path.surface_from_nozzle
     write_path(
@@ -150,11 +153,12 @@ def test_the_scan_lies_where_it_is_in_truth_and_where_plan_finds_it(start: Start
     assert len(seen) > 10 and away <= 2 * MAX_ERROR_MM
 
 
+@pytest.mark.parametrize("name", ["flat.ply", "other.ply"])
 def test_a_scan_that_is_not_found_for_certain_is_told_and_nothing_is_printed(
-    start: Start, cache: Path, tmp_path: Path
+    name: str, start: Start, cache: Path, tmp_path: Path
 ) -> None:
     record = tmp_path / "run.mcap"
-    run = start("--scan", cache / "flat.ply", "--record", record, "--yes")
+    run = start("--scan", cache / name, "--record", record, "--yes")
     run.wait_for("where the path belongs is not certain")
     assert run.end() == 1 and "\nprint\n" not in run.said and "\nhoming" not in run.said
     assert not RunFiles(record).surface.exists()

@@ -266,12 +266,12 @@ def _scan_of(settings: LiveSettings, session: File) -> File | None:
     return scan
 
 
-def agreed_scan(given: File | None, own: File | None, where: object) -> File | None:
+def agreed_scan(given: File | None, own: File | None, where: File) -> File | None:
     """The scan that is given or that the cameras' files (where) hold; InputError where these are two different ones."""
     if given is None or own is None:
         return given or own
     if given.read_bytes() != own.read_bytes():
-        raise InputError(given, "scan", f"other than {own.name} of {where}", "one scan: leave out one of the two")
+        raise InputError(given, "scan", f"other than {own.name} of {where.name}", "one scan: leave out one of the two")
     return given
 
 
