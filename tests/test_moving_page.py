@@ -192,13 +192,23 @@ def test_many_presses_are_few_requests_and_nothing_of_them_is_lost(run: Moved) -
     for _ in range(3):
         run.page.click("[data-move=right]")
     run.page.key("Comma", ",")
-    assert not run.page.js('document.getElementById("go").disabled') or run.moves == 0
     far, turned, count = 0.0, 0.0, 0
     while count < 4 and turned == 0:
         move = run.follow().move
         far, turned, count = far + float(np.hypot(move.x_mm, move.y_mm)), turned + move.turn_deg, count + 1
     assert far == pytest.approx(15.0, abs=0.1) and abs(turned) == pytest.approx(5.0, abs=1e-3)
     run.still()
+
+
+def test_what_the_run_has_not_yet_moved_is_not_confirmed(run: Moved) -> None:
+    run.page.key("ArrowLeft", "ArrowLeft")
+    run.follow()
+    run.page.until('!document.getElementById("go").disabled')
+    run.page.key("ArrowRight", "ArrowRight")
+    run.page.until('document.getElementById("go").disabled')
+    run.page.click("#go")
+    run.follow()  # one request, and none to confirm
+    run.page.until('!document.getElementById("go").disabled')
 
 
 def test_three_points_of_the_path_are_laid_on_three_places(run: Moved) -> None:
