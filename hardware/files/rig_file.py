@@ -13,11 +13,13 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from hardware.files.mesh_file import read_mesh
 from hardware.files.session import SURFACE_SUFFIXES
 from hardware.process import checks
 from hardware.process.checks import Table
 from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board
 
+RIG_FILE = "rig.toml"
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
 SIGMA_KEY = "lens_sigma"  # standard deviations of fx fy cx cy k1 k2 p1 p2 k3, where a calibration gave them
 RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
@@ -294,3 +296,25 @@ def surface_of_folder(folder: Path, rig_file: RigFile) -> Path | None:
     if files and not files[0].stat().st_size:
         raise InputError(files[0], "file", "empty", "a scan of the surface, mm")
     return files[0] if files else None
+
+
+def scan_of(given: Path | None, session: Path) -> Path | None:
+    """The scan that is given, or that the rig file or session folder names; InputError where it cannot be read."""
+    own: Path | None = None
+    if session.is_dir():
+        own = surface_of_folder(session, read_rig(session / RIG_FILE))
+    elif session.suffix == ".toml":
+        own = surface_of_rig(session, read_rig(session).surface)
+    scan = agreed_scan(given, own, session)
+    if scan is not None:
+        read_mesh(scan)
+    return scan
+
+
+def agreed_scan(given: Path | None, own: Path | None, where: Path) -> Path | None:
+    """The scan that is given or that the cameras' files (where) hold; InputError where these are two different ones."""
+    if given is None or own is None:
+        return given or own
+    if given.read_bytes() != own.read_bytes():
+        raise InputError(given, "scan", f"other than {own.name} of {where.name}", "one scan: leave out one of the two")
+    return given

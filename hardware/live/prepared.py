@@ -34,10 +34,9 @@ from hardware.files.dispenser_file import (
     outlets_from,
     read_dispensers,
 )
-from hardware.files.mesh_file import read_mesh
 from hardware.files.path_file import read_path, read_progress, write_progress_durably
 from hardware.files.region_table import check_region
-from hardware.files.rig_file import read_rig, surface_of_folder, surface_of_rig
+from hardware.files.rig_file import RIG_FILE, read_rig, scan_of
 from hardware.live.settings import (
     VIRTUAL_ARM,
     LiveSettings,
@@ -57,7 +56,6 @@ from hardware.recording.messages import rig_from_message
 from planning.material import Outlets, with_offsets
 from planning.path import Path
 
-RIG_FILE = "rig.toml"
 PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
 
 
@@ -249,30 +247,8 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
         unattended=settings.unattended,
         patience=settings.patience,
     )
-    rig, again, scan = rig_from_session(session), scenario is not None, _scan_of(settings, session)
+    rig, again, scan = rig_from_session(session), scenario is not None, scan_of(settings.scan, session)
     return Prepared(settings, session, rig, again, virtual, task, scan, placement, files, tuple(notes))
-
-
-def _scan_of(settings: LiveSettings, session: File) -> File | None:
-    """The scan that is given, or that the rig file or session folder names; InputError where it cannot be read."""
-    own: File | None = None
-    if session.is_dir():
-        own = surface_of_folder(session, read_rig(session / RIG_FILE))
-    elif session.suffix == ".toml":
-        own = surface_of_rig(session, read_rig(session).surface)
-    scan = agreed_scan(settings.scan, own, session)
-    if scan is not None:
-        read_mesh(scan)
-    return scan
-
-
-def agreed_scan(given: File | None, own: File | None, where: File) -> File | None:
-    """The scan that is given or that the cameras' files (where) hold; InputError where these are two different ones."""
-    if given is None or own is None:
-        return given or own
-    if given.read_bytes() != own.read_bytes():
-        raise InputError(given, "scan", f"other than {own.name} of {where.name}", "one scan: leave out one of the two")
-    return given
 
 
 def _dispensers(settings: LiveSettings, path: Path, where: File) -> tuple[str, Outlets]:

@@ -23,9 +23,10 @@ from estimation.runtime import use_one_arena
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.files.mesh_file import read_mesh
+from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
 from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
-from hardware.live.prepared import Prepared, SurfacePlacement, agreed_scan
+from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
     LiveMotionReport,
@@ -49,7 +50,7 @@ from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import FrameSet, PrintHead, Roi, region_since
 from perception.lens import undistort
 from perception.tracking.step import STAGES, TrackingStep
-from perception.tracking.wound_step import WoundTrackingStep
+from perception.tracking.wound_step import RegionTrackingStep
 from planning.placement import (
     NoSurfaceError,
     PathPlacement,
@@ -83,11 +84,6 @@ class SurfaceOutline:
     def on_surface(self) -> list[Array]:
         """The outlines that are placed, (K, 3) mm each, surface frame."""
         return list(self._corners.values())
-
-    @property
-    def placed(self) -> bool:
-        """Whether any region is placed."""
-        return bool(self._corners)
 
     def place(self, rois: Sequence[Roi], points_surface: Array, base_from_surface: Array) -> None:
         """Put the regions onto a surface of landmarks (V, 3), mm; a region that is a whole picture is no outline."""
@@ -192,7 +188,7 @@ class _TrackingLoop:
         self._commanded_head = _CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
         self._source: FrameSource
-        self._step: TrackingStep | WoundTrackingStep
+        self._step: TrackingStep | RegionTrackingStep
         self._outline: SurfaceOutline
         self._session: Session | None = None  # that is shown; held, as it may have unpacked the scan
         if prepared.live:
@@ -343,7 +339,7 @@ class _TrackingLoop:
         """Landmarks (V, 3) for the page, taken anew now and then, as the map grows."""
         if self.report.sets % MAP_REFRESH_SETS or (surface_map := self._step.map) is None:
             return self.report.surface
-        if not self._outline.placed and pose.state.measured:
+        if not self._outline.on_surface and pose.state.measured:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
         return np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
 

@@ -2,10 +2,11 @@
 import { drawPath, Lens, product } from "./lens.js";
 
 const OLD = 1500; // ms: they come five times a second
+const NO_HAND = { drag: null, press: () => false, click: () => false, preview: () => null, draw() {} }; // nothing is moved
 
 export class CameraPane {
   // hand: takes presses, pulls and clicks in css px of the picture; see Placing
-  constructor(name, chosen, hand) {
+  constructor(name, chosen, hand = NO_HAND) {
     this.name = name;
     this.root = document.createElement("figure");
     this.root.className = "camera";
