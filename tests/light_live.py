@@ -53,6 +53,7 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
     from hardware.live.records import PoseEntry, PoseHandover, SetEntry, TrackingReport
     from hardware.process.clock import WallClock
     from hardware.process.system import pipe_closed, set_up_process
+    from planning.placement import PathPlacement, PlacedBy
     from tests.moving import breathing, pose_at
 
     set_up_process("tracking")
@@ -60,14 +61,19 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
     outbox.put(prepared.rig)
     names = tuple(camera.name for camera in prepared.rig.cameras)
     begin = due = clock.now()
+    earlier = prepared.placement
+    lies, by = (np.eye(4), PlacedBy.SCAN) if earlier is None else (earlier.surface_from_path, PlacedBy.EARLIER)
+    known = PathPlacement(lies, by, "known", earlier is None or earlier.certain, True), begin
+    side = np.linspace(-70, 70, 15)
+    ground = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
     while not pipe_closed(channels.lifeline):
         due += 1 / RATE
         clock.wait_until(due)
         stamp, sets = due - AGE, round((due - begin) * RATE)
         pose = pose_at(lambda t: breathing(t, height=1.0, tilt=0.005), stamp)
         channels.poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
-        known = np.eye(4), begin
-        channels.reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, used=(50, 50)))
+        seen = {"used": (50, 50), "looks": channels.looks.value, "surface": ground, "since": begin}
+        channels.reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, **seen))
         outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
         outbox.put(PoseEntry(pose, no_observations(stamp)))
         moved = channels.motion.get()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import pty
@@ -12,13 +13,16 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import astuple
 from itertools import pairwise
 from pathlib import Path
 
+import aiohttp
 import numpy as np
 
 from hardware.files.session import Session
 from hardware.live.prepared import RunFiles
+from hardware.operator.view import MoveRequest
 from hardware.process.clock import WallClock
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.session_reader import open_session
@@ -211,6 +215,27 @@ def printed_once(*records: Path) -> None:
         spans.append((min(places), max(places)))
     for before, after in pairwise(spans):
         assert after[0] >= before[1] - 1e-9 and after[0] - before[1] <= 1.0 + 1e-9
+
+
+def asks_to_move(run: Running, move: MoveRequest) -> None:
+    """Open a window of the run's page, and ask for a move under the turn that it shows."""
+
+    async def ask(address: str) -> None:
+        origin = {"Origin": address.rsplit("/", 2)[0]}
+        async with aiohttp.ClientSession() as session, session.ws_connect(f"{address}socket", headers=origin) as socket:
+            asked = False
+            async for message in socket:
+                said = json.loads(message.data) if message.type is aiohttp.WSMsgType.TEXT else {}
+                if "bundle" in said:
+                    await socket.send_str(json.dumps({"shown": said["bundle"]}))
+                if said.get("kind") == "asked":
+                    assert said["number"], said
+                    return
+                if not asked and said.get("view") and said["view"]["stage"] == "confirm":
+                    asked, turn = True, said["view"]["turn"]
+                    await socket.send_str(json.dumps({"ask": "move", "turn": turn, "tag": 1, "move": astuple(move)}))
+
+    asyncio.run(asyncio.wait_for(ask(re.search(r"open (\S+) to see", run.said)[1]), 30.0))
 
 
 @contextmanager

@@ -318,6 +318,41 @@ MUTANTS = (
         "if spread[1] < 0",
         ("test_arm_calibration.py::test_moves_that_cannot_tell_are_named",),
     ),
+    Mutant(
+        "a guess is confirmed as it lies",
+        "hardware/live/state_machine.py",
+        "return placement.certain or (placement.usable and self.moves > 0)",
+        "return placement.usable",
+        ("test_live_stages.py::test_a_guess_is_confirmed_by_nobody_before_it_was_moved",),
+    ),
+    Mutant(
+        "a guess is printed with nobody there",
+        "hardware/live/state_machine.py",
+        "if task.unattended and not placement.certain:",
+        "if task.unattended and not placement.usable:",
+        ("test_live_stages.py::test_nobody_there_and_no_certain_place_ends_the_run",),
+    ),
+    Mutant(
+        "a scan of something else fits",
+        "estimation/scans/registration.py",
+        "fits = not words",
+        "fits = True",
+        ("test_placement.py::test_the_scan_of_something_else_cannot_be_used_at_all",),
+    ),
+    Mutant(
+        "a moved path does not follow the surface",
+        "planning/placement.py",
+        "place = foot + height * leaning",
+        "place = place + 0 * height",
+        ("test_placement.py::test_a_moved_path_keeps_its_height_and_leans_with_the_surface",),
+    ),
+    Mutant(
+        "a move of any size is a message",
+        "hardware/operator/broadcast.py",
+        "if not MoveRequest(*shift).allowed:",
+        "if not shift:",
+        ("test_operator_words.py::test_a_move_that_is_not_three_figures_within_bounds_is_no_message",),
+    ),
 )
 
 

@@ -140,7 +140,7 @@ INSTEAD = {  # (what is run in its place, why)
         "stillbed cameras http://CAMERA --seconds 1 --json",
         "a camera that is not plugged in",
     ),
-    "stillbed live --rig rig.toml --path path.csv --profile arm.toml --arm /dev/ttyUSB0 --record run.mcap": (
+    "stillbed live --rig rig.toml --path path.csv --scan scan.ply --arm /dev/ttyUSB0 --record run.mcap": (
         "stillbed live --rig sessions/monday --path path.csv --arm virtual --record run.mcap",
         "cameras that see the arm's surface",
     ),

@@ -26,10 +26,11 @@ from hardware.cli.main import main
 from hardware.cli.parser import INTERRUPTED, run_script
 from hardware.files.folder_tables import write_tum
 from hardware.files.path_file import read_path, write_path
+from hardware.operator.view import MoveRequest
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.board_session import rendered
 from tests.documents import commands
-from tests.live_runs import ROOT, Running
+from tests.live_runs import ROOT, Running, asks_to_move
 from tests.moving import raster
 from tests.shown_commands import MADE, to_run
 from tests.streams import HttpCamera, served
@@ -200,7 +201,10 @@ def run_live(words: list[str], cache: Path) -> int:
     live = Running(*words, cache=cache, cwd=Path.cwd())
     try:
         if "--yes" not in words:
-            at = live.wait_for("confirm")
+            at = live.wait_for("now: .*\n")
+            if "move the path" in live.said:  # without a scan it is a guess
+                asks_to_move(live, MoveRequest(0.5, 0.0, 0.0))
+                at = live.wait_for("moved by hand")
             live.press("y")
             live.wait_for("ready", at)
             live.press("s")

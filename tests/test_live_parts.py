@@ -22,6 +22,7 @@ from estimation.pose import SurfacePose, TrackState, Trajectory
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
 from hardware.files.path_file import read_progress, write_path, write_progress_durably
+from hardware.files.ply_file import write_ply
 from hardware.live.checklist import place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.motion_process import LAG_STEP, LiveMotion
@@ -56,6 +57,7 @@ from perception.frames import Frame, FrameSet
 from planning.material import Outlet, SwitchDelay
 from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
+from tests.scans import body, height_field
 from tests.session_files import rig
 
 THERE = available_cores()
@@ -87,7 +89,7 @@ def test_the_session_file_that_init_writes_is_read_back_as_the_defaults(tmp_path
 def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
     used = LiveSettings(
         rig=tmp_path / "rig", path=tmp_path / 'a "b".csv', arm="virtual", record=tmp_path / "x.mcap", jpeg_quality=0,
-        dry_run=True, lift=3.25, unattended=True, patience=2.5, cores_motion=(1,),
+        scan=tmp_path / "x.ply", dry_run=True, lift=3.25, unattended=True, patience=2.5, cores_motion=(1,),
     )  # fmt: skip
     (tmp_path / "session.toml").write_text(settings_text(used))
     assert read_settings(tmp_path / "session.toml") == used
@@ -265,7 +267,11 @@ def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     write_placement(tmp_path / "x.toml", SurfacePlacement(tmp_path / "run.mcap", 1 / 7, pose, se3.inverse(pose)))
     found = read_placement(tmp_path / "x.toml")
     assert (found.surface_from_path == pose).all() and (found.arm_from_base == se3.inverse(pose)).all()
-    assert found.until == 1 / 7
+    assert found.until == 1 / 7 and found.since == -np.inf and not found.certain and not found.verdict
+    said = SurfacePlacement(tmp_path / "run.mcap", 0.5, pose, pose, 0.25, True, 'by "hand" \\ and a scan')
+    write_placement(tmp_path / "z.toml", said)
+    again = read_placement(tmp_path / "z.toml")
+    assert (again.since, again.certain, again.verdict) == (said.since, True, said.verdict)
     for name in ("gone.mcap", 800 * "x"):
         write_placement(tmp_path / "y.toml", SurfacePlacement(tmp_path / name, 0.0, pose, pose))
         with pytest.raises(InputError, match="map"):
@@ -274,11 +280,50 @@ def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     assert RunFiles(tmp_path / "run-2.mcap").next().record == tmp_path / "run-3.mcap"
 
 
+RIG = (
+    '[[camera]]\nname = "a"\nsource = "usb:1"\nsize = [8, 6]\nmatrix = [[9, 0, 4], [0, 9, 3], [0, 0, 1]]\n'
+    "distortion = [0, 0, 0, 0, 0]\nbase_from_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+)
+
+
+def scan_given(folder: Path, surface: str, scan: str) -> Path | None:
+    """The scan of a run whose rig.toml names one, and whose settings another; each is a name, or "" for none."""
+    (folder / "rig.toml").write_text((f'surface = "{surface}"\n' if surface else "") + RIG)
+    write_path(folder / "path.csv", raster())
+    for name, size in (("one.ply", 40.0), ("copy.ply", 40.0), ("other.ply", 50.0)):
+        made = height_field(body, (size, size), 4.0)
+        write_ply(folder / name, vertices=made.vertices, triangles=made.triangles)
+    (folder / "broken.ply").write_text("no scan")
+    given = {"scan": folder / scan} if scan else {}
+    files = {"rig": folder / "rig.toml", "path": folder / "path.csv", "record": folder / "run.mcap"}
+    return prepare(LiveSettings(arm="virtual", page=False, **files, **given), "here", True).scan
+
+
+@pytest.mark.parametrize(
+    ("surface", "scan", "used"),
+    [("", "", None), ("one.ply", "", "one.ply"), ("", "one.ply", "one.ply"), ("one.ply", "copy.ply", "copy.ply")],
+)
+def test_the_scan_of_live_cameras_is_the_one_that_is_named(
+    surface: str, scan: str, used: str | None, tmp_path: Path
+) -> None:
+    assert scan_given(tmp_path, surface, scan) == (None if used is None else tmp_path / used)
+
+
+@pytest.mark.parametrize(
+    ("surface", "scan", "words"),
+    [
+        ("one.ply", "other.ply", r"other\.ply: scan = 'other than one\.ply of rig\.toml', allowed one scan"),
+        ("", "broken.ply", r"broken\.ply"), ("broken.ply", "", r"broken\.ply"), ("", "gone.ply", "a file that exists"),
+        ("gone.ply", "", "surface = 'gone.ply', allowed a file that is there"), ("path.csv", "", "allowed a file .ply"),
+    ],
+)  # fmt: skip
+def test_two_scans_and_one_that_cannot_be_read_are_refused(surface: str, scan: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=words):
+        scan_given(tmp_path, surface, scan)
+
+
 def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text(
-        '[[camera]]\nname = "a"\nsource = "usb:1"\nsize = [8, 6]\nmatrix = [[9, 0, 4], [0, 9, 3], [0, 0, 1]]\n'
-        "distortion = [0, 0, 0, 0, 0]\nbase_from_camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
-    )
+    (tmp_path / "rig.toml").write_text(RIG)
     write_path(tmp_path / "path.csv", raster())
     record, names = tmp_path / "run.mcap", ("rig.toml", "path.csv")
     rig, path = (tmp_path / name for name in names)

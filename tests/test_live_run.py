@@ -11,13 +11,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from estimation import se3
+from hardware.arm.profile import ArmProfile
 from hardware.files.path_file import read_path, read_progress
-from hardware.live.prepared import RunFiles
+from hardware.live.prepared import RunFiles, read_placement
 from hardware.live.recorded_run import replay_run
-from hardware.recording.session_reader import open_session
+from hardware.operator.view import MoveRequest
+from hardware.recording.session_reader import open_session, read_poses, used_inputs
+from planning.kinematics import nozzle_from_axes
+from planning.path import Path as PrintPath
+from planning.placement import path_middle
 from tests.browser import Browser, Page
 from tests.light_live import HOME, prepare_files
-from tests.live_runs import CLOCK, Running, closed, executed, light_runs, messages, printed_once, rests, summary
+from tests.live_runs import (
+    CLOCK,
+    Running,
+    asks_to_move,
+    closed,
+    executed,
+    light_runs,
+    messages,
+    printed_once,
+    rests,
+    summary,
+)
 from tests.slowly import slowly
 from tests.test_arm_port import serving
 
@@ -114,6 +131,58 @@ def test_the_main_process_killed_leaves_an_arm_at_rest_and_a_whole_recording(sta
     run.process.kill()
     assert rests(record, killed, 0.5) and killed - closed(record).sets[-1][0].stamp < 0.5
     assert kept(record, tmp_path / "path.csv") == pytest.approx(last_place(record), abs=0.2)
+
+
+def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: Start, tmp_path: Path) -> None:
+    record, path = tmp_path / "run.mcap", read_path(tmp_path / "path.csv")
+    run = start(record, "--page")
+    run.wait_for(r"\nconfirm: known")
+    asks_to_move(run, MoveRequest(3.0, -2.0, 12.0))
+    at = run.wait_for(r"confirm: moved by hand, move 1: x 3\.00 mm, y -2\.00 mm, turn 12\.00 degrees")
+    for key, stage in (("y", "ready"), ("s", r"\nprint\n")):
+        run.press(key)
+        at = run.wait_for(stage, at)
+    CLOCK.wait_until(CLOCK.now() + 0.6)
+    run.press("q")
+    assert run.end() == 1
+    turn, middle = se3.exp_rotation([0.0, 0.0, np.deg2rad(12.0)]), path_middle(path)
+    lies = se3.make(turn, middle + [3.0, -2.0, 0.0] - turn @ middle)
+    placed = read_placement(RunFiles(record).surface)
+    assert placed.surface_from_path == pytest.approx(lies, abs=1e-9) and placed.certain
+    assert "moved by hand" in placed.verdict and placed.map == record.resolve()
+    inputs = used_inputs(record)
+    printed, profile = inputs.path, inputs.profile
+    assert printed.surface_from_nozzle == pytest.approx(placed.surface_from_path @ path.surface_from_nozzle, abs=1e-6)
+    assert any("moved by hand, move 1: x 3.00 mm" in str(m["message"]) for m in messages(record, "/events"))
+    nozzle_lies_on(record, printed, profile)
+    ticks = list(replay_run(record))
+    assert len(ticks) > 20 and all(tick.frame == tick.recorded for tick in ticks)
+
+    again = start(record, "--resume", "--yes")
+    again.wait_for(r"\nprint\n")
+    CLOCK.wait_until(CLOCK.now() + 0.6)
+    again.press("q")
+    again.end()
+    second = RunFiles(record).next().record.with_name("run-2.mcap")
+    assert (used_inputs(second).path.surface_from_nozzle == printed.surface_from_nozzle).all()
+    assert read_placement(RunFiles(second).surface).surface_from_path == pytest.approx(lies, abs=1e-9)
+
+
+def nozzle_lies_on(record: Path, printed: PrintPath, profile: ArmProfile) -> None:
+    """That what was extruded lies on the path where it was moved to, as the surface stood at the commands."""
+    poses = {pose.stamp: pose for pose in read_poses(record)}
+    stamps, points = np.array(sorted(poses)), printed.surface_from_nozzle[:, :3, 3]
+    places = np.linspace(0, len(points) - 1, 50 * len(points))
+    line = np.column_stack([np.interp(places, np.arange(len(points)), points[:, k]) for k in range(3)])
+    off = []
+    for move in messages(record, "/move"):
+        if not move["extrude"]:
+            continue
+        due = float(str(move["stamp"])) + profile.tick + profile.lag
+        pose = poses[stamps[np.argmin(np.abs(stamps - due))]]
+        tip = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(profile.arm, np.array(move["axes"]))
+        off.append(np.linalg.norm(line - tip[:3, 3], axis=1).min())
+    assert len(off) > 10 and np.median(off) < 0.3
 
 
 def test_who_resumes_is_asked_again_though_the_run_before_asked_nobody(start: Start, tmp_path: Path) -> None:

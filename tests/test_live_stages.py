@@ -12,18 +12,22 @@ from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.live.checklist import run_checks
-from hardware.live.records import LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
+from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
 from hardware.live.state_machine import PrintTask, RunStateMachine
 from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
 from hardware.motion.material import MaterialStatus
 from hardware.operator.shared_state import OperatorRequest
-from hardware.operator.view import CheckVerdict, RunStage, Wish
+from hardware.operator.view import MAX_MOVE_DEG, MAX_MOVE_MM, STAGE_OFFERS, CheckVerdict, MoveRequest, RunStage, Wish
 from planning.command import Hold
 from planning.path import PrintPhase, PrintProgress
+from planning.placement import PathPlacement, PlacedBy, path_middle
 from tests.moving import raster
 
 PROFILE = ArmProfile()
+CERTAIN = PathPlacement(np.eye(4), PlacedBy.SCAN, "found", True, True, 0.05, 0.001)
+X, Y = np.meshgrid(np.linspace(-60, 60, 25), np.linspace(-60, 60, 25))
+GROUND = np.column_stack([X.ravel(), Y.ravel(), 0 * X.ravel()])  # (625, 3) mm, 5 mm apart
 SURFACE = SurfacePose(0.0, ARM_FROM_BENCH, np.eye(6) * 1e-6, np.zeros(6), TrackState.TRACKING)
 
 
@@ -38,19 +42,23 @@ class Staged:
         self.wanted, self.material = "", MaterialStatus("gel: off", True, False)
         self.seen, self.pose = RunReports(recorder=RecorderReport(0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
+        self.placement: PathPlacement | None = CERTAIN
+        self.points, self.looks = GROUND, 0
         self.orders: list[object] = []
         self.led: list[object] = []  # orders on the way to where it prints, begun paths by a word
 
-    def look(self, *wishes: Wish, seconds: float = 0.1) -> RunStage:
+    def look(self, *wishes: Wish | MoveRequest, seconds: float = 0.1) -> RunStage:
         self.now += seconds
         asked = []
         for wish in wishes:
             self.asked += 1
-            asked.append(OperatorRequest(self.asked, wish, self.conductor.turn))
+            move, wish = (wish, Wish.MOVE) if isinstance(wish, MoveRequest) else (None, wish)
+            asked.append(OperatorRequest(self.asked, wish, self.conductor.turn, move))
         pose = replace(self.pose, stamp=self.now)
         self.seen.tracking = TrackingReport(
-            self.now, ("a", "b"), (0, 1), pose, np.eye(4), 0.0, 5, ended=self.ended, used=(50, 50)
-        )
+            self.now, ("a", "b"), (0, 1), pose, self.placement, 0.0, 5, ended=self.ended, used=(50, 50),
+            surface=self.points, looks=self.looks,
+        )  # fmt: skip
         nan = float("nan")
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
         tick = Tick(self.now, Hold(self.now, 0.001, "x"), b"", 0.0, status, Reason())
@@ -349,3 +357,141 @@ def test_cameras_pass_that_deliver_now_and_one_alone_does_not(
     tracking = TrackingReport(5.0, ("a", "b", "c"), delivering, replace(SURFACE, stamp=5.0 - age))
     checks = run_checks(RunReports(tracking=tracking), raster(), 0.0, None, True, 5.0)
     assert {check.name: check.verdict for check in checks}["cameras"] is verdict
+
+
+GUESS = replace(CERTAIN, by=PlacedBy.REGION, verdict="placed by the region, move it", certain=False)
+NOT_FOUND = replace(CERTAIN, verdict="the scan was not found here", certain=False, usable=False)
+
+
+def to_confirm(placement: PathPlacement, **task: object) -> Staged:
+    run = Staged(**task)
+    run.placement = placement
+    run.look(seconds=0.0)
+    run.look()
+    return run
+
+
+def test_what_a_scan_found_for_certain_may_be_confirmed_at_once_or_moved() -> None:
+    run = to_confirm(CERTAIN)
+    assert run.look() is RunStage.CONFIRM and run.conductor.offers == (Wish.CONFIRM, Wish.MOVE, Wish.AGAIN, Wish.END)
+    assert run.look(Wish.CONFIRM) is RunStage.READY
+
+
+@pytest.mark.parametrize("placement", [GUESS, replace(GUESS, by=PlacedBy.SCAN)], ids=["region", "open scan"])
+def test_a_guess_is_confirmed_by_nobody_before_it_was_moved(placement: PathPlacement) -> None:
+    run = to_confirm(placement)
+    assert run.conductor.reason == placement.verdict and run.conductor.question.startswith("Move the path")
+    assert Wish.CONFIRM not in run.conductor.offers
+    assert run.look(Wish.CONFIRM) is RunStage.CONFIRM
+    assert run.look(MoveRequest(1.0, -2.0, 5.0)) is RunStage.CONFIRM and run.conductor.answer.followed
+    assert run.look(Wish.CONFIRM) is RunStage.READY
+    run.look(Wish.START)
+    run.arm = ArmState.ARMED
+    run.look()
+    run.arm = ArmState.DISARMED
+    run.look()
+    (begun,) = [order for order in run.orders if isinstance(order, BeginPrint)]
+    turned = se3.exp_rotation([0.0, 0.0, np.deg2rad(5)])
+    middle = path_middle(run.conductor.task.path)
+    lies = se3.make(turned, middle + [1.0, -2.0, 0.0] - turned @ middle)
+    assert begun.path.surface_from_nozzle == pytest.approx(lies @ run.conductor.task.path.surface_from_nozzle, abs=1e-9)
+
+
+def test_what_cannot_be_placed_is_neither_confirmed_nor_moved_nor_printed() -> None:
+    run = to_confirm(NOT_FOUND)
+    assert run.conductor.offers == (Wish.AGAIN, Wish.END) and "cannot be placed" in run.conductor.question
+    run.look(MoveRequest(1.0, 0.0, 0.0), Wish.CONFIRM, Wish.START)
+    run.stays(RunStage.CONFIRM)
+    assert run.orders == []
+
+
+@pytest.mark.parametrize("placement", [GUESS, NOT_FOUND], ids=["guess", "not found"])
+def test_nobody_there_and_no_certain_place_ends_the_run(placement: PathPlacement) -> None:
+    run = to_confirm(placement, unattended=True)
+    assert run.look() is RunStage.FAILED and placement.verdict in run.conductor.ended
+    assert Order.HOME not in run.orders
+
+
+@pytest.mark.parametrize(
+    "move",
+    [
+        None, MoveRequest(MAX_MOVE_MM + 1e-9, 0, 0), MoveRequest(0, -MAX_MOVE_MM - 1e-9, 0),
+        MoveRequest(0, 0, MAX_MOVE_DEG + 1e-9), MoveRequest(float("nan"), 0, 0), MoveRequest(0, 0, float("inf")),
+    ],
+)  # fmt: skip
+def test_a_move_that_is_none_or_too_far_moves_nothing(move: MoveRequest | None) -> None:
+    run = to_confirm(CERTAIN)
+    placed, turn = run.conductor.placed_path, run.conductor.turn
+    run.look(Wish.MOVE if move is None else move)
+    assert run.conductor.placed_path is placed and run.conductor.turn == turn and not run.conductor.answer.followed
+
+
+def test_a_move_off_the_mapped_surface_or_while_it_is_not_seen_says_why() -> None:
+    run = to_confirm(CERTAIN)
+    run.look(MoveRequest(90.0, 0.0, 0.0))
+    assert "nothing of the surface is mapped there" in run.conductor.answer.words
+    run.pose = replace(run.pose, state=TrackState.LOST)
+    run.look(MoveRequest(1.0, 0.0, 0.0))
+    assert "not seen" in run.conductor.answer.words
+
+
+def test_each_move_is_a_turn_so_that_what_was_shown_before_is_not_confirmed() -> None:
+    run = to_confirm(CERTAIN)
+    shown = run.conductor.turn
+    for _ in range(2):
+        turn = run.conductor.turn
+        run.look(MoveRequest(1.0, 0.0, 0.0))
+        assert run.conductor.turn > turn
+    run.conductor(run.now, run.seen, [OperatorRequest(99, Wish.CONFIRM, shown)])
+    assert run.conductor.stage is RunStage.CONFIRM and "look again" in run.conductor.answer.words
+
+
+@pytest.mark.parametrize("stage", [stage for stage in RunStage if stage is not RunStage.CONFIRM])
+def test_a_path_is_moved_while_it_is_to_be_confirmed_and_at_no_other_stage(stage: RunStage) -> None:
+    assert Wish.MOVE not in STAGE_OFFERS.get(stage, ())
+    run = to_confirm(CERTAIN)
+    run.conductor.stage, placed = stage, run.conductor.placed_path
+    run.conductor._answer(
+        OperatorRequest(7, Wish.MOVE, run.conductor.turn, MoveRequest(1.0, 0, 0)), run.seen.tracking, 1.0
+    )
+    assert run.conductor.placed_path is placed and not run.conductor.answer.followed
+
+
+def test_again_looks_anew_and_takes_no_place_of_the_look_before() -> None:
+    run = to_confirm(CERTAIN)
+    run.look(MoveRequest(1.0, 0.0, 0.0))
+    run.look(Wish.AGAIN)
+    assert run.conductor.looks == 1 and run.conductor.moves == 0 and run.conductor.placed_path is None
+    run.look()
+    run.stays(RunStage.FIND, 5)
+    run.looks = 1
+    assert run.look() is RunStage.CONFIRM and run.conductor.placement is CERTAIN
+
+
+def test_a_path_that_was_moved_out_of_reach_is_not_confirmed_until_it_is_moved_back() -> None:
+    run = Staged()
+    run.pose = replace(SURFACE, base_from_surface=SURFACE.base_from_surface)
+    low, high = PROFILE.limits.low.copy(), PROFILE.limits.high.copy()
+    middle = (SURFACE.base_from_surface @ np.append(path_middle(run.conductor.task.path), 1.0))[:3]
+    low[0], high[0] = middle[0] - 25, middle[0] + 25
+    profile = replace(PROFILE, limits=replace(PROFILE.limits, low=low, high=high))
+    run.conductor.task = replace(run.conductor.task, profile=profile)
+    run.look(seconds=0.0)
+    assert run.look() is RunStage.CONFIRM and Wish.CONFIRM in run.conductor.offers
+    for far, offered in ((40.0, False), (-40.0, True)):
+        run.look(MoveRequest(far, 0.0, 0.0))
+        assert run.conductor.answer.followed and (Wish.CONFIRM in run.conductor.offers) is offered
+
+
+@pytest.mark.parametrize(("state", "ends"), [(TrackState.INITIALISING, False), (TrackState.TRACKING, True)])
+def test_a_tracker_that_looks_for_a_scan_for_long_is_no_camera_that_fails(state: TrackState, ends: bool) -> None:
+    run = Staged(unattended=True, patience=1.0)
+    run.pose = replace(SURFACE, state=state)
+    run.look(seconds=0.0)
+    report = run.seen.tracking
+    for _ in range(80):
+        run.now += 0.1
+        run.seen.tracking = report
+        run.orders += run.conductor(run.now, run.seen, [])
+        run.conductor.stage = run.conductor.stage if run.conductor.ended else RunStage.CHECK
+    assert bool(run.conductor.ended) is ends

@@ -17,9 +17,9 @@ from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ArmProfile
 from hardware.files.images import decode
 from hardware.live.records import LiveMotionReport, TrackingReport
-from hardware.live.tracking_process import SurfaceOutline
 from hardware.live.view import NozzleErrorEstimate
 from hardware.motion.loop import Tick
+from hardware.operator.overlays import SurfaceOutline
 from hardware.operator.process import THUMBNAIL_PERIOD, THUMBNAIL_WIDTH, CameraShot, Thumbnailer, crop_around
 from hardware.operator.shared_state import PICTURES_CAPACITY, PagePictures, RequestLine
 from hardware.process.system import SharedLatest
@@ -153,7 +153,7 @@ def test_an_outline_is_carried_by_the_surface_that_it_was_told_on(camera: int) -
     told = pixels_from_points(RIG.cameras[camera], se3.transform_points(rest, SQUARE))[0]
     outline = SurfaceOutline(RIG)
     outline.place([Roi(camera, 0.0, told)], landmarks, rest)
-    assert outline.placed and outline.in_pixels(1 - camera, rest) == ()
+    assert outline.on_surface and outline.in_pixels(1 - camera, rest) == ()
     for moved in (rest, rest @ se3.exp(np.array([0.05, 0.02, 0.1, 2.0, -3.0, 6.0]))):
         (shown,) = outline.in_pixels(camera, moved)
         expected = pixels_from_points(RIG.cameras[camera], se3.transform_points(moved, SQUARE))[0]
@@ -164,7 +164,7 @@ def test_a_whole_picture_is_no_outline() -> None:
     outline = SurfaceOutline(RIG)
     whole = np.array([[0.0, 0], [639, 0], [639, 479], [0, 479]])
     outline.place([Roi(0, 0.0, whole)], np.zeros((50, 3)), np.eye(4))
-    assert not outline.placed and outline.in_pixels(0, np.eye(4)) == ()
+    assert not outline.on_surface and outline.in_pixels(0, np.eye(4)) == ()
 
 
 def reports(now: float, off: float, extrude: bool) -> tuple[TrackingReport, LiveMotionReport]:

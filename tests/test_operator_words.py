@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -39,17 +40,52 @@ from hardware.operator.shared_state import (
     RequestLine,
     scene_from,
 )
-from hardware.operator.view import CALMING_WISHES, Wish, refusal
+from hardware.operator.view import CALMING_WISHES, MAX_MOVE_DEG, MAX_MOVE_MM, MoveRequest, Wish, refusal
 from planning.path import Path
 from tests.operator_page import full_view
 
 COUNTS = st.integers(0, MAX_BROWSER_INTEGER)
 
 
-@given(st.sampled_from(list(Wish)), COUNTS, COUNTS)
+@given(st.sampled_from([wish for wish in Wish if wish is not Wish.MOVE]), COUNTS, COUNTS)
 def test_what_the_page_says_is_understood(wish: Wish, turn: int, tag: int) -> None:
     assert parse_message(json.dumps({"ask": wish.value, "turn": turn, "tag": tag})) == RequestMessage(wish, turn, tag)
     assert parse_message(json.dumps({"shown": turn})) == ShownMessage(turn)
+
+
+FAR = st.floats(-MAX_MOVE_MM, MAX_MOVE_MM) | st.integers(-100, 100)
+
+
+@given(FAR, FAR, st.floats(-MAX_MOVE_DEG, MAX_MOVE_DEG), COUNTS, COUNTS)
+def test_a_move_is_understood_and_comes_through_the_line_to_the_last_digit(
+    x: float, y: float, turn_deg: float, turn: int, tag: int
+) -> None:
+    said = parse_message(json.dumps({"ask": "move", "turn": turn, "tag": tag, "move": [x, y, turn_deg]}))
+    move = MoveRequest(float(x), float(y), turn_deg)
+    assert said == RequestMessage(Wish.MOVE, turn, tag, move)
+    line = RequestLine()
+    line.ask(said.wish, said.turn, said.move)
+    assert line.take() == [OperatorRequest(1, Wish.MOVE, turn, move)]
+
+
+@pytest.mark.parametrize("wish", [wish for wish in Wish if wish is not Wish.MOVE])
+def test_no_other_wish_carries_a_move(wish: Wish) -> None:
+    for move in ([1, 2, 3], None):
+        assert parse_message(json.dumps({"ask": wish.value, "turn": 1, "tag": 1, "move": move})) is None
+
+
+@pytest.mark.parametrize(
+    "move",
+    [
+        "null", "1", "[]", "[1,2]", "[1,2,3,4]", '["1",2,3]', "[true,2,3]", "[null,2,3]", "[[1],2,3]", "{}",
+        "[NaN,0,0]",
+        "[0,Infinity,0]", "[0,0,-Infinity]", "[100.001,0,0]", "[0,-100.001,0]", "[0,0,180.001]", "[1e999,0,0]",
+        f"[{10**400},0,0]", "[0,0,1e300]",
+    ],
+)  # fmt: skip
+def test_a_move_that_is_not_three_figures_within_bounds_is_no_message(move: str) -> None:
+    assert parse_message(f'{{"ask":"move","turn":1,"tag":1,"move":{move}}}') is None
+    assert parse_message('{"ask":"move","turn":1,"tag":1}') is None
 
 
 ANYTHING = st.recursive(
@@ -59,7 +95,9 @@ ANYTHING = st.recursive(
 )
 NEARLY = st.fixed_dictionaries(
     {},
-    optional={name: ANYTHING | COUNTS | st.sampled_from(list(Wish)) for name in ("ask", "turn", "tag", "shown", "x")},
+    optional={
+        name: ANYTHING | COUNTS | st.sampled_from(list(Wish)) for name in ("ask", "turn", "tag", "shown", "move", "x")
+    },
 )
 
 
@@ -67,7 +105,8 @@ NEARLY = st.fixed_dictionaries(
 def test_anything_else_is_no_message_and_no_error(said: str) -> None:
     message = parse_message(said)
     if isinstance(message, RequestMessage):
-        assert json.loads(said) == {"ask": message.wish.value, "turn": message.turn, "tag": message.tag}
+        move = {} if message.move is None else {"move": list(astuple(message.move))}
+        assert json.loads(said) == {"ask": message.wish.value, "turn": message.turn, "tag": message.tag} | move
     elif message is not None:
         assert json.loads(said) == {"shown": message.bundle}
 
@@ -141,7 +180,7 @@ def test_requests_come_in_order_and_those_that_found_no_room_were_refused(steps:
         number = line.ask(step, turn)
         assert (number is None) == (waiting >= (REQUEST_SLOTS if step in CALMING_WISHES else OTHER_REQUEST_SLOTS))
         if number is not None:
-            asked.append(OperatorRequest(number, step, turn))
+            asked.append(OperatorRequest(number, step, turn, MoveRequest(0, 0, 0) if step is Wish.MOVE else None))
             waiting += 1
     assert taken + line.take() == asked
     assert [r.number for r in asked] == list(range(1, len(asked) + 1))

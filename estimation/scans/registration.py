@@ -53,6 +53,7 @@ class Registration:
     sure: bool  # whether the pose is determined, unique and fits
     verdict: str  # the same in words
     rival: Array | None = None  # (4, 4) another pose that fits as well
+    fits: bool = True  # whether the points lie on the scan there: it is this surface's scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,17 +106,18 @@ def register_near(points_base: Array, sigma: float, shared: float, index: ScanIn
     return _judge([fit], points_base, max(sigma, fit.rms))
 
 
-def _judge(fits: list[_Candidate], points: Array, sigma: float) -> Registration:
-    best = fits[0]
+def _judge(candidates: list[_Candidate], points: Array, sigma: float) -> Registration:
+    best = candidates[0]
     free = best.observability
-    words = []
+    words: list[str] = []
     if best.rms > 2 * sigma:
         words.append(f"poor fit: {best.rms:.3g} mm rms, {sigma:.3g} mm expected")
     if best.share < 0.7:
         words.append(f"poor fit: only {best.share:.0%} of the points lie on the scan")
+    fits = not words
     # another pose that fits as well as the best, within what chance explains
     bound, near = max(best.cost, sigma**2) * (1 + 4 * np.sqrt(2 / len(points))), 0.1 * _radius(points)
-    rivals = (f for f in fits[1:] if f.cost < bound and _apart(f.pose, best.pose, points) > near)
+    rivals = (f for f in candidates[1:] if f.cost < bound and _apart(f.pose, best.pose, points) > near)
     rival = next(rivals, None)
     if rival is not None and not len(free.directions):
         away = _apart(best.pose, rival.pose, points)
@@ -125,14 +127,14 @@ def _judge(fits: list[_Candidate], points: Array, sigma: float) -> Registration:
         words.append("free: " + "; ".join(free.names))
     verdict = ". ".join(words) or f"found: {best.rms:.3g} mm rms, weakest direction good to {free.weakest:.2g} mm"
     other = None if rival is None or len(free.directions) else rival.pose
-    return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict, other)
+    return Registration(best.pose, best.rms, free.covariance, free.directions, not words, verdict, other, fits)
 
 
 def _no_registration(index: ScanIndex, count: int) -> Registration:
     size = float(np.ptp(index.samples, axis=0).max())
     covariance = np.diag([np.pi**2] * 3 + [size**2] * 3)
     verdict = f"{count} points, {MIN_REGISTRATION_POINTS} needed"
-    return Registration(np.eye(4), np.inf, covariance, np.eye(6), False, verdict)
+    return Registration(np.eye(4), np.inf, covariance, np.eye(6), False, verdict, fits=False)
 
 
 def _refine(

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from hardware.cameras.sources import CameraDevice
 
 SETTINGS_FLAGS = (
-    "rig", "simulated", "model", "path", "arm", "profile", "record", "dry_run", "lift", "stands_home", "jpeg_quality",
+    "rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift", "stands_home",
+    "jpeg_quality",
     "dispensers", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
@@ -39,7 +40,7 @@ def add_live(commands: Commands) -> None:
         "whatever ends the run, and --resume goes on where it stopped. Exit code 0 where the path is printed, 1 where\n"
         "the run ended before, 2 for wrong input, 128 and more where a signal ended it.",
         "stillbed live session.toml",
-        "stillbed live --rig rig.toml --path path.csv --arm /dev/ttyUSB0 --record run.mcap",
+        "stillbed live --rig rig.toml --path path.csv --scan scan.ply --arm /dev/ttyUSB0 --record run.mcap",
         "stillbed live --simulated data/scenarios/breathing_calm.toml --record run.mcap --yes",
         "stillbed live --resume run.mcap",
         "stillbed live session.toml --page-address 0.0.0.0 --page-cert page.pem --page-key page.key --page-name lab",
@@ -51,6 +52,7 @@ def add_live(commands: Commands) -> None:
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
+    add("--scan", type=named_path, metavar="SCAN.ply", help="scan of the surface, in the frame of the path")
     add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
     add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="what lets material out; else nothing does")

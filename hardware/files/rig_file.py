@@ -13,10 +13,13 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
+from hardware.files.mesh_file import read_mesh
+from hardware.files.session import SURFACE_SUFFIXES
 from hardware.process import checks
 from hardware.process.checks import Table
 from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board
 
+RIG_FILE = "rig.toml"
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
 SIGMA_KEY = "lens_sigma"  # standard deviations of fx fy cx cy k1 k2 p1 p2 k3, where a calibration gave them
 RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
@@ -269,3 +272,49 @@ def _within(path: Path, key: str, value: object, low: float, high: float) -> flo
     if not low <= number <= high:
         raise InputError(path, key, number, f"{low:g} to {high:g}")
     return number
+
+
+def surface_of_rig(file: Path, surface: str | None) -> Path | None:
+    """The scan that a rig.toml names by `surface`; InputError where it is none."""
+    if surface is None:
+        return None
+    path = file.parent / surface
+    if path.suffix.lower() not in SURFACE_SUFFIXES:
+        raise InputError(file, "surface", surface, f"a file {', '.join(SURFACE_SUFFIXES)}")
+    if not path.is_file():
+        raise InputError(file, "surface", surface, "a file that is there")
+    return path
+
+
+def surface_of_folder(folder: Path, rig_file: RigFile) -> Path | None:
+    """The scan in a session folder, as its rig.toml names it or by its own name; InputError where it is none."""
+    named = surface_of_rig(folder / "rig.toml", rig_file.surface)
+    files = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()] if named is None else [named]
+    if len(files) > 1:
+        names = ", ".join(p.name for p in files)
+        raise InputError(folder, "surface", names, "one of them (or `surface = ` in rig.toml)")
+    if files and not files[0].stat().st_size:
+        raise InputError(files[0], "file", "empty", "a scan of the surface, mm")
+    return files[0] if files else None
+
+
+def scan_of(given: Path | None, session: Path) -> Path | None:
+    """The scan that is given, or that the rig file or session folder names; InputError where it cannot be read."""
+    own: Path | None = None
+    if session.is_dir():
+        own = surface_of_folder(session, read_rig(session / RIG_FILE))
+    elif session.suffix == ".toml":
+        own = surface_of_rig(session, read_rig(session).surface)
+    scan = agreed_scan(given, own, session)
+    if scan is not None:
+        read_mesh(scan)
+    return scan
+
+
+def agreed_scan(given: Path | None, own: Path | None, where: Path) -> Path | None:
+    """The scan that is given or that the cameras' files (where) hold; InputError where these are two different ones."""
+    if given is None or own is None:
+        return given or own
+    if given.read_bytes() != own.read_bytes():
+        raise InputError(given, "scan", f"other than {own.name} of {where.name}", "one scan: leave out one of the two")
+    return given

@@ -17,8 +17,8 @@ from estimation.pose import Trajectory
 from estimation.rig import Camera
 from hardware.files.folder_tables import read_frames, read_heads, read_roi, read_tum
 from hardware.files.images import Video, check_size, count_by_decoding, decode
-from hardware.files.rig_file import ImageSource, RigFile, read_rig
-from hardware.files.session import NO_PRINT_HEADS, SURFACE_SUFFIXES, FrameRef, Session, common_stamps, frame_refs
+from hardware.files.rig_file import ImageSource, RigFile, read_rig, surface_of_folder
+from hardware.files.session import NO_PRINT_HEADS, FrameRef, Session, common_stamps, frame_refs
 from hardware.process import checks
 from perception.frames import Image
 
@@ -95,7 +95,8 @@ def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
     rois = read_roi(roi, rig, common_stamps(rig, stamps)) if roi.exists() else ()
     head = folder / "head.csv"
     heads = read_heads(head) if head.exists() else NO_PRINT_HEADS
-    sets, surface, open_reader = frame_refs(rig, stamps), _surface(folder, rig_file), partial(FolderReader, cameras)
+    sets, open_reader = frame_refs(rig, stamps), partial(FolderReader, cameras)
+    surface = surface_of_folder(folder, rig_file)
     return Session(folder, rig, rois, surface, truth_of(folder), sets, open_reader, heads=heads)
 
 
@@ -150,21 +151,3 @@ def _check_first_image(files: CameraFiles) -> None:
     reader = FolderReader((files,))
     reader.read(FrameRef(0, 0, 0.0, 0.0))
     reader.close()
-
-
-def _surface(folder: Path, rig_file: RigFile) -> Path | None:
-    if rig_file.surface is not None:
-        path = folder / rig_file.surface
-        if path.suffix.lower() not in SURFACE_SUFFIXES:
-            raise InputError(folder / "rig.toml", "surface", rig_file.surface, f"a file {', '.join(SURFACE_SUFFIXES)}")
-        if not path.is_file():
-            raise InputError(folder / "rig.toml", "surface", rig_file.surface, "a file that is there")
-        files = [path]
-    else:
-        files = [p for s in SURFACE_SUFFIXES if (p := folder / f"surface{s}").exists()]
-    if len(files) > 1:
-        names = ", ".join(p.name for p in files)
-        raise InputError(folder, "surface", names, "one of them (or `surface = ` in rig.toml)")
-    if files and not files[0].stat().st_size:
-        raise InputError(files[0], "file", "empty", "a scan of the surface, mm")
-    return files[0] if files else None

@@ -7,17 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation import se3
-from estimation.pose import SurfacePose
+from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, RunReports, TrackingReport
-from hardware.operator.view import Check, CheckVerdict
+from hardware.operator.view import MAX_MOVE_DEG, MAX_MOVE_MM, Check, CheckVerdict, MoveRequest
 from hardware.process.progress import count_text
 from planning.kinematics import axes_from_nozzle, joints_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN
 from planning.material import Outlets, with_offsets
 from planning.path import Path
+from planning.placement import NoSurfaceError, PathPlacement, PlacedBy, SurfaceMove, moved_along
 
 MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
 PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN
@@ -47,6 +48,23 @@ def place_path(
     path = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
     profile = placed(profile, pose.base_from_surface) if place else profile
     return PlacedPath(path, profile, reach_problem(with_offsets(path, outlets or {}), pose, profile))
+
+
+def moved_placement(
+    placement: PathPlacement, path: Path, tracking: TrackingReport | None, move: MoveRequest | None
+) -> PathPlacement | str:
+    """Where a path lies after a move that the operator asked for, on the surface as it is mapped now; or why not."""
+    if move is None or not move.allowed:
+        return f"a path is moved by {MAX_MOVE_MM:g} mm and {MAX_MOVE_DEG:g} degrees at most"
+    pose = None if tracking is None else tracking.pose
+    if tracking is None or pose is None or not pose.state.measured or tracking.surface is None:
+        return "the surface is not seen now"
+    along = SurfaceMove(move.x_mm, move.y_mm, float(np.deg2rad(move.turn_deg)))
+    try:
+        lies = moved_along(placement, path, tracking.surface, along)
+    except NoSurfaceError as error:
+        return str(error)
+    return replace(placement, surface_from_path=lies, by=PlacedBy.HAND, certain=False)
 
 
 def raised_path(path: Path, lift: float) -> Path:
@@ -104,6 +122,8 @@ def _camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Ch
     if report.pose is None:
         remedy = "plug in the cameras, or see who else uses them"
         return Check("cameras", BUSY, "no pictures yet", remedy), calibration
+    if report.pose.state is TrackState.INITIALISING and (silent := now - report.stamp) > MAX_PICTURE_AGE:
+        return Check("cameras", BUSY, f"the surface is looked for in their pictures, for {silent:.0f} s"), calibration
     if (age := now - report.pose.stamp) > MAX_PICTURE_AGE:
         return Check("cameras", FAIL, f"no pictures for {age:.1f} s", "plug in the cameras"), calibration
     if missing := [name for i, name in enumerate(report.cameras) if i not in report.delivering]:

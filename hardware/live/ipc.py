@@ -11,7 +11,7 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from ctypes import c_double
+from ctypes import c_double, c_uint64
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -182,6 +182,7 @@ class RunChannels:
     link: OperatorLink
     trouble: SharedLatest[str]  # why the arm cannot be used at all
     start: c_double  # s, when printing began; NaN before
+    looks: c_uint64  # how often the surface is to be looked for anew
 
     def end(self) -> None:
         """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
@@ -217,12 +218,14 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:
             processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
-        track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, to_recorder[1][1], lifeline[0])
+        looks = RawValue(c_uint64, 0)
+        ends_of_tracking = to_recorder[1][1], looks, lifeline[0]
+        track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, *ends_of_tracking)
         processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
         sender = RecorderSender(to_recorder[2][1])
         own_ends = orders[1], lifeline[1], arm_lifeline[1], sender
         stack.pop_all()
-    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, link, trouble, start)
+    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, link, trouble, start, looks)
 
 
 def _start_arm(processes: ProcessGroup, prepared: Prepared, device: File, lifeline: Connection) -> None:

@@ -36,7 +36,7 @@ from hardware.files.dispenser_file import (
 )
 from hardware.files.path_file import read_path, read_progress, write_progress_durably
 from hardware.files.region_table import check_region
-from hardware.files.rig_file import read_rig
+from hardware.files.rig_file import RIG_FILE, read_rig, scan_of
 from hardware.live.settings import (
     VIRTUAL_ARM,
     LiveSettings,
@@ -44,6 +44,7 @@ from hardware.live.settings import (
     override_settings,
     page_settings,
     read_settings,
+    toml_string,
 )
 from hardware.live.state_machine import PrintTask
 from hardware.process import checks
@@ -55,7 +56,6 @@ from hardware.recording.messages import rig_from_message
 from planning.material import Outlets, with_offsets
 from planning.path import Path
 
-RIG_FILE = "rig.toml"
 PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
 
 
@@ -91,25 +91,38 @@ class SurfacePlacement:
     until: float  # s, the last stamp of those sets
     surface_from_path: Array  # (4, 4) mm
     arm_from_base: Array  # (4, 4) mm
+    since: float = -math.inf  # s, the first stamp of those sets
+    certain: bool = False  # whether the operator had confirmed it, or a scan was found without doubt
+    verdict: str = ""  # by what it was placed, in words
 
 
 def write_placement(file: File, placement: SurfacePlacement) -> None:
     """Write beside the file and rename: there is always one that can be read, or none."""
+    beside = file.with_name(file.name + ".new")
+    beside.write_text(placement_text(placement), encoding="utf-8")
+    beside.replace(file)
+
+
+def placement_text(placement: SurfacePlacement) -> str:
+    """The placement as TOML."""
     lines = [
         f'map = "{placement.map.resolve()}"',
         f"until_s = {checks.toml_number(placement.until)}",
         f"surface_from_path = {checks.toml_numbers(placement.surface_from_path)}",
         f"arm_from_base = {checks.toml_numbers(placement.arm_from_base)}",
+        f"certain = {str(placement.certain).lower()}",
+        f"verdict = {toml_string(placement.verdict)}",
     ]
-    beside = file.with_name(file.name + ".new")
-    beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    beside.replace(file)
+    if math.isfinite(placement.since):
+        lines.append(f"since_s = {checks.toml_number(placement.since)}")
+    return "\n".join(lines) + "\n"
 
 
 def read_placement(file: File) -> SurfacePlacement:
     """The placement in a file; InputError where it makes no sense."""
     table = checks.read_toml(file)
-    checks.check_keys(file, "", table, ("map", "until_s", "surface_from_path", "arm_from_base"))
+    optional = "since_s", "certain", "verdict"
+    checks.check_keys(file, "", table, ("map", "until_s", "surface_from_path", "arm_from_base"), optional)
     poses = {key: checks.numbers(file, key, table[key], (4, 4)) for key in ("surface_from_path", "arm_from_base")}
     for key, pose in poses.items():
         if not se3.is_transform(pose):
@@ -121,7 +134,17 @@ def read_placement(file: File) -> SurfacePlacement:
         there = False
     if not there:
         raise InputError(file, "map", recording, "the recording that shows the surface")
-    return SurfacePlacement(recording, checks.number(file, "until_s", table["until_s"]), **poses)
+    certain = table.get("certain", False)
+    if not isinstance(certain, bool):
+        raise InputError(file, "certain", certain, "true or false")
+    return SurfacePlacement(
+        recording,
+        checks.number(file, "until_s", table["until_s"]),
+        **poses,
+        since=checks.number(file, "since_s", table["since_s"]) if "since_s" in table else -math.inf,
+        certain=certain,
+        verdict=checks.text(file, "verdict", table["verdict"]) if table.get("verdict") else "",
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +157,7 @@ class Prepared:
     again: bool  # whether the session is shown to and fro for ever; its truth is then exact
     virtual: File | None  # settings of a virtual arm, None for one that answers and is never at fault
     task: PrintTask
+    scan: File | None  # that is registered: given, or of the rig file or session folder
     placement: SurfacePlacement | None  # of the run that is resumed, None of a new run
     files: RunFiles
     notes: tuple[str, ...]  # that the operator sees all the time
@@ -223,8 +247,8 @@ def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlaceme
         unattended=settings.unattended,
         patience=settings.patience,
     )
-    rig, again = rig_from_session(session), scenario is not None
-    return Prepared(settings, session, rig, again, virtual, task, placement, files, tuple(notes))
+    rig, again, scan = rig_from_session(session), scenario is not None, scan_of(settings.scan, session)
+    return Prepared(settings, session, rig, again, virtual, task, scan, placement, files, tuple(notes))
 
 
 def _dispensers(settings: LiveSettings, path: Path, where: File) -> tuple[str, Outlets]:

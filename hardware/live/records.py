@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from ctypes import c_double
+from ctypes import c_double, c_uint64
 from dataclasses import dataclass
 from enum import Enum
 from math import nan
@@ -28,6 +28,7 @@ from hardware.process.ticks import Histogram
 from perception.frames import Frame, PrintHead, Roi
 from planning.material import Outlets
 from planning.path import Path, PrintProgress
+from planning.placement import PathPlacement
 
 FRAMES_TO_WIRE_STAGE = "frames handed over to move on the wire"  # as it stands in reports and recordings
 EXPOSURE_TO_WIRE_STAGE = "exposure to move on the wire"
@@ -62,7 +63,7 @@ class TrackingReport:
     cameras: tuple[str, ...] = ()  # names
     delivering: tuple[int, ...] = ()  # numbers of the cameras in the last set
     pose: SurfacePose | None = None  # the newest
-    surface_from_path: Array | None = None  # (4, 4) mm, in the tracker's surface frame; None until it is known
+    placement: PathPlacement | None = None  # of the path in the tracker's surface frame; None until it is known
     registered: float = nan  # s, stamp of the pose by which the path was placed
     sets: int = 0  # frame sets tracked
     dropped: int = 0  # frame sets left out, as a newer one was there
@@ -74,6 +75,8 @@ class TrackingReport:
     truth: Array | None = None  # (4, 4) mm, true base_from_surface at the pose's stamp, of a simulated world
     surface: Array | None = None  # (V, 3) mm, landmarks in the surface frame
     draws: bool = False  # whether somebody has to draw the region first
+    looks: int = 0  # how often the surface was looked for anew
+    since: float = nan  # s, stamp of the first frame set since then
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,6 +236,7 @@ class TrackingChannels:
     motion: SharedLatest[LiveMotionReport]
     link: OperatorLink
     recorder: Connection
+    looks: c_uint64  # how often the surface is to be looked for anew
     lifeline: Connection  # its end says that the run is gone
 
 

@@ -18,7 +18,11 @@ from multiprocessing.connection import wait
 from pathlib import Path as File
 from types import FrameType
 
+import numpy as np
+
+from estimation import se3
 from estimation.errors import InputError
+from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.link import emergency_stop
 from hardware.arm.profile import ArmProfile
@@ -28,18 +32,19 @@ from hardware.live.checklist import PlacedPath, checks_table
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
-from hardware.live.prepared import Prepared, ProgressWriter, SurfacePlacement, write_placement
+from hardware.live.prepared import Prepared, ProgressWriter, SurfacePlacement, placement_text, write_placement
 from hardware.live.records import BeginPrint, EventEntry, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text
 from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
 from hardware.motion.loop import Order
 from hardware.operator.process import OperatorPage
-from hardware.operator.shared_state import OperatorRequest, scene_from
+from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunStage, Wish
 from hardware.process.clock import WallClock
 from hardware.recording.schemas import INFO, WARNING
 from hardware.recording.session_reader import input_texts, inputs_from_texts
+from planning.placement import PlacedBy
 
 POLL_PERIOD = 0.02  # s between looks while nothing happens
 VIEW_PERIOD = 0.15  # s between views for the page
@@ -67,9 +72,10 @@ class LiveRun:
         self._turn = 0  # of the state machine, when its stage was last announced
         self._announced = -1e9  # s
         self._silence_logged = self._arm_halted = False
-        self._placement_written = prepared.placement is not None
-        self._shown_path: PlacedPath | None = None
-        self._shown_landmarks = 0
+        self._placement_written: tuple[PlacedPath, bool] | None = None  # what run.surface.toml says, whether confirmed
+        self._shown: tuple[PlacedPath | None, int, ScanDrawing | None] = None, 0, None  # path, landmarks and scan
+        self._lies = ""  # the placement, as run.surface.toml has it
+        self._asked: RunStage | None = None  # the stage whose keys were told
         self._profile: ArmProfile | None = None  # of the arm since the path was begun
 
     def __call__(self) -> RunOutcome:
@@ -119,6 +125,7 @@ class LiveRun:
         for text in self._injector.update(now):
             self._log(f"on purpose: {text}", WARNING)
         self._send(self._check_failures(progress_writer, now) + machine(now, reports, requests))
+        channels.looks.value = machine.looks
         arm = None if machine.placed_path is None else machine.placed_path.profile.arm
         self._statistics.update(now, machine.stage, reports, arm)
         self._view_builder.update(reports, self._profile)
@@ -210,6 +217,7 @@ class LiveRun:
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""
         texts, order = recorded_begin(order, self._prepared.task.dispensers)
+        texts["surface.toml"] = self._lies
         for name, text in texts.items():
             self._channels.sender.put(UsedEntry(name, text))
         self._profile = order.profile
@@ -256,19 +264,47 @@ class LiveRun:
         self._channels.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics))
 
     def _show_surface(self) -> None:
-        """Show path and surface on the page, and write the placement once, for a run that resumes."""
-        tracking, placed, prepared = self._reports.tracking, self._machine.placed_path, self._prepared
-        surface = None if tracking is None else tracking.surface
-        count = 0 if surface is None else len(surface)
-        if placed is not self._shown_path or count != self._shown_landmarks:
-            self._shown_path, self._shown_landmarks = placed, count
-            self._channels.link.scene.put(scene_from(prepared.rig, None if placed is None else placed.path, surface))
-        if self._placement_written or placed is None or tracking is None or tracking.surface_from_path is None:
-            return
-        self._placement_written = True
+        """Show path, surface and scan on the page; keep where the path lies, for a run that resumes."""
+        tracking, placed, link = self._reports.tracking, self._machine.placed_path, self._channels.link
+        surface, scan = None if tracking is None else tracking.surface, link.scan.get()
+        shown = placed, 0 if surface is None else len(surface), scan
+        if any(a is not b and a != b for a, b in zip(shown, self._shown, strict=True)):
+            self._shown = shown
+            link.scene.put(self._scene(surface, scan))
+        if (lies := self._placement()) is not None:
+            self._lies = placement_text(lies)
+            write_placement(self._prepared.files.surface, lies)
+
+    def _scene(self, surface: Array | None, scan: ScanDrawing | None) -> PageScene:
+        """What stands still in the view: path and scan where they are placed, and the landmarks."""
+        rig, placed, placement = self._prepared.rig, self._machine.placed_path, self._machine.placement
+        path = None if placed is None else placed.path
+        if scan is None or placement is None:
+            return scene_from(rig, path, surface)
+        lies = placement.surface_from_path
+        lines = se3.transform_points(lies, scan.lines.reshape(-1, 3)).reshape(-1, 2, 3)
+        return scene_from(rig, path, se3.transform_points(lies, scan.points), scan.triangles, lines)
+
+    def _placement(self) -> SurfacePlacement | None:
+        """Where the path lies, if that has changed since it was kept."""
+        machine, tracking, prepared = self._machine, self._reports.tracking, self._prepared
+        placed, placement = machine.placed_path, machine.placement
+        if placed is None or placement is None or tracking is None:
+            return None
+        confirmed = placement.certain or machine.stage not in (RunStage.CHECK, RunStage.FIND, RunStage.CONFIRM)
+        if self._placement_written is not None and self._placement_written[0] is placed:
+            confirmed |= self._placement_written[1]
+            if confirmed == self._placement_written[1]:
+                return None
+        self._placement_written = placed, confirmed
+        verdict = f"{placement.verdict}; moved by hand" if machine.moves else placement.verdict
+        lies, first, earlier = placement.surface_from_path, tracking.placement, prepared.placement
+        if earlier is not None and first is not None and first.by is PlacedBy.EARLIER:  # in the frame of its recording
+            moved = se3.inverse(first.surface_from_path) @ lies if machine.moves else np.eye(4)
+            lies = earlier.surface_from_path @ moved
+            return replace(earlier, surface_from_path=lies, certain=confirmed, verdict=verdict)
         arm_from_base, record = placed.profile.arm.arm_from_base, prepared.files.record
-        placement = SurfacePlacement(record, tracking.registered, tracking.surface_from_path, arm_from_base)
-        write_placement(prepared.files.surface, placement)
+        return SurfacePlacement(record, tracking.registered, lies, arm_from_base, tracking.since, confirmed, verdict)
 
     def _announce(self, now: float) -> None:
         """Log a new stage and a process that has become silent; write a status line now and then."""
@@ -284,12 +320,21 @@ class LiveRun:
             if machine.stage is RunStage.FIND:
                 self._console.say(checks_table(machine.checks))
             elif machine.stage in (RunStage.CONFIRM, RunStage.READY):
-                key = "y: the path is right" if machine.stage is RunStage.CONFIRM else "s: start"
-                self._console.say(f"  {KEYS_HELP}\n  now: {key}")
-            self._announced = now
+                key = "s: start" if machine.stage is RunStage.READY else self._confirm_key()
+                if self._asked is not machine.stage:
+                    self._console.say(f"  {KEYS_HELP}\n  now: {key}")
+            self._asked, self._announced = machine.stage, now
         elif now > self._announced + STATUS_PERIOD:
             self._announced = now
             self._console.say(status_line(machine, self._reports))
+
+    def _confirm_key(self) -> str:
+        """What can be done about the path as it lies, for the terminal."""
+        machine = self._machine
+        if machine.confirmable:
+            return "y: the path is right"
+        movable = machine.placement is not None and machine.placement.usable
+        return "move the path on the page, then y" if movable else "a: look again, q: end"
 
     def _log(self, text: str, level: int = INFO) -> None:
         self._console.say(text)

@@ -57,11 +57,16 @@ class LiveSettings:
         "network that finds the wound: your own; left out: the one that comes along",
     )
     path: Path | None = _key("print.path", '"path.csv"', "checkpoints on the surface; a scenario has its own")
+    scan: Path | None = _key(
+        "print.scan",
+        '"scan.ply"',
+        "scan of the surface, mm, in the path's frame; without one you move the path into place",
+    )
     dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
     lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under
         "print.lift_mm", "10.0", "how far above, in a dry run; 0 to 100", 10.0
     )
-    unattended: bool = _key("print.unattended", "false", "nobody confirms the path and the start", False)
+    unattended: bool = _key("print.unattended", "false", "nobody confirms; a scan must be found for certain", False)
     arm: str = _key("arm.device", '"/dev/ttyUSB0"', 'path of a port, URL of pyserial\'s, or "virtual"', "")
     profile: Path | None = _key("arm.profile", '"arm.toml"', "arm file: place, limits, dialect, lag, tool")
     stands_home: bool = _key("arm.stands_home", "false", "an arm that does not answer stands at its home now", False)
@@ -167,7 +172,7 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
             raise InputError(where, f"cores.{key}", list(cores), allowed)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
-    for name in ("rig", "simulated", "model", "path", "profile", "dispensers"):
+    for name in ("rig", "simulated", "model", "path", "scan", "profile", "dispensers"):
         file = getattr(s, name)
         if file is not None and not file.exists():
             raise InputError(where, name, file, "a file that exists")
@@ -206,8 +211,13 @@ def _toml_value(value: object) -> str | None:
     if isinstance(value, Path):
         value = str(value.resolve())
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return toml_string(value)
     return repr(value)
+
+
+def toml_string(text: str) -> str:
+    """A text without control characters as TOML writes it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def override_settings(settings: LiveSettings, flags: dict[str, Any]) -> LiveSettings:

@@ -12,15 +12,17 @@ from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile, measured_lag
-from hardware.live.checklist import PlacedPath, place_path, raised_path, run_checks
+from hardware.live.checklist import PlacedPath, moved_placement, place_path, raised_path, run_checks
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
 from hardware.motion.loop import Order
 from hardware.operator.shared_state import OperatorRequest
 from hardware.operator.view import (
     ACTIVE_STAGES,
     STAGE_OFFERS,
+    STAGE_QUESTIONS,
     Check,
     CheckVerdict,
+    MoveRequest,
     RequestAnswer,
     RunStage,
     Wish,
@@ -29,6 +31,7 @@ from hardware.operator.view import (
 from hardware.process.ticks import tick_in_step
 from planning.material import Outlets
 from planning.path import Path, PrintPhase, fingerprint
+from planning.placement import PathPlacement
 
 SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s
 HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
@@ -86,6 +89,9 @@ class RunStateMachine:
     done: bool = False  # the path is printed
     silence: str = ""  # that a process is silent while the arm may move, "" while both report
     placed_path: PlacedPath | None = None
+    placement: PathPlacement | None = None  # of that path: by what, and what it is worth
+    moves: int = 0  # how often the operator has moved it
+    looks: int = 0  # how often the surface is to be looked for anew
     answer: RequestAnswer | None = None  # to the last request
     checks: tuple[Check, ...] = ()
     _since: float = nan  # s, when the stage was entered
@@ -103,7 +109,32 @@ class RunStateMachine:
     @property
     def offers(self) -> tuple[Wish, ...]:
         """The wishes that would be followed now."""
-        return STAGE_OFFERS.get(self.stage, ())
+        offers = STAGE_OFFERS.get(self.stage, ())
+        if self.stage is not RunStage.CONFIRM or self.placement is None:
+            return offers
+        held = [Wish.CONFIRM] if not self.confirmable else []
+        held += [Wish.MOVE] if not self.placement.usable else []
+        return tuple(wish for wish in offers if wish not in held)
+
+    @property
+    def confirmable(self) -> bool:
+        """Whether the path may be confirmed as it lies: found for certain, or moved there by somebody."""
+        placement, placed = self.placement, self.placed_path
+        if placement is None or placed is None or placed.unreachable:
+            return False
+        return placement.certain or (placement.usable and self.moves > 0)
+
+    @property
+    def question(self) -> str:
+        """What the operator is asked or told now."""
+        if self.stage is RunStage.CONFIRM and self.placement is not None and self.placed_path is not None:
+            if not self.placement.usable:
+                return "The path cannot be placed here: look again, or finish"
+            if self.placed_path.unreachable:
+                return "The arm cannot reach the path here: move it, or look again"
+            if not self.confirmable:
+                return "Move the path to where it should be printed"
+        return STAGE_QUESTIONS.get(self.stage, "")
 
     def __call__(self, now: float, reports: RunReports, requests: Sequence[OperatorRequest]) -> Orders:
         """The orders that follow from reports and requests at `now`, s."""
@@ -111,7 +142,7 @@ class RunStateMachine:
             self._since = now
         orders: Orders = []
         for request in requests:
-            orders += self._answer(request, now)
+            orders += self._answer(request, reports.tracking, now)
         task = self.task
         self.checks = run_checks(reports, task.path, task.start, self.placed_path, task.stands_home, now)
         if not self.ended:
@@ -134,8 +165,10 @@ class RunStateMachine:
 
     # -- requests
 
-    def _answer(self, request: OperatorRequest, now: float) -> Orders:
+    def _answer(self, request: OperatorRequest, tracking: TrackingReport | None, now: float) -> Orders:
         why = refusal(request.wish, request.turn, self.offers, self.turn)
+        if not why and request.wish is Wish.MOVE:
+            why = self._move(request.move, tracking, now)
         self.answer = RequestAnswer(request.number, request.wish, not why, why)
         return [] if why else self._follow(request.wish, now)
 
@@ -149,7 +182,8 @@ class RunStateMachine:
         if wish is Wish.CONFIRM:
             self._enter(RunStage.READY, "", now)
         elif wish is Wish.AGAIN:
-            self.placed_path = None
+            self.placed_path = self.placement = None
+            self.looks, self.moves = self.looks + 1, 0
             self._enter(RunStage.CHECK, "", now)
         elif wish is Wish.START:
             return self._home(RunStage.APPROACH, now)
@@ -165,9 +199,24 @@ class RunStateMachine:
             return [*material, PauseOrder.RESUME, *([Order.ARM] if resting else [])]
         return []
 
-    def _home(self, after: RunStage, now: float) -> Orders:
+    def _move(self, move: MoveRequest | None, tracking: TrackingReport | None, now: float) -> str:
+        """Move the path along the surface; why it stays where it is, "" where it was moved."""
+        placement, placed, task = self.placement, self.placed_path, self.task
+        assert placement is not None and placed is not None
+        moved = moved_placement(placement, task.path, tracking, move)
+        if isinstance(moved, str):
+            return moved
+        assert move is not None and tracking is not None and tracking.pose is not None
+        self.moves, self.placement, lies = self.moves + 1, moved, moved.surface_from_path
+        self.placed_path = place_path(task.path, lies, tracking.pose, placed.profile, False, task.outlets)
+        where = f"x {move.x_mm:.2f} mm, y {move.y_mm:.2f} mm, turn {move.turn_deg:.2f} degrees"
+        reach = f"; out of reach: {self.placed_path.unreachable}" if self.placed_path.unreachable else ""
+        self._enter(RunStage.CONFIRM, f"moved by hand, move {self.moves}: {where}{reach}", now)
+        return ""
+
+    def _home(self, after: RunStage, now: float, reason: str = "") -> Orders:
         self._after_homing, self._homed, self._ordered = after, False, now
-        self._enter(RunStage.HOMING, "", now)
+        self._enter(RunStage.HOMING, reason, now)
         declared, self._home_declared = self.task.stands_home and not self._home_declared, True
         return [*([Order.AT_HOME] if declared else []), Order.HOME]
 
@@ -222,19 +271,22 @@ class RunStateMachine:
     def _await_surface(self, tracking: TrackingReport, now: float) -> Orders:
         task = self.task
         if self.stage is RunStage.FIND:
-            if tracking.surface_from_path is None or tracking.pose is None or not tracking.pose.state.measured:
+            placement = tracking.placement if tracking.looks == self.looks else None
+            if placement is None or tracking.pose is None or not tracking.pose.state.measured:
                 if task.unattended and now - self._since > SEARCH_TIMEOUT:
                     why = "no pictures" if tracking.pose is None else tracking.pose.reason
                     return self.end(f"the surface was not found: {why}", now)
                 return []
+            if task.unattended and not placement.certain:
+                return self.end(f"where the path belongs is not certain: {placement.verdict}", now)
             by = task.profile, task.place, task.outlets
-            placed = place_path(task.path, tracking.surface_from_path, tracking.pose, *by)
-            self.placed_path = placed
-            if placed.unreachable:
+            placed = place_path(task.path, placement.surface_from_path, tracking.pose, *by)
+            self.placed_path, self.placement = placed, placement
+            if placed.unreachable and (placement.certain or task.unattended):
                 return self.end(f"out of reach: {placed.unreachable}", now) if task.unattended else []
-            self._enter(RunStage.CONFIRM, "", now)
-        if task.unattended:
-            return self._home(RunStage.APPROACH, now)
+            self._enter(RunStage.CONFIRM, placement.verdict, now)
+        if task.unattended and self.placement is not None:
+            return self._home(RunStage.APPROACH, now, self.placement.verdict)
         return []
 
     def _check_faults(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:

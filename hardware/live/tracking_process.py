@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import signal
 from collections import deque
-from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
-from itertools import takewhile
-from pathlib import Path
+from itertools import dropwhile, takewhile
 from types import FrameType
 
 import numpy as np
@@ -19,13 +17,14 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
-from estimation.rig import Rig, ideal_pixels, pixels_from_points
 from estimation.runtime import use_one_arena
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
+from hardware.files.mesh_file import read_mesh
+from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
 from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
-from hardware.live.prepared import Prepared
+from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
     LiveMotionReport,
@@ -39,6 +38,7 @@ from hardware.live.records import (
 )
 from hardware.motion.loop import CommandedPose
 from hardware.offline.track import FrameSetStep, region_search, tracker
+from hardware.operator.overlays import SurfaceOutline, scan_drawing
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock
 from hardware.process.system import (
@@ -51,11 +51,18 @@ from hardware.process.system import (
 )
 from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
-from perception.frames import FrameSet, PrintHead, Roi, region_since
-from perception.lens import undistort
-from perception.tracking.step import STAGES
+from perception.frames import FrameSet, PrintHead, region_since
+from perception.tracking.step import STAGES, TrackingStep
+from perception.tracking.wound_step import RegionTrackingStep
+from planning.placement import (
+    NoSurfaceError,
+    PathPlacement,
+    PlacedBy,
+    path_middle,
+    placement_by_region,
+    placement_by_scan,
+)
 
-DEPTH_NEIGHBOURS = 3  # landmarks whose depth a corner of an outline is taken to have
 SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
 FRAME_WAIT = 0.1  # s of a wait for frames, after which the lifeline is looked at
 MAP_REFRESH_SETS = 15  # sets between two looks at the map for the page
@@ -65,44 +72,7 @@ HISTOGRAM_PERIOD = 30.0  # s between histograms in the recording
 EXPOSURE_STAGE, QUEUE_STAGE = "exposure to frames handed over", "frames wait for the tracker"
 TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
-
-
-class SurfaceOutline:
-    """Each camera's region of interest as an outline on the surface, once it is placed there."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._rig = rig
-        self._corners: dict[int, Array] = {}  # (K, 3) mm, surface frame, by camera
-
-    @property
-    def placed(self) -> bool:
-        """Whether any region is placed."""
-        return bool(self._corners)
-
-    def place(self, rois: Sequence[Roi], points_surface: Array, base_from_surface: Array) -> None:
-        """Put the regions onto a surface of landmarks (V, 3), mm; a region that is a whole picture is no outline."""
-        points_base = se3.transform_points(base_from_surface, points_surface)
-        surface_from_base = se3.inverse(base_from_surface)
-        for roi in rois:
-            camera = self._rig.cameras[roi.camera]
-            inside = ((roi.polygon > 0) & (roi.polygon < np.array(camera.size) - 1)).all(axis=1)
-            if len(points_base) < DEPTH_NEIGHBOURS or not inside.any():
-                continue
-            corners = undistort(camera, roi.polygon)  # (K, 2)
-            pixels, depths = ideal_pixels(camera, points_base)
-            distances = np.linalg.norm(corners[:, None] - pixels[None], axis=2)  # (K, V)
-            nearest = np.argsort(distances, axis=1)[:, :DEPTH_NEIGHBOURS]
-            rays = np.column_stack([corners, np.ones(len(corners))]) @ np.linalg.inv(camera.matrix).T
-            corners_base = se3.transform_points(camera.base_from_camera, rays * depths[nearest].mean(axis=1)[:, None])
-            self._corners[roi.camera] = se3.transform_points(surface_from_base, corners_base)
-
-    def in_pixels(self, camera: int, base_from_surface: Array) -> tuple[Array, ...]:
-        """A camera's outline in its picture, (K, 2) px as the lens images it; none if it is not known."""
-        if camera not in self._corners:
-            return ()
-        points_base = se3.transform_points(base_from_surface, self._corners[camera])
-        pixels, depth = pixels_from_points(self._rig.cameras[camera], points_base)
-        return (pixels,) if (depth > 0).all() else ()
+TRUE_PLACE = "placed in the true frame of the simulated world"
 
 
 def _true_pose(truth: Trajectory, stamp: float) -> Array:
@@ -113,7 +83,7 @@ def _true_pose(truth: Trajectory, stamp: float) -> Array:
     return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
 
 
-def _restore_map(step: FrameSetStep, record: Path, session: Session, until: float, shift: float) -> Array:
+def _restore_map(step: FrameSetStep, placement: SurfacePlacement, session: Session, shift: float) -> Array:
     """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
 
     shift: s, added to their stamps.
@@ -121,14 +91,16 @@ def _restore_map(step: FrameSetStep, record: Path, session: Session, until: floa
     Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
     runs' poses at the last of them. InputError where the surface is not found in its own pictures.
     """
+    record, until = placement.map, placement.until
     poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
-    sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, session.frame_sets())
+    later = dropwhile(lambda frames: frames.stamp < placement.since, session.frame_sets())
+    sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, later)
     new_from_old: Array | None = None
     for frames in sets:
         shifted = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
         pose, old = step(FrameSet(frames.stamp + shift, shifted, frames.head)), poses.get(frames.stamp)
         step.idle()
-        if old is not None and old.state is pose.state is TrackState.TRACKING:
+        if old is not None and old.state.measured and pose.state.measured and old.state is pose.state:
             new_from_old = se3.inverse(pose.base_from_surface) @ old.base_from_surface
     if new_from_old is None:
         raise InputError(record, "recording", "no surface", "pictures in which it is found again")
@@ -177,10 +149,11 @@ class _TrackingLoop:
     ) -> None:
         self._prepared, self._channels, self._sender = prepared, channels, sender
         self._clock, self.times = WallClock(), StageHistograms()
-        profile, placement = prepared.task.profile, prepared.placement
-        self._commanded_head = _CommandedHead(channels.motion, profile)
+        self._commanded_head = _CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
         self._source: FrameSource
+        self._step: TrackingStep | RegionTrackingStep
+        self._outline: SurfaceOutline
         self._session: Session | None = None  # that is shown; held, as it may have unpacked the scan
         if prepared.live:
             self._source = LiveCameraSource(prepared.session)
@@ -189,39 +162,53 @@ class _TrackingLoop:
             self._session = open_session(prepared.session)
             self._source, rig = RingSource(channels.ring, channels.notices), self._session.rig
         stack.callback(self._source.close)
-        session = self._session
-        self._truth = None if session is None else session.truth
-        surface = None if session is None else session.surface
+        session, placement = self._session, prepared.placement
+        self._rig, self._truth = rig, None if session is None else session.truth
+        own = None if session is None else session.surface
+        self._surface = agreed_scan(prepared.scan, own, prepared.session)
         self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
         self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
-        self._outline = SurfaceOutline(rig)
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
         channels.reports.put(self.report)
-        earlier = None if placement is None else open_session(placement.map)
-        source, region = session if earlier is None else earlier, prepared.settings.region
+        self._earlier = None if placement is None else open_session(placement.map)
+        source, region = session if self._earlier is None else self._earlier, prepared.settings.region
         rois = () if source is None else source.roi
-        if earlier is None and region.by is not None:
+        if self._earlier is None and region.by is not None:
             rois = region.rois(rig, self.report.stamp)
         sender.put(rig)
-        if surface is not None:
-            sender.put(ScanEntry(surface))
+        if self._surface is not None:
+            sender.put(ScanEntry(self._surface))
+            channels.link.scan.put(scan_drawing(read_mesh(self._surface).scan))
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
-        self._region_recorded, self._drawn = bool(rois), region.drawn and not rois
+        self._rois, self._region_recorded, self._drawn = rois, bool(rois), region.drawn and not rois
+        self._steps = stack.enter_context(ExitStack())
+        self._look(0)
+
+    def _look(self, looks: int) -> None:
+        """Look for the surface, with a tracker that knows nothing of it yet; a run that resumes shows it its map."""
+        self._steps.close()
+        self._outline = SurfaceOutline(self._rig)
+        placed, placement, settings = None, self._prepared.placement, self._prepared.settings
         # the stamps of earlier pictures are to end a second ago: the clock may have begun anew since
         shift = 0.0 if placement is None else self._clock.now() - placement.until - SETTLING_TIME - 1.0
-        since = [-np.inf if earlier is None else roi.stamp + shift for roi in rois]
-        timed = tuple(replace(roi, stamp=stamp) for roi, stamp in zip(rois, since, strict=True))
-        find = region_search(rig, region, channels.link.regions, prepared.settings.model)
-        step = tracker(rig, timed, surface, self._clock.now, profile.tool, model=prepared.settings.model, find=find)
-        self._step = stack.enter_context(step)
-        if placement is not None and earlier is not None:
-            new_from_old = _restore_map(self._step, placement.map, earlier, placement.until, shift)
-            self.report = replace(self.report, surface_from_path=new_from_old @ placement.surface_from_path)
+        since = [-np.inf if self._earlier is None else roi.stamp + shift for roi in self._rois]
+        timed = tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, since, strict=True))
+        find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
+        given = self._surface, self._clock.now, self._prepared.task.profile.tool
+        self._step = self._steps.enter_context(tracker(self._rig, timed, *given, model=settings.model, find=find))
+        if placement is not None and self._earlier is not None:
+            new_from_old = _restore_map(self._step, placement, self._earlier, shift)
+            words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
+            lies = new_from_old @ placement.surface_from_path
+            placed = PathPlacement(lies, PlacedBy.EARLIER, words, placement.certain, True)
+        self.report = replace(self.report, placement=placed, registered=np.nan, surface=None, looks=looks, since=np.nan)
 
     def __call__(self) -> None:
         settle_memory()
         while not pipe_closed(self._channels.lifeline):
+            if (looks := self._channels.looks.value) != self.report.looks:
+                self._look(looks)
             arrived = self._source.take(FRAME_WAIT)
             if arrived is None:
                 self.report = replace(self.report, stamp=self._clock.now())
@@ -262,14 +249,36 @@ class _TrackingLoop:
         times.add(HANDED_TO_POSE_STAGE, sent - arrived.handed)
 
     def _register(self, pose: SurfacePose, arrived: TimedFrameSet) -> None:
-        """Place the path, once: in the tracker's own surface frame, or in the true one of a simulated world."""
-        if self.report.surface_from_path is not None or pose.state is not TrackState.TRACKING:
+        """Place the path, once: by the scan, in the true frame of a simulated world, or as the region lies."""
+        if np.isnan(self.report.since):
+            self.report = replace(self.report, since=arrived.frames.stamp)
+        if self.report.placement is not None or not pose.state.measured:
             return
-        surface_from_path = np.eye(4)
-        if self._prepared.again and self._truth is not None:
-            surface_from_path = se3.inverse(pose.base_from_surface) @ _true_pose(self._truth, arrived.source)
-        self.report = replace(self.report, surface_from_path=surface_from_path, registered=pose.stamp)
-        settle_memory()  # what was compiled since, as nothing moves yet
+        scan, placed = self._step.registration, None
+        if scan is None and pose.state is not TrackState.TRACKING:
+            return
+        middle, outward = path_middle(self._prepared.task.path), self._outward(pose)
+        if scan is not None:
+            placed = placement_by_scan(scan, middle, outward)
+        elif self._prepared.again and self._truth is not None:
+            lies = se3.inverse(pose.base_from_surface) @ _true_pose(self._truth, arrived.source)
+            placed = PathPlacement(lies, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
+        elif (surface_map := self._step.map) is not None:
+            self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
+            with suppress(NoSurfaceError):  # the map grows
+                outlines = self._outline.on_surface
+                placed = placement_by_region(self._prepared.task.path, outlines, surface_map.points, outward)
+        if placed is not None:
+            self.report = replace(self.report, placement=placed, registered=pose.stamp)
+            settle_memory()  # what was compiled since, as nothing moves yet
+
+    def _outward(self, pose: SurfacePose) -> Array:
+        """(3,) from the surface's middle to that of the cameras, surface frame."""
+        cameras = np.mean([camera.base_from_camera[:3, 3] for camera in self._rig.cameras], axis=0)
+        surface_map = self._step.map
+        points = np.zeros((1, 3)) if surface_map is None else surface_map.points
+        direction = se3.transform_points(se3.inverse(pose.base_from_surface), cameras[None])[0] - points.mean(axis=0)
+        return np.asarray(direction / np.linalg.norm(direction))
 
     def _report(self, arrived: TimedFrameSet, pose: SurfacePose) -> None:
         report = self.report
@@ -294,7 +303,7 @@ class _TrackingLoop:
         """Landmarks (V, 3) for the page, taken anew now and then, as the map grows."""
         if self.report.sets % MAP_REFRESH_SETS or (surface_map := self._step.map) is None:
             return self.report.surface
-        if not self._outline.placed and pose.state.measured:
+        if not self._outline.on_surface and pose.state.measured:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
         return np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
 

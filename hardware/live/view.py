@@ -25,13 +25,13 @@ from hardware.live.records import FRAMES_TO_WIRE_STAGE, LiveMotionReport, RunRep
 from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import (
     DRAW_QUESTION,
-    STAGE_QUESTIONS,
     Activity,
     CameraView,
     CheckVerdict,
     LatencyView,
     MotionView,
     OperatorView,
+    PlacementView,
     ProgressView,
     RunStage,
     TrackingView,
@@ -41,6 +41,7 @@ from hardware.operator.view import (
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.path import Path, PrintPhase, way_lengths
+from planning.placement import tangent_of
 
 MAX_COMMANDS_KEPT = 64  # a second of them
 MAX_COMMAND_GAP = 0.1  # s between two commands that a straight line joins
@@ -143,7 +144,7 @@ class ViewBuilder:
             stamp=now,
             turn=machine.turn,
             stage=machine.stage,
-            question=DRAW_QUESTION if draws else STAGE_QUESTIONS.get(machine.stage, ""),
+            question=DRAW_QUESTION if draws else machine.question,
             reason=machine.silence or machine.reason,
             offers=machine.offers,
             checks=machine.checks,
@@ -153,10 +154,21 @@ class ViewBuilder:
             latency=None if motion is None else _latency(motion),
             cameras=() if tracking is None else self._cameras(tracking, now),
             answer=machine.answer,
+            placement=self._placement(machine, tracking),
             notes=self.prepared.notes,
             events=() if motion is None else tuple(event.text for event in motion.events),
             draws=draws,
         )
+
+    def _placement(self, machine: RunStateMachine, tracking: TrackingReport | None) -> PlacementView | None:
+        placement = machine.placement
+        if machine.stage is not RunStage.CONFIRM or placement is None:
+            return None
+        points = None if tracking is None else tracking.surface
+        tangent = None if points is None else tangent_of(placement, self.prepared.task.path, points)
+        known = placement.sigma, placement.turn_sigma
+        worth = placement.certain, machine.moves > 0, machine.confirmable
+        return PlacementView(placement.by.value, placement.verdict, *worth, tangent, *known)
 
     def _motion(self, motion: LiveMotionReport, machine: RunStateMachine, statistics: RunStatistics) -> MotionView:
         status, command = motion.tick.status, motion.tick.command

@@ -19,7 +19,15 @@ import numpy as np
 
 from estimation.rig import Camera
 from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene
-from hardware.operator.view import Activity, MotionView, OperatorView, RecordingView, WavingView, Wish
+from hardware.operator.view import (
+    Activity,
+    MotionView,
+    MoveRequest,
+    OperatorView,
+    RecordingView,
+    WavingView,
+    Wish,
+)
 
 _HEAD_SIZE = struct.Struct("<I")
 JSON_DIGITS = 7  # significant ones of a number below 1
@@ -72,6 +80,7 @@ def scene_text(scene: PageScene) -> str:
         extrude=scene.extrude.astype(np.uint8),
         surface=np.round(scene.surface, 2).ravel(),
         triangles=scene.triangles.ravel(),
+        scan=np.round(scene.scan, 2).ravel(),
     )
 
 
@@ -160,6 +169,7 @@ class RequestMessage:
     wish: Wish
     turn: int  # of the view it was asked under
     tag: int  # the window's own number for it
+    move: MoveRequest | None = None  # of Wish.MOVE, and of no other
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,10 +201,25 @@ def parse_message(text: str) -> RequestMessage | RegionMessage | ShownMessage | 
     if message.keys() == {"region", "turn", "tag"}:
         sound = isinstance(message["region"], dict) and _is_count(message["turn"]) and _is_count(message["tag"])
         return RegionMessage(message["region"], message["turn"], message["tag"]) if sound else None
-    if message.keys() != {"ask", "turn", "tag"} or not (_is_count(message["turn"]) and _is_count(message["tag"])):
+    wish = message.get("ask")
+    if not isinstance(wish, str) or wish not in Wish.__members__.values():
         return None
-    known = isinstance(message["ask"], str) and message["ask"] in Wish.__members__.values()
-    return RequestMessage(Wish(message["ask"]), message["turn"], message["tag"]) if known else None
+    moves = wish == Wish.MOVE
+    if message.keys() != {"ask", "turn", "tag", *(["move"] if moves else [])}:
+        return None
+    if not (_is_count(message["turn"]) and _is_count(message["tag"])):
+        return None
+    move = _parse_move(message["move"]) if moves else None
+    return None if moves and move is None else RequestMessage(Wish(wish), message["turn"], message["tag"], move)
+
+
+def _parse_move(shift: object) -> MoveRequest | None:
+    """The move in [x_mm, y_mm, turn_deg]; None where it is none, not finite, or too far."""
+    if not isinstance(shift, list) or len(shift) != 3 or not all(type(v) in (int, float) for v in shift):
+        return None
+    if not MoveRequest(*shift).allowed:  # before the figures are floats: an integer may be too long for one
+        return None
+    return MoveRequest(*map(float, shift))
 
 
 def _is_count(value: object) -> bool:

@@ -5,17 +5,20 @@ To learn the page by. Nothing moves, whatever is pressed: three painted cameras 
 
 from __future__ import annotations
 
-from math import nan
+from dataclasses import replace
+from math import nan, radians
 
 import numpy as np
 
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.rig import Camera, Rig, ideal_pixels
+from estimation.scans.scan import scan_from_triangles
 from estimation.se3 import Array
+from hardware.operator.overlays import scan_drawing
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import OperatorLink, OperatorRequest, PageScene, scene_from
+from hardware.operator.shared_state import OperatorLink, OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import (
     ACTIVE_STAGES,
     STAGE_OFFERS,
@@ -25,7 +28,9 @@ from hardware.operator.view import (
     CheckVerdict,
     LatencyView,
     MotionView,
+    MoveRequest,
     OperatorView,
+    PlacementView,
     ProgressView,
     RequestAnswer,
     RunStage,
@@ -36,6 +41,7 @@ from hardware.operator.view import (
 from hardware.process.clock import Clock, WallClock
 from perception.frames import Image
 from planning.path import Path
+from planning.placement import NoSurfaceError, PathPlacement, PlacedBy, SurfaceMove, moved_along, tangent_of
 
 DEMO_IMAGE_SIZE = (640, 360)  # px
 BREATH_PERIOD = 4.0  # s
@@ -68,15 +74,29 @@ def surface_height(x: Array, y: Array) -> Array:
     return np.asarray(-(x**2 + 1.6 * y**2) / 400)
 
 
-def demo_scene() -> PageScene:
-    """Cameras, path and surface."""
+def demo_scene(surface_from_path: Array, scan: ScanDrawing) -> PageScene:
+    """Cameras, path and scan where they are placed, and the surface."""
     side = 24  # points each way
     x, y = np.meshgrid(np.linspace(-45, 45, side), np.linspace(-32, 32, side))
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]
     triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
     surface = np.column_stack([x.ravel(), y.ravel(), surface_height(x, y).ravel()])
-    return scene_from(demo_rig(), demo_path(), surface, triangles)
+    path = demo_path()
+    path = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
+    lines = se3.transform_points(surface_from_path, scan.lines.reshape(-1, 3)).reshape(-1, 2, 3)
+    return scene_from(demo_rig(), path, surface, triangles, lines)
+
+
+def demo_scan() -> ScanDrawing:
+    """A scan of the same surface with its wound, 2 mm deep."""
+    side = 60  # points each way
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-40, 40, side), np.linspace(-27, 27, side)))
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]
+    triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
+    deep = 2 * np.clip(4 * (1 - np.hypot(x / WOUND_HALF_AXES[0], y / WOUND_HALF_AXES[1])), 0, 1)
+    return scan_drawing(scan_from_triangles(np.column_stack([x, y, surface_height(x, y) - deep]), triangles))
 
 
 def surface_at(now: float) -> Array:
@@ -145,8 +165,12 @@ def _camera(name: str, turn: float) -> Camera:
 DEMO_VIEW_PERIOD = 0.1  # s between two views
 DEMO_SPEED = 9.0  # checkpoints/s
 DEMO_HOLD_ERROR = 0.62  # mm: of error while it holds
+DEMO_PLACEMENT = PathPlacement(
+    np.eye(4), PlacedBy.SCAN, "placed by the scan, good to 0.06 mm and 0.11 degrees", True, True, 0.06, 0.002
+)
 NEXT_STAGES = {
     Wish.CONFIRM: RunStage.READY,
+    Wish.MOVE: RunStage.CONFIRM,
     Wish.AGAIN: RunStage.FIND,
     Wish.START: RunStage.APPROACH,
     Wish.PAUSE: RunStage.PAUSED,
@@ -170,6 +194,10 @@ class DemoRun:
     def __init__(self, fraction: float, now: float) -> None:
         self.stage, self._turn, self._since, self._then, self._fraction = RunStage.CHECK, 1, now, now, fraction
         self._path = demo_path()
+        side = np.linspace(-60, 60, 25)
+        x, y = (part.ravel() for part in np.meshgrid(side, side))
+        self._points = np.column_stack([x, y, surface_height(x, y)])
+        self.placement, self._moved = DEMO_PLACEMENT, False
         self._answer: RequestAnswer | None = None
 
     def _enter(self, stage: RunStage, now: float) -> None:
@@ -178,9 +206,21 @@ class DemoRun:
     def follow(self, request: OperatorRequest, now: float) -> None:
         """Follow a request, or refuse it."""
         why = refusal(request.wish, request.turn, STAGE_OFFERS.get(self.stage, ()), self._turn)
+        if not why and request.wish is Wish.MOVE and request.move is not None:
+            why = self._move(request.move)
         self._answer = RequestAnswer(request.number, request.wish, not why, why)
         if not why:
             self._enter(NEXT_STAGES[request.wish], now)
+
+    def _move(self, move: MoveRequest) -> str:
+        """Move the path along the surface; why not, "" where it was moved."""
+        by = SurfaceMove(move.x_mm, move.y_mm, radians(move.turn_deg))
+        try:
+            lies = moved_along(self.placement, self._path, self._points, by)
+        except NoSurfaceError as error:
+            return str(error)
+        self.placement, self._moved = replace(self.placement, surface_from_path=lies, by=PlacedBy.HAND), True
+        return ""
 
     def step(self, now: float) -> OperatorView:
         """The run at `now`, s."""
@@ -206,12 +246,18 @@ class DemoRun:
             checks=_checks(now - self._since) if stage is RunStage.CHECK else (),
             tracking=_tracking(stage, now),
             motion=self._motion(now) if known else None,
-            progress=self._progress() if known else None,
+            progress=self._progress() if known and stage not in (RunStage.CONFIRM, RunStage.READY) else None,
             latency=LatencyView(0.0142, 0.0271 + 0.002 * np.sin(now), 0.035) if known else None,
             cameras=tuple(CameraView(f"camera{k}", CheckVerdict.PASS, 29.9, 61 - 7 * k) for k in range(3)),
             answer=self._answer,
+            placement=self._placement_view() if stage is RunStage.CONFIRM else None,
             notes=("demonstration",),
         )
+
+    def _placement_view(self) -> PlacementView:
+        placed, tangent = self.placement, tangent_of(self.placement, self._path, self._points)
+        worth = placed.verdict, not self._moved, self._moved, True
+        return PlacementView(placed.by.value, *worth, tangent, placed.sigma, placed.turn_sigma)
 
     def _motion(self, now: float) -> MotionView:
         moves = self.stage in (RunStage.PRINT, RunStage.APPROACH)
@@ -275,12 +321,16 @@ def run(link: OperatorLink, page: OperatorPage, clock: Clock) -> None:
     """Go on until interrupted."""
     made_up, painter = DemoRun(260.0, clock.now()), Painter(demo_rig(), np.random.default_rng(1))
     thumbnailer = Thumbnailer(link.pictures, link.requests)
-    link.scene.put(demo_scene())
+    scan, shown = demo_scan(), made_up.placement
+    link.scene.put(demo_scene(shown.surface_from_path, scan))
     while True:
         now = clock.now()
         page.tend(now)
         for request in link.requests.take():
             made_up.follow(request, now)
+        if made_up.placement is not shown:
+            shown = made_up.placement
+            link.scene.put(demo_scene(shown.surface_from_path, scan))
         link.views.put(made_up.step(now))
         if link.requests.windows:
             pose = surface_at(now)

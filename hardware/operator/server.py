@@ -87,7 +87,7 @@ class WindowSession:
 
     def _ask(self, ask: RequestMessage) -> None:
         number, words = None, self._refusal(ask)
-        if not words and (number := self._link.requests.ask(ask.wish, ask.turn)) is None:
+        if not words and (number := self._link.requests.ask(ask.wish, ask.turn, ask.move)) is None:
             words = "the run has not yet taken what was asked before"
         self._replies.append(text(kind="asked", tag=ask.tag, wish=ask.wish, number=number, words=words))
         self._newest.wake()

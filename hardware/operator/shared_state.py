@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from hardware.files.region_table import Corners
-from hardware.operator.view import CALMING_WISHES, OperatorView, RecordingView, WavingView, Wish
+from hardware.operator.view import CALMING_WISHES, MoveRequest, OperatorView, RecordingView, WavingView, Wish
 from hardware.process.system import SharedLatest
 from planning.path import Path
 
@@ -30,7 +30,8 @@ OTHER_REQUEST_SLOTS = 8  # of them for what does not lead towards rest: a flood 
 PICTURES_CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
 MAX_PATH_POINTS, MAX_TRIANGLES = 4000, 1500  # what a browser without a graphics card draws ten times a second
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
-_RECORD = struct.Struct("=QQBI")  # number, turn, wish, check sum
+_BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
+_RECORD = struct.Struct("=QQBdddI")  # the same, and its check sum
 _LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS = range(5)  # last number given, last stop, records written and taken, windows
 _WISHES = tuple(Wish)
 
@@ -42,6 +43,7 @@ class OperatorRequest:
     number: int  # counts up over all windows
     wish: Wish
     turn: int  # of the view that the operator saw when asking
+    move: MoveRequest | None = None  # of Wish.MOVE, and of no other
 
 
 class RequestLine:
@@ -52,8 +54,11 @@ class RequestLine:
         self._records: Any = RawArray("B", REQUEST_SLOTS * _RECORD.size)
         self._stops_seen = 0
 
-    def ask(self, wish: Wish, turn: int) -> int | None:
-        """Number of the request; None where the line is full: for CALMING_WISHES later, for a stop never."""
+    def ask(self, wish: Wish, turn: int, move: MoveRequest | None = None) -> int | None:
+        """Number of the request; None where the line is full: for CALMING_WISHES later, for a stop never.
+
+        move: of Wish.MOVE.
+        """
         number = int(self._counts[_LAST]) + 1
         if wish is Wish.STOP:
             self._counts[_LAST] = number
@@ -62,7 +67,8 @@ class RequestLine:
         written = self._counts[_WRITTEN]
         if written - self._counts[_TAKEN] >= (REQUEST_SLOTS if wish in CALMING_WISHES else OTHER_REQUEST_SLOTS):
             return None
-        body = (number, turn, _WISHES.index(wish))
+        shift = (0.0, 0.0, 0.0) if move is None else (move.x_mm, move.y_mm, move.turn_deg)
+        body = (number, turn, _WISHES.index(wish), *shift)
         _RECORD.pack_into(self._records, _slot_offset(written), *body, _check_sum(*body))
         self._counts[_LAST] = number
         self._counts[_WRITTEN] = written + 1
@@ -94,10 +100,13 @@ class RequestLine:
     def _waiting(self) -> list[OperatorRequest]:
         taken, written, requests = self._counts[_TAKEN], self._counts[_WRITTEN], []
         while taken < written:
-            number, turn, index, check = _RECORD.unpack_from(self._records, _slot_offset(taken))
-            if check != _check_sum(number, turn, index):
+            *body, check = _RECORD.unpack_from(self._records, _slot_offset(taken))
+            if check != _check_sum(*body):
                 break  # the count was seen before the record: the next look finds it whole
-            requests.append(OperatorRequest(number, _WISHES[index], turn))
+            number, turn, index, *shift = body
+            wish = _WISHES[index]
+            move = MoveRequest(*shift) if wish is Wish.MOVE else None
+            requests.append(OperatorRequest(number, wish, turn, move))
             taken += 1
         self._counts[_TAKEN] = taken
         return requests
@@ -107,8 +116,8 @@ def _slot_offset(count: int) -> int:
     return (count % REQUEST_SLOTS) * _RECORD.size
 
 
-def _check_sum(number: int, turn: int, index: int) -> int:
-    return crc32(struct.pack("=QQB", number, turn, index))
+def _check_sum(*body: float) -> int:
+    return crc32(_BODY.pack(*body))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,23 +158,33 @@ class PageScene:
     extrude: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))  # (K,) whether on the way to each
     surface: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) mm
     triangles: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))  # (T, 3), or none known
+    scan: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))  # (L, 2, 3) mm, lines of the scan
 
 
 def scene_from(
-    rig: Rig, path: Path | None = None, surface: Array | None = None, triangles: NDArray[np.int64] | None = None
+    rig: Rig,
+    path: Path | None = None,
+    surface: Array | None = None,
+    triangles: NDArray[np.int64] | None = None,
+    scan: Array | None = None,
 ) -> PageScene:
-    """The scene, thinned to what a browser draws with ease. surface: (V, 3) mm, triangles: (T, 3), surface frame."""
+    """The scene, thinned to what a browser draws with ease.
+
+    surface: (V, 3) mm, triangles: (T, 3), scan: (L, 2, 3) mm, lines of it; all in the surface frame.
+    """
     empty = PageScene(rig.cameras)
     drawn = empty.checkpoint if path is None else _drawn_checkpoints(path)
     points = empty.surface if surface is None else np.asarray(surface, float)
     corners = empty.triangles if triangles is None else np.asarray(triangles, np.int64)
     if len(corners) > MAX_TRIANGLES:
-        points, corners = _coarser_mesh(points, corners)
+        points, corners = coarser_mesh(points, corners, MAX_TRIANGLES)
     elif not len(corners) and len(points) > MAX_TRIANGLES:
         points = points[np.linspace(0, len(points) - 1, MAX_TRIANGLES).astype(np.int64)]
+    lines = empty.scan if scan is None else scan
     if path is None:
-        return PageScene(rig.cameras, surface=points, triangles=corners)
-    return PageScene(rig.cameras, path.surface_from_nozzle[drawn, :3, 3], drawn, path.extrude[drawn], points, corners)
+        return PageScene(rig.cameras, surface=points, triangles=corners, scan=lines)
+    places = path.surface_from_nozzle[drawn, :3, 3]
+    return PageScene(rig.cameras, places, drawn, path.extrude[drawn], points, corners, lines)
 
 
 def _drawn_checkpoints(path: Path) -> NDArray[np.int64]:
@@ -179,21 +198,30 @@ def _drawn_checkpoints(path: Path) -> NDArray[np.int64]:
     return np.unique(np.concatenate([even, ends[: MAX_PATH_POINTS // 2]]))
 
 
-def _coarser_mesh(points: Array, triangles: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """The surface with the corners in each cell of a cube grid drawn together; as fine as MAX_TRIANGLES allow."""
+def coarser_mesh(points: Array, triangles: NDArray[np.int64], most: int) -> tuple[Array, NDArray[np.int64]]:
+    """The surface with the corners in each cell of a cube grid drawn together; as fine as `most` triangles allow."""
     low, high = points.min(axis=0), points.max(axis=0)
-    cell = float((high - low).max()) / np.sqrt(MAX_TRIANGLES)
+    cell = float((high - low).max()) / np.sqrt(most)
     while True:
         _, group = np.unique(np.floor((points - low) / cell).astype(np.int64), axis=0, return_inverse=True)
         group = group.reshape(-1)
         merged = group[triangles]
         distinct = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
         coarse = np.unique(np.sort(merged[distinct], axis=1), axis=0)
-        if len(coarse) <= MAX_TRIANGLES:
+        if len(coarse) <= most:
             break
         cell *= 1.2
     middles = np.stack([np.bincount(group, points[:, k]) for k in range(3)], axis=1) / np.bincount(group)[:, None]
     return middles, coarse
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanDrawing:
+    """A scan as it is drawn, in its own frame."""
+
+    lines: Array  # (L, 2, 3) mm, from where to where
+    points: Array  # (V, 3) mm
+    triangles: NDArray[np.int64]  # (T, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,5 +234,6 @@ class OperatorLink:
     views: SharedLatest[OperatorView | WavingView | RecordingView] = field(default_factory=SharedLatest)
     pictures: SharedLatest[PagePictures] = field(default_factory=lambda: SharedLatest(PICTURES_CAPACITY))
     scene: SharedLatest[PageScene] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))
+    scan: SharedLatest[ScanDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
     requests: RequestLine = field(default_factory=RequestLine)
     regions: SharedLatest[DrawnRegion] = field(default_factory=SharedLatest)  # from the page

@@ -36,6 +36,7 @@ class Wish(StrEnum):
     """What can be asked for. A STOP is always followed; the others where the run offers them."""
 
     CONFIRM = "confirm"  # what is shown over the pictures is right
+    MOVE = "move"  # move the path along the surface to where it belongs
     AGAIN = "again"  # do this stage anew: check, or look for the wound
     START = "start"  # let the arm move: approach, then print
     PAUSE = "pause"  # hold above the surface, ready to go on
@@ -50,7 +51,7 @@ ACTIVE_STAGES = (RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING, RunStage.PA
 STAGE_OFFERS = {
     RunStage.CHECK: (Wish.END,),
     RunStage.FIND: (Wish.END,),
-    RunStage.CONFIRM: (Wish.CONFIRM, Wish.AGAIN, Wish.END),
+    RunStage.CONFIRM: (Wish.CONFIRM, Wish.MOVE, Wish.AGAIN, Wish.END),
     RunStage.READY: (Wish.START, Wish.AGAIN, Wish.END),
     RunStage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
     RunStage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),
@@ -86,6 +87,23 @@ def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> st
     if wish not in CALMING_WISHES and turn != present:
         return "the run has changed since this was shown: look again, then ask again"
     return "" if wish in offers else f"{wish} cannot be done at this stage"
+
+
+MAX_MOVE_MM, MAX_MOVE_DEG = 100.0, 180.0  # of one request to move the path
+
+
+@dataclass(frozen=True, slots=True)
+class MoveRequest:
+    """How far the path is to be moved along the surface, in the frame of PlacementView."""
+
+    x_mm: float
+    y_mm: float
+    turn_deg: float  # about the surface's normal through the path's middle
+
+    @property
+    def allowed(self) -> bool:
+        """Whether all of it is finite and within MAX_MOVE_MM and MAX_MOVE_DEG."""
+        return all(abs(v) <= MAX_MOVE_MM for v in (self.x_mm, self.y_mm)) and abs(self.turn_deg) <= MAX_MOVE_DEG
 
 
 class CheckVerdict(StrEnum):
@@ -183,6 +201,20 @@ class CameraView:
     sharpness: float = nan  # of the newest picture, as a share of the sharpest so far
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacementView:
+    """Where the path lies, while somebody may move it."""
+
+    by: str  # scan, region, truth, earlier run or hand
+    verdict: str  # what it is worth, in words
+    certain: bool  # found, unique and determined by a scan, and not moved since
+    moved: bool  # whether the operator has moved it
+    confirmable: bool  # whether it may be confirmed as it lies
+    surface_from_tangent: Array | None  # (4, 4) mm, in which a move is meant; None where the surface is not mapped
+    sigma: float = nan  # mm, of the path's middle
+    turn_sigma: float = nan  # rad
+
+
 @dataclass(frozen=True, slots=True)
 class RequestAnswer:
     """What became of a request."""
@@ -210,6 +242,7 @@ class OperatorView:
     latency: LatencyView | None = None
     cameras: tuple[CameraView, ...] = ()
     answer: RequestAnswer | None = None
+    placement: PlacementView | None = None
     notes: tuple[str, ...] = ()  # what one should know all the time, such as "dry run" or "simulated"
     events: tuple[str, ...] = ()  # the last ones, newest last
     draws: bool = False  # whether the region has to be drawn now, by whoever sees the newest view

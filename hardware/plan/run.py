@@ -31,9 +31,12 @@ from hardware.process.progress import Progress, count_text, duration_text
 from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
 from planning.layers.wound import WoundVolume
 from planning.path import check_path
+from planning.placement import PathPlacement, placement_by_scan
 
 if TYPE_CHECKING:
+    from estimation.pose import SurfacePose
     from estimation.rig import Camera
+    from hardware.files.session import Session
     from perception.frames import FrameSet
 
 # off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
@@ -294,29 +297,39 @@ def placement_lines(verdict: str, sightings: Sequence[WoundSighting]) -> list[st
 
 
 def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> tuple[str, list[WoundSighting]]:
-    """Register a scan in a session's first pictures: verdict and sightings, none where it was not registered.
+    """Register a scan in a session's first pictures, as a live run does: verdict, and sightings where it is certain.
 
     outline: (N, 3) mm, of the planned wound, scan frame.
+    """
+    session, pose, placement, frames = register_in_session(session_path, scan_file, outline.mean(axis=0))
+    if placement is None or pose is None or frames is None:
+        why = "no frame set in the session" if pose is None else pose.reason or pose.state.value
+        return f"not placed: {why}", []
+    return placement.verdict, _sightings(session.rig.cameras, frames, pose.base_from_surface, outline)
+
+
+def register_in_session(
+    session_path: Path, scan_file: Path, middle: Array
+) -> tuple[Session, SurfacePose | None, PathPlacement | None, FrameSet | None]:
+    """Where a scan lies in a session's first pictures: its pose and placement at the last frame set looked at.
+
+    middle: (3,) mm, of what is planned, scan frame. No placement where no pose was measured.
     """
     from hardware.offline.track import tracker  # loads gtsam and cv2, which a plan alone does not need
     from hardware.recording.session_reader import open_session
 
     session = open_session(session_path)
-    pose, frames = None, None
+    pose, placement, frames = None, None, None
     with tracker(session.rig, session.roi, scan_file) as step:
         for number, frames in enumerate(session.frame_sets()):
             pose = step(frames)
             step.idle()
-            if pose.state.measured or number + 1 == MAX_FRAME_SETS:
+            if pose.state.measured and step.registration is not None:
+                outward = pose.base_from_surface[:3, 2]
+                placement = placement_by_scan(step.registration, middle, outward)
+            if placement is not None or number + 1 == MAX_FRAME_SETS:
                 break
-    if pose is None or frames is None:
-        return "the session holds no frame set", []
-    if not pose.state.measured:
-        return f"not placed: {pose.reason or pose.state.value}", []
-    sigma = np.sqrt(np.diag(pose.covariance))
-    accuracy = f"good to {np.linalg.norm(sigma[3:]):.3f} mm and {np.rad2deg(np.linalg.norm(sigma[:3])):.2f} degrees"
-    verdict = f"{pose.state.value}, {accuracy}" + (f"; {pose.reason}" if pose.reason else "")
-    return verdict, _sightings(session.rig.cameras, frames, pose.base_from_surface, outline)
+    return session, pose, placement, frames
 
 
 def _sightings(cameras: Sequence[Camera], frames: FrameSet, pose: Array, outline: Array) -> list[WoundSighting]:

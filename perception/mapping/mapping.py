@@ -56,7 +56,10 @@ class TrackedSet:
 
 
 class Mapping:
-    """Makes and keeps the map of one surface; every change is handed to the matcher and the estimator."""
+    """Makes and keeps the map of one surface; every change is handed to the matcher and the estimator.
+
+    registration: where the scan lies in the pictures that confirmed the first map; None before, and without a scan.
+    """
 
     _matcher: Matcher  # of the map since the last `start`
 
@@ -78,6 +81,7 @@ class Mapping:
         self._estimator, self._masks = estimator, masks
         self._placing = None if scan is None else ScanPlacing(scan)
         self._place: Registration | None = None  # of the scan at the first instant
+        self.registration: Registration | None = None
         self._refiner = Refiner(lenses.rig, executor)
         self._cameras = np.mean([c.base_from_camera[:3, 3] for c in lenses.rig.cameras], axis=0)
         self._tries, self._failure = 0, ""  # to make a first map, and why the last one failed
@@ -259,6 +263,7 @@ class Mapping:
         lenses = Lenses(as_at_one_instant(self._lenses.rig, pose, self._camera_poses(tracked)))
         images = {c: p[0] for c, p in tracked.pyramids.items()}
         place = placing.refine(lenses, images, replace(self._place, base_from_surface=pose))
+        self.registration = place
         self._set_caveat(place)
         new_from_old = se3.inverse(place.base_from_surface) @ pose
         moved = moved_map(estimator.map, new_from_old)

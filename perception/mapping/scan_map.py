@@ -265,6 +265,8 @@ SHARED_ERROR_FACTOR = 2.5  # and their errors another part, as measured: each is
 REFINEMENT_ROUNDS = 4  # of matching and settling: the third was measured to move by 0.01 mm, the fourth by 0.002
 APEX_DISTANCE_MM = 1e5  # mm: rays from there are parallel to 1e-3 rad over a body
 SCAN_MARGIN_MM = 2.0  # mm around the part that was seen
+# mm rms on the scan: 0.04 on the right one, 0.19 on another; the lower limit where the relief did not fit at first
+MAX_FIT_RMS_MM, EXACT_FIT_RMS_MM = 0.15, 0.06
 RIVAL_RMS_RATIO = 1.5  # a rival pose whose points stand off this much more is none
 
 
@@ -311,9 +313,16 @@ class ScanPlacing:
             reference = middle_camera(lenses, sorted(images), nodes[on_scan].mean(0)) if on_scan.any() else 0
             matched = match_near(lenses, images, nodes, reference, MATCH_SPACING_NODES) if on_scan.any() else None
             if matched is None:
-                return replace(near, sure=False, verdict=f"{near.verdict}; no two cameras see the scan there")
+                unseen = f"{near.verdict}; no two cameras see the scan there"
+                return replace(near, sure=False, fits=False, verdict=unseen)
             sure = matched.sure & on_scan[::MATCH_SPACING_NODES, ::MATCH_SPACING_NODES]
             place = register_near(matched.points[sure], MATCH_SIGMA_MM, SHARED_ERROR_FACTOR, self._index, pose)
+        if place.rms > MAX_FIT_RMS_MM:
+            poor = f"poor fit: {place.rms:.3g} mm rms on the scan, {MAX_FIT_RMS_MM:g} mm at most. {place.verdict}"
+            return replace(place, sure=False, fits=False, verdict=poor)
+        if place.sure and not near.sure and place.rms > EXACT_FIT_RMS_MM:
+            doubt = f"doubtful: {place.rms:.3g} mm rms on the scan, as the relief did not fit it. {place.verdict}"
+            return replace(place, sure=False, verdict=doubt)
         return place
 
     def _lattice(self, lenses: Lenses, cameras: list[int], points: Array, outward: Array, pose: Array) -> Array:

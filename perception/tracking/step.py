@@ -19,6 +19,7 @@ from estimation.observations import Observations, no_observations
 from estimation.online.estimator import Estimator
 from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
+from estimation.scans.registration import Registration
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
@@ -130,6 +131,11 @@ class TrackingStep:
     def map(self) -> SurfaceMap | None:
         """The map as it is now, in the surface frame; None before there is one."""
         return self._estimator.map
+
+    @property
+    def registration(self) -> Registration | None:
+        """Where the scan lies, as of the pictures that confirmed the first map; None before, and without a scan."""
+        return self._mapping.registration
 
     def idle(self) -> None:
         """Work that no pose waits for: learning, mapping, relocalisation. Call it after each pose."""

@@ -11,6 +11,7 @@ import numpy as np
 from estimation.mapping.refiner import DelayedJob
 from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
+from estimation.scans.registration import Registration
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import FrameSet, Image, Roi, whole_pictures
@@ -192,6 +193,11 @@ class RegionTrackingStep:
     def map(self) -> SurfaceMap | None:
         """The map as it is now, in the surface frame; None before there is one."""
         return None if self._step is None else self._step.map
+
+    @property
+    def registration(self) -> Registration | None:
+        """Where the scan lies, as of the pictures that confirmed the first map; None before, and without a scan."""
+        return None if self._step is None else self._step.registration
 
     @property
     def roi(self) -> tuple[Roi, ...]:

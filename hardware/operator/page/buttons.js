@@ -12,11 +12,12 @@ const PATIENCE = 1500; // ms until a request without an answer is spoken of
 const SHOWN = 6000; // ms
 
 export class Buttons {
-  // ask: given wish and turn, asks; returns a tag or null
+  // ask: given wish, turn and, of a move, how far, asks; returns a tag or null
   constructor(ask) {
     this.ask = ask;
     this.view = null;
     this.live = false;
+    this.held = false; // what is shown is not yet what the run has: it is not to be confirmed
     this.waiting = new Map(); // tag -> { wish, number, since }
     this.pressed = new Map(); // button -> turn that was shown when it was touched
     this.bar = document.querySelector("footer");
@@ -65,11 +66,15 @@ export class Buttons {
     this.sure.hidden = true;
     this.asking = null;
   }
-  send(wish, turn) {
-    const tag = this.ask(wish, turn);
-    if (tag === null) return this.say(`${upper(wish)} was not sent: no connection.`, true);
+  send(wish, turn, move) {
+    const tag = this.ask(wish, turn, move);
+    if (tag === null) {
+      this.say(`${upper(wish)} was not sent: no connection.`, true);
+      return null;
+    }
     this.waiting.set(tag, { wish, number: null, since: performance.now() });
     this.mark();
+    return tag;
   }
   // the page's process has taken a request, or says why not
   asked(message) {
@@ -108,7 +113,7 @@ export class Buttons {
     }
     const soon = this.view && BEFORE.includes(this.view.stage) ? "start" : "resume";
     this.go.textContent = WISHES[wish || soon];
-    this.go.disabled = !wish;
+    this.go.disabled = !wish || (wish === "confirm" && this.held);
   }
   // compare what waits with the run's last answer
   settle() {
@@ -116,7 +121,7 @@ export class Buttons {
     if (answer && answer.number !== this.answered) {
       this.answered = answer.number;
       const words = answer.words ? `: ${answer.words}.` : ".";
-      this.say(`${upper(answer.wish)} ${answer.followed ? "was followed" : "was not followed"}${words}`, !answer.followed);
+      if (answer.wish !== "move" || !answer.followed) this.say(`${upper(answer.wish)} ${answer.followed ? "was followed" : "was not followed"}${words}`, !answer.followed);
     }
     for (const [tag, each] of this.waiting) if (answer && each.number !== null && answer.number >= each.number) this.waiting.delete(tag);
     this.mark();

@@ -1,10 +1,12 @@
 // One camera's live picture with what was found in it: outline, tracks, the path where it will lie, the nozzle.
-import { drawPath, Lens } from "./lens.js";
+import { drawPath, Lens, product } from "./lens.js";
 
 const OLD = 1500; // ms: they come five times a second
+const NO_HAND = { drag: null, press: () => false, click: () => false, preview: () => null, draw() {} }; // nothing is moved
 
 export class CameraPane {
-  constructor(name, chosen) {
+  // hand: takes presses, pulls and clicks in css px of the picture; see Placing
+  constructor(name, chosen, hand = NO_HAND) {
     this.name = name;
     this.root = document.createElement("figure");
     this.root.className = "camera";
@@ -16,12 +18,43 @@ export class CameraPane {
     this.fare.className = "fare";
     caption.append(this.title, this.fare);
     this.root.append(this.canvas, caption);
-    this.root.addEventListener("click", (event) => this.clicked(event) || chosen(name));
+    const place = (event) => {
+      const box = this.canvas.getBoundingClientRect();
+      return [event.clientX - box.left, event.clientY - box.top];
+    };
+    let dragged = false;
+    this.canvas.addEventListener("pointerdown", (event) => {
+      dragged = false;
+      if (event.button === 0 && hand.press(this, place(event), event)) this.canvas.setPointerCapture(event.pointerId);
+    });
+    this.canvas.addEventListener("pointermove", (event) => {
+      if (hand.drag && hand.drag.camera === this && hand.drag.id === event.pointerId) hand.pull(place(event));
+    });
+    for (const kind of ["pointerup", "pointercancel"]) this.canvas.addEventListener(kind, (event) => {
+      if (hand.drag && hand.drag.camera === this && hand.drag.id === event.pointerId) dragged = hand.release();
+    });
+    this.root.addEventListener("click", (event) => {
+      if (!dragged && !hand.click(this, place(event)) && !this.clicked(event)) chosen(name);
+    });
+    this.hand = hand;
+    this.fitted = null; // how a pixel of the camera lies on the canvas
     this.corners = []; // of the region, [x, y] px
     this.drawing = this.place = null; // takes a corner while a region is drawn; where the picture lies on the canvas
     this.image = this.close = this.found = this.lens = null;
     this.title.textContent = name;
     this.fare.hidden = true;
+  }
+  // pixel of the camera at a place of the canvas in css px, null beside the picture
+  pixel([x, y]) {
+    if (!this.fitted) return null;
+    const { scale, x0, y0, left, top, across, down, ratio } = this.fitted;
+    const u = (x * ratio - x0) / scale, v = (y * ratio - y0) / scale;
+    return u < 0 || v < 0 || u > across || v > down ? null : [u + left - 0.5, v + top - 0.5];
+  }
+  // place on the canvas in css px of a pixel of the camera
+  shown([u, v]) {
+    const { scale, x0, y0, left, top, ratio } = this.fitted;
+    return [(x0 + scale * (u - left + 0.5)) / ratio, (y0 + scale * (v - top + 0.5)) / ratio];
   }
   see(camera) {
     this.lens = new Lens(camera);
@@ -69,6 +102,7 @@ export class CameraPane {
     const crop = near && !this.drawing && this.close && this.found.crop, [left, top, across, down] = crop || [0, 0, ...size];
     const scale = Math.min(w / across, h / down), x0 = (w - scale * across) / 2, y0 = (h - scale * down) / 2;
     this.place = { x0, y0, scale, size, ratio };
+    this.fitted = { scale, x0, y0, left, top, across, down, ratio };
     this.canvas.dataset.drawn = !this.image ? "" : scene && pose && this.lens ? "path" : "picture";
     if (this.image) g.drawImage(crop ? this.close : this.image, x0, y0, scale * across, scale * down);
     if (!this.lens) return;
@@ -80,16 +114,34 @@ export class CameraPane {
     this.found && this.overlay(g, on, ratio);
     this.region(g, on, ratio);
     if (scene && pose) {
-      const pixel = this.lens.from(pose);
+      const shift = this.hand.preview(), pixel = this.lens.from(shift ? product(pose, shift) : pose);
+      this.scan(g, scene.scan, (x, y, z) => on(pixel(x, y, z)), ratio);
       const line = this.line(on(pixel(0, 0, 0)), on(pixel(1, 0, 0)), on(pixel(0, 1, 0)), ratio);
       const here = drawPath(g, scene, fraction, (x, y, z) => on(pixel(x, y, z)), {
         halo: line > ratio && { colour: "rgb(10 18 28 / .45)", width: 2.2 * line }, next: { colour: "#9fdcff", width: 0.9 * line },
         done: { colour: "#3ddc84", width: 1.4 * line },
       });
       if (here) this.ring(g, here, ratio);
+      this.hand.draw(g, this, on, ratio);
     }
     if (base_from_nozzle) this.nozzle(g, on, base_from_nozzle, ratio);
     g.restore();
+  }
+  // the scan's rim and lines of equal depth
+  scan(g, lines, pixel, ratio) {
+    if (!lines || !lines.length) return;
+    g.beginPath();
+    for (let i = 0; i + 5 < lines.length; i += 6) {
+      const a = pixel(lines[i], lines[i + 1], lines[i + 2]), b = pixel(lines[i + 3], lines[i + 4], lines[i + 5]);
+      if (!a || !b) continue;
+      g.moveTo(a[0], a[1]);
+      g.lineTo(b[0], b[1]);
+    }
+    g.lineCap = "round";
+    for (const [colour, width] of [["rgb(10 18 28 / .5)", 3], ["#e3bdff", 1.6]]) {
+      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
+      g.stroke();
+    }
   }
   // width of the path's line: a third of a millimetre of the surface, so that neighbours stay apart
   line(middle, right, up, ratio) {

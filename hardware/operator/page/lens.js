@@ -35,6 +35,21 @@ export class Lens {
     const y = (py - this.cy) / this.fy;
     return this.bent((px - this.cx - this.skew * y) / this.fx, y);
   }
+  // the normalised place that a pixel shows: the inverse of `bent`
+  straight(px, py) {
+    const [k1, k2, p1, p2, k3] = this.camera.distortion, v = (py - this.cy) / this.fy, u = (px - this.cx - this.skew * v) / this.fx;
+    let [x, y] = [u, v];
+    for (let i = 0; i < 30; i++) {
+      const r2 = x * x + y * y, radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
+      [x, y] = [(u - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial, (v - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial];
+    }
+    return [x, y];
+  }
+  // the ray of a pixel in a frame whose pose in the base is given
+  ray(base_from_frame, px, py) {
+    const t = product(inverse(base_from_frame), this.camera.base_from_camera), [x, y] = this.straight(px, py), origin = moved(t, 0, 0, 0);
+    return { origin, direction: moved(t, x, y, 1).map((v, k) => v - origin[k]) };
+  }
   // a function from points, in a frame whose pose in the base is given, to pixels; null behind the camera
   from(base_from_frame) {
     const t = product(this.from_base, base_from_frame);

@@ -3,6 +3,7 @@ import { Buttons } from "./buttons.js";
 import { Course } from "./course.js";
 import { Drawing } from "./draw.js";
 import { Panes } from "./panes.js";
+import { Placing } from "./placing.js";
 import { SceneView } from "./scene.js";
 import { Line } from "./socket.js";
 import { ACTIVITIES, duration, figure, milliseconds, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
@@ -12,7 +13,8 @@ const EVENTS = 2; // of the last ones that there is room for
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
 const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null, near: true };
-const panes = new Panes(by("pictures"), choose);
+const placing = new Placing(by("placing"), (move, turn) => buttons.send("move", turn, move), (words, bad) => buttons.say(words, bad), refresh);
+const panes = new Panes(by("pictures"), choose, placing);
 const course = new Course(document.querySelector("#course canvas"));
 const space = new SceneView(by("scene"));
 
@@ -21,7 +23,10 @@ async function hear(message) {
   if (message.kind === "scene") scene(message);
   else if (message.kind === "course") course.begin(message.rows);
   else if (message.kind === "asked" && message.wish === "region") drawing.asked(message);
-  else if (message.kind === "asked") buttons.asked(message);
+  else if (message.kind === "asked") {
+    buttons.asked(message);
+    placing.asked(message);
+  }
   else if (message.kind === "full") state.full = true;
   else if (message.kind === "view" || message.kind === "gone") view(message);
 }
@@ -38,7 +43,7 @@ function view(message) {
 }
 
 function scene(message) {
-  for (const key of ["path", "surface"]) message[key] = Float32Array.from(message[key]);
+  for (const key of ["path", "surface", "scan"]) message[key] = Float32Array.from(message[key]);
   state.scene = message;
   for (const camera of message.cameras) panes.of(camera.name).see(camera);
   space.see(message);
@@ -50,6 +55,11 @@ async function pictures(data) {
   by("closer").hidden = !head.pictures.some((each) => each.crop);
   state.poses = head.base_from_surface;
   refresh();
+}
+
+// what a move by hand is meant in: the large picture
+function sees() {
+  placing.sees(panes.get(state.chosen ?? [...panes.keys()][0]), state.scene, state.poses);
 }
 
 function choose(name) {
@@ -67,6 +77,9 @@ function show() {
   by("news").textContent = (state.refused ? `${state.refused} refused · ` : "") + { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
   alarm(news, age);
   if (seen) stage(seen);
+  sees();
+  placing.show(seen, news === "live");
+  buttons.held = placing.busy;
   buttons.show(seen, news === "live");
   drawing.show(seen, news === "live");
   if (seen) {
@@ -100,7 +113,7 @@ function stage(seen) {
   document.body.dataset.tone = holds ? "hold" : about.tone;
   const same = seen.question.toLowerCase() === about.word.toLowerCase(); // it stands beside it already
   by("question").textContent = (!same && seen.question) || (holds ? "Holding until it is safe to print." : about.say);
-  by("reason").textContent = upper((holds && seen.motion.reason) || seen.reason);
+  by("reason").textContent = upper((holds && seen.motion.reason) || (seen.placement && seen.placement.verdict === seen.reason ? "" : seen.reason));
   by("notes").replaceChildren(...seen.notes.map((note) => {
     const made = text("span", note.split(/[:;]/)[0]); // the rest is told to whoever points at it
     made.title = note;
@@ -203,6 +216,7 @@ function refresh() {
   requestAnimationFrame(() => {
     due = false;
     const seen = state.view, fraction = seen && seen.progress ? seen.progress.fraction : -1;
+    sees();
     const nozzle = seen && seen.motion && seen.motion.base_from_nozzle;
     for (const each of panes.values()) each.draw(state.scene, state.poses, fraction, nozzle, state.near);
     space.draw(seen, fraction);
@@ -225,7 +239,7 @@ for (const button of by("closer").querySelectorAll("button")) button.addEventLis
 space.changed = refresh;
 window.addEventListener("resize", refresh);
 const line = new Line(hear);
-const buttons = new Buttons((wish, turn) => line.ask(wish, turn));
+const buttons = new Buttons((wish, turn, move) => line.ask(wish, turn, move));
 const drawing = new Drawing(by("draw"), panes, line, (words, bad) => buttons.say(words, bad));
 setInterval(() => {
   for (const each of panes.values()) each.tick();

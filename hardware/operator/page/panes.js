@@ -14,13 +14,13 @@ export async function unpacked(data) {
 }
 
 export class Panes extends Map {
-  constructor(root, choose) {
+  constructor(root, choose, hand) {
     super();
-    [this.root, this.choose] = [root, choose];
+    [this.root, this.choose, this.hand] = [root, choose, hand];
   }
   of(name) {
     if (!this.has(name)) {
-      const made = new CameraPane(name, this.choose);
+      const made = new CameraPane(name, this.choose, this.hand);
       this.set(name, made);
       this.root.append(made.root);
     }
