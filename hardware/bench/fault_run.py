@@ -136,6 +136,7 @@ class FaultRunRecord:
     over: int = 0  # ticks of commands beyond a limit
     ended: float = 0.0  # s
     stopped: list[float] = field(default_factory=list)  # s, at which the arm was stopped and an operator was needed
+    seen_to: list[float] = field(default_factory=list)  # s, at which an operator made a dispenser ready again
 
 
 class _KilledError(Exception):
@@ -209,6 +210,7 @@ class FaultRun:
         self._dispensers.advance(record.ended)
         times = row_instants(0.0, record.ended)
         record.log = self._truth_log.rows(times, self._virtual.axes_at, self._dispensers.flow)
+        record.seen_to = self._motion.seen_to
         record.told_outside = self._dispensers.told_outside(record.ended, self._left_alone)
         record.left_open = self._dispensers.open_after(self._left_alone, record.ended)
         record.over = int(self._oracle.over.sum())

@@ -39,6 +39,7 @@ from hardware.process.faults import Fault
 from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
 from planning.command import Command, Move
 from planning.material import Outlets
+from planning.motion.planner import PAUSED
 from planning.path import Path
 from planning.path import PrintProgress
 
@@ -49,8 +50,9 @@ TRUTH_KEYS = {  # key in a table [dispenser]: field of VirtualDispenserSettings
 }
 IDEAL = VirtualDispenserSettings(on_dead_time=0.0, on_lag=0.0, off_dead_time=0.0, off_lag=0.0)
 METERED_ON = "ON {flow_mm3_s}"  # in the language of `arduino`
+ROUNDING = 1e-9  # s: what is shorter is the rounding of an instant
 ANSWER_TIME = 0.01  # s after a line is whole again, within which it is looked at and told
-SEEN_TO_AFTER = 0.3  # s until an operator makes a dispenser ready that is not
+SEEN_TO_AFTER = 0.3  # s until an operator makes a dispenser ready that is not, and tries again
 PRESET = "arduino"
 
 
@@ -199,7 +201,8 @@ class SimulatedDispensers:
             for left, back in alone:
                 excused |= (middle >= left) & (middle < back + ANSWER_TIME)
             told = flows[np.searchsorted(stamps, middle, "right") - 1] > 0
-            outside += float(np.diff(edges)[told & ~excused].sum())
+            length = np.diff(edges)
+            outside += float(length[told & ~excused & (length > ROUNDING)].sum())
         return outside
 
     def open_after(self, alone: Sequence[tuple[float, float]], until: float) -> float:
@@ -244,24 +247,30 @@ class SimulatedDispensers:
 
 
 class DispensedMotion:
-    """A motion that waits above the surface while material cannot flow, and an operator who sees to that."""
+    """A motion that waits above the surface while material cannot flow, and an operator who sees to that.
+
+    seen_to: instants, s, at which the operator made a dispenser ready again.
+    """
 
     def __init__(self, step: MotionStep, control: MaterialControl) -> None:
         self._step, self._control = step, control
-        self._see_to_at = -math.inf
+        self.seen_to: list[float] = []
+        self._dry_since = -math.inf
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s."""
         dry = self._control.reason
+        self._dry_since = self._dry_since if dry else now
         wanted = bool(self._step.progress.wanted)
         if wanted:
             self._step.material_in()
-        if wanted or (dry and now >= self._see_to_at):
-            self._see_to_at = now + SEEN_TO_AFTER
+        if wanted or (dry and now >= self._dry_since + SEEN_TO_AFTER):
+            self.seen_to.append(now)
+            self._dry_since = now
             self._control.begin(self._step.progress.fraction, now)
         self._step.paused = bool(dry)
         command = self._step(pose, now)
-        return replace(command, reason=dry) if dry and command.reason else command
+        return replace(command, reason=dry) if dry and command.reason in ("", PAUSED) else command
 
     def recalled(self, place: Array, stands: Array) -> None:
         """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
