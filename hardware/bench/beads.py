@@ -63,8 +63,9 @@ def bead_figures(prints: Mapping[str, BeadsPrint]) -> list[Figure]:
 
 def _by_speed(ends: EndsOfBeads) -> str:
     """The mean error at each speed, in whole mm/s."""
-    speeds = np.round(ends.speed)
-    each = (f"{speed:g} mm/s {np.nanmean(ends.error[speeds == speed]):+.2f}" for speed in np.unique(speeds))
+    there = np.isfinite(ends.error)
+    speeds, error = np.round(ends.speed[there]), ends.error[there]
+    each = (f"{speed:g} mm/s {error[speeds == speed].mean():+.2f}" for speed in np.unique(speeds))
     return ", ".join(each)
 
 
@@ -76,7 +77,5 @@ def beads_section(prints: Mapping[str, BeadsPrint]) -> str:
         for what, ends in (("begin", one.material.begins), ("end", one.material.stops))
     ]
     late = 1000 * prints[LED].delay
-    text = (
-        f"The dispenser gives half of its flow {late:.0f} ms after it is told. Laid of the planned, by mm of the path."
-    )
+    text = f"Half of the dispenser's flow comes {late:.0f} ms after it is told. Laid of the planned, by mm of the path."
     return section(LATE_DISPENSER, text, f'<div class="two">{"".join(charts)}</div>')

@@ -180,8 +180,9 @@ class SimulatedDispensers:
 
     def forbid(self, now: float) -> None:
         """The arm is not armed from `now`, s, until the next command."""
-        if not self._permits or self._permits[-1][1] > now:
-            self._permits.append((now, now))
+        last = self._permits[-1] if self._permits else (now, math.inf)
+        if last[1] > now:
+            self._permits.append((max(now, last[0]),) * 2)
 
     def told_outside(self, until: float, alone: Sequence[tuple[float, float]] = ()) -> float:
         """How long, s, until `until`, a device was open on its orders while none was to be: by no move that prints.

@@ -340,8 +340,8 @@ def _ends(result: NozzleResult) -> str:
         f"{1000 * m.flowing:.0f} ms material flowed while the motion did not print; told to was it then for {told}."
     )
     text = (
-        "Errors along the path: above 0, material begins or ends farther on than planned. Too much: what lies within 1 mm "
-        "of a bead's end, less what is planned there. Below, laid of the planned about each end, by mm of the path."
+        "Errors along the path: above 0, material begins or ends farther on than planned. Too much: what lies within "
+        "1 mm of a bead's end, less what is planned there. Below, laid of the planned about each, by mm of the path."
     )
     body = page.figures_table(head, rows) + f'<p class="note">{escape(note)}</p>'
     return page.section("Where beads begin and end", text, body + f'<div class="two">{"".join(charts)}</div>')
