@@ -37,6 +37,7 @@ from hardware.process import checks
 from hardware.process.clock import Clock
 from hardware.process.faults import Fault
 from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
+from hardware.simulator.truth import FlowAt
 from planning.command import Command, Move
 from planning.material import Outlets
 from planning.motion.planner import PAUSED
@@ -245,6 +246,17 @@ class SimulatedDispensers:
         """Instants (M,), s, rising, and flows (M,) that it obeyed from each on."""
         stamps, flows = np.array([(-math.inf, 0.0), *model.switches]).T
         return stamps, flows
+
+
+def flow_from_told(told: Sequence[tuple[float, float]], truth: VirtualDispenserSettings | None = None) -> FlowAt:
+    """The true flow of a dispenser that was told flows, mm^3/s, at instants, s, rising; truth: None of an ideal one."""
+    if truth is None:
+        stamps, flows = np.array([(-math.inf, 0.0), *told]).T
+        return lambda instants, needed: needed * (flows[np.searchsorted(stamps, instants, "right") - 1] > 0)
+    model = DispenserModel(replace(truth, watchdog=math.inf), told[0][0] if told else 0.0)
+    for stamp, flow in told:
+        model.obey(flow, stamp)
+    return lambda instants, needed: model.flow_at(instants)
 
 
 class DispensedMotion:
