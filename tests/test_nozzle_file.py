@@ -17,9 +17,8 @@ import pytest
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.report.evaluation import evaluate, spread
-from hardware.simulator.bead_ends import material_figures
 from hardware.simulator.deposit import NozzleLog, deposit_figures, deposit_map, planned_line
-from hardware.simulator.nozzle_error import nozzle_errors, nozzle_figures
+from hardware.simulator.nozzle_error import material_figures, nozzle_errors, nozzle_figures
 from hardware.simulator.nozzle_report import (
     CELL_COLOURS,
     CELL_KINDS,

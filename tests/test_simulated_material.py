@@ -19,11 +19,10 @@ from hardware.arm.port import UnpluggedError
 from hardware.files.path_file import read_path
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
-from hardware.simulator.bead_ends import MaterialFigures, material_figures
 from hardware.simulator.deposit import deposit_figures, deposit_map, planned_line, row_volumes
 from hardware.simulator.dispenser import DispenserModel, DispenserPort
 from hardware.simulator.material import IDEAL, SimulatedDispensers, flow_from_told
-from hardware.simulator.nozzle_error import nozzle_errors
+from hardware.simulator.nozzle_error import MaterialFigures, material_figures, nozzle_errors
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.truth import divide_path
 from hardware.simulator.world import SimulatedWorld

@@ -35,8 +35,8 @@ from hardware.process.clock import WallClock
 from hardware.process.progress import cache_folder
 from hardware.process.ticks import measure_evenness
 from hardware.recording.session_reader import open_session
-from hardware.simulator.bead_ends import MaterialFigures
 from hardware.simulator.dispenser import VirtualDispenserSettings
+from hardware.simulator.nozzle_error import MaterialFigures
 from planning.path import Path as Toolpath
 from planning.path import way_lengths
 

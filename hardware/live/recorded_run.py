@@ -34,10 +34,10 @@ from hardware.recording.messages import (
     row_from_message,
 )
 from hardware.recording.session_reader import PATH_ATTACHMENT, PrintInputs, inputs_from_texts
-from hardware.simulator.bead_ends import MaterialFigures, material_figures
 from hardware.simulator.deposit import NozzleLog, PlannedLine, join_logs, planned_line
 from hardware.simulator.dispenser import VirtualDispenserSettings
 from hardware.simulator.material import flow_from_told
+from hardware.simulator.nozzle_error import MaterialFigures, material_figures
 from hardware.simulator.nozzle_error import nozzle_errors as row_errors
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
+from scipy.spatial import cKDTree
 
 from estimation.se3 import Array
 from planning.material import bead_areas
@@ -260,3 +261,38 @@ def _disc(width: float) -> Array:
     density = np.where(inside > 0, 1 / np.sqrt(np.where(inside > 0, inside, 1.0)), 0.0)
     weights = density.reshape(2 * reach + 1, _DISC_SUBCELLS, 2 * reach + 1, _DISC_SUBCELLS).sum(axis=(1, 3))
     return np.asarray(width * weights / weights.sum())
+
+
+BLOB_RADIUS = 1.0  # mm about a bead's end, within which what is laid is held against the plan
+
+
+def planned_beads(line: PlannedLine) -> tuple[Array, Array, Array]:
+    """Where each planned bead begins and ends, (B,) mm of the path, rising; and its cross-section there, mm^2."""
+    flips = np.diff(np.concatenate([[False], line.printed, [False]]).astype(np.int8))
+    first, last = np.flatnonzero(flips > 0), np.flatnonzero(flips < 0)
+    return line.knots[first], line.knots[last], line.area[first]
+
+
+def excess_volumes(log: NozzleLog, line: PlannedLine, places: Array, layers: NDArray[np.int64]) -> Array:
+    """Volume (B,), mm^3, laid within BLOB_RADIUS of places (B, 2) in their layers (B,), less the planned."""
+    volume, layer = row_volumes(log), line.layer[row_pieces(log, line)]
+    leaves = np.flatnonzero((volume > 0) & np.isfinite(log.surface_from_tip[:, 0]))
+    tree = cKDTree(log.surface_from_tip[leaves, :2])
+    found = np.zeros(len(places))
+    for i, near in enumerate(tree.query_ball_point(places, BLOB_RADIUS) if len(places) else ()):
+        near_rows = leaves[near]
+        found[i] = volume[near_rows[layer[near_rows] == layers[i]]].sum() - _planned_volume(line, places[i], layers[i])
+    return found
+
+
+def _planned_volume(line: PlannedLine, place: Array, layer: int) -> float:
+    """Planned volume, mm^3, within BLOB_RADIUS of a place (2,) in a layer: the chords of the circle, in their share."""
+    keep = line.printed & (line.layer == layer)
+    start = line.points[:-1, :2][keep] - place
+    step = line.points[1:, :2][keep] - line.points[:-1, :2][keep]
+    length = np.linalg.norm(step, axis=1)
+    square = np.where(length > 0, length**2, 1.0)
+    middle = -np.sum(start * step, axis=1) / square
+    half = np.sqrt(np.maximum(BLOB_RADIUS**2 - np.sum(start**2, axis=1) + middle**2 * square, 0.0) / square)
+    share = np.clip(middle + half, 0.0, 1.0) - np.clip(middle - half, 0.0, 1.0)
+    return float(np.sum(share * np.diff(line.knots)[keep] * line.area[keep]))

@@ -16,9 +16,8 @@ from estimation.se3 import Array
 from hardware.report import page
 from hardware.report.evaluation import figure
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
-from hardware.simulator.bead_ends import EndsOfBeads, profile_edges
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
-from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleLag
+from hardware.simulator.nozzle_error import NEAR_ERROR, EndsOfBeads, NozzleLag, profile_edges
 from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share
 
 PAGE_FOOTER = (

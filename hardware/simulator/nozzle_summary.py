@@ -15,7 +15,6 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.process import checks
 from hardware.report.evaluation import Evaluation, Spread, figure, finite, percent, spread
-from hardware.simulator.bead_ends import MaterialFigures, material_figures
 from hardware.simulator.deposit import (
     DepositFigures,
     DepositMap,
@@ -25,7 +24,15 @@ from hardware.simulator.deposit import (
     deposit_map,
     planned_line,
 )
-from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleFigures, RowErrors, nozzle_errors, nozzle_figures
+from hardware.simulator.nozzle_error import (
+    NEAR_ERROR,
+    MaterialFigures,
+    NozzleFigures,
+    RowErrors,
+    material_figures,
+    nozzle_errors,
+    nozzle_figures,
+)
 from planning.path import Path
 
 
