@@ -123,6 +123,14 @@ def test_a_line_that_takes_nothing_stops_the_print_and_it_goes_on() -> None:
     assert sink.progress[-1].fraction == 3.0 and sink.log.flow[sink.log.stamps > 2.0].max() > 5.0
 
 
+def test_a_hold_in_the_middle_of_a_bead_closes_at_once() -> None:
+    world, sink = printed((), ("tracking hang at 0.4s for 0.6s",))
+    held = [command.stamp for command in sink.commands if isinstance(command, Hold) and "old" in command.reason]
+    assert held and world.told_outside == 0.0 and not world.dispensers.models[0].closed_itself
+    assert not sink.log.flow[(sink.log.stamps > held[0] + 0.002) & (sink.log.stamps < held[-1])].any()
+    assert sink.progress[-1].fraction == 3.0
+
+
 def test_a_line_loses_what_its_faults_say() -> None:
     clock, model = SimClock(), DispenserModel(IDEAL)
     texts = "dispenser drop at 1s for 1s", "dispenser block at 2s for 1s", "dispenser unplug at 3s for 1s"

@@ -182,8 +182,8 @@ class FaultRun:
         dispenser = scenario.dispenser if dispenser is None else dispenser
         self._dispensers = SimulatedDispensers(on.path, dispenser, self._clock, faults, scenario.path)
         self._dispensers.control.begin(0.0, 0.0)
-        step = MotionStep(on.path, self._profile, outlets=self._dispensers.outlets)
-        self._motion = DispensedMotion(step, self._dispensers.control)
+        motion_step = MotionStep(on.path, self._profile, outlets=self._dispensers.outlets)
+        self._motion = DispensedMotion(motion_step, self._dispensers.control)
         self._truth_log = TruthLog(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
         self._hangs = faults_striking(faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
