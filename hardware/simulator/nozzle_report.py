@@ -351,14 +351,14 @@ def ends_chart(ends: EndsOfBeads, label: str, width: int) -> str:
     edges = profile_edges()
     at = (edges[1:] + edges[:-1]) / 2
     top = max(1.5, float(ends.profile.max(initial=0.0)) * 1.1)
-    plot = page.Plot(width, 230, (float(edges[0]), float(edges[-1])), (0.0, min(top, 4.0)), label=label)
+    plot = page.Plot(width, 230, (float(edges[0]), float(edges[-1])), (0.0, min(top, 4.0)))
     plot.level(1.0, "as planned", "limit")
     for each in ends.profile[:MAX_DRAWN_ENDS]:
         plot.line(at, np.minimum(each, min(top, 4.0)), "aside")
     if len(ends.profile):
         plot.line(at, np.median(ends.profile, axis=0), "estimate")
     plot.mark(0.0, "planned", "median")
-    return plot.svg()
+    return f'<div class="caption">{escape(label)}</div>{plot.svg()}'
 
 
 def _holds(result: NozzleResult) -> str:
