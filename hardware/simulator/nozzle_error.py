@@ -280,8 +280,9 @@ class EndsOfBeads:
 
     @property
     def size(self) -> Spread:
-        """Of the errors without their sign, mm; a bead that was not laid counts as infinite."""
-        return spread(np.nan_to_num(np.abs(self.error), nan=np.inf)) if len(self.error) else spread(self.error)
+        """Of the errors without their sign, mm; a bead that was not laid counts as infinite, which meets no limit."""
+        with np.errstate(invalid="ignore"):  # between two infinite ones lies nothing that is known
+            return spread(np.nan_to_num(np.abs(self.error), nan=np.inf))
 
     @property
     def median(self) -> float:
