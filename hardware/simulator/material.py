@@ -41,8 +41,7 @@ from hardware.simulator.truth import FlowAt
 from planning.command import Command, Move
 from planning.material import Outlets
 from planning.motion.planner import PAUSED
-from planning.path import Path
-from planning.path import PrintProgress
+from planning.path import Path, PrintProgress
 
 TRUTH_KEYS = {  # key in a table [dispenser]: field of VirtualDispenserSettings
     **{"on_dead_time_s": "on_dead_time", "on_lag_s": "on_lag", "off_dead_time_s": "off_dead_time"},
