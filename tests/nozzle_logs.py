@@ -91,6 +91,7 @@ def nozzle_log(
         nozzle[:, :3, 3] += surface[:, :3, :3] @ offset
     line = planned_line(path)
     piece = line.piece(place)
+    extrude = line.printed[piece] & moving
     return NozzleLog(
         stamps=stamps,
         base_from_surface=surface,
@@ -98,10 +99,22 @@ def nozzle_log(
         base_from_target=surface @ on_path(path, place),
         place=place,
         checkpoint=piece + 1,
-        extrude=line.printed[piece] & moving,
+        extrude=extrude,
         reason=reason,
         surface_from_tip=(se3.inverse(surface) @ nozzle)[:, :3, 3],
+        flow=needed(place, stamps) * extrude,
     )
+
+
+def needed(place: Array, stamps: Array) -> Array:
+    """What a bead of 1 mm^2 needs (N,), mm^3/s, at places (N,), mm, at stamps (N,), s."""
+    return np.asarray(np.diff(place, prepend=place[:1]) / np.diff(stamps, prepend=stamps[0] - 1e-3))
+
+
+def dry(log: NozzleLog, rows: slice | NDArray[np.bool_]) -> None:
+    """Let nothing be printed in some rows of a log."""
+    log.extrude[rows] = False
+    log.flow[rows] = 0.0
 
 
 def held(start: float, end: float, reason: str = "surface is LOST") -> Callable[[Array], NDArray[np.str_]]:
@@ -141,6 +154,7 @@ class NozzleTable:
 
     stamps: Array
     extrude: NDArray[np.bool_]
+    flow: Array
     nozzle: Array
     target: Array
     distance: Array
@@ -162,14 +176,15 @@ def read_nozzle(file: File) -> NozzleTable:
     assert tuple(header) == NOZZLE_HEADER
     rows = [row for row in rows if len(row) == len(header)]
     numbers = np.array([[float(cell or "nan") for cell in row[:-1]] for row in rows]).reshape(-1, len(header) - 1)
-    stamps, extrude, distance, angle, path, place, checkpoint = numbers[:, [0, 1, 8, 12, 13, 14, 15]].T
+    stamps, extrude, flow, distance, angle, path, place, checkpoint = numbers[:, [0, 1, 2, 9, 13, 14, 15, 16]].T
     return NozzleTable(
         stamps=stamps,
         extrude=extrude == 1,
-        nozzle=numbers[:, 2:5],
-        target=numbers[:, 5:8],
+        flow=flow,
+        nozzle=numbers[:, 3:6],
+        target=numbers[:, 6:9],
         distance=distance,
-        vector=numbers[:, 9:12],
+        vector=numbers[:, 10:13],
         angle=np.radians(angle),
         path=path,
         place=place,

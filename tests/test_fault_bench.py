@@ -74,7 +74,9 @@ def ran(
     extrude = np.ones(len(ROWS), bool)
     extrude[np.array([held is not None and held[0] <= t < held[1] for t in ROWS])] = False
     none = np.zeros(len(ROWS))
-    log = NozzleLog(ROWS, target, nozzle, target, none, none.astype(np.int64), extrude, none.astype(str), none[:, None])
+    log = NozzleLog(
+        ROWS, target, nozzle, target, none, none.astype(np.int64), extrude, none.astype(str), none[:, None], none
+    )
     words = []
     for stamp in STAMPS.tolist():
         holds = held is not None and held[0] <= stamp < held[1]

@@ -33,7 +33,7 @@ from hardware.simulator.nozzle_error import (
 )
 from planning.path import Path
 from tests.moving import raster
-from tests.nozzle_logs import breathing, held, nozzle_log, part, sliding, straight, through, without_target
+from tests.nozzle_logs import breathing, dry, held, needed, nozzle_log, part, sliding, straight, through, without_target
 
 FEW = settings(max_examples=10)
 vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
@@ -164,9 +164,9 @@ def test_what_prints_nothing_has_no_figures() -> None:
     assert np.isnan(laid(nozzle_log(bare), bare)[1].coverage)
     empty = judged(part(log, slice(0, 0)), path)[1]
     assert np.isnan([empty.duty, empty.position.max, empty.lag.seconds]).all()
-    log.extrude[:] = False
-    dry, gap = judged(log, path)[1], laid(log, path)[1]
-    assert dry.duty == 0.0 and np.isnan(dry.position.rmse)
+    dry(log, slice(None))
+    nothing, gap = judged(log, path)[1], laid(log, path)[1]
+    assert nothing.duty == 0.0 and np.isnan(nothing.position.rmse)
     assert (gap.coverage, gap.gaps, gap.outside, gap.material) == (0, 1, 0, 0)
 
 
@@ -186,7 +186,7 @@ def test_a_checkpoint_belongs_to_the_piece_that_leads_to_it() -> None:
 def test_a_hold_costs_duty_to_the_end_of_the_path_or_of_the_run() -> None:
     path = straight(length=20.0, speed=5.0)
     log = nozzle_log(path, breathing, seconds=8.0, reasons=held(1.0, 2.0))
-    log.extrude[5000:] = False  # the path is finished after 5 s
+    dry(log, slice(5000, None))  # the path is finished after 5 s
     log.reason[5001:] = "path finished"[: log.reason.itemsize // 4]
     _, figures = judged(log, path)
     assert figures.finished and figures.duty == pytest.approx(0.8, abs=1e-3)
@@ -214,7 +214,7 @@ def test_a_place_that_is_not_known_is_the_last_one_that_was() -> None:
     travelling = without_target(log, slice(1500, 1600))  # 1 to 2 s is travel
     assert judged(travelling, path)[1].duty == 1.0
     printing = without_target(log, slice(500, 600))
-    printing.extrude[500:600] = False
+    dry(printing, slice(500, 600))
     assert judged(printing, path)[1].duty == pytest.approx(0.95, abs=1e-3)
 
 
@@ -289,7 +289,7 @@ def test_a_shift_across_lies_outside_by_shift_times_length(shift: float, heading
 def test_a_piece_that_was_left_out_is_a_gap() -> None:
     path = straight()
     log = nozzle_log(path)
-    log.extrude[1000:2000] = False  # a quarter
+    dry(log, slice(1000, 2000))  # a quarter
     _, figures = laid(log, path)
     assert figures.gaps == pytest.approx(0.25, abs=0.03) and figures.coverage == pytest.approx(0.75, abs=0.01)
     assert figures.material == pytest.approx(0.75, abs=0.001)
@@ -310,6 +310,7 @@ def test_a_nozzle_that_waits_lays_nothing_and_a_gap_in_the_stamps_neither() -> N
     path = straight()
     log = nozzle_log(path, seconds=5.0, reasons=held(1.0, 2.0))
     log.extrude[:] = True
+    log.flow[:] = needed(log.place, log.stamps)
     assert laid(log, path)[1].material == pytest.approx(1, abs=1e-3)
     ends = join_logs([part(log, slice(0, 501)), part(log, slice(4500, None))])
     assert laid(ends, path)[1].material == pytest.approx(0.25, abs=0.001)
@@ -331,7 +332,7 @@ def test_each_layer_is_held_against_its_own_plan() -> None:
     found, figures = laid(log, path)
     assert found.layers.tolist() == [0, 1]
     assert (figures.gaps, figures.overlap) == (0, 0)
-    log.extrude[log.place > 10.5] = False  # nothing of the second
+    dry(log, log.place > 10.5)  # nothing of the second
     assert laid(log, path)[1].gaps == pytest.approx(0.5, abs=0.02)
 
 
@@ -341,6 +342,7 @@ def test_travel_is_not_planned_and_what_is_laid_on_it_is_outside() -> None:
     log = nozzle_log(path)
     assert laid(log, path)[1].outside == pytest.approx(0, abs=0.01)
     log.extrude[:] = True
+    log.flow[:] = needed(log.place, log.stamps)
     assert laid(log, path)[1].outside == pytest.approx(5 / 20, abs=0.05)
 
 

@@ -18,7 +18,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.report.evaluation import evaluate, spread
 from hardware.simulator.deposit import NozzleLog, deposit_figures, deposit_map, planned_line
-from hardware.simulator.nozzle_error import nozzle_errors, nozzle_figures
+from hardware.simulator.nozzle_error import material_figures, nozzle_errors, nozzle_figures
 from hardware.simulator.nozzle_report import (
     CELL_COLOURS,
     CELL_KINDS,
@@ -44,7 +44,7 @@ from hardware.simulator.nozzle_summary import (
 from hardware.simulator.run_folder import NozzleWriter
 from planning.path import Path
 from tests.moving import raster
-from tests.nozzle_logs import breathing, held, nozzle_log, part, read_nozzle, straight, through, without_target
+from tests.nozzle_logs import breathing, dry, held, nozzle_log, part, read_nozzle, straight, through, without_target
 from tests.runs import run
 from tests.test_report import text_of_page
 
@@ -77,6 +77,7 @@ def test_what_was_written_comes_back(tmp_path: File) -> None:
         (table.angle, errors.angle),
         (table.path, errors.path),
         (table.place, log.place),
+        (table.flow, log.flow),
     ]
     for got, expected in pairs:
         assert np.allclose(got, expected, atol=1e-6, equal_nan=True)
@@ -126,8 +127,11 @@ def test_a_run_of_20_s_is_written_within_a_second(tmp_path: File) -> None:
 
 def figures() -> RunFigures:
     log = eventful()
-    nozzle = nozzle_figures(log, LINE, nozzle_errors(log, LINE))
-    return RunFigures(nozzle, deposit_figures(deposit_map(log, LINE, 0.8)), spread(np.array([0.1, 0.2])))
+    errors = nozzle_errors(log, LINE)
+    late = nozzle_log(PATH, breathing, offset=np.array([0.1, 0.0, 0.0]))
+    material = material_figures(late, LINE, nozzle_errors(late, LINE), 0.8, told=0.002)
+    deposit = deposit_figures(deposit_map(log, LINE, 0.8))
+    return RunFigures(nozzle_figures(log, LINE, errors), deposit, material, spread(np.array([0.1, 0.2])))
 
 
 @pytest.mark.parametrize("name", BOUNDS)
@@ -142,11 +146,12 @@ def test_a_limit_is_met_at_its_bound_and_missed_by_one_epsilon(name: str) -> Non
 
 def test_what_is_not_known_meets_no_limit() -> None:
     log = part(eventful(), slice(0, 0))
-    nozzle = nozzle_figures(log, LINE, nozzle_errors(log, LINE))
+    errors = nozzle_errors(log, LINE)
+    nozzle, material = nozzle_figures(log, LINE, errors), material_figures(log, LINE, errors, 0.8, float("nan"))
     empty = replace(figures().deposit, **{n: float("nan") for n in ("coverage", "gaps", "overlap", "outside")})
     names = [name for name in BOUNDS if name != "hold_s"]
     limits = {n: 0.0 if BOUNDS[n].minimum else 1e9 for n in names}
-    assert not any(verdict.met for verdict in check_limits(limits, RunFigures(nozzle, empty)))
+    assert not any(verdict.met for verdict in check_limits(limits, RunFigures(nozzle, empty, material)))
 
 
 def test_limits_are_read_in_their_order() -> None:
@@ -216,7 +221,7 @@ def test_a_run_of_next_to_nothing_has_a_page_without_a_number_that_is_none(rows:
 
 def test_a_run_that_never_printed_says_so_and_meets_no_limit_of_an_error() -> None:
     log = nozzle_report_eventful()
-    log.extrude[:] = False
+    dry(log, slice(None))
     result = judged(log, limits=LIMITS)
     assert "Nothing was printed" in nozzle_verdict(result)[0]
     assert "3 of 3 limits missed" in " ".join(nozzle_verdict(result))
@@ -291,7 +296,7 @@ def colours(svg: str) -> Array:
 def test_the_bead_map_has_x_to_the_right_and_y_up_and_each_kind_in_its_colour() -> None:
     path = through(np.array([[-10.0, 0, 0], [10, 0, 0]]))
     log = nozzle_log(path)
-    log.extrude[log.place > 15] = False  # missing on the right
+    dry(log, log.place > 15)  # missing on the right
     log.surface_from_tip[log.place < 5, 1] += 3  # left: laid above instead
     picture = colours(bead_picture(judged(log, path), 0, 500.0))
     view = whole_map_view(deposit_map(log, planned_line(path), 0.8), picture.shape[1])

@@ -30,6 +30,7 @@ from hardware.simulator.arm.settings import ReplyMode
 from hardware.simulator.camera_pipeline import CameraPipeline, EventQueue, Exposures
 from hardware.simulator.cameras import Shot
 from hardware.simulator.deposit import NozzleLog
+from hardware.simulator.material import DispensedMotion, SimulatedDispenser, SimulatedDispensers
 from hardware.simulator.scenario import Scenario, TrackingSettings, read_scenario
 from hardware.simulator.scenario_tables import bare_scene
 from hardware.simulator.scene.shape import Shape
@@ -130,9 +131,12 @@ class FaultRunRecord:
     statements: list[Statement] = field(default_factory=list)  # a tick each
     timeouts: list[Statement] = field(default_factory=list)  # the main process's, of a process that was silent
     log: NozzleLog | None = None  # of nozzle and target
+    told_outside: float = 0.0  # s in which a dispenser was open on its orders while no sent move printed, or unarmed
+    left_open: float = 0.0  # s for which a dispenser stayed open at most after its line or the motion had ended
     over: int = 0  # ticks of commands beyond a limit
     ended: float = 0.0  # s
     stopped: list[float] = field(default_factory=list)  # s, at which the arm was stopped and an operator was needed
+    seen_to: list[float] = field(default_factory=list)  # s, at which an operator made a dispenser ready again
 
 
 class _KilledError(Exception):
@@ -148,7 +152,10 @@ class _NoSink:
 class FaultRun:
     """One run with faults, from the first frame until the path is printed, the motion is killed, or `MAX_RUN_S`."""
 
-    def __init__(self, on: PreparedScenario, faults: Sequence[Fault], seed: int) -> None:
+    def __init__(
+        self, on: PreparedScenario, faults: Sequence[Fault], seed: int, dispenser: SimulatedDispenser | None = None
+    ) -> None:
+        """dispenser: instead of the scenario's own."""
         self._events, self._clock = EventQueue(), SimClock()
         scenario = replace(on.scenario, faults=tuple(faults), seed=seed)
         fold = fold_deformation("faults", on.truth.deformation, faults)
@@ -171,7 +178,12 @@ class FaultRun:
         self._virtual = VirtualArm(scenario.arm, self._profile.dialect, home, faults, self._profile.baud)
         self._device = VirtualDevice(self._virtual, self._clock, self._profile.baud)
         self._arm = Arm(self._device, self._profile, 0.0, LinkSettings(poll=POLL_PERIOD))
-        self._motion = MotionStep(on.path, self._profile)
+        self._faults = faults
+        dispenser = scenario.dispenser if dispenser is None else dispenser
+        self._dispensers = SimulatedDispensers(on.path, dispenser, self._clock, faults, scenario.path)
+        self._dispensers.control.begin(0.0, 0.0)
+        motion_step = MotionStep(on.path, self._profile, outlets=self._dispensers.outlets)
+        self._motion = DispensedMotion(motion_step, self._dispensers.control)
         self._truth_log = TruthLog(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
         self._hangs = faults_striking(faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
@@ -185,7 +197,8 @@ class FaultRun:
     def __call__(self) -> FaultRunRecord:
         """Run it."""
         self._cameras.begin()
-        loop = MotionLoop(self._motion, self._arm, self, lambda: self._pose, self._orders, self._note)
+        material, poses = self._dispensers.control, lambda: self._pose
+        loop = MotionLoop(self._motion, self._arm, self, poses, self._orders, self._note, material=material)
         try:
             loop.run(MAX_RUN_S)
         except _KilledError:
@@ -194,9 +207,20 @@ class FaultRun:
         record = self._record
         record.ended = self._clock.now()
         self._virtual.advance(record.ended)
-        record.log = self._truth_log.rows(row_instants(0.0, record.ended), self._virtual.axes_at)
+        self._dispensers.advance(record.ended)
+        times = row_instants(0.0, record.ended)
+        record.log = self._truth_log.rows(times, self._virtual.axes_at, self._dispensers.flow)
+        record.seen_to = self._motion.seen_to
+        record.told_outside = self._dispensers.told_outside(record.ended, self._left_alone)
+        record.left_open = self._dispensers.open_after(self._left_alone, record.ended)
         record.over = int(self._oracle.over.sum())
         return record
+
+    @property
+    def _left_alone(self) -> list[tuple[float, float]]:
+        """From, until, s: when nobody could tell a dispenser anything."""
+        lines = faults_striking(self._faults, FaultPart.DISPENSER)
+        return [(fault.start, min(fault.end, MAX_RUN_S)) for fault in (*lines, *self._hangs)]
 
     # -- the clock of the motion: while it waits, the rest of the world goes on
 
@@ -206,10 +230,13 @@ class FaultRun:
 
     def wait_until(self, instant: float) -> None:
         """Let the world go on until `instant`, s, or for as long as the motion hangs."""
+        if self._arm.state is not ArmState.ARMED:
+            self._dispensers.forbid(self._clock.now())
         self._advance(instant)
         for fault in self._hangs:
             if fault.covers(self._clock.now()):
                 if fault.kind is FaultKind.KILL or fault.end >= MAX_RUN_S:
+                    self._dispensers.cut()
                     raise _KilledError
                 self._advance(fault.end)
         if self._motion.progress.phase is PrintPhase.FINISHED:
@@ -253,6 +280,7 @@ class FaultRun:
         if tick.status.state is ArmState.STOPPED and (not record.stopped or (anew and tick.stamp > record.stopped[-1])):
             record.stopped.append(tick.stamp)
         self._truth_log.write(tick.command, self._motion.progress)
+        self._dispensers.note(tick.command, self._profile.tick)
         if tick.stamp - self._sent_at > 1.5 * self._profile.tick or self._arm.travels:
             self._oracle.rest()  # a tick that sends nothing, just after one that did, is no rest yet
         if tick.recalled is not None:

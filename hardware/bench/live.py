@@ -23,6 +23,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.bench.figures import Figure, append_rows, at_least, at_most, with_progress
 from hardware.bench.whole import LiveSession
+from hardware.files.dispenser_file import read_dispensers
 from hardware.files.path_file import read_path, write_path
 from hardware.live.prepared import RunFiles
 from hardware.live.prerender import prerender
@@ -34,6 +35,8 @@ from hardware.process.clock import WallClock
 from hardware.process.progress import cache_folder
 from hardware.process.ticks import measure_evenness
 from hardware.recording.session_reader import open_session
+from hardware.simulator.dispenser import VirtualDispenserSettings
+from hardware.simulator.nozzle_error import MaterialFigures
 from planning.path import Path as Toolpath
 from planning.path import way_lengths
 
@@ -194,10 +197,12 @@ def _repeated(path: Toolpath, seconds: float) -> Toolpath:
 def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
     record, clock = folder / "print.mcap", WallClock()
     arguments, alone = _arguments(options.scenario, record, path), measure_evenness(clock, PROBE_PIECES)
-    if options.pinned:  # a session.toml that gives each loop a core of its own
+    settings = LiveSettings(dispensers=options.dispenser)
+    if options.pinned:  # each loop has a core of its own
         one, other = available_cores()[:1], available_cores()[1:2]
-        settings = settings_text(LiveSettings(cores_tracking=one, cores_motion=other, cores_recorder=other))
-        (folder / "session.toml").write_text(settings)
+        settings = replace(settings, cores_tracking=one, cores_motion=other, cores_recorder=other)
+    if settings != LiveSettings():
+        (folder / "session.toml").write_text(settings_text(settings))
         arguments.insert(0, str(folder / "session.toml"))
     run = LiveSession(arguments)
     load = []
@@ -211,7 +216,7 @@ def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: P
     finally:
         run.close()
     summary: dict[str, Any] = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))
-    error = nozzle_errors(record, path, arm)
+    error = nozzle_errors(record, path, arm, _truth(options.dispenser))
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
     even = f"{1000 * alone.usual:.1f} ms usually; before the run, nothing else of it running: no run can be more even"
@@ -245,8 +250,24 @@ def _errors(name: str, summary: dict[str, Any], error: NozzleErrors) -> list[Fig
         Figure(f"{name}: duty", 100 * error.duty, "%", at_least(80)),
         Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50)),
         Figure(f"{name}: virtual arm held up by the machine, longest", 1000 * error.held_up, "ms"),
+        *_beads(name, error.material),
         Figure(f"{name}: frame sets left out", summary["frame_sets_dropped"], "", None, "", sets),
     ]
+
+
+def _truth(file: Path | None) -> VirtualDispenserSettings | None:
+    """What the first dispenser of a file does, by the file; None without one."""
+    if file is None:
+        return None
+    profile = read_dispensers(file)[0].profile
+    delays = profile.on_dead_time, profile.on_lag, profile.off_dead_time, profile.off_lag
+    return VirtualDispenserSettings("arduino", *delays, flow=profile.flow)
+
+
+def _beads(name: str, material: MaterialFigures | None) -> list[Figure]:
+    """Where beads begin and end, of a run whose recording holds what a dispenser was told."""
+    ends = () if material is None else (("begin", material.begins), ("end", material.stops))
+    return [Figure(f"{name}: beads {what} off the plan, 95 %", each.size.p95, "mm") for what, each in ends]
 
 
 def memory_growth(memory: Sequence[tuple[float, dict[str, float]]]) -> dict[str, tuple[float, float]]:

@@ -10,14 +10,15 @@ squared errors over the last seconds, relative to the best one's.
 `loop`: each print is one of a scenario in virtual time: exposure, transport, pairing, the estimator on tracks, the
 motion of a live run and the virtual arm, whose nozzle is compared with its true checkpoint every millisecond. Only the
 pose that the motion is given differs: the first one for ever, the last one at rest, the last one with its velocity, or
-the pose as it is. The first three state no error: only the arm's limits keep them from printing.
+the pose as it is. The first three state no error: only the arm's limits keep them from printing. One more scenario has
+a late dispenser: hardware/bench/planner.py.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +33,7 @@ from estimation.se3 import Array
 from hardware.bench import figures
 from hardware.bench.fault_run import FaultRun, PreparedScenario, prepare_scenario
 from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
+from hardware.bench.planner import LED, NOT_LED, BeadsPrint, bead_figures, beads_section, print_beads
 from hardware.bench.subjects import BREATHING
 from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock
@@ -320,8 +322,9 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
     with workers(options.jobs) as pool:
         prints = pool.map(partial(_print_case, options.seed), *zip(*cases, strict=True))
         by_case = dict(zip(cases, with_progress("loop", "prints", prints, len(cases)), strict=True))
-    figures.write_page(options.out, "loop.html", lambda: loop_page(by_case), "picture")
-    return [figure for name in options.scenario for figure in _figures(name, by_case)]
+        beads = dict(zip((LED, NOT_LED), pool.map(partial(print_beads, options.seed), (LED, NOT_LED)), strict=True))
+    figures.write_page(options.out, "loop.html", lambda: loop_page(by_case, beads), "picture")
+    return [*(figure for name in options.scenario for figure in _figures(name, by_case)), *bead_figures(beads)]
 
 
 def _print_case(seed: int, scenario: str, way: str) -> Print:
@@ -344,9 +347,9 @@ def _figures(scenario: str, prints: dict[tuple[str, str], Print]) -> list[Figure
     ]
 
 
-def loop_page(prints: dict[tuple[str, str], Print]) -> str:
-    """The error at the nozzle over time, a plot for each way, one scale for all of a scenario."""
-    body = []
+def loop_page(prints: dict[tuple[str, str], Print], beads: Mapping[str, BeadsPrint]) -> str:
+    """The error at the nozzle over time, a plot for each way, one scale for all of a scenario; and where beads lie."""
+    body = [beads_section(beads)]
     keys = legend([line_key("estimate", "error while extruding, mm"), line_key("limit", f"{MAX_NOZZLE_ERROR:g} mm")])
     for scenario in dict.fromkeys(name for name, _ in prints):
         ways = {way: one for (name, way), one in prints.items() if name == scenario}

@@ -172,6 +172,7 @@ _SUBJECTS = (
         _number("--kills", 0, "N", "of random processes; default none"),
         _number("--seed", 0, None, "of what is killed when"),
         _option("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other"),
+        _option("--dispenser", type=Path, metavar="DISPENSER.toml", help="to tell, e.g. a virtual one; default none"),
         _option(
             "--scenario", type=Path, default=Path("data/live/calm.toml"), metavar="SCENARIO.toml", help="which world"
         ),

@@ -34,6 +34,11 @@ from hardware.recording.messages import (
     row_from_message,
 )
 from hardware.recording.session_reader import PATH_ATTACHMENT, PrintInputs, inputs_from_texts
+from hardware.simulator.deposit import NozzleLog, PlannedLine, join_logs, planned_line
+from hardware.simulator.dispenser import VirtualDispenserSettings
+from hardware.simulator.material import flow_from_told
+from hardware.simulator.nozzle_error import MaterialFigures, material_figures
+from hardware.simulator.nozzle_error import nozzle_errors as row_errors
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold
 from planning.path import PrintPhase, PrintProgress
@@ -143,6 +148,7 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     return ReplayCount(frames, other, run.damage)
 
 
+BEAD_WIDTH = 1.0  # mm
 BLOCK_SECONDS = 10.0  # s of rows compared at once
 
 
@@ -154,6 +160,7 @@ class NozzleErrors:
     duty: float  # share of the time due in which material left; NaN where none was due
     deepest: float  # s of motion that the arm ever had queued
     held_up: float  # s that a busy machine kept the virtual arm from its line at most
+    material: MaterialFigures | None = None  # of what a dispenser was told; None of a run without one
 
     def figure(self, share: float) -> float:
         """Error, mm, that `share` percent do not exceed; NaN of none."""
@@ -179,16 +186,24 @@ class _TrueMotion:
         raise NotImplementedError
 
 
-def nozzle_errors(record: File, path: File, arm: File) -> NozzleErrors:
-    """path: checkpoints in the true surface frame; arm: the arm as it truly stands. InputError without ticks."""
-    run = _read_run(record, "/tick", "/move", "/truth")
+def nozzle_errors(
+    record: File, path: File, arm: File, dispenser: VirtualDispenserSettings | None = None
+) -> NozzleErrors:
+    """path: checkpoints in the true surface frame; arm: the arm as it truly stands. InputError without ticks.
+
+    dispenser: what the one that was told truly does; None: it gives each bead what it needs, at once.
+    """
+    run = _read_run(record, "/tick", "/move", "/truth", "/dispenser")
     if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
     true, profile = read_arm(arm), inputs_from_texts(run.texts, record).profile  # tick and lag as the run took them
     rows = np.unique(np.array([row_from_message(message) for message in run.messages["/truth"]]), axis=0)
     rising = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
     truth = Truth(np.eye(4), _TrueMotion(rows[rising]))
-    truth_log = TruthLog(read_path(path), true.arm, truth, profile.tick, profile.lag)
+    checkpoints = read_path(path)
+    truth_log = TruthLog(checkpoints, true.arm, truth, profile.tick, profile.lag)
+    told = sorted((float(m["stamp"]), float(m["flow"][0])) for m in run.messages["/dispenser"] if m["flow"])
+    flow, logs = flow_from_told(told, dispenser), list[NozzleLog]()
     commands = _commands(run)
     for command, progress in commands:
         truth_log.write(command, progress)
@@ -204,14 +219,22 @@ def nozzle_errors(record: File, path: File, arm: File) -> NozzleErrors:
     printed = PrintPhase.LEAVING, PrintPhase.FINISHED  # nothing is due any more
     finished = min((command.stamp for command, progress in commands if progress.phase in printed), default=np.inf)
     for start in np.arange(first, last, BLOCK_SECONDS):
-        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at)
+        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at, flow)
+        if told:
+            logs.append(log)
         known = log.extrude & np.isfinite(log.place)
         off = log.base_from_nozzle[known, :3, 3] - log.base_from_target[known, :3, 3]
         errors.append(np.linalg.norm(off, axis=1))
         extruding += int(log.extrude.sum())
         due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
     duty = extruding / due if due else float("nan")
-    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up)
+    material = _material(join_logs(logs), planned_line(checkpoints)) if logs else None
+    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up, material)
+
+
+def _material(log: NozzleLog, line: PlannedLine) -> MaterialFigures:
+    """The width of beads is not recorded: it is taken as that of UNIT_AREA, 1 mm."""
+    return material_figures(log, line, row_errors(log, line), BEAD_WIDTH, float("nan"))
 
 
 def printed_range(record: File) -> tuple[float, float]:

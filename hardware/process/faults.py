@@ -2,10 +2,10 @@
 
     PART KIND [AMOUNT] [at TIME] [for TIME] [seed N]
 
-PART is camera0 and so on (by its number in the rig), clock, tracking, motion, arm, disk, page or surface; SPECS says
-what each can do, what its amount is, how long it lasts where nothing is said, and which commands can let it happen.
-TIME is such as 2s or 600ms and counts from the beginning of a simulation, a recording, a virtual arm, or of a live
-run's printing. `str` of a fault gives the text that is read back as the very same fault.
+PART is camera0 and so on (by its number in the rig), clock, tracking, motion, arm, disk, page, surface or dispenser;
+FAULT_SPECS says what each can do, what its amount is, how long it lasts where nothing is said, and which commands can
+let it happen. TIME is such as 2s or 600ms and counts from the beginning of a simulation, a recording, a virtual arm, or
+of a live run's printing. `str` of a fault gives the text that is read back as the very same fault.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class FaultPart(StrEnum):
     DISK = "disk"
     PAGE = "page"
     SURFACE = "surface"
+    DISPENSER = "dispenser"
 
 
 class FaultKind(StrEnum):
@@ -61,6 +62,7 @@ class FaultKind(StrEnum):
     FAST = "fast"
     FOLD = "fold"
     COVER = "cover"
+    BLOCK = "block"
 
 
 class FaultRunner(StrEnum):
@@ -122,6 +124,9 @@ FAULT_SPECS: dict[tuple[FaultPart, FaultKind], FaultSpec] = {
     ),
     (Part.SURFACE, Kind.FOLD): FaultSpec("a ridge that high rises and falls", (_SIMULATE,), "mm", 0.1, 20, 3.0, 1.0),
     (Part.SURFACE, Kind.COVER): FaultSpec("something lies over the wound, before all cameras", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.UNPLUG): FaultSpec("its line is gone", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.BLOCK): FaultSpec("its line takes nothing", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.DROP): FaultSpec("what it is told is lost on the line", (_SIMULATE,)),
 }
 
 _NUMBER = r"-?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"

@@ -14,8 +14,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
+from scipy.spatial import cKDTree
 
 from estimation.se3 import Array
+from planning.material import bead_areas
 from planning.path import MIN_SPACING, Path, way_lengths
 
 DISTANCES_AT_ONCE = 2_000_000  # distances held at once
@@ -29,6 +31,7 @@ class PlannedLine:
     points: Array  # (K, 3) mm, surface frame
     printed: NDArray[np.bool_]  # (K-1,) whether material leaves on it
     layer: NDArray[np.int64]  # (K-1,)
+    area: Array  # (K-1,) mm^2, cross-section of the bead; of a piece that is not printed, that of the bead beside it
 
     def piece(self, place: Array) -> NDArray[np.int64]:
         """Piece (N,) on which each place (N,), mm, lies; a checkpoint belongs to the piece that leads to it."""
@@ -65,10 +68,16 @@ class PlannedLine:
 
 
 def planned_line(path: Path) -> PlannedLine:
-    """The pieces of a path: whether, how fast and in which layer is printed is said by the checkpoint they lead to."""
-    poses = path.surface_from_nozzle
+    """The pieces of a path: whether, how fast and in which layer is printed is said by the checkpoint they lead to.
+
+    InputError for a path whose volumes or beads make no sense.
+    """
+    poses, printed, area = path.surface_from_nozzle, path.extrude[1:], bead_areas(path)[1:]
     knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
-    return PlannedLine(knots, poses[:, :3, 3], path.extrude[1:], path.layer[1:])
+    beads = np.flatnonzero(printed)
+    if len(beads):
+        area = area[beads[np.maximum(np.searchsorted(beads, np.arange(len(area)), "right") - 1, 0)]]
+    return PlannedLine(knots, poses[:, :3, 3], printed, path.layer[1:], area)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,9 +90,10 @@ class NozzleLog:
     base_from_target: Array  # (N, 4, 4) mm, the checkpoint on the true surface that was due
     place: Array  # (N,) mm along the path of that checkpoint
     checkpoint: NDArray[np.int64]  # (N,) its number, -1 for none
-    extrude: NDArray[np.bool_]  # (N,) whether material leaves the nozzle
+    extrude: NDArray[np.bool_]  # (N,) whether the motion prints
     reason: NDArray[np.str_]  # (N,) why the arm holds, "" while it moves
     surface_from_tip: Array  # (N, 3) mm, the tip in the surface frame, deformation taken back
+    flow: Array  # (N,) mm^3/s, what truly leaves the nozzle
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -92,6 +102,18 @@ class NozzleLog:
 def row_step(log: NozzleLog) -> float:
     """How long a row lasts, s; 0 where there are not two."""
     return float(np.median(np.diff(log.stamps))) if len(log) > 1 else 0.0
+
+
+def row_volumes(log: NozzleLog) -> Array:
+    """What left the nozzle (N,), mm^3, since the row before; 0 in the first one and after a gap in the stamps."""
+    since = np.diff(log.stamps, prepend=log.stamps[:1])
+    return np.asarray(np.where(since < 1.5 * row_step(log), log.flow * since, 0.0))
+
+
+def row_pieces(log: NozzleLog, line: PlannedLine) -> NDArray[np.int64]:
+    """Piece (N,) of the line at which each row is; before any place is known the first, then the last one known."""
+    rows = np.maximum.accumulate(np.where(np.isfinite(log.place), np.arange(len(log)), -1))
+    return line.piece(np.where(rows >= 0, log.place[rows], 0.0))
 
 
 def join_logs(logs: Sequence[NozzleLog]) -> NozzleLog:
@@ -137,8 +159,8 @@ class DepositFigures:
 def deposit_map(log: NozzleLog, line: PlannedLine, bead: float) -> DepositMap:
     """The map of a run with beads `bead` mm wide.
 
-    Between two extruding rows material leaves in proportion to the way that the path goes on meanwhile, and falls on
-    the straight line between the nozzle's two tips; it belongs to the layer of the path's piece.
+    What leaves between two rows falls on the straight line between the two places of the tip; its layer is that of the
+    path's piece.
     """
     cell = min(MAP_CELL, bead / MIN_CELLS_PER_BEAD)
     start, end = line.points[:-1, :2][line.printed], line.points[1:, :2][line.printed]
@@ -195,16 +217,15 @@ class _Drops:
 
 
 def _deposited_drops(log: NozzleLog, line: PlannedLine, cell: float) -> _Drops:
-    from_above = np.linalg.norm(np.diff(line.points[:, :2], axis=0), axis=1)
-    way = np.interp(log.place, line.knots, np.concatenate([[0.0], np.cumsum(from_above)]))  # NaN stays NaN
-    steady = np.diff(log.stamps) < 1.5 * row_step(log)
-    on = log.extrude[:-1] & log.extrude[1:] & steady & (np.diff(way) > 0)
-    on &= np.isfinite(log.surface_from_tip[:-1, 0]) & np.isfinite(log.surface_from_tip[1:, 0])
+    from_above, way = np.linalg.norm(np.diff(line.points[:, :2], axis=0), axis=1), np.diff(line.knots)
+    seen = np.where(way > MIN_SPACING, from_above / np.maximum(way, MIN_SPACING), 1.0)  # of a mm of the path
+    volume, piece = row_volumes(log)[1:], row_pieces(log, line)[1:]
+    on = (volume > 0) & np.isfinite(log.surface_from_tip[:-1, 0]) & np.isfinite(log.surface_from_tip[1:, 0])
     start, end = log.surface_from_tip[:-1, :2][on], log.surface_from_tip[1:, :2][on]
-    middle = (log.place[:-1] + np.diff(log.place) / 2)[on]
+    volume, piece = volume[on], piece[on]
     low, high = line.points[:, :2].min(axis=0) - MAP_REACH, line.points[:, :2].max(axis=0) + MAP_REACH
     start, end = np.clip(start, low, high), np.clip(end, low, high)
-    return _drops(start, end, np.diff(way)[on], line.layer[line.piece(middle)], cell)
+    return _drops(start, end, volume / line.area[piece] * seen[piece], line.layer[piece], cell)
 
 
 def _drops(start: Array, end: Array, material: Array, layer: NDArray[np.int64], cell: float) -> _Drops:
@@ -240,3 +261,38 @@ def _disc(width: float) -> Array:
     density = np.where(inside > 0, 1 / np.sqrt(np.where(inside > 0, inside, 1.0)), 0.0)
     weights = density.reshape(2 * reach + 1, _DISC_SUBCELLS, 2 * reach + 1, _DISC_SUBCELLS).sum(axis=(1, 3))
     return np.asarray(width * weights / weights.sum())
+
+
+BLOB_RADIUS = 1.0  # mm about a bead's end, within which what is laid is held against the plan
+
+
+def planned_beads(line: PlannedLine) -> tuple[Array, Array, Array]:
+    """Where each planned bead begins and ends, (B,) mm of the path, rising; and its cross-section there, mm^2."""
+    flips = np.diff(np.concatenate([[False], line.printed, [False]]).astype(np.int8))
+    first, last = np.flatnonzero(flips > 0), np.flatnonzero(flips < 0)
+    return line.knots[first], line.knots[last], line.area[first]
+
+
+def excess_volumes(log: NozzleLog, line: PlannedLine, places: Array, layers: NDArray[np.int64]) -> Array:
+    """Volume (B,), mm^3, laid within BLOB_RADIUS of places (B, 2) in their layers (B,), less the planned."""
+    volume, layer = row_volumes(log), line.layer[row_pieces(log, line)]
+    leaves = np.flatnonzero((volume > 0) & np.isfinite(log.surface_from_tip[:, 0]))
+    tree = cKDTree(log.surface_from_tip[leaves, :2])
+    found = np.zeros(len(places))
+    for i, near in enumerate(tree.query_ball_point(places, BLOB_RADIUS) if len(places) else ()):
+        near_rows = leaves[near]
+        found[i] = volume[near_rows[layer[near_rows] == layers[i]]].sum() - _planned_volume(line, places[i], layers[i])
+    return found
+
+
+def _planned_volume(line: PlannedLine, place: Array, layer: int) -> float:
+    """Planned volume, mm^3, within BLOB_RADIUS of a place (2,) in a layer: the chords of the circle, in their share."""
+    keep = line.printed & (line.layer == layer)
+    start = line.points[:-1, :2][keep] - place
+    step = line.points[1:, :2][keep] - line.points[:-1, :2][keep]
+    length = np.linalg.norm(step, axis=1)
+    square = np.where(length > 0, length**2, 1.0)
+    middle = -np.sum(start * step, axis=1) / square
+    half = np.sqrt(np.maximum(BLOB_RADIUS**2 - np.sum(start**2, axis=1) + middle**2 * square, 0.0) / square)
+    share = np.clip(middle + half, 0.0, 1.0) - np.clip(middle - half, 0.0, 1.0)
+    return float(np.sum(share * np.diff(line.knots)[keep] * line.area[keep]))

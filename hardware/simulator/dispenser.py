@@ -11,7 +11,7 @@ import os
 import re
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import partial
@@ -22,8 +22,10 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.arm.port import UnpluggedError
 from hardware.process.checks import error_text
 from hardware.process.clock import Clock, WallClock
+from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
 from hardware.simulator.arm.ports import device_link, open_pty, stop_on_signals
 
 DISPENSER_POLL = 0.001  # s between looks at the line
@@ -121,6 +123,12 @@ class DispenserModel:
         for line in lines:
             self._take(line.decode("ascii", "replace").strip())
 
+    def obey(self, flow: float, now: float) -> None:
+        """Be told a flow, mm^3/s, at `now`, s; 0: off."""
+        self.advance(now)
+        self._fed = now
+        self._switch(flow, now)
+
     def advance(self, now: float) -> None:
         """Let time pass until `now`, s."""
         assert now >= self.now
@@ -194,26 +202,43 @@ class DispenserModel:
 
 
 class DispenserPort:
-    """A line to a model in virtual time; an opener of itself."""
+    """A line to a model in virtual time; an opener of itself. dead: what is written to it gets nowhere."""
 
-    def __init__(self, model: DispenserModel, clock: Clock) -> None:
-        self.model, self._clock = model, clock
+    def __init__(self, model: DispenserModel, clock: Clock, faults: Sequence[Fault] = ()) -> None:
+        """faults: those on a dispenser count."""
+        self.model, self._clock, self.dead = model, clock, False
+        self._faults = faults_striking(faults, FaultPart.DISPENSER)
 
     def __call__(self) -> DispenserPort:
-        """Open it."""
+        """Open it; UnpluggedError while it is away."""
+        self._here()
         return self
+
+    def _here(self) -> float:
+        """The instant, s; UnpluggedError while it is away."""
+        now = self._clock.now()
+        if self._struck(FaultKind.UNPLUG, now):
+            raise UnpluggedError("the device is gone")
+        return now
+
+    def _struck(self, kind: FaultKind, now: float) -> bool:
+        return any(fault.kind is kind and fault.covers(now) for fault in self._faults)
 
     def release(self) -> None:
         """Nothing is held."""
 
     def write(self, data: bytes) -> int:
-        """The model has bytes at once."""
-        self.model.receive(data, self._clock.now())
+        """The model has bytes at once, unless a fault takes them."""
+        now = self._here()
+        if self._struck(FaultKind.BLOCK, now):
+            return 0
+        if not (self.dead or self._struck(FaultKind.DROP, now)):
+            self.model.receive(data, now)
         return len(data)
 
     def read(self) -> bytes:
         """What the model has answered."""
-        return self.model.transmit(self._clock.now())
+        return self.model.transmit(self._here())
 
     def waiting(self) -> int:
         """Nothing is under way."""

@@ -17,7 +17,7 @@ from hardware.report import page
 from hardware.report.evaluation import figure
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
-from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleLag
+from hardware.simulator.nozzle_error import NEAR_ERROR, EndsOfBeads, NozzleLag, profile_edges
 from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share
 
 PAGE_FOOTER = (
@@ -147,7 +147,7 @@ def nozzle_page(result: NozzleResult) -> str:
         text = "limits met" if result.met else "limits missed" if result.run.complete else "not complete"
         parts.insert(0, f'<div class="badge {"met" if result.met else "missed"}">{text}</div>')
     if len(result.run.log):
-        parts += [_over_time(result), _parts(result), _spread(result), _pictures(result)]
+        parts += [_over_time(result), _parts(result), _spread(result), _pictures(result), _ends(result)]
     parts += [_holds(result), _camera_pictures(result)]
     if result.run.tracking is not None:
         parts.append('<h2 class="part">Tracking</h2>' + "\n".join(sections(result.run.tracking)))
@@ -316,6 +316,49 @@ def _pictures(result: NozzleResult) -> str:
     more = len(deposit.layers) - MAX_LAYERS
     rest = f'<p class="note">and {more} more layers</p>' if more > 0 else ""
     return page.section("Deposited and planned", text, (both if wide else f'<div class="two">{both}</div>') + rest)
+
+
+MAX_DRAWN_ENDS = 200  # beads in a chart: more are no longer told apart
+
+
+def _ends(result: NozzleResult) -> str:
+    """Where beads begin and end, as a table and as what was laid about there."""
+    m = result.figures.material
+    if not len(m.begins.error):
+        return ""
+    rows, charts = [], []
+    for name, ends in (("begin", m.begins), ("end", m.stops)):
+        missing, excess = int(np.isnan(ends.error).sum()), float(ends.excess.mean()) if len(ends.excess) else np.nan
+        values = ends.median, ends.size.p95, ends.size.max, excess, ends.blob
+        rows.append([f"{name}: {len(ends.error)}, {missing} not laid", *map(figure, values)])
+        charts.append(f"<div>{ends_chart(ends, f'about where beads {name}', HALF_CHART_WIDTH)}</div>")
+    head = ("", "median, mm", "95 %, mm", "max, mm", "too much, mean, mm³", "most, mm³")
+    told = "not known" if np.isnan(m.told) else f"{1000 * m.told:.0f} ms"
+    note = (
+        f"{m.laid:.1f} of {m.planned:.1f} mm³ were laid, {figure(m.ooze)} mm³ of it beside all beads. For "
+        f"{1000 * m.flowing:.0f} ms material flowed while the motion did not print; told to was it then for {told}."
+    )
+    text = (
+        "Errors along the path: above 0, material begins or ends farther on than planned. Too much: what lies within "
+        "1 mm of a bead's end, less what is planned there. Below, laid of the planned about each, by mm of the path."
+    )
+    body = page.figures_table(head, rows) + f'<p class="note">{escape(note)}</p>'
+    return page.section("Where beads begin and end", text, body + f'<div class="two">{"".join(charts)}</div>')
+
+
+def ends_chart(ends: EndsOfBeads, label: str, width: int) -> str:
+    """What was laid of the planned about each bead's beginning or end, by mm along the path; and the median of all."""
+    edges = profile_edges()
+    at = (edges[1:] + edges[:-1]) / 2
+    top = max(1.5, float(ends.profile.max(initial=0.0)) * 1.1)
+    plot = page.Plot(width, 230, (float(edges[0]), float(edges[-1])), (0.0, min(top, 4.0)))
+    plot.level(1.0, "as planned", "limit")
+    for each in ends.profile[:MAX_DRAWN_ENDS]:
+        plot.line(at, np.minimum(each, min(top, 4.0)), "aside")
+    if len(ends.profile):
+        plot.line(at, np.median(ends.profile, axis=0), "estimate")
+    plot.mark(0.0, "planned", "median")
+    return f'<div class="caption">{escape(label)}</div>{plot.svg()}'
 
 
 def _holds(result: NozzleResult) -> str:

@@ -24,7 +24,15 @@ from hardware.simulator.deposit import (
     deposit_map,
     planned_line,
 )
-from hardware.simulator.nozzle_error import NEAR_ERROR, NozzleFigures, RowErrors, nozzle_errors, nozzle_figures
+from hardware.simulator.nozzle_error import (
+    NEAR_ERROR,
+    MaterialFigures,
+    NozzleFigures,
+    RowErrors,
+    material_figures,
+    nozzle_errors,
+    nozzle_figures,
+)
 from planning.path import Path
 
 
@@ -34,6 +42,7 @@ class RunFigures:
 
     nozzle: NozzleFigures
     deposit: DepositFigures
+    material: MaterialFigures
     tracking: Spread | None = None  # errors of the estimated surface, mm, from the start; None where not known
 
 
@@ -70,6 +79,9 @@ BOUNDS = {  # key in [limits]: with its unit
     "gaps": Bound("gaps", "", False, lambda f: f.deposit.gaps),
     "overlap": Bound("overlap", "", False, lambda f: f.deposit.overlap),
     "outside": Bound("material outside", "", False, lambda f: f.deposit.outside),
+    "bead_begin_p95_mm": Bound("beads begin off the plan, 95 %", "mm", False, lambda f: f.material.begins.size.p95),
+    "bead_stop_p95_mm": Bound("beads end off the plan, 95 %", "mm", False, lambda f: f.material.stops.size.p95),
+    "told_outside_ms": Bound("told to flow while not printing", "ms", False, lambda f: 1000 * f.material.told),
     "tracking_rms_mm": Bound("tracking error, RMS", "mm", False, _tracking("rmse")),
     "tracking_p95_mm": Bound("tracking error, 95 %", "mm", False, _tracking("p95")),
     "tracking_max_mm": Bound("tracking error, largest", "mm", False, _tracking("max")),
@@ -135,6 +147,7 @@ class NozzleRun:
     path: Path  # in the true surface frame
     bead: float  # width, mm
     limits: RunLimits = field(default_factory=dict)
+    told_outside: float = math.nan  # s in which a dispenser was told to be open while no move printed
     tracking: Evaluation | None = None  # of the surface, where known
     complete: bool = True  # whether it ran to its end
     pictures: tuple[tuple[str, bytes], ...] = ()  # of the cameras: name, and bytes of a JPEG or PNG
@@ -166,7 +179,8 @@ def evaluate_run(run: NozzleRun) -> NozzleResult:
     deposit = deposit_map(run.log, line, run.bead)
     comparison = None if run.tracking is None else run.tracking.comparison
     tracking = None if comparison is None else spread(comparison.start.translation)
-    figures = RunFigures(nozzle_figures(run.log, line, errors), deposit_figures(deposit), tracking)
+    material = material_figures(run.log, line, errors, run.bead, run.told_outside)
+    figures = RunFigures(nozzle_figures(run.log, line, errors), deposit_figures(deposit), material, tracking)
     return NozzleResult(run, line, errors, figures, deposit, tuple(check_limits(run.limits, figures)))
 
 
@@ -199,6 +213,11 @@ def nozzle_verdict(result: NozzleResult) -> list[str]:
     sentences.append(f"It printed for {share(f.duty)} of the time it had{'' if f.finished else ' and did not finish'}.")
     if math.isfinite(deposit.coverage):
         sentences.append(f"{share(deposit.coverage)} of the planned area got its material.")
+    material = result.figures.material
+    if material.told > 0:
+        sentences.append(
+            f"For {1000 * material.told:.0f} ms a dispenser was told to be open while nothing was printed."
+        )
     if f.without_target > 0:
         sentences.append(f"For {f.without_target:.3f} s material left the nozzle where nothing was due.")
     return sentences + _limits_in_words(result)
@@ -253,10 +272,34 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
             "planned_mm2": deposit.area,
             **{name: getattr(deposit, name) for name in ("coverage", "gaps", "overlap", "outside", "material")},
         },
+        "material": _material_dict(result.figures.material),
         "tracking_mm": None if result.figures.tracking is None else asdict(result.figures.tracking),
     }
     cleaned: dict[str, Any] = finite(summary)
     return cleaned
+
+
+def _material_dict(material: MaterialFigures) -> dict[str, Any]:
+    ends = {"begin": material.begins, "stop": material.stops}
+    return {
+        **{
+            name: {
+                "count": len(each.error),
+                "missing": int(np.isnan(each.error).sum()),
+                "median_mm": each.median,
+                "p95_mm": each.size.p95,
+                "max_mm": each.size.max,
+                "excess_mean_mm3": float(each.excess.mean()) if len(each.excess) else math.nan,
+                "excess_max_mm3": each.blob,
+            }
+            for name, each in ends.items()
+        },
+        "laid_mm3": material.laid,
+        "planned_mm3": material.planned,
+        "ooze_mm3": material.ooze,
+        "flowing_while_not_printing_ms": 1000 * material.flowing,
+        "told_while_not_printing_ms": 1000 * material.told,
+    }
 
 
 def nozzle_text(summary: dict[str, Any]) -> str:
@@ -270,6 +313,12 @@ def nozzle_text(summary: dict[str, Any]) -> str:
     parts = [("duty", summary["duty"]), *((name, deposit[name]) for name in ("coverage", "gaps", "overlap", "outside"))]
     shares = [f"{name} {share(np.nan if value is None else value)}" for name, value in parts]
     lines += ["", ", ".join([*shares, f"lag {'–' if lag is None else f'{lag:.1f}'} ms"])]
+    for name, end in ((name, summary["material"][name]) for name in ("begin", "stop")):
+        if end["count"]:
+            off = f"off by {_number(end['median_mm'])} mm (median), {_number(end['p95_mm'])} mm (95 %)"
+            lines.append(
+                f"beads that {name}: {end['count']}, {off}; most too much {_number(end['excess_max_mm3'])} mm3"
+            )
     for hold in summary["holds"]:
         lines.append(f"held {hold['count']} x, {hold['total_s']:.2f} s in all: {hold['reason']}")
     for limit in summary["limits"]:

@@ -126,11 +126,11 @@ class WatchPage:
 
 
 NOZZLE_HEADER = (
-    *("stamp_s", "extrude", "x_mm", "y_mm", "z_mm", "target_x_mm", "target_y_mm", "target_z_mm"),
+    *("stamp_s", "extrude", "flow_mm3_s", "x_mm", "y_mm", "z_mm", "target_x_mm", "target_y_mm", "target_z_mm"),
     *("error_mm", "error_x_mm", "error_y_mm", "error_z_mm", "angle_deg", "path_error_mm"),
     *("place_mm", "checkpoint", "reason"),
 )
-_ROW = "%.6f,%d" + ",%.6f" * 13 + ",%d,"
+_ROW = "%.6f,%d" + ",%.6f" * 14 + ",%d,"
 
 
 class NozzleWriter:
@@ -146,7 +146,7 @@ class NozzleWriter:
         nozzle, target, errors = log.base_from_nozzle, log.base_from_target, nozzle_errors(log, self._line)
         error = errors.distance, errors.vector, np.degrees(errors.angle), errors.path
         places = nozzle[:, :3, 3], target[:, :3, 3]
-        rows = np.column_stack([log.stamps, log.extrude, *places, *error, log.place, log.checkpoint])
+        rows = np.column_stack([log.stamps, log.extrude, log.flow, *places, *error, log.place, log.checkpoint])
         reasons = {reason: _quoted(reason) for reason in np.unique(log.reason).tolist()}
         for row, reason in zip(rows.tolist(), log.reason.tolist(), strict=True):
             self._file.write((_ROW % tuple(row)).replace("nan", "") + reasons[reason])

@@ -18,6 +18,8 @@ faults = ["arm stall 600ms at 5s"]   # what goes wrong, as hardware/process/faul
                                  # register = "texture" or "scan"
 [arm]                            # file, assumed_lag_s, wire_baud, tool_mm (as in an arm file), and the virtual
                                  # controller: servo, dead time, replies
+[dispenser]                      # what it does and what the motion knows of it (hardware/simulator/material.py); left
+                                 # out: an ideal one
 [planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
 [limits]                         # what the run must reach, for the exit code
 """
@@ -46,6 +48,7 @@ from hardware.process.checks import Table
 from hardware.process.faults import Fault, FaultRunner, check_faults, faults_from_texts
 from hardware.simulator.arm.settings import ArmSettings, arm_settings_from_table
 from hardware.simulator.cameras import CameraSettings, camera_settings_from_table
+from hardware.simulator.material import SimulatedDispenser, dispenser_from_table
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
 from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
@@ -86,6 +89,7 @@ class Scenario:
     jpeg_quality: int | None
     tracking: TrackingSettings
     arm: ArmSettings  # the virtual controller
+    dispenser: SimulatedDispenser | None  # None: an ideal one
     faults: tuple[Fault, ...]
     true_arm: SimpleArm  # where the arm stands
     baud: float  # bits/s of its line
@@ -95,7 +99,7 @@ class Scenario:
     beads: bool  # whether pictures show what was printed
 
 
-SCENARIO_TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "planted", "limits")
+SCENARIO_TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "dispenser", "planted", "limits")
 OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *SCENARIO_TABLES)
 MAX_CAMERAS = 8
 WITHOUT_PICTURES = ("truth", "tracks")  # ways of tracking that need no pictures
@@ -149,6 +153,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         jpeg_quality=quality or None,
         tracking=_tracking(path, parts["tracking"]),
         arm=arm,
+        dispenser=dispenser_from_table(path, parts["dispenser"], path.parent),
         faults=_faults(path, table.get("faults", []), len(rig)),
         true_arm=profile.arm,
         baud=baud,

@@ -214,7 +214,7 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
         scan.parent.mkdir(exist_ok=True)
         write_ply(scan, *scene.shape.mesh(SCAN_MESH_STEP))
     folder = RunFolder(out, scenario, planned_line(path), wound_rois, truth.base_from_surface, scan)
-    complete, skipped = False, 0
+    complete, skipped, told_outside = False, 0, float("nan")
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
@@ -228,9 +228,10 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
                 world.run(progress)
             finally:
                 skipped = world.pipeline.skipped
+                told_outside = world.told_outside
         complete = True
     finally:
-        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped)
+        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped, told_outside)
     return outcome
 
 
@@ -265,8 +266,12 @@ def _write_results(
     regions: Sequence[Roi],
     complete: bool,
     skipped: int,
+    told_outside: float,
 ) -> SimulationResult:
-    """Judge what was simulated; writes both reports and summaries. skipped: frame sets that found the tracker busy."""
+    """Judge what was simulated; writes both reports and summaries. skipped: frame sets that found the tracker busy.
+
+    told_outside: s in which a dispenser was told to be open while no move printed.
+    """
     out = folder.out
     if not folder.logs:
         return SimulationResult("nothing was simulated", False)
@@ -274,7 +279,8 @@ def _write_results(
     pictures = tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items()))
     files = tuple(f for f in FILE_NOTES if scenario.tracking.pictures or f[0] != "session")
     log = join_logs(folder.logs)
-    run = NozzleRun(scenario.title, log, path, scenario.bead, scenario.limits, tracking, complete, pictures, files)
+    judged = scenario.limits, told_outside, tracking, complete
+    run = NozzleRun(scenario.title, log, path, scenario.bead, *judged, pictures, files)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
@@ -155,6 +156,7 @@ def fold_deformation(
 
 
 ROW_STEP = 0.001  # s between rows
+FlowAt = Callable[[Array, Array], Array]  # times (N,), s, and what the bead needs there (N,) -> mm^3/s (N,)
 
 
 class TruthLog:
@@ -167,7 +169,8 @@ class TruthLog:
     def __init__(self, path: Path, arm: SimpleArm, truth: Truth, tick: float, lag: float) -> None:
         """path: in the true surface frame. arm: where it truly stands. tick, lag: s, as the motion knows them."""
         self._path, self._arm, self._truth, self._tick, self._lag = path, arm, truth, tick, lag
-        self._places = planned_line(path).knots  # (N,) mm along the path of each checkpoint
+        self._line = planned_line(path)
+        self._places = self._line.knots  # (N,) mm along the path of each checkpoint
         self._due: list[float] = []  # s, rising: when each command is to be fulfilled
         self._fraction: list[float] = []  # checkpoints, at `due`; NaN before printing began
         self._extrude: list[bool] = []
@@ -187,20 +190,24 @@ class TruthLog:
         return self._due[-1] if self._due else -np.inf
 
     def extruding(self, times: Array) -> NDArray[np.bool_]:
-        """Whether material leaves (N,) at times (N,), s."""
+        """Whether the motion prints (N,) at times (N,), s."""
         return np.array([self._extrude[i] if 0 <= i < len(self._due) else False for i in self._rows(times)], bool)
 
-    def rows(self, times: Array, executed: Callable[[Array], Array]) -> NozzleLog:
-        """The log at times (N,), s; executed: machine axes (N, 6) at times (N,)."""
+    def rows(self, times: Array, executed: Callable[[Array], Array], flow: FlowAt | None = None) -> NozzleLog:
+        """The log at times (N,), s; executed: machine axes (N, 6) at times (N,).
+
+        flow: what truly leaves the nozzle; None: wherever the motion prints, what the bead needs.
+        """
         index = self._rows(times)
         known = (index >= 0) & (index < len(self._due))
-        fraction = self._fractions(times, index, known)
+        fraction, rate = self._fractions(times, index, known)
         target = np.full((len(times), 4, 4), np.nan)
         there = np.isfinite(fraction)
         target[there] = self._truth.checkpoints(times[there], self._between(fraction[there]))
         nozzle = nozzle_from_axes(self._arm, executed(times))
         place = np.interp(fraction, np.arange(len(self._places)), self._places)
         filled = np.where(there, fraction, 0.0)
+        extruding, needed = self.extruding(times), self._needed(filled, rate)
         reasons = [self._reason[i] if ok else "no surface is followed yet" for i, ok in zip(index, known, strict=True)]
         return NozzleLog(
             stamps=times,
@@ -209,9 +216,10 @@ class TruthLog:
             base_from_target=target,
             place=np.where(there, place, np.nan),
             checkpoint=np.where(there, np.minimum(np.ceil(filled), len(self._places) - 1), -1).astype(np.int64),
-            extrude=self.extruding(times),
+            extrude=extruding,
             reason=np.array(reasons, dtype=np.str_),
             surface_from_tip=self._truth.material(times, nozzle[:, :3, 3]),
+            flow=needed * extruding if flow is None else flow(times, needed),
         )
 
     def _rows(self, times: Array) -> NDArray[np.int64]:
@@ -219,16 +227,22 @@ class TruthLog:
         first = self._due[0] - self._tick if self._due else np.inf
         return np.array([-1 if t <= first else bisect_left(self._due, t) for t in times.tolist()], np.int64)
 
-    def _fractions(self, times: Array, index: NDArray[np.int64], known: NDArray[np.bool_]) -> Array:
-        """Fractional checkpoint (N,) due at times (N,), NaN where there is none."""
-        out = np.full(len(times), np.nan)
+    def _needed(self, fraction: Array, rate: Array) -> Array:
+        """What the bead needs (N,), mm^3/s, at fractional checkpoints (N,) that are passed at a rate (N,), 1/s."""
+        piece = np.clip(np.ceil(fraction).astype(np.int64) - 1, 0, len(self._places) - 2)
+        return np.asarray(self._line.area[piece] * np.diff(self._places)[piece] * rate)
+
+    def _fractions(self, times: Array, index: NDArray[np.int64], known: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Fractional checkpoint (N,) due at times (N,), NaN where there is none; and its rate (N,), 1/s."""
+        out, rate = np.full(len(times), np.nan), np.zeros(len(times))
         for row, i in enumerate(index.tolist()):
             if known[row]:
                 end = self._fraction[i]
                 start = self._fraction[i - 1] if i > 0 and np.isfinite(self._fraction[i - 1]) else end
                 share = 1.0 - (self._due[i] - times[row]) / self._tick
                 out[row] = start + min(max(share, 0.0), 1.0) * (end - start)
-        return out
+                rate[row] = max(end - start, 0.0) / self._tick  # NaN where there is none
+        return out, np.nan_to_num(rate)
 
     def _between(self, fraction: Array) -> Array:
         """surface_from_nozzle (N, 4, 4) at fractional checkpoints (N,): straight and evenly from one to the next."""
@@ -286,4 +300,18 @@ def divide_path(path: Path, piece: float) -> Path:
     cut[:, :3, 3] = before + share[:, None] * (poses[source, :3, 3] - before)
     columns = {name: getattr(path, name)[source] for name in ("speed", "material", "temperature", "layer", "extrude")}
     extra = {name: column[source] for name, column in path.extra.items()}
+    number = np.concatenate([[0], *(np.arange(n) for n in counts)])  # of a piece on its way
+    if "wait_s" in extra:  # at the beginning of the way
+        extra["wait_s"] = np.where(number == 0, extra["wait_s"], "0")
+    if "volume_mm3" in extra:
+        extra["volume_mm3"] = _divided(extra["volume_mm3"], np.concatenate([[1], np.repeat(counts, counts)]))
     return replace(path, surface_from_nozzle=cut, extra=extra, **columns)
+
+
+def _divided(column: NDArray[np.str_], counts: NDArray[np.int64]) -> NDArray[np.str_]:
+    """Numbers as texts (N,), each by its count (N,); what is no number stays, for whoever reads it to say so."""
+    divided = column.astype("U32")
+    for i in np.flatnonzero(counts > 1).tolist():
+        with suppress(ValueError):
+            divided[i] = repr(float(column[i]) / int(counts[i]))
+    return np.asarray(divided)

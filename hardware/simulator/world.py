@@ -30,7 +30,7 @@ from hardware.arm.protocol import frame_from_command
 from hardware.motion.loop import CommandedPose
 from hardware.motion.step import MotionStep
 from hardware.offline.track import FrameSetStep
-from hardware.process.clock import Clock
+from hardware.process.clock import Clock, SimClock
 from hardware.process.faults import FaultPart, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
 from hardware.simulator.arm.controller import VirtualArm
@@ -46,17 +46,19 @@ from hardware.simulator.camera_pipeline import (
 )
 from hardware.simulator.cameras import Shot, TrueCameras
 from hardware.simulator.deposit import NozzleLog
+from hardware.simulator.material import DispensedMotion, SimulatedDispensers
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from perception.frames import FrameSet
-from planning.command import Command
+from planning.command import Command, Move
 from planning.kinematics import nozzle_from_axes
 from planning.path import Path, PrintPhase, PrintProgress
 
 ROW_BLOCK = 0.2  # s of truth rows handed to the sink at once
 RUN_OUT = 0.3  # s that the run goes on after the path is finished
+MATERIAL_POLL = 0.005  # s between looks at the dispensers' lines, as in a live run
 BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
 NEWTON_STEPS = 12  # from the mean plane onto the surface; a wound takes four
 SLOPE_STEP = 1e-3  # mm, for the slope along the surface
@@ -162,7 +164,10 @@ class SimulatedWorld:
         self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *views)
         self._motion_stalls = faults_striking(scenario.faults, FaultPart.MOTION)
         self._pose: SurfacePose | None = None
-        self._motion: MotionStep | None = None
+        self._motion: DispensedMotion | None = None
+        self._time, where = SimClock(), scenario.path
+        self.dispensers = SimulatedDispensers(path, scenario.dispenser, self._time, scenario.faults, where)
+        self.dispensers.control.begin(0.0, 0.0)
         self._ticks, self._rows_until, self._printed_until = 0, 0.0, 0.0
         self._bead_end: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
@@ -172,6 +177,7 @@ class SimulatedWorld:
         total = int(self.scenario.seconds / self.scenario.cameras.period)
         self.pipeline.begin()
         self._events.at(0.0, TICK_EVENT, self._tick)
+        self._events.at(MATERIAL_POLL, TICK_EVENT, partial(self._poll_material, again=True))
         reported, complete = 0, False
         try:
             for _ in self._events.run(lambda: self._end):
@@ -181,6 +187,11 @@ class SimulatedWorld:
             complete = True
         finally:
             self._emit_rows(self._end if complete else self.arm.now)
+
+    @property
+    def told_outside(self) -> float:
+        """How long, s, a dispenser was told to be open until now while no move that prints was sent."""
+        return self.dispensers.told_outside(self._time.now())
 
     def _state_at(self, shot: Shot, now: float) -> WorldState:
         """The world as a shot meets it; the very same object for cameras that expose together."""
@@ -210,18 +221,21 @@ class SimulatedWorld:
         if change is None:
             return
         placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
-        self._motion = MotionStep(placed_path, scenario.profile)
+        step = MotionStep(placed_path, scenario.profile, outlets=self.dispensers.outlets)
+        self._motion = DispensedMotion(step, self.dispensers.control)
         self._sink.registered(change)
 
     def _tick(self, now: float) -> None:
         self._ticks += 1
         self._events.at(self._ticks * self.scenario.profile.tick, TICK_EVENT, self._tick)
-        if self._motion is not None and not any(fault.covers(now) for fault in self._motion_stalls):
+        if self._motion is not None and not self._motion_hangs(now):
+            self._time.wait_until(now)
             command = self._motion(self._pose, now)
             frame = frame_from_command(command, self.scenario.profile.dialect)
             arrival = float(self._wire.send(frame, now)[-1])
             self._events.at(arrival, ARRIVAL_EVENT, partial(self.arm.receive, self._line(frame)))
             self._truth_log.write(command, self._motion.progress)
+            self._tell(command, now)
             self._commanded.add(command, now)
             self.arm.advance(now)
             self._sink.command(command, self._motion.progress, frame, self.arm.transmit(now))
@@ -230,12 +244,30 @@ class SimulatedWorld:
         if now - self._rows_until >= ROW_BLOCK:
             self._emit_rows(now)
 
+    def _motion_hangs(self, now: float) -> bool:
+        return any(fault.covers(now) for fault in self._motion_stalls)
+
+    def _tell(self, command: Command, now: float) -> None:
+        """Let the dispensers be told what a command asks for, at the instant in the tick that it says."""
+        self.dispensers.note(command, self.scenario.profile.tick)
+        self.dispensers.control.follow(command, now)
+        if isinstance(command, Move) and command.flow_after:
+            self._events.at(command.stamp + command.flow_after, TICK_EVENT, self._poll_material)
+
+    def _poll_material(self, now: float, again: bool = False) -> None:
+        if again:
+            self._events.at(now + MATERIAL_POLL, TICK_EVENT, partial(self._poll_material, again=True))
+        if not self._motion_hangs(now):
+            self._time.wait_until(now)
+            self.dispensers.control.poll(now)
+
     def _emit_rows(self, now: float) -> None:
         self.arm.advance(now)
+        self.dispensers.advance(now)
         times = row_instants(self._rows_until, now)
         if len(times):
             self._rows_until = now
-            self._sink.rows(self._truth_log.rows(times, self.arm.axes_at))
+            self._sink.rows(self._truth_log.rows(times, self.arm.axes_at, self.dispensers.flow))
 
     def _print_beads(self, until: float) -> None:
         ends = np.arange(self._printed_until + BEAD_STEP, until, BEAD_STEP)
@@ -243,10 +275,10 @@ class SimulatedWorld:
             return
         self._printed_until = float(ends[-1])
         self.arm.advance(max(until, self.arm.now))
-        extruding = self._truth_log.extruding(ends)
+        laid = self.dispensers.flowing(ends) if self.scenario.dispenser else self._truth_log.extruding(ends)
         nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(ends))
         places = self._scene.shape.material(self._truth.material(ends, nozzle[:, :3, 3]))
-        for place, extrude in zip(places, extruding, strict=True):
-            if extrude and self._bead_end is not None:
+        for place, there in zip(places, laid, strict=True):
+            if there and self._bead_end is not None:
                 self._scene.ink.lay(self._bead_end, place, self.scenario.bead)
-            self._bead_end = place if extrude else None
+            self._bead_end = place if there else None

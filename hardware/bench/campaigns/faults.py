@@ -84,7 +84,7 @@ def judge_fault(run: FaultRunRecord, fault: Fault, until: float) -> FaultVerdict
         silent=_silent(wrong, stamps[rows & report]),
         restless=_restless(log, stamps[rows], (moving | own)[rows]),
         recovered=_recovered(stamps[rows], report[rows] | ~moving[rows], fault),
-        operator=any(fault.start <= stamp < until for stamp in run.stopped),
+        operator=any(fault.start <= stamp < until for stamp in (*run.stopped, *run.seen_to)),
     )
 
 
@@ -205,10 +205,13 @@ def _kind(verdict: FaultVerdict) -> str:
 
 SCENARIOS = ("breathing_calm", "breathing_deep", "breathing_irregular", "hand", "shaking_table_0_1_hz", "still")
 prepared = lru_cache(maxsize=len(SCENARIOS))(prepare_scenario)
+MAX_LEFT_OPEN = 0.1  # s: the dispenser's watchdog
+NOT_PRINTING = "the last command sent is no move that prints, or the arm is not armed"
+LEFT_OPEN = "its line or the motion process was gone: its watchdog closes it"
 EXPOSURE_NOTE = "of what pictures show, until the exposure of the pose that said so"
 FAULT_LOG_COLUMNS = (
     *("seed", "run", "scenario", "over", "spent_s", "fault", "detected_s", "seen_s", "worst_mm"),
-    *("silent", "restless", "recovered_s", "operator"),
+    *("silent", "restless", "recovered_s", "operator", "told_outside_s", "left_open_s"),
 )
 
 
@@ -222,6 +225,8 @@ class FaultRow:
     over: int  # commands of its run that were beyond a limit
     spent: float  # s of processor of its run
     verdict: FaultVerdict
+    told_outside: float = 0.0  # s of its run in which a dispenser was told to be open while no sent move printed
+    left_open: float = 0.0  # s for which a dispenser stayed open at most in its run, when nobody could tell it anything
 
 
 def run_faults(options: argparse.Namespace) -> list[Figure]:
@@ -259,7 +264,8 @@ def one_run(folder: Path, seed: int, number: int) -> list[FaultRow]:
     spent = clock.now() - start
     ends = [*(fault.start for fault in faults[1:]), run.ended]
     verdicts = [judge_fault(run, fault, end) for fault, end in zip(faults, ends, strict=True)]
-    return [FaultRow(seed, number, scenario, run.over, spent, verdict) for verdict in verdicts if verdict is not None]
+    of_run, material = (seed, number, scenario, run.over, spent), (run.told_outside, run.left_open)
+    return [FaultRow(*of_run, verdict, *material) for verdict in verdicts if verdict is not None]
 
 
 def append_log(file: Path, rows: Iterable[FaultRow]) -> None:
@@ -268,7 +274,8 @@ def append_log(file: Path, rows: Iterable[FaultRow]) -> None:
     for row in rows:
         v = row.verdict
         measured = v.detected, v.exposure, v.worst, int(v.silent), int(v.restless), v.recovered, int(v.operator)
-        cells.append([row.seed, row.run, row.scenario, row.over, row.spent, v.fault, *measured])
+        material = row.told_outside, row.left_open
+        cells.append([row.seed, row.run, row.scenario, row.over, row.spent, v.fault, *measured, *material])
     figures.append_rows(file, FAULT_LOG_COLUMNS, cells)
 
 
@@ -280,12 +287,12 @@ def read_log(file: Path, seed: int) -> list[FaultRow]:
             numbers = [float(each[name]) for name in FAULT_LOG_COLUMNS if name not in ("scenario", "fault")]
         except (TypeError, ValueError):
             raise InputError(file, f"line {number}", each, "numbers") from None
-        own, run, over, spent, detected, exposure, worst, silent, restless, recovered, operator = numbers
+        own, run, over, spent, detected, exposure, worst, silent, restless, recovered, operator, *material = numbers
         if own == seed:
             fault = fault_from_text(file, f"line {number}", each["fault"])
             flags = bool(silent), bool(restless), recovered, bool(operator)
             verdict = FaultVerdict(fault, detected, exposure, worst, *flags)
-            rows.append(FaultRow(int(own), int(run), each["scenario"], int(over), spent, verdict))
+            rows.append(FaultRow(int(own), int(run), each["scenario"], int(over), spent, verdict, *material))
     return rows
 
 
@@ -299,11 +306,14 @@ def fault_figures(rows: Sequence[FaultRow]) -> list[Figure]:
     in_time = float((exposure <= MAX_DETECTION).mean()) if len(exposure) else math.nan
     each = sum(row.spent for row in runs.values()) / max(len(verdicts), 1)
     note = f"of {len(verdicts)} faults in {len(runs)} runs of {len({row.scenario for row in rows})} scenarios"
+    told, left = (max((getattr(row, n) for row in rows), default=math.nan) for n in ("told_outside", "left_open"))
     all_day = f"10,000 take {10_000 * each / 3600:.1f} h of one core"
     return [
         Figure("silent failures", sum(v.silent for v in verdicts), "", at_most(0), "", note),
         Figure("commands beyond a limit", sum(row.over for row in runs.values()), "", at_most(0)),
         Figure("arms that moved on while held", sum(v.restless for v in verdicts), "", at_most(0)),
+        Figure("dispenser told on while not printing, most of a run", 1000 * told, "ms", at_most(0), "", NOT_PRINTING),
+        Figure("dispenser left open, longest", 1000 * left, "ms", at_most(1000 * MAX_LEFT_OPEN), "", LEFT_OPEN),
         Figure("largest error while extruding", max((v.worst for v in verdicts), default=math.nan), "mm"),
         Figure("said after, 99 %", _share(exposure, 99), "ms", at_most(1000 * MAX_DETECTION), "", EXPOSURE_NOTE),
         Figure("said within 100 ms", in_time, "", None, "", EXPOSURE_NOTE),

@@ -1,0 +1,294 @@
+"""The dispensers of a simulated print, told over lines in virtual time; as late and as leaky as a scenario says.
+
+[dispenser]                # left out: one that at once gives each bead what it needs while it is told to
+on_dead_time_s = 0.08      # these are true of the device; hardware/simulator/dispenser.py says what they mean
+on_lag_s = 0.04
+off_dead_time_s = 0.08
+off_lag_s = 0.04
+ooze_mm3 = 0.5
+ooze_lag_s = 0.5
+watchdog_s = 0.1
+flow_mm3_s = 5.0           # it is a valve that gives that much; left out: it gives the flow that it is told
+led = true                 # whether the motion knows the four delays and leads them; false: it takes them for 0
+file = "dispenser.toml"    # or what it takes the dispensers for, as in a dispenser file
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path as File
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.errors import InputError
+from estimation.pose import SurfacePose
+from estimation.se3 import Array
+from hardware.dispenser.dispenser import DispenserProfile, Dispensers, check_path_materials
+from hardware.dispenser.line_dispenser import LineDispenser
+from hardware.dispenser.messages import PRESETS
+from hardware.files.dispenser_file import DispenserSettings, outlets_from, read_dispensers
+from hardware.motion.material import MaterialControl
+from hardware.motion.step import MotionStep
+from hardware.process import checks
+from hardware.process.clock import Clock
+from hardware.process.faults import Fault
+from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
+from hardware.simulator.truth import FlowAt
+from planning.command import Command, Move
+from planning.material import Outlets
+from planning.motion.planner import PAUSED
+from planning.path import Path, PrintProgress
+
+TRUTH_KEYS = {  # key in a table [dispenser]: field of VirtualDispenserSettings
+    **{"on_dead_time_s": "on_dead_time", "on_lag_s": "on_lag", "off_dead_time_s": "off_dead_time"},
+    **{"off_lag_s": "off_lag", "ooze_mm3": "ooze", "ooze_lag_s": "ooze_lag", "watchdog_s": "watchdog"},
+    "flow_mm3_s": "flow",
+}
+IDEAL = VirtualDispenserSettings(on_dead_time=0.0, on_lag=0.0, off_dead_time=0.0, off_lag=0.0)
+METERED_ON = "ON {flow_mm3_s}"  # in the language of `arduino`
+ROUNDING = 1e-9  # s: what is shorter is the rounding of an instant
+ANSWER_TIME = 0.01  # s after a line is whole again, within which it is looked at and told
+SEEN_TO_AFTER = 0.3  # s until an operator makes a dispenser ready that is not, and tries again
+PRESET = "arduino"
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedDispenser:
+    """A table [dispenser] of a scenario."""
+
+    truth: VirtualDispenserSettings  # what it does
+    metered: bool = True  # whether it gives the flow that it is told
+    led: bool = True  # whether the motion knows its delays
+    believed: tuple[DispenserSettings, ...] = ()  # what the motion takes it for, of a file
+
+
+def dispenser_from_table(where: object, table: checks.Table, folder: File) -> SimulatedDispenser | None:
+    """The table of the scenario `where`, None for an empty one; InputError names the key that makes no sense."""
+    if not table:
+        return None
+    checks.check_keys(where, "dispenser.", table, (), (*TRUTH_KEYS, "led", "file"))
+    values: dict[str, Any] = {
+        name: checks.number(where, f"dispenser.{k}", table[k]) for k, name in TRUTH_KEYS.items() if k in table
+    }
+    led = table.get("led", True)
+    if not isinstance(led, bool) or ("file" in table and "led" in table):
+        raise InputError(where, "dispenser.led", led, "true or false, and left out where a file says it")
+    believed: tuple[DispenserSettings, ...] = ()
+    if "file" in table:
+        believed = _virtual(folder / checks.text(where, "dispenser.file", table["file"]))
+    try:
+        truth = replace(IDEAL, **values)
+        _profile(truth, ("",), metered=True, led=True)
+    except InputError as error:
+        keys = {name: key for key, name in TRUTH_KEYS.items()}
+        raise InputError(where, f"dispenser.{keys[str(error.what)]}", error.got, error.allowed) from None
+    result = SimulatedDispenser(truth, "flow_mm3_s" not in table, led, believed)
+    if not believed:
+        _drivers(result, ("",), where)
+    return result
+
+
+def _virtual(file: File) -> tuple[DispenserSettings, ...]:
+    """The dispensers of a file, each of which a virtual one can stand for; InputError where it cannot."""
+    found = read_dispensers(file)
+    for each in found:
+        if each.preset not in DIALECTS:
+            raise InputError(file, "dispenser.preset", each.preset, f"for a simulation one of {', '.join(DIALECTS)}")
+        if each.profile.nozzle_offset.any():
+            offset = each.profile.nozzle_offset.tolist()
+            raise InputError(file, "dispenser.nozzle_offset_mm", offset, "left out: a simulation has one nozzle")
+    outlets_from(found, file)
+    return found
+
+
+def _profile(truth: VirtualDispenserSettings, materials: tuple[str, ...], metered: bool, led: bool) -> DispenserProfile:
+    names = ("on_dead_time", "on_lag", "off_dead_time", "off_lag") if led else ()
+    delays = {name: getattr(truth, name) for name in names}
+    return DispenserProfile("dispenser", materials, **delays, watchdog=truth.watchdog, metered=metered, flow=truth.flow)
+
+
+def _drivers(of: SimulatedDispenser, materials: tuple[str, ...], where: object) -> tuple[DispenserSettings, ...]:
+    """What the motion takes a dispenser for that carries all materials; InputError for delays too long to be led."""
+    profile, line = _profile(of.truth, materials, of.metered, of.led), PRESETS[PRESET].line
+    if of.metered:
+        line = replace(line, messages=replace(line.messages, on=METERED_ON, flow=METERED_ON))
+    settings = (
+        DispenserSettings(profile, PRESET, replace(line, keepalive=min(line.keepalive, 0.4 * of.truth.watchdog))),
+    )
+    outlets_from(settings, where)
+    return settings
+
+
+class SimulatedDispensers:
+    """Virtual dispensers, and the motion's hand on them.
+
+    control: for the motion, to be polled every few milliseconds. outlets: for its planner.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        of: SimulatedDispenser | None,
+        clock: Clock,
+        faults: Sequence[Fault] = (),
+        where: object = "path",
+    ) -> None:
+        """of: a scenario's; None: an ideal one. clock: of the virtual time. faults: those on a dispenser's line count.
+
+        InputError (where) for a path with a material that none of them carries.
+        """
+        self._ideal, self._clock = of is None, clock
+        of = SimulatedDispenser(IDEAL, metered=False) if of is None else of
+        materials = tuple(dict.fromkeys(map(str, path.material.tolist())))
+        drivers = of.believed or _drivers(of, materials, where)
+        self.models = [DispenserModel(replace(of.truth, preset=each.preset), clock.now()) for each in drivers]
+        self._ports = [DispenserPort(model, clock, faults) for model in self.models]
+        lines = [
+            LineDispenser(each.profile, replace(each.line, start=0.0), port)
+            for each, port in zip(drivers, self._ports, strict=True)
+            if each.line is not None
+        ]
+        dispensers = Dispensers(lines, where)
+        if of.believed:
+            check_path_materials(dispensers, path, where)
+        self.outlets: Outlets = outlets_from(drivers, where)
+        self.control = MaterialControl(dispensers, path)
+        self._permits: list[tuple[float, float]] = []  # from, until, s: when material may be told to flow
+
+    def cut(self) -> None:
+        """Nobody speaks to them any more."""
+        for port in self._ports:
+            port.dead = True
+
+    def advance(self, now: float) -> None:
+        """Let their time pass until `now`, s."""
+        for model in self.models:
+            model.advance(now)
+
+    # -- what was commanded, to hold what was told against
+
+    def note(self, command: Command, tick: float) -> None:
+        """A command was sent: a Move lets material flow until the next one, or in a tick in which it closes."""
+        until = command.stamp
+        if isinstance(command, Move) and (command.flow or command.flow_after):
+            until = math.inf if command.flow else command.stamp + tick
+        self._permits.append((command.stamp, until))
+
+    def forbid(self, now: float) -> None:
+        """The arm is not armed from `now`, s, until the next command."""
+        last = self._permits[-1] if self._permits else (now, math.inf)
+        if last[1] > now:
+            self._permits.append((max(now, last[0]),) * 2)
+
+    def told_outside(self, until: float, alone: Sequence[tuple[float, float]] = ()) -> float:
+        """How long, s, until `until`, a device was open on its orders while none was to be: by no move that prints.
+
+        alone: from, until, s: when nobody could tell it anything, and what it does is `open_after`.
+        """
+        begin = np.array([start for start, _ in self._permits])
+        end = np.minimum([end for _, end in self._permits], np.append(begin[1:], until)[: len(begin)])
+        outside = 0.0
+        for model in self.models:
+            stamps, flows = self._switches(model)
+            edges = np.concatenate([stamps[1:], begin, end, np.ravel(alone), [until]])
+            edges = np.unique(np.clip(edges, 0.0, until))
+            middle = (edges[1:] + edges[:-1]) / 2
+            last = np.searchsorted(begin, middle, "right") - 1
+            excused = (last >= 0) & (middle < np.append(end, 0.0)[last])
+            for left, back in alone:
+                excused |= (middle >= left) & (middle < back + ANSWER_TIME)
+            told = flows[np.searchsorted(stamps, middle, "right") - 1] > 0
+            length = np.diff(edges)
+            outside += float(length[told & ~excused & (length > ROUNDING)].sum())
+        return outside
+
+    def open_after(self, alone: Sequence[tuple[float, float]], until: float) -> float:
+        """How long, s, a device stayed open at most from when nobody could tell it anything; alone: from, until, s."""
+        longest = 0.0
+        for stamps, flows in map(self._switches, self.models):
+            for left, back in alone:
+                if left < until and flows[np.searchsorted(stamps, left, "right") - 1] > 0:
+                    closed = stamps[(stamps > left) & (flows == 0)]
+                    longest = max(longest, min(closed[0] if len(closed) else until, back, until) - left)
+        return longest
+
+    def open_at(self, instants: Array) -> NDArray[np.bool_]:
+        """Whether a device was told last to be open (N,), and had not closed itself, at instants (N,), s."""
+        told = np.zeros(len(instants), bool)
+        for stamps, flows in map(self._switches, self.models):
+            told |= flows[np.searchsorted(stamps, instants, "right") - 1] > 0
+        return told
+
+    def flow(self, instants: Array, needed: Array) -> Array:
+        """The true flow (N,), mm^3/s, at instants (N,), s. needed: (N,) mm^3/s, what the bead needs there."""
+        if self._ideal:
+            return np.asarray(needed * self.open_at(instants))
+        return np.asarray(sum(model.flow_at(instants) for model in self.models))
+
+    def flowing(self, instants: Array) -> NDArray[np.bool_]:
+        """Whether half of the flow that a device was told last leaves it (N,), at instants (N,), s."""
+        flowing = np.zeros(len(instants), bool)
+        for model in self.models:
+            stamps, flows = self._switches(model)
+            opened = flows > 0
+            last = np.searchsorted(stamps[opened], instants, "right") - 1
+            told = np.append(flows[opened], math.inf)[last]  # before the first there is none
+            flowing |= model.flow_at(instants) > told / 2
+        return flowing
+
+    @staticmethod
+    def _switches(model: DispenserModel) -> tuple[Array, Array]:
+        """Instants (M,), s, rising, and flows (M,) that it obeyed from each on."""
+        stamps, flows = np.array([(-math.inf, 0.0), *model.switches]).T
+        return stamps, flows
+
+
+def flow_from_told(told: Sequence[tuple[float, float]], truth: VirtualDispenserSettings | None = None) -> FlowAt:
+    """The true flow of a dispenser that was told flows, mm^3/s, at instants, s, rising; truth: None of an ideal one."""
+    if truth is None:
+        stamps, flows = np.array([(-math.inf, 0.0), *told]).T
+        return lambda instants, needed: needed * (flows[np.searchsorted(stamps, instants, "right") - 1] > 0)
+    model = DispenserModel(replace(truth, watchdog=math.inf), told[0][0] if told else 0.0)
+    for stamp, flow in told:
+        model.obey(flow, stamp)
+    return lambda instants, needed: model.flow_at(instants)
+
+
+class DispensedMotion:
+    """A motion that waits above the surface while material cannot flow, and an operator who sees to that.
+
+    seen_to: instants, s, at which the operator made a dispenser ready again.
+    """
+
+    def __init__(self, step: MotionStep, control: MaterialControl) -> None:
+        self._step, self._control = step, control
+        self.seen_to: list[float] = []
+        self._dry_since = -math.inf
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s."""
+        dry = self._control.reason
+        self._dry_since = self._dry_since if dry else now
+        wanted = bool(self._step.progress.wanted)
+        if wanted:
+            self._step.material_in()
+        if wanted or (dry and now >= self._dry_since + SEEN_TO_AFTER):
+            self.seen_to.append(now)
+            self._dry_since = now
+            self._control.begin(self._step.progress.fraction, now)
+        self._step.paused = bool(dry)
+        command = self._step(pose, now)
+        return replace(command, reason=dry) if dry and command.reason in ("", PAUSED) else command
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
+        self._step.recalled(place, stands)
+
+    @property
+    def progress(self) -> PrintProgress:
+        """How far the print is."""
+        return self._step.progress
