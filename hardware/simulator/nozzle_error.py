@@ -25,7 +25,7 @@ from hardware.simulator.deposit import (
     row_step,
     row_volumes,
 )
-from planning.motion.flow import MIN_FLOW_SPEED
+from planning.material import MIN_FLOW_SPEED
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")  # but not the 2 of a camera called cam2
 _VARYING_NUMBER = "…"

@@ -23,7 +23,7 @@ from estimation.se3 import Array
 from planning.command import Command, Hold, Move, feed_for
 from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
-from planning.material import Outlets, material_plan
+from planning.material import FlowCommands, FlowOrder, Outlets, RestsAhead, material_plan
 from planning.motion.curve import (
     CORNER_SPEED_CHANGE,
     CORNER_TOLERANCE,
@@ -36,7 +36,6 @@ from planning.motion.curve import (
     point_above,
     straight_curve,
 )
-from planning.motion.flow import FlowCommands, FlowOrder, RestsAhead
 from planning.motion.follow import LOOKAHEAD, AxisFollower
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import Path, PrintPhase, PrintProgress, check_path, check_start
