@@ -164,7 +164,7 @@ def test_a_line_that_is_full_for_a_moment_still_gets_the_off_of_a_close() -> Non
     bench.clock.wait_until(now() + 0.3)
     assert not bench.driver.close(now())
     bench.port.room = 100
-    assert bench.driver.close(now()) and not bench.open
+    assert any(bench.driver.close(now()) for _ in range(2)) and not bench.open, "the first sends what waited"
 
 
 def test_one_that_is_being_closed_is_not_switched_on() -> None:

@@ -123,7 +123,7 @@ class DispenserLine:
     start: float = 0.0  # s after opening in which it takes in nothing but an off: it resets and starts
     gap: float = 0.0  # s between two lines, for a device that must answer one before the next; an off does not wait
     keepalive: float = 0.04  # s between two of them: two may be lost within a watchdog of 100 ms, and one may be late
-    timeout: float = 0.2  # s that the line may take no bytes, or an HTTP request may last
+    timeout: float = 0.05  # s; a line that takes nothing for twice that has failed; of an HTTP request
     plunger: float | None = None  # mm^2
 
 
