@@ -21,14 +21,13 @@ from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
-from hardware.files.path_file import read_progress, write_path, write_progress_durably
+from hardware.files.path_file import ProgressWriter, read_progress, write_path, write_progress_durably
 from hardware.files.ply_file import write_ply
 from hardware.live.checklist import place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.motion_process import LAG_STEP, LiveMotion
 from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
 from hardware.live.prepared import (
-    ProgressWriter,
     RunFiles,
     SurfacePlacement,
     prepare,
@@ -51,6 +50,7 @@ from hardware.live.settings import (
 )
 from hardware.live.state_machine import PrintTask
 from hardware.motion.loop import RecordedTick
+from hardware.process.faults import faults_from_texts
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet
@@ -523,3 +523,42 @@ def test_a_sender_whose_recorder_has_ended_is_no_failure_of_its_own() -> None:
     sender.put(EventEntry(0.0, "x", 2, "y"))
     sender.close()
     sender.check()
+
+
+SCENARIO = 'title = "t"\nseconds = 2\npath = "path.csv"\n'
+
+
+@pytest.mark.parametrize(
+    ("changes", "faults", "words"),
+    [
+        ({"profile": "wrong.toml"}, [], ["wrong.toml", "lag_s"]),
+        ({"path": "wrong.csv"}, [], ["wrong.csv"]),
+        ({"dispensers": "wrong.toml"}, [], ["wrong.toml", "lag_s"]),
+        ({"dispensers": "d.toml"}, [], ["material", "2"]),
+        ({"model": "wrong.onnx"}, [], ["wrong"]),
+        ({}, ["camera5 off at 1s"], ["camera0 to camera2"]),
+        ({"page": False}, ["page flood at 1s"], ["--no-page"]),
+        ({"arm": "/dev/none"}, ["camera0 off at 1s"], ["a virtual arm alone"]),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_away(
+    changes: dict[str, object], faults: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = raster()
+    write_path(tmp_path / "path.csv", replace(path, material=np.where(np.arange(len(path)) < 3, 1, 2)))
+    (tmp_path / "scenario.toml").write_text(SCENARIO)
+    (tmp_path / "d.toml").write_text(DISPENSER.format(materials="1", preset="arduino", dead=0.08))
+    for name, text in (("wrong.toml", "lag_s = -1\n"), ("wrong.csv", "x\n1\n"), ("wrong.onnx", "")):
+        (tmp_path / name).write_text(text)
+    record = tmp_path / "run.mcap"
+    record.write_bytes(b"an earlier run")
+    files = RunFiles(record)
+    files.progress.write_text("an earlier place")
+    names = {key: tmp_path / str(value) if key not in ("page", "arm") else value for key, value in changes.items()}
+    given = {"simulated": tmp_path / "scenario.toml", "arm": "virtual", "record": record} | names
+    with pytest.raises(StillbedError) as caught:
+        asked = faults_from_texts("command line", "--fault", faults)
+        prepare(LiveSettings(**given), "here", True, asked)  # type: ignore[arg-type]
+    assert all(word in str(caught.value) for word in words)
+    assert not (tmp_path / "cache" / "stillbed").exists() and files.progress.read_text() == "an earlier place"

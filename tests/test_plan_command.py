@@ -224,3 +224,23 @@ def test_a_camera_that_shows_no_wound_says_so() -> None:
     nothing = np.zeros(arc_rig().cameras[0].size[::-1], bool)
     found = _sighting(arc_rig().cameras[0], nothing, BASE_FROM_REST, OUTLINE)
     assert "no wound" in placement_lines("TRACKING", [found])[1]
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "words"),
+    [
+        ("--arm", "lag_s = -1\n", "lag_s"), ("--arm", "lag_s = 0.1\n", "kinematics"),
+        ("--outline", "x\n", "header"), ("--session", "", "session"),
+    ],
+)  # fmt: skip
+def test_every_file_that_a_plan_is_given_is_read_before_the_scan(
+    option: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scan is none: whoever read it first would tell of that."""
+    (tmp_path / "scan.ply").write_text("no scan")
+    wrong = tmp_path / ("nowhere.mcap" if option == "--session" else "wrong.toml")
+    if text:
+        wrong.write_text(text)
+    assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "path.csv"), option, str(wrong)]) == 2
+    told = capsys.readouterr().err
+    assert f"stillbed: {wrong}: {words}" in told and "scan.ply" not in told and not (tmp_path / "path.csv").exists()

@@ -132,7 +132,7 @@ def add_init(commands: Commands) -> None:
 
 def _run_live(a: argparse.Namespace) -> int:
     from hardware.files.region_table import read_region
-    from hardware.live.prepared import add_faults, prepare, prepare_resumed
+    from hardware.live.prepared import prepare, prepare_resumed
     from hardware.live.run import LiveRun
     from hardware.live.settings import LiveSettings, override_settings, parse_host_names, read_settings
     from hardware.live.view import Console
@@ -147,13 +147,13 @@ def _run_live(a: argparse.Namespace) -> int:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is None:
         settings = LiveSettings() if a.settings is None else read_settings(a.settings)
-        prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force)
+        prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
     elif a.settings is not None or a.record is not None:
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
     else:
-        prepared = prepare_resumed(a.resume, flags)
+        prepared = prepare_resumed(a.resume, flags, faults)
     with Console() as console:
-        outcome = LiveRun(add_faults(prepared, faults), console)()
+        outcome = LiveRun(prepared, console)()
         outcome.write()
         console.say(outcome.words)
     return outcome.code

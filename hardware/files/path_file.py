@@ -20,7 +20,9 @@ import difflib
 import io
 import math
 import os
+import threading
 from collections.abc import Sequence
+from ctypes import c_double
 from pathlib import Path as File
 
 import numpy as np
@@ -40,6 +42,7 @@ PATH_HEADER = (*POSE_COLUMNS, "speed_mm_s", *PRINT_COLUMNS, *OPTIONAL_COLUMNS)
 COLUMN_STEMS = {name.split("_")[0]: name for name in ("temperature_c", *POSE_COLUMNS)}  # x, alpha: they need units
 COLUMN_STEMS["speed"] = " or ".join(SPEED_COLUMNS)
 MIN_PATH_SPAN = 0.1  # mm, corner to corner: less than any wound, and as much as a tenth of a metre has in metres
+PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
 
 
 def read_path(file: str | File) -> Path:
@@ -284,3 +287,42 @@ def _replace(file: File, mark: ProgressMark, printed: int, durable: bool = False
         if durable:
             os.fsync(stream.fileno())
     beside.replace(file)
+
+
+class ProgressWriter:
+    """Writes progress.toml in a thread whenever the place has changed, as the disk may take its time.
+
+    failed: the error of the disk, or what ended the thread; "" if there is none.
+    """
+
+    def __init__(self, file: File, fingerprint: str, place: c_double) -> None:
+        """fingerprint: of the path; "" for a dry run, of which no place is kept. place: on the path, in checkpoints."""
+        self.failed = ""
+        self._file, self._fingerprint, self._place = file, fingerprint, place
+        self._written = math.nan
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write the last place, and end."""
+        self._closed.set()
+        self._thread.join()
+
+    def _keep(self) -> None:
+        try:
+            while not self._closed.wait(PROGRESS_PERIOD):
+                self._write()
+            self._write()
+        except Exception as error:  # whatever ends this thread ends the run
+            self.failed = f"{self._file}: {type(error).__name__}: {error}"
+
+    def _write(self) -> None:
+        fraction = self._place.value
+        if not self._fingerprint or math.isnan(fraction) or fraction == self._written:
+            return
+        try:
+            write_progress_durably(self._file, self._fingerprint, fraction)
+            self._written, self.failed = fraction, ""
+        except OSError as error:
+            self.failed = f"{self._file}: {error.strerror or error}"

@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 import re
 import shutil
-import threading
-from ctypes import c_double
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path as File
 from typing import Any
@@ -34,7 +34,7 @@ from hardware.files.dispenser_file import (
     outlets_from,
     read_dispensers,
 )
-from hardware.files.path_file import read_path, read_progress, write_progress_durably
+from hardware.files.path_file import read_path, read_progress
 from hardware.files.region_table import check_region
 from hardware.files.rig_file import RIG_FILE, read_rig, scan_of
 from hardware.live.settings import (
@@ -56,7 +56,7 @@ from hardware.recording.messages import rig_from_message
 from planning.material import Outlets, with_offsets
 from planning.path import Path
 
-PROGRESS_PERIOD = 0.05  # s between looks at the place: a tenth of a checkpoint's time, or less
+RENDERED = File("session.mcap")  # of a scenario: the session in its folder, which holds no scan
 
 
 class RunFiles:
@@ -169,8 +169,12 @@ class Prepared:
         return self.session.suffix == ".toml"
 
 
-def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
-    """A new run. InputError where a file makes no sense or the recording exists and `force` is not set."""
+def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fault, ...] = ()) -> Prepared:
+    """A new run. InputError where a file makes no sense or the recording exists and `force` is not set.
+
+    faults: to be injected, before simulated cameras and a simulated arm alone. Every input is checked before a scenario
+    is rendered, and before anything of an earlier run is taken away.
+    """
     settings = check_settings(settings, where)
     if settings.page:
         page_settings(settings, where)
@@ -180,14 +184,13 @@ def prepare(settings: LiveSettings, where: object, force: bool) -> Prepared:
         raise InputError(settings.record, "--record", "a file that exists", "a new file, or --force")
     if not settings.record.parent.is_dir():
         raise InputError(settings.record, "--record", "no such folder", "a file in a folder that exists")
-    prepared = _prepared(settings, files, None)
-    check_region(where, settings.region, prepared.rig)
+    prepared = _prepared(settings, files, None, faults, where)
     for file in (files.progress, files.surface):
         file.unlink(missing_ok=True)
     return prepared
 
 
-def prepare_resumed(record: File, flags: dict[str, Any]) -> Prepared:
+def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ...] = ()) -> Prepared:
     """The run that goes on where the one recorded in `record` stopped, with its settings and what `flags` overrides.
 
     Whether it runs unattended is never taken over: nobody has looked at this run yet.
@@ -203,8 +206,7 @@ def prepare_resumed(record: File, flags: dict[str, Any]) -> Prepared:
     settings = check_settings(replace(settings, record=again.record), files.session)
     if settings.page:
         page_settings(settings, files.session)
-    prepared = _prepared(settings, again, placement)
-    check_region(files.session, settings.region, prepared.rig)
+    prepared = _prepared(settings, again, placement, faults, files.session)
     path = prepared.task.path
     start = read_progress(files.progress, path) if files.progress.exists() else 0.0
     if start >= len(path) - 1:
@@ -219,45 +221,70 @@ def prepare_resumed(record: File, flags: dict[str, Any]) -> Prepared:
     return replace(prepared, task=task)
 
 
-def _prepared(settings: LiveSettings, files: RunFiles, placement: SurfacePlacement | None) -> Prepared:
+def _prepared(
+    settings: LiveSettings,
+    files: RunFiles,
+    placement: SurfacePlacement | None,
+    faults: tuple[Fault, ...],
+    where: object,
+) -> Prepared:
     notes = [f"dry run, {settings.lift:g} mm above the path"] if settings.dry_run else []
-    scenario, session, profile, path = settings.simulated, settings.rig, settings.profile, settings.path
-    virtual: File | None = None
-    if scenario is not None:
-        rendered = _rendered(scenario)
-        session, virtual = rendered / "session.mcap", rendered / "virtual_arm.toml"
-        profile, path = profile or rendered / "arm.toml", path or rendered / "path.csv"
-        notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
-    assert session is not None and path is not None
-    printed_path = read_path(path)
-    dispensers, outlets = _dispensers(settings, printed_path, path)
+    scenario, session, virtual = settings.simulated, settings.rig, None
+    _check_live_faults(settings, faults)
+    check_rig = partial(_check_rig, settings, faults, where)
+    given = None if settings.profile is None else read_arm(settings.profile)
+    named = settings.path if settings.path is not None or scenario is None else _path_named_in(scenario)
+    path = None if named is None else read_path(named)
+    dispensers, outlets = _dispensers(settings, path, named)
     notes += _dispenser_notes(settings, dispensers)
     if settings.model is not None:
         from perception.wound.network import hash_of, read_settings  # loads onnxruntime
 
         read_settings(settings.model.with_suffix(".toml"), hash_of(settings.model))
+    scan = scan_of(settings.scan, RENDERED if session is None else session)
+    if scenario is not None:
+        rendered = _rendered(scenario, check_rig)
+        session, virtual = rendered / RENDERED, rendered / "virtual_arm.toml"
+        given = given or read_arm(rendered / "arm.toml")
+        path = read_path(rendered / "path.csv") if settings.path is None else path
+        notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
+    assert session is not None and path is not None
     task = PrintTask(
-        path=printed_path,
+        path=path,
         dispensers=dispensers,
         outlets=outlets,
-        profile=_switching(ArmProfile() if profile is None else read_arm(profile), dispensers),
-        place=profile is None,
+        profile=_switching(given or ArmProfile(), dispensers),
+        place=given is None,
         stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
         lift=settings.lift if settings.dry_run else None,
         unattended=settings.unattended,
         patience=settings.patience,
     )
-    rig, again, scan = rig_from_session(session), scenario is not None, scan_of(settings.scan, session)
-    return Prepared(settings, session, rig, again, virtual, task, scan, placement, files, tuple(notes))
+    rig, again = rig_from_session(session), scenario is not None
+    check_rig(rig)
+    notes += [f"will happen: {fault}" for fault in faults]
+    return Prepared(settings, session, rig, again, virtual, task, scan, placement, files, tuple(notes), faults)
 
 
-def _dispensers(settings: LiveSettings, path: Path, where: File) -> tuple[str, Outlets]:
+def _check_rig(settings: LiveSettings, faults: tuple[Fault, ...], where: object, rig: Rig) -> None:
+    """InputError where a fault or the region is of a camera that the rig has not."""
+    check_faults(faults, FaultRunner.LIVE, "command line", "--fault", len(rig))
+    check_region(where, settings.region, rig)
+
+
+def _path_named_in(scenario: File) -> File | None:
+    """The path that a scenario names; None where it names none, which whoever renders it says."""
+    named = checks.read_toml(scenario).get("path")
+    return scenario.parent / named if isinstance(named, str) and named else None
+
+
+def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -> tuple[str, Outlets]:
     """The text of the dispenser file and the outlets of the path's materials; nothing in a dry run or without a file.
 
     InputError where the path needs what no dispenser can do.
     """
     file = settings.dispensers
-    if file is None or settings.dry_run:
+    if file is None or path is None or settings.dry_run:
         return "", {}
     read = read_dispensers(file)
     dispensers = Dispensers([dispenser_from_settings(each) for each in read], file)
@@ -304,10 +331,13 @@ def rig_from_session(session: File) -> Rig:
     raise InputError(session, "/rig", "no message", "a recording of stillbed's")
 
 
-def _rendered(scenario: File) -> File:
-    """The folder of the scenario's pre-rendered session; rendering is done by a process that ends before the run."""
+def _rendered(scenario: File, check_rig: Callable[[Rig], None]) -> File:
+    """The folder of the scenario's pre-rendered session; rendering is done by a process that ends before the run.
+
+    check_rig: is shown its cameras before it is rendered. StillbedError for a scenario that makes no sense.
+    """
     answer, theirs = SPAWN.Pipe(duplex=False)
-    process = SPAWN.Process(target=_render, args=(scenario, theirs))
+    process = SPAWN.Process(target=_render, args=(scenario, check_rig, theirs))
     process.start()
     theirs.close()
     try:
@@ -321,11 +351,13 @@ def _rendered(scenario: File) -> File:
     return File(folder)
 
 
-def _render(scenario: File, answer: Connection) -> None:
+def _render(scenario: File, check_rig: Callable[[Rig], None], answer: Connection) -> None:
     from hardware.live.prerender import prerender  # loads all of the simulator
+    from hardware.simulator.scenario import read_scenario
 
     cache = cache_folder()
     try:
+        check_rig(read_scenario(scenario).known_rig)
         answer.send((str(prerender(scenario, cache).folder), ""))
     except StillbedError as error:
         answer.send(("", str(error)))
@@ -333,54 +365,15 @@ def _render(scenario: File, answer: Connection) -> None:
         answer.send(("", str(cache_error(cache, error))))
 
 
-def add_faults(prepared: Prepared, faults: tuple[Fault, ...]) -> Prepared:
-    """The run with faults to be injected; InputError unless cameras and arm are simulated."""
-    check_faults(faults, FaultRunner.LIVE, "command line", "--fault", len(prepared.rig))
-    if faults and (prepared.live or prepared.settings.arm != VIRTUAL_ARM):
+def _check_live_faults(settings: LiveSettings, faults: tuple[Fault, ...]) -> None:
+    """InputError for faults of anything that is not simulated, or that cannot be."""
+    check_faults(faults, FaultRunner.LIVE, "command line", "--fault")
+    live = settings.simulated is None and settings.rig is not None and settings.rig.suffix == ".toml"
+    if faults and (live or settings.arm != VIRTUAL_ARM):
         raise InputError("command line", "--fault", str(faults[0]), "with --simulated and a virtual arm alone")
     for fault in faults:
-        if fault.part is FaultPart.PAGE and not prepared.settings.page:
+        if fault.part is FaultPart.PAGE and not settings.page:
             raise InputError("command line", "--fault", str(fault), "a run with the operator's page, without --no-page")
         if fault.part is FaultPart.ARM and math.isfinite(fault.duration):
             allowed = "no duration: a virtual arm is not plugged in again"
             raise InputError("command line", "--fault", str(fault), allowed)
-    return replace(prepared, faults=faults, notes=(*prepared.notes, *(f"will happen: {fault}" for fault in faults)))
-
-
-class ProgressWriter:
-    """Writes progress.toml in a thread whenever the place has changed, as the disk may take its time.
-
-    failed: the error of the disk, or what ended the thread; "" if there is none.
-    """
-
-    def __init__(self, file: File, fingerprint: str, place: c_double) -> None:
-        """fingerprint: of the path; "" for a dry run, of which no place is kept. place: on the path, in checkpoints."""
-        self.failed = ""
-        self._file, self._fingerprint, self._place = file, fingerprint, place
-        self._written = math.nan
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._keep, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Write the last place, and end."""
-        self._closed.set()
-        self._thread.join()
-
-    def _keep(self) -> None:
-        try:
-            while not self._closed.wait(PROGRESS_PERIOD):
-                self._write()
-            self._write()
-        except Exception as error:  # whatever ends this thread ends the run
-            self.failed = f"{self._file}: {type(error).__name__}: {error}"
-
-    def _write(self) -> None:
-        fraction = self._place.value
-        if not self._fingerprint or math.isnan(fraction) or fraction == self._written:
-            return
-        try:
-            write_progress_durably(self._file, self._fingerprint, fraction)
-            self._written, self.failed = fraction, ""
-        except OSError as error:
-            self.failed = f"{self._file}: {error.strerror or error}"

@@ -28,11 +28,12 @@ from hardware.arm.link import emergency_stop
 from hardware.arm.profile import ArmProfile
 from hardware.dispenser.dispenser import Dispensers, close_dispensers
 from hardware.files.dispenser_file import dispenser_from_settings, dispensers_from_text
+from hardware.files.path_file import ProgressWriter
 from hardware.live.checklist import PlacedPath, checks_table
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
-from hardware.live.prepared import Prepared, ProgressWriter, SurfacePlacement, placement_text, write_placement
+from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
 from hardware.live.records import BeginPrint, EventEntry, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text
 from hardware.live.state_machine import Orders, RunStateMachine

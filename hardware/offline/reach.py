@@ -113,10 +113,11 @@ def run_reach(
 ) -> ReachAnswer:
     """Whether an arm can print a path, given their files; writes path.csv, reach.csv and reach.html into `out`."""
     checkpoints = read_path(path)
+    if out is not None:
+        prepare_out(out, force)
     model, motion, reach = _evaluated(checkpoints, arm, question)
     text = reach_text(model, reach, best_posture(model, _arm_from_surface(question), checkpoints, motion), question)
     if out is not None:
-        prepare_out(out, force)
         _write(out, with_feasible_column(checkpoints, reach), reach)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
     return ReachAnswer(text, bool(reach.feasible.all()))
@@ -131,14 +132,19 @@ def with_feasible(path: Path, arm: File) -> tuple[Path, str]:
 
 def _evaluated(path: Path, arm: File, question: ReachQuestion) -> tuple[JointModel, SurfaceMotion, Reach]:
     """The arm's model, the surface's motion, and the arm's reach along the path over that motion."""
-    profile = read_arm(arm)
-    model = profile.arm.joints
-    if model is None:
-        raise InputError(arm, "kinematics", "missing", "a table [kinematics]: data/arms has examples")
+    profile, model = read_jointed_arm(arm)
     motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
     place = _arm_from_surface(question)
     spin = best_spin(model, place, path, motion) if question.spin else np.zeros(len(path))
     return model, motion, _within(profile, place, path, motion, reach_at_spin(model, place, path, motion, spin))
+
+
+def read_jointed_arm(arm: File) -> tuple[ArmProfile, JointModel]:
+    """The profile in an arm file and the model of its joints; InputError where it has none."""
+    profile = read_arm(arm)
+    if profile.arm.joints is None:
+        raise InputError(arm, "kinematics", "missing", "a table [kinematics]: data/arms has examples")
+    return profile, profile.arm.joints
 
 
 def with_feasible_column(path: Path, reach: Reach) -> Path:

@@ -203,6 +203,8 @@ def run_track(
     session = open_session(path)
     if model is not None:
         _network_segmenter(model)  # what is wrong with it is told before anything is written
+    if record is not None:
+        _check_record(record, force)
     prepare_out(out, force)
     clock = WallClock()
     complete = False
@@ -220,6 +222,17 @@ def run_track(
         finally:
             text = _write_report(out, session, complete, method)
     return f"{text}\nreport: {out / 'report.html'}", session.damage
+
+
+def _check_record(record: Path, force: bool) -> None:
+    """InputError where the recording cannot be written, before a tracker is started."""
+    from estimation.errors import InputError
+
+    if record.is_dir() or (record.exists() and not force):
+        got = "a folder" if record.is_dir() else "a file that exists"
+        raise InputError(record, "--record", got, "a new file, or --force")
+    if not record.parent.is_dir():
+        raise InputError(record, "--record", "no such folder", "a file in a folder that exists")
 
 
 def follow(

@@ -232,20 +232,20 @@ def subject_of(request: PlanRequest, flat: bool, progress: ProgressReport = no_p
         if contour.shape[1] != 2:
             raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
         return PlanSubject(request.scan.name, flat_wound(contour, height, request.scan), None)
+    drawn = None if request.outline is None else read_contour(request.outline)
     raw = read_raw_mesh(request.scan)
     progress(1, SCAN_STEPS)
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
     scan, repairs = repair_mesh(vertices, raw.triangles, request.scan, request.flip)
     progress(2, SCAN_STEPS)
-    outline = None if request.outline is None else _outline(request.outline, scan.vertices)
+    outline = None if drawn is None else _outline(drawn, scan.vertices)
     wound = find_wound(scan, step, request.scan, outline, request.flip)
     progress(SCAN_STEPS, SCAN_STEPS)
     return PlanSubject(request.scan.name, wound, repairs)
 
 
-def _outline(file: Path, vertices: Array) -> Array:
-    """An outline (N, 3), mm; without z it is laid on the scan as seen along the scan's z."""
-    points = read_contour(file)
+def _outline(points: Array, vertices: Array) -> Array:
+    """An outline (N, 3), mm, of points (N, 2 or 3); without z it is laid on the scan as seen along the scan's z."""
     if points.shape[1] == 3:
         return points
     near = [int(np.argmin(np.sum((vertices[:, :2] - point) ** 2, axis=1))) for point in points]

@@ -23,7 +23,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.files.path_file import gcode_text, write_path
 from hardware.files.ply_file import write_ply
-from hardware.offline.reach import with_feasible
+from hardware.offline.reach import read_jointed_arm, with_feasible
 from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, order_of, subject_of
 from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text
 from hardware.process.clock import WallClock
@@ -57,6 +57,8 @@ def run_plan(request: PlanRequest) -> str:
 
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
     order = order_of(request.settings, flat)
+    if request.arm is not None:
+        read_jointed_arm(request.arm)  # what is wrong with it is told before the long work
     if request.session is not None:
         if flat:
             allowed = "nothing with a contour: it has no shape to be found by"
