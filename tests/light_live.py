@@ -99,7 +99,7 @@ def png() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-def unkept(order: Any) -> Any:
+def unkept(*_: Any) -> Any:
     """A path that, carried to where it lies, is refused by the reader of paths."""
     from estimation.errors import InputError
 
