@@ -15,8 +15,9 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import Dialect
+from hardware.cli.main import main
 from hardware.files import arm_file
-from hardware.files.arm_file import read_arm, write_arm
+from hardware.files.arm_file import FAR_LIMIT, LIMIT_KEYS, far_limits_text, read_arm, write_arm
 from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
 from planning.command import Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm
@@ -267,3 +268,37 @@ def test_every_limit_has_a_range_with_room_around_its_default() -> None:
     for name, (low, high) in arm_file.LIMIT_RANGES.items():
         value = np.asarray(getattr(defaults, name)) / arm_file._unit(name)
         assert (low < value).all() and (1.5 * value < high).all(), name
+
+
+@given(name=st.sampled_from(LIMIT_KEYS), times=st.floats(0.2, 6.0), axis=st.integers(0, 5))
+def test_a_limit_is_told_exactly_if_it_is_more_than_three_times_the_usual_one(
+    name: str, times: float, axis: int
+) -> None:
+    usual = getattr(MotionLimits(), name)
+    each = np.ones(6)
+    each[axis] = times
+    limits = object.__new__(MotionLimits)  # what no arm could have is none of its business
+    for field in fields(MotionLimits):
+        object.__setattr__(limits, field.name, getattr(MotionLimits(), field.name))
+    object.__setattr__(limits, name, usual * (each if np.ndim(usual) else times))
+    told = far_limits_text(limits)
+    assert (f"limits.{name} = " in told) == (times > FAR_LIMIT) == bool(told)
+    assert "\n" not in told
+
+
+def test_arms_that_come_along_have_usual_limits() -> None:
+    for name in ("s6h4d", "six_axis"):
+        assert far_limits_text(read_arm(f"data/arms/{name}.toml").limits) == ""
+
+
+@pytest.mark.parametrize("words", [["reach", "data/paths/square_10mm.csv", "--arm"], ["arm", "/dev/none", "--arm"]])
+def test_limits_far_beyond_the_usual_ones_are_told(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = Path("data/arms/s6h4d.toml").read_text()
+    (tmp_path / "arm.toml").write_text(text + "[limits]\npose_error = 5\n")
+    main([*words, str(tmp_path / "arm.toml")])
+    told = capsys.readouterr().out
+    assert told.count("limits.pose_error = 5, 10 times its 0.5") == 1
+    main([*words, "data/arms/s6h4d.toml"])
+    assert "limits." not in capsys.readouterr().out

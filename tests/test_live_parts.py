@@ -386,6 +386,12 @@ def test_a_dispenser_without_a_watchdog_is_told_to_the_operator(tmp_path: Path) 
     assert note == "no dispenser is given: nothing is extruded"
 
 
+def test_limits_far_beyond_the_usual_ones_are_told_to_the_operator(tmp_path: Path) -> None:
+    (tmp_path / "arm.toml").write_text("[limits]\nfeed = 2000\n")
+    (note,) = prepare(dispensing(tmp_path, profile=tmp_path / "arm.toml"), "here", False).notes
+    assert note.startswith("limits far beyond a SEED S6H4D's: limits.feed = 2000, ")
+
+
 def test_a_dry_run_opens_no_dispenser_and_asks_for_no_material(tmp_path: Path) -> None:
     task = prepare(dispensing(tmp_path, dry_run=True), "here", False).task
     assert task.dispensers == "" and task.outlets == {}

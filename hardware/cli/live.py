@@ -206,7 +206,11 @@ def add_arm(commands: Commands) -> None:
 
 
 def _run_arm(a: argparse.Namespace) -> int:
+    from hardware.files.arm_file import far_limits_text
+
     profile = arm_profile(a.arm)
+    if text := far_limits_text(profile.limits):
+        print(text, flush=True)
     return _serve_virtual_arm(a, profile) if a.virtual else _connect_arm(a, profile)
 
 

@@ -44,7 +44,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile, at_baud
+from hardware.arm.profile import AXIS_LETTERS, ArmProfile, at_baud
 from hardware.arm.protocol import Dialect
 from hardware.process import checks
 from perception.frames import check_profile
@@ -54,6 +54,7 @@ from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
 _RAD = float(np.deg2rad(1.0))  # rad a degree
+_ROUNDING = 1e-9  # relative, of a number that has been degrees and rad
 _DH_UNITS = np.array([1.0, _RAD, 1.0, _RAD])  # mm and rad, of a row in mm and degrees
 _AXIS_UNITS = np.array([1.0, 1, 1, _RAD, _RAD, _RAD])  # likewise, of X Y Z A B C
 
@@ -159,6 +160,7 @@ LIMIT_RANGES = {  # in the file's units: beyond, a slip of the pen would switch 
     "on_path": (0.001, 10.0),  # ten beads' width
     "pause": (0.0001, 1.0),
 }
+FAR_LIMIT = 3.0  # times the S6H4D's own: the operator is told of a limit beyond it
 MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
@@ -291,6 +293,19 @@ def _limits(path: Path, table: object, zones: object) -> MotionLimits:
         if np.min(value) < low or np.max(value) > high:
             raise InputError(path, f"limits.{name}", value, f"{low:g} to {high:g}, {_unit_text(name)}")
     return checked
+
+
+def far_limits_text(limits: MotionLimits) -> str:
+    """One line for the operator about limits of more than FAR_LIMIT times the S6H4D's own; "" where there are none."""
+    usual, far = MotionLimits(), list[str]()
+    for name in LIMIT_KEYS:
+        value, known = (np.atleast_1d(getattr(each, name) / _unit(name)) for each in (limits, usual))
+        times = np.abs(value) / np.abs(known)
+        axis = int(times.argmax())
+        if times[axis] > FAR_LIMIT * (1 + _ROUNDING):
+            of = f" of {AXIS_LETTERS[axis]}" if name in _AXES else ""
+            far.append(f"limits.{name} = {value[axis]:g}{of}, {times[axis]:.3g} times its {known[axis]:g}")
+    return f"limits far beyond a SEED S6H4D's: {'; '.join(far)}. Does this arm bear them?" if far else ""
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:

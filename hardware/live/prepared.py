@@ -27,7 +27,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.dispenser.dispenser import Dispensers, check_path_materials
-from hardware.files.arm_file import read_arm
+from hardware.files.arm_file import far_limits_text, read_arm
 from hardware.files.dispenser_file import (
     dispenser_from_settings,
     dispensers_from_text,
@@ -262,6 +262,7 @@ def _prepared(
     )
     rig, again = rig_from_session(session), scenario is not None
     check_rig(rig)
+    notes += filter(None, [far_limits_text(task.profile.limits)])
     notes += [f"will happen: {fault}" for fault in faults]
     return Prepared(settings, session, rig, again, virtual, task, scan, placement, files, tuple(notes), faults)
 
