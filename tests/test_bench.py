@@ -286,3 +286,15 @@ def test_a_file_that_is_no_table_is_one_clear_line(tmp_path: Path) -> None:
     for file in (tmp_path / "x.json", tmp_path / "none.json"):
         with pytest.raises(InputError, match="bench --all"):
             read_whole(file)
+
+
+def test_too_few_views_to_calibrate_from_are_told_and_the_figures_are_not_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["bench", "calibration", "--instants", "2", "--runs", "1", "-o", str(tmp_path / "out")]
+    assert main(line) == 0
+    told = capsys.readouterr().out
+    assert "not measured: camera a: views of the board = 2, allowed 10 or more" in told and "0 of 6" not in told
+    *rendered, drawn = read_figures(tmp_path / "out" / "figures.json")
+    assert all(math.isnan(f.value) and f.note.startswith("not measured") for f in rendered)
+    assert len(rendered) == 10 and math.isfinite(drawn.value)

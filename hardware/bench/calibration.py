@@ -17,7 +17,7 @@ from estimation import se3
 from estimation.calibration.arm_fit import ArmFit, ArmUnknowns, fit_arm
 from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, first_pose, predict
 from estimation.calibration.camera_rig import Calibration, calibrate
-from estimation.calibration.lens_model import BoardViews, lens_of, matrix_of, project_lens
+from estimation.calibration.lens_model import BoardViews, Implausible, Undetermined, lens_of, matrix_of, project_lens
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from hardware.bench.figures import CONSISTENT_NEES, Figure, at_most, relative_nees, rms
@@ -84,27 +84,53 @@ def swaying_board(seed: int, speed: float = 1.0) -> Callable[[Array], Array]:
     return motion
 
 
+RENDERED_FIGURES = (  # of rendered boards: what, unit, target, note
+    ("focal length", "%", at_most(0.1), "largest of three cameras"),
+    ("place", "mm", at_most(0.05), ""),
+    ("place, as claimed", "mm", None, ""),
+    ("turn", "degrees", at_most(0.02), ""),
+    ("clock offset", "ms", at_most(1.0), ""),
+    ("3D error in the working volume", "mm", at_most(0.05), "RMS, shape only"),
+    ("3D error as predicted", "mm", None, ""),
+    ("corner residual, median", "px", None, ""),
+    ("and in stretches held out", "px", None, ""),
+    ("squared error, rendered, in parts of what is claimed", "", None, ""),
+)
+
+
 def _rendered(instants: int) -> Iterator[Figure]:
-    rig = true_rig()
+    """The figures of rendered boards; NaN, with the reason, where they show too little to calibrate from."""
+    rig, missing = true_rig(), ""
+    try:
+        values = _rendered_values(rig, instants)
+    except (Undetermined, Implausible) as error:
+        values, missing = [float("nan")] * len(RENDERED_FIGURES), str(error)
+    pictures = f"{instants} frame sets at {BOARD_RATE:g} Hz, {BOARD}, blur {BLUR_PX:g} px, noise {GREY_NOISE:g}"
+    for number, (value, (what, unit, target, note)) in enumerate(zip(values, RENDERED_FIGURES, strict=True)):
+        told = note if number else f"{pictures}; {note}"
+        if missing:
+            told = "not measured" if number else f"not measured: {missing}"
+        yield Figure(what, value, unit, target, "" if number else NO_REFERENCE, told)
+
+
+def _rendered_values(rig: Rig, instants: int) -> list[float]:
+    """The values of RENDERED_FIGURES."""
     views, _ = usable_views(_corner_table(rig, instants), BOARD, tuple("abc"), (PICTURE_SIZE,) * 3)
     calibration = calibrate(views)
-    error = _errors(calibration, rig)
-    pictures = f"{instants} frame sets at {BOARD_RATE:g} Hz, {BOARD}, blur {BLUR_PX:g} px, noise {GREY_NOISE:g}"
-    focal = float(np.abs(error[:, 0] / TRUE_LENSES[:, 0]).max())
-    note = f"{pictures}; largest of three cameras"
-    yield Figure("focal length", 100 * focal, "%", at_most(0.1), NO_REFERENCE, note)
-    yield Figure("place", float(np.linalg.norm(error[:, 12:15], axis=1).max()), "mm", at_most(0.05))
-    sigma = max(float(np.sqrt(np.trace(calibration.covariance_of(c)[12:15, 12:15]))) for c in range(len(rig)))
-    yield Figure("place, as claimed", sigma, "mm")
-    yield Figure("turn", float(np.degrees(np.linalg.norm(error[:, 9:12], axis=1).max())), "degrees", at_most(0.02))
-    yield Figure("clock offset", 1e3 * float(np.abs(error[:, 15]).max()), "ms", at_most(1.0))
-    points = calibration.working_volume()
-    shape = rms(_triangulation_errors(calibration.rig, rig, points))
-    yield Figure("3D error in the working volume", shape, "mm", at_most(0.05), "", "RMS, shape only")
-    yield Figure("3D error as predicted", calibration.predicted_error(points).typical, "mm")
-    yield Figure("corner residual, median", median_residual(calibration), "px")
-    yield Figure("and in stretches held out", held_out_residual(calibration), "px")
-    yield Figure("squared error, rendered, in parts of what is claimed", _camera_nees(calibration, error), "")
+    error, points = _errors(calibration, rig), calibration.working_volume()
+    covariances = (calibration.covariance_of(c)[12:15, 12:15] for c in range(len(rig)))
+    return [
+        100 * float(np.abs(error[:, 0] / TRUE_LENSES[:, 0]).max()),
+        float(np.linalg.norm(error[:, 12:15], axis=1).max()),
+        max(float(np.sqrt(np.trace(covariance))) for covariance in covariances),
+        float(np.degrees(np.linalg.norm(error[:, 9:12], axis=1).max())),
+        1e3 * float(np.abs(error[:, 15]).max()),
+        rms(_triangulation_errors(calibration.rig, rig, points)),
+        calibration.predicted_error(points).typical,
+        median_residual(calibration),
+        held_out_residual(calibration),
+        _camera_nees(calibration, error),
+    ]
 
 
 def _corner_table(rig: Rig, instants: int) -> CornerTable:

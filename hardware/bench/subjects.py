@@ -102,7 +102,7 @@ _SUBJECTS = (
         _number("--seed", 0, None, "of motions and noise; default 0"),
     ),
     _subject("calibration", "calibration", "cameras calibrated from rendered boards, beside the exact rig")(
-        _number("--instants", 60, "N", "frame sets that are rendered; default 60"),
+        _option("--instants", type=_positive, default=60, metavar="N", help="frame sets, rendered; default 60"),
         _number("--runs", 50, "N", "runs without pictures; default 50"),
     ),
     _subject("cameras", "detection", "frames of live cameras put into sets: complete, wrong, waited for")(
