@@ -21,10 +21,13 @@ from estimation.errors import InputError, StillbedError
 from hardware.arm.profile import ArmProfile
 from hardware.cli.main import main
 from hardware.files.arm_file import write_arm
+from hardware.files.rig_file import write_board
+from hardware.offline.convert import import_folder
 from hardware.recording import session_reader as channels
 from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, walk
 from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.session_reader import open_session
+from tests.board_session import BOARD, rendered
 from tests.recorded import whole_recording, write_frames
 from tests.session_files import image, make_folder, rig, stamps
 from tests.started import ROOT
@@ -238,3 +241,24 @@ def test_what_damage_leaves_says_so(flags: list[str], tmp_path: Path, capsys: py
     assert "is damaged" not in capsys.readouterr().out
     assert main([*flags, str(cut), "-o", str(tmp_path / "cut")]) == 1
     assert capsys.readouterr().out.startswith(f"The recording is damaged: {open_session(cut).damage}.\n")
+
+
+def test_a_plan_laid_into_a_damaged_recording_masks_and_a_calibration_from_one_say_so(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    plan = ["plan", "--example", "forearm", "-o", str(tmp_path / "path.csv"), "--no-pictures", "--bead", "2"]
+    assert main([*plan, "--session", str(cut)]) == 1
+    told = f"The recording is damaged: {open_session(cut).damage}.\n"
+    assert capsys.readouterr().out.endswith(told)
+    assert main(["segment", str(cut), "-o", str(tmp_path / "masks"), "--method", "shape"]) == 1
+    assert f"The recording is damaged: {cut}: {open_session(cut).damage}.\n" in capsys.readouterr().out
+    write_board(tmp_path / "board.toml", BOARD)
+    import_folder(rendered(tmp_path / "waved", instants=12), tmp_path / "waved.mcap")
+    calibrate = ["calibrate", "cameras", "--board", str(tmp_path / "board.toml"), "--limit-mm", "10"]
+    assert main([*calibrate, str(tmp_path / "waved.mcap"), "-o", str(tmp_path / "rig.toml")]) == 0
+    assert "is damaged" not in capsys.readouterr().out
+    cut.write_bytes((tmp_path / "waved.mcap").read_bytes()[:-100])
+    assert main([*calibrate, str(cut), "-o", str(tmp_path / "again.toml")]) == 1
+    assert capsys.readouterr().out.endswith(f"The recording is damaged: {open_session(cut).damage}.\n")

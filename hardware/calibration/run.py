@@ -52,6 +52,7 @@ class CalibrationResult:
     calibration: Calibration
     verdict: CalibrationVerdict
     text: str  # for the terminal
+    damage: str = ""  # what was lost of the recording's file, "" if nothing
 
 
 def run_calibration(
@@ -65,7 +66,7 @@ def run_calibration(
     recording, material = open_source(session)
     _check_options(material.names, material.calibrated, recording.path, options)
     table = collect_corners(recording, board, corners_of(out), report)
-    return finish(material, table, board, board_file, out, options)
+    return replace(finish(material, table, board, board_file, out, options), damage=recording.damage)
 
 
 def run_live(

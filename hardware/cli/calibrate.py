@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, INTERRUPTED, Commands, arm_profile, positive, progress_bar, wrong_option
+from hardware.cli.parser import (
+    FAILED,
+    INTERRUPTED,
+    Commands,
+    arm_profile,
+    damage_code,
+    positive,
+    progress_bar,
+    wrong_option,
+)
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import check_new, left_files_text
 
@@ -171,7 +180,8 @@ def _cameras(a: argparse.Namespace) -> int:
         print(f"\nstillbed: interrupted; {message}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)
-    return 0 if outcome.verdict.passed else FAILED
+    code = damage_code(outcome.damage)
+    return code if outcome.verdict.passed else FAILED
 
 
 def _opened_page(clock: Clock) -> WavingPage:

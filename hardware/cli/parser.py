@@ -68,6 +68,15 @@ def wrong_option(option: str, got: object, allowed: str) -> InputError:
     return InputError("command line", option, got, allowed)
 
 
+def damage_code(damage: str) -> int:
+    """Print what is damaged in a recording, where something is; the exit code of a command that used it."""
+    from hardware.files.session import damage_text
+
+    if text := damage_text(damage):
+        print(text)
+    return FAILED if damage else 0
+
+
 def progress_bar(what: str, unit: str) -> Progress:
     """Progress by the machine's clock, on stderr."""
     return Progress(what, unit, WallClock().now)

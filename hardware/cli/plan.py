@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import StillbedError
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, not_negative, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, Commands, damage_code, not_negative, wrong_option
 from perception.package_data import named_path
 
 if TYPE_CHECKING:
@@ -130,14 +130,16 @@ def _add_way(command: argparse.ArgumentParser) -> None:
         add(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
 
 
-def _run_plan(a: argparse.Namespace) -> None:
+def _run_plan(a: argparse.Namespace) -> int:
     from hardware.plan.order import PlanRequest, PlanSettings
     from hardware.plan.run import run_plan
 
     values = {f.name: getattr(a, f.name) for f in fields(PlanSettings) if f.name != "tissues"}
     settings = PlanSettings(tissues=tuple(a.tissue), **values)
     source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
-    print(run_plan(PlanRequest(*source, not a.no_pictures, a.force, a.arm, settings)))
+    text, damage = run_plan(PlanRequest(*source, not a.no_pictures, a.force, a.arm, settings))
+    print(text)
+    return damage_code(damage)
 
 
 def add_reach(commands: Commands) -> None:
@@ -246,7 +248,7 @@ def add_train(commands: Commands) -> None:
     add("--force", action="store_true", help="overwrite X.onnx and begin anew")
 
 
-def _run_segment(a: argparse.Namespace) -> None:
+def _run_segment(a: argparse.Namespace) -> int:
     from hardware.offline.segment import SegmentOptions, run_segment
 
     if a.mm_per_px is not None and not 0 < a.mm_per_px < 100:
@@ -258,7 +260,9 @@ def _run_segment(a: argparse.Namespace) -> None:
     if a.method == UNET_METHOD and a.scan is not None:
         raise wrong_option("--scan", a.scan, "a scan only with --method shape")
     segmenter = _segmenter(a)
-    print(run_segment(a.inputs, a.out, segmenter, SegmentOptions(a.overlay, a.mm_per_px, a.force)))
+    text, damage = run_segment(a.inputs, a.out, segmenter, SegmentOptions(a.overlay, a.mm_per_px, a.force))
+    print(text)
+    return damage_code(damage)
 
 
 def _segmenter(a: argparse.Namespace) -> Segmenter:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, progress_bar, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, damage_code, progress_bar, wrong_option
 from hardware.offline.track import MAP_METHOD, TRACKING_METHODS
 from hardware.process.progress import prepare_out
 from perception.package_data import named_path
@@ -115,7 +115,7 @@ def _replay(a: argparse.Namespace) -> int:
     prepare_out(a.out, a.force)
     with progress_bar("replay", "frame sets") as progress:
         moves, holds = replay_session(session, a.path, a.out, progress, profile, a.resume, faults)
-    code = _damage_code(session.damage)
+    code = damage_code(session.damage)
     print(f"{moves} moves and {holds} holds: commands.csv and frames.bin in {a.out}")
     return code
 
@@ -125,7 +125,7 @@ def _replay_run(a: argparse.Namespace) -> int:
 
     count = write_replay(a.session, a.out, a.force)
     same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
-    code = _damage_code(count.damage)
+    code = damage_code(count.damage)
     print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {a.out}")
     return FAILED if count.other else code
 
@@ -143,18 +143,9 @@ def _export(a: argparse.Namespace) -> int:
 
     with progress_bar("export", "images") as progress:
         damage = export_recording(a.mcap, a.out, progress)
-    code = _damage_code(damage)
+    code = damage_code(damage)
     print(f"a session folder is in {a.out}")
     return code
-
-
-def _damage_code(damage: str) -> int:
-    """Print what is damaged in a recording, where something is; the exit code of a command that used it."""
-    from hardware.files.session import damage_text
-
-    if text := damage_text(damage):
-        print(text)
-    return FAILED if damage else 0
 
 
 def add_smooth(commands: Commands) -> None:
@@ -228,7 +219,7 @@ def _compare(a: argparse.Namespace) -> int:
     from hardware.offline.trajectory_files import poses_damage
 
     print(run_compare(a.estimated, a.reference, a.delta, a.out))
-    return max(_damage_code(poses_damage(name)) for name in (a.estimated, a.reference) if name is not None)
+    return max(damage_code(poses_damage(name)) for name in (a.estimated, a.reference) if name is not None)
 
 
 def add_view(commands: Commands) -> None:

@@ -41,25 +41,26 @@ class SegmentOptions:
     force: bool = False  # into a folder that is not empty
 
 
-def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: SegmentOptions) -> str:
-    """Segment pictures, folders of pictures, videos and recordings into `out`; the result in two lines of text.
+def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options: SegmentOptions) -> tuple[str, str]:
+    """Segment pictures, folders of pictures, videos and recordings into `out`.
 
-    A mask is NAME.png (a video's NAME_000000.png and so on, a recording's NAME_CAMERA_000000.png), 0 or 255, of the
-    picture's own size. InputError for files that cannot be read is raised at the end, when the masks of all others are
-    written.
+    Returns the result in two lines of text, and what was lost of videos that are cut short and of damaged recordings,
+    "" if nothing. A mask is NAME.png (a video's NAME_000000.png and so on, a recording's NAME_CAMERA_000000.png), 0 or
+    255, of the picture's own size. InputError for files of which nothing can be read is raised at the end, when the
+    masks of all others are written.
     """
     files = input_files(inputs)
     prepare_out(out, options.force)
     if options.overlay:
         (out / OVERLAY_FOLDER).mkdir(exist_ok=True)
-    clock, errors = WallClock(), list[InputError]()
+    clock, errors, lost = WallClock(), list[InputError](), list[str]()
     times, wounds = list[float](), 0  # times: ms of each picture
     with (out / WOUND_TABLE).open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(WOUND_COLUMNS)
         with Progress("segment", "pictures", clock.now) as progress:
             total = sum(expected_count(file) for file in files)
-            for name, image in read_pictures(files, errors):
+            for name, image in read_pictures(files, errors, lost):
                 start = clock.now()
                 result = segmenter(image)
                 times.append(1000 * (clock.now() - start))
@@ -71,7 +72,8 @@ def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options
     _raise_errors(errors, len(times))
     median, p99 = np.percentile(times, [50, 99])
     took = f"{median:.1f} ms each (median), {p99:.1f} ms (p99)"
-    return f"{wounds} of {len(times)} pictures show a wound; {took}\nmasks and {WOUND_TABLE} are in {out}"
+    text = f"{wounds} of {len(times)} pictures show a wound; {took}\nmasks and {WOUND_TABLE} are in {out}"
+    return text, "; ".join(lost)
 
 
 def input_files(inputs: Sequence[Path]) -> list[Path]:
@@ -114,38 +116,42 @@ def expected_count(file: Path) -> int:
     return count
 
 
-def read_pictures(files: Sequence[Path], errors: list[InputError]) -> Iterator[tuple[str, Image]]:
-    """Name of the mask and picture (H, W) or (H, W, 3) BGR, one after another; adds what cannot be read to `errors`."""
+def read_pictures(files: Sequence[Path], errors: list[InputError], lost: list[str]) -> Iterator[tuple[str, Image]]:
+    """Name of the mask and picture (H, W) or (H, W, 3) BGR, one after another.
+
+    Adds what cannot be read to `errors`, and to `lost` what is missing of a video.
+    """
     for file in files:
         try:
             if file.suffix.lower() in PICTURE_SUFFIXES:
                 yield file.stem, decode(file.read_bytes(), file, "picture")
             elif file.suffix.lower() in RECORDING_SUFFIXES:
-                yield from _recorded(file)
+                yield from _recorded(file, lost)
             else:
-                yield from _frames(file)
+                yield from _frames(file, lost)
         except InputError as error:
             errors.append(error)
 
 
-def _recorded(file: Path) -> Iterator[tuple[str, Image]]:
+def _recorded(file: Path, lost: list[str]) -> Iterator[tuple[str, Image]]:
     session = open_session(file)
     with closing(session.open_reader()) as reader:
         for ref in (ref for refs in session.sets for ref in refs):
             yield f"{file.stem}_{session.rig.cameras[ref.camera].name}_{ref.number:06d}", reader.read(ref)
     if session.damage:
-        raise InputError(file, "recording", session.damage, "one that is whole")
+        lost.append(f"{file}: {session.damage}")
 
 
-def _frames(file: Path) -> Iterator[tuple[str, Image]]:
+def _frames(file: Path, lost: list[str]) -> Iterator[tuple[str, Image]]:
     video = Video(file)
     reported = video.reported_count()
     try:
         while (image := video.read()) is not None:
             yield f"{file.stem}_{video.next - 1:06d}", image
-        if video.next < reported or not video.next:
-            allowed = f"{reported}, as the file says (is it cut short?)"
-            raise InputError(file, "frames", f"{video.next} that decode", allowed)
+        if not video.next:
+            raise InputError(file, "frames", "none that decodes", f"{reported}, as the file says (is it cut short?)")
+        if video.next < reported:
+            lost.append(f"{file}: {video.next} of {reported} frames decode, those behind them are lost")
     finally:
         video.close()
 

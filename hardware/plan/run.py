@@ -51,19 +51,23 @@ LAYER_COLUMNS = (
 REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
-def run_plan(request: PlanRequest) -> str:
-    """Plan, and write all files, the path first; returns a summary for the terminal."""
+def run_plan(request: PlanRequest) -> tuple[str, str]:
+    """Plan, and write all files, the path first; returns a summary, and what was lost of the session's file, as texts.
+
+    InputError for whatever is wrong with a file, before the long work.
+    """
     from hardware.recording.session_reader import open_session
 
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
     order = order_of(request.settings, flat)
     if request.arm is not None:
         read_jointed_arm(request.arm)  # what is wrong with it is told before the long work
+    damage = ""
     if request.session is not None:
         if flat:
             allowed = "nothing with a contour: it has no shape to be found by"
             raise InputError("command line", "--session", request.session, allowed)
-        open_session(request.session)  # what is wrong with it is reported before anything is written
+        damage = open_session(request.session).damage  # what is wrong with it is told before anything is written
     check_out(request.out, request.gcode, request.force)
     with _progress("scan", "steps (read, repaired, wound found)") as progress:
         subject = subject_of(request, flat, progress)
@@ -84,7 +88,7 @@ def run_plan(request: PlanRequest) -> str:
     if request.session is not None:
         scan = request.out.with_name(f"{request.out.stem}_scan.ply")
         placed = placement_lines(*scan_placement(request.session, scan, plan.wound.rim))
-    return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed])
+    return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed]), damage
 
 
 def _write_atomically(file: Path, write: Callable[[Path], object]) -> None:
