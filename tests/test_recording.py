@@ -192,6 +192,17 @@ class LibraryWriter:
     def start(self, library: str) -> None:
         self.writer.start("", library)
 
+    @property
+    def chunks(self) -> int:
+        return len(self.writer._Writer__chunk_indices)
+
+    def repeat_definitions(self) -> None:
+        builder = self.writer._Writer__chunk_builder
+        for schema in self.writer._Writer__schemas.values():
+            builder.add_schema(schema)
+        for channel in self.writer._Writer__channels.values():
+            builder.add_channel(channel)
+
     def add_message(self, channel: int, log_time: int, data: bytes, sequence: int) -> None:
         self.writer.add_message(channel, log_time, data, log_time, sequence)
 

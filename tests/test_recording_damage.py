@@ -22,9 +22,11 @@ from hardware.arm.profile import ArmProfile
 from hardware.cli.main import main
 from hardware.files.arm_file import write_arm
 from hardware.files.rig_file import write_board
+from hardware.live.prepared import rig_from_session
 from hardware.offline.convert import import_folder
 from hardware.recording import session_reader as channels
 from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, walk
+from hardware.recording.messages import message_from_rig
 from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.session_reader import open_session
 from tests.board_session import BOARD, rendered
@@ -88,10 +90,7 @@ def test_a_flipped_bit_never_gives_a_wrong_image(whole: Path, where: float, bit:
     data[int(where * len(data))] ^= 1 << bit
     part = whole.parent / "flip.mcap"
     part.write_bytes(data)
-    try:
-        session = open_session(part)
-    except InputError:
-        return  # the first chunk, with the rig, is broken
+    session = open_session(part)  # the rig stands in two chunks
     frames = {(f.camera, f.stamp): f.image for s in session.frame_sets() for f in s.frames}
     original = {3 * stamp: number for number, stamp in enumerate(stamps(24, 0.0))}
     assert all(np.array_equal(i, image(c, original[s])) for (c, s), i in frames.items())
@@ -130,6 +129,24 @@ def test_behind_a_broken_chunk_all_is_read_and_the_seconds_that_are_lost_are_tol
     assert sum(len(s.frames) for s in session.frame_sets()) == held
     assert session.damage.endswith("what was recorded from 1.10 to 1.80 s is lost")
     assert main(["export", str(struck), "-o", str(whole.parent / "exported")]) == 1
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_without_its_first_chunk_a_recording_opens_closed_or_not(whole: Path, closed: bool, tmp_path: Path) -> None:
+    starts = [part.offset for part in walk(whole) if isinstance(part, ChunkMessages)]
+    data = bytearray(whole.read_bytes())
+    data[starts[0] + 500] ^= 4
+    struck = tmp_path / "struck.mcap"
+    struck.write_bytes(data if closed else data[: starts[-1]])
+    first, whole_session, session = next(walk(whole)), open_session(whole), open_session(struck)
+    assert isinstance(first, ChunkMessages)
+    lost = sum(message.topic == "/frames" for message in first.messages)
+    assert 0 < lost < 24 and "what was recorded before " in session.damage
+    assert message_from_rig(session.rig) == message_from_rig(whole_session.rig)
+    if closed:
+        assert sum(map(len, session.sets)) == 48 - lost == sum(len(s.frames) for s in session.frame_sets())
+        assert len(list(channels.read_poses(struck))) >= 24 - lost
+    assert rig_from_session(struck).cameras[0].name == session.rig.cameras[0].name
 
 
 KILLED = """

@@ -1,8 +1,8 @@
 """MCAP files: read record by record, whole or damaged, every checksum checked.
 
 A file is read from its start, not through its index: the same code reads a file whose end is missing, and a wrong
-index does no harm. Behind a broken record reading goes on at the next whole one. Only where the chunk that names the
-channels is broken are they taken from the file's summary.
+index does no harm. Behind a broken record reading goes on at the next whole one. Where the chunk that names the
+channels is broken, the second one names them again, or the file's summary does.
 """
 
 from __future__ import annotations

@@ -71,6 +71,16 @@ class McapWriter:
         self._add(self._channels[-1])
         return number
 
+    @property
+    def chunks(self) -> int:
+        """How many chunks are closed."""
+        return self._chunks
+
+    def repeat_definitions(self) -> None:
+        """Write all schemas and channels so far once more: the open chunk and those behind it need no earlier one."""
+        for record in (*self._schemas, *self._channels):
+            record.write(self._chunk)
+
     def add_message(self, channel: int, log_time: int, data: bytes, sequence: int) -> None:
         """Add a message to the open chunk. log_time: ns."""
         first, last = self._span if self._messages else (log_time, 0)

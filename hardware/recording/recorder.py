@@ -56,7 +56,8 @@ class Recorder:
 
     A chunk is closed and handed to the system before its stamps span more than half a second: a run that is killed at
     any instant loses no more than that (a power cut may take more). A full or lost disk is a StillbedError: what was
-    written before stays readable, and later writes raise the same error.
+    written before stays readable, and later writes raise the same error. The rig and what the channels are stand in the
+    first chunk and again in the second: whichever of them is damaged, the other opens the recording.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Recorder:
         self._numbers = [0] * len(rig)  # next frame number per camera
         self._epoch: int | None = None  # s, known at the first stamp
         self._chunk_start = math.nan  # s, stamp of the open chunk's first message
+        self._repeated = False  # whether the second chunk has begun, with the rig once more
         self._last: dict[str, float] = {}  # s, per stream of images or truth
         self._failed = ""
         self._closed = False
@@ -248,6 +250,10 @@ class Recorder:
             self.flush()
         if math.isnan(self._chunk_start):
             self._chunk_start = stamp
+        if self._writer.chunks == 1 and not self._repeated:
+            self._repeated = True  # before the rig comes here itself
+            self._guarded(self._writer.repeat_definitions)
+            self._message("/rig", stamp, messages.message_from_rig(self.rig))
         channel = self._channel(topic, schema)
         self._guarded(lambda: self._writer.add_message(channel, log_time, data, sequence))
 
