@@ -49,6 +49,7 @@ from planning.material import MAX_DELAY
 MAX_PICTURES = 12  # of each camera before, and after: their mean is taken
 RUN_IN = 4.0  # mm before the place of the switch at which nothing can be printed yet
 STRIP_STEP = 0.2  # mm
+MIN_ROOM, MAX_ROOM = 1.0, 4.0  # mm on each side of a line in which nothing else lies; more is not looked at
 CORE = (0.5, 0.95)  # share of the length at which the full width is measured
 WHITE, BLACK = 252.0, 3.0  # grey levels beyond which a camera is saturated
 MIN_CONTRAST, MIN_SIGNAL = 12.0, 8.0  # grey levels between line and sheet; its width over the width's noise
@@ -247,9 +248,10 @@ def measure_lines(folder: Path, dispenser: DispenserProfile, height: float) -> L
     profiles, left_out = [], {}
     for number, line in enumerate(lines):
         for camera, pictures in enumerate(means):
-            room = min(float(gaps[number].min()) / 2 - 0.2, 4.0)
-            found: LineProfile | str = line.wrong or "no pictures"
-            if pictures is not None and not line.wrong:
+            room = min(float(gaps[number].min()) / 2 - 0.2, MAX_ROOM)
+            crowded = f"another line lies {gaps[number].min():.1f} mm beside it" if room < MIN_ROOM else ""
+            found: LineProfile | str = line.wrong or crowded or "no pictures"
+            if pictures is not None and not (line.wrong or crowded):
                 found = profile_of(number, line, camera, session.rig.cameras[camera], pictures, room)
             if isinstance(found, str):
                 left_out[number, camera] = found

@@ -56,7 +56,7 @@ TRAVEL = MoveOptions(speed=60.0)  # between lines, and away
 PREPARE_TIME = 600.0  # s to be ready: a heated syringe takes minutes
 STALL = 0.15  # s without a set-point after which material is stopped
 MIN_LINES = 4
-MAX_OFF_TRACK = 0.15  # mm of the nozzle off a straight line at constant speed
+MIN_LENGTH, MAX_OFF_TRACK = 5.0, 0.15  # mm from on to off; of the nozzle off a straight line at constant speed
 DEPOSIT_STEP = 0.002  # s between the places of a virtual nozzle
 VIRTUAL_DELAYS = (0.08, 0.04, 0.06, 0.05)  # s, of a virtual dispenser: on dead time, on lag, off dead time, off lag
 
@@ -274,19 +274,22 @@ def drawn_lines(
     """The lines as the arm drew them, `height` mm under the nozzle; offset: (3,) mm, its tip in the tool's frame."""
     set_point, late = read_commanded(folder / COMMANDED_FILE), max(profile.lag - profile.frame_time, 0.0)
     lines: list[DrawnLine] = []
+    first: Array | None = None
     for on, off in told:
         stamps = np.linspace(on - STEADY / 2, off + 0.8 * TAIL, 200)
         poses = nozzle_from_axes(profile.arm, set_point.lagged(np.append(stamps, [on, off]), late / 2, late / 2))
         tips = se3.transform_points(poses, offset[None])[:, 0]
-        way = tips[-1] - tips[-2]
-        length = max(float(np.linalg.norm(way)), 1e-6)
+        way, up = tips[-1] - tips[-2], poses[-2, :3, 2]
+        length = float(np.linalg.norm(way))
+        if length < MIN_LENGTH:
+            lines.append(DrawnLine(0.0, length, np.eye(4), 1.0, f"the nozzle moved by {length:.1f} mm from on to off"))
+            continue
         along, speed = way / length, length / (off - on)
         beside = np.linalg.norm(tips[:-2] - tips[-2] - np.outer((stamps - on) * speed, along), axis=1).max()
-        across = np.cross(poses[-2, :3, 2], along)
-        across /= np.linalg.norm(across)
-        axes = np.stack([along, across, np.cross(along, across)], 1)
-        frame = se3.make(axes, tips[-2] - height * poses[-2, :3, 2])
-        forth = 1.0 if not lines or along @ lines[0].frame[:3, 0] > 0 else -1.0
+        across = np.cross(up, along) / np.linalg.norm(np.cross(up, along))
+        frame = se3.make(np.stack([along, across, np.cross(along, across)], 1), tips[-2] - height * up)
+        first = along if first is None else first
+        forth = 1.0 if along @ first > 0 else -1.0
         wrong = f"the nozzle was up to {beside:.2f} mm off a straight way at constant speed"
         lines.append(DrawnLine(speed, length, frame, forth, wrong if beside > MAX_OFF_TRACK else ""))
     return lines
