@@ -55,10 +55,12 @@ WHITE, BLACK = 252.0, 3.0  # grey levels beyond which a camera is saturated
 MIN_CONTRAST, MIN_SIGNAL = 12.0, 8.0  # grey levels between line and sheet; its width over the width's noise
 MAX_BEND, MAX_BESIDE = 0.3, 2.0  # mm: of a line's middle off a straight line, RMS, and beside the nozzle's way
 MAX_UNSTEADY = 0.15  # share by which the width differs between the halves of its core
-DISCS = 21  # of a bead that are looked at
+DISCS = 17  # of a bead that are looked at
+BLUR_NODES = ((-(3.0**0.5), 1 / 6), (0.0, 2 / 3), (3.0**0.5, 1 / 6))  # of a normal distribution, and their weights
 LN2 = float(np.log(2.0))
 MIN_SPEED_RATIO, MIN_SHARE = 1.5, 0.5  # fastest to slowest; share of the lines that count, at least
-MAX_DELAY_SIGMA, MAX_SCATTER, MAX_MISFIT = 0.005, 0.3, 0.08  # s, mm, share of the width: to pass
+PLACE_DOUBT, END_DOUBT = 0.04, 0.08  # mm, and share of the widths' range, of half the width from slow to fast lines
+MAX_DELAY_SIGMA, MAX_SCATTER, MAX_MISFIT = 0.008, 0.3, 0.08  # s, mm, share of the width: to pass
 MAX_JUMP = 2.0  # s of delay or lag that are sought
 
 
@@ -72,7 +74,7 @@ def mean_pictures(session: Session, folder: Path, span: tuple[float, float]) -> 
     with closing(session.open_reader()) as reader:
 
         def mean(some: Sequence[FrameRef]) -> Array:
-            image = np.mean([reader.read(ref) for ref in some], axis=0, dtype=np.float64)
+            image: Array = np.asarray(np.mean([reader.read(ref) for ref in some], axis=0, dtype=np.float64))
             return np.asarray(np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image)
 
         for camera in range(len(session.rig)):
@@ -95,6 +97,7 @@ class LineProfile:
     along: Array  # (K,) mm from the nozzle's place at on
     share: Array  # (K,) of its full width
     width: float  # mm
+    contrast: float  # grey levels at its middle: fewer where the line is thinner than the picture is sharp
 
 
 def profile_of(
@@ -139,7 +142,7 @@ def profile_of(
     halves = [float(np.median(half)) for half in np.array_split(width[core], 2)]
     if abs(halves[1] - halves[0]) > MAX_UNSTEADY * (full - base):
         return "its width is not steady: a longer line, or no air in the material"
-    return LineProfile(number, camera, line, along, (width - base) / (full - base), full - base)
+    return LineProfile(number, camera, line, along, (width - base) / (full - base), full - base, float(bright))
 
 
 def flow_share(beyond: Array, rise: Array, blur: float) -> Array:
@@ -150,9 +153,15 @@ def flow_share(beyond: Array, rise: Array, blur: float) -> Array:
 
 def bead_share(beyond: Array, rise: Array, blur: float, width: Array, on: bool) -> Array:
     """The share (N,) of a bead's full `width` (N,), mm: it is the union of discs, each as wide as the flow then is."""
-    apart = np.linspace(-1, 1, DISCS)
-    flow = flow_share(beyond[:, None] - apart * width[:, None] / 2, rise[:, None], blur)
-    return np.asarray(np.sqrt(np.maximum((flow if on else 1 - flow) ** 2 - apart**2, 0.0).max(1)))
+    apart, out = np.linspace(-1, 1, DISCS), np.zeros(len(beyond))
+    for (
+        node,
+        weight,
+    ) in BLUR_NODES:  # half of the blur's variance is the flow's, for a smooth fit; half is the picture's
+        at = (beyond + node * blur / 2**0.5)[:, None] - apart * width[:, None] / 2
+        flow = flow_share(at, rise[:, None], blur / 2**0.5)
+        out += weight * np.sqrt(np.maximum((flow if on else 1 - flow) ** 2 - apart**2, 0.0).max(1))
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +170,8 @@ class SwitchFit:
 
     dead_time: float  # s
     lag: float  # s
-    delay_sigma: float  # s, of dead time + ln 2 lag
+    scatter_sigma: float  # s, of dead time + ln 2 lag, by how lines differ
+    shape_sigma: float  # s, of the same, by what the model does not know of a bead's ends
     lag_sigma: float  # s
     constant: float  # mm, the same at any speed
     blur: float  # mm, one sigma
@@ -176,6 +186,11 @@ class SwitchFit:
         return self.dead_time + LN2 * self.lag
 
     @property
+    def delay_sigma(self) -> float:
+        """Seconds, one sigma of the delay."""
+        return float(np.hypot(self.scatter_sigma, self.shape_sigma))
+
+    @property
     def scatter(self) -> float:
         """mm, RMS of the lines about the fit."""
         return float(np.sqrt(np.mean((self.places - self.delay * self.speeds) ** 2)))
@@ -183,7 +198,7 @@ class SwitchFit:
 
 def fit_switch(profiles: Sequence[LineProfile], on: bool) -> SwitchFit:
     """Fit dead time, lag and constant distances to the beginnings (on) or the ends of all lines."""
-    parts = [p.along < 0.8 * p.line.length if on else p.along > 0.6 * p.line.length for p in profiles]
+    parts = [p.along < 0.6 * p.line.length if on else p.along > 0.8 * p.line.length for p in profiles]
     x = np.concatenate([p.along[rows] - (not on) * p.line.length for p, rows in zip(profiles, parts, strict=True)])
     y = np.concatenate([p.share[rows] for p, rows in zip(profiles, parts, strict=True)])
     row = np.repeat(np.arange(len(profiles)), [int(rows.sum()) for rows in parts])
@@ -213,8 +228,9 @@ def fit_switch(profiles: Sequence[LineProfile], on: bool) -> SwitchFit:
     speeds = np.array([speed[number == line].mean() for line in lines])
     places = (state[0] + LN2 * state[1]) * speeds + np.array([beside[number == line].mean() for line in lines])
     dead, lag, blur, constant = state[:4].tolist()
+    shape = float((PLACE_DOUBT + END_DOUBT * np.ptp(width)) / np.ptp(speed))
     rms = float(np.sqrt(np.mean(off**2)))
-    return SwitchFit(dead, lag, float(sigma[0]), float(sigma[1]), constant, blur, lines, speeds, places, rms)
+    return SwitchFit(dead, lag, float(sigma[0]), shape, float(sigma[1]), constant, blur, lines, speeds, places, rms)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,6 +283,8 @@ def measure_lines(folder: Path, dispenser: DispenserProfile, height: float) -> L
         got = f"{min(speeds):.1f} to {max(speeds):.1f} mm/s"
         raise InputError(folder, "speeds", got, f"a ratio of {MIN_SPEED_RATIO:g} or more: one shows no delay alone")
     names = tuple(c.name for c in session.rig.cameras)
+    most = [max((p.contrast for p in profiles if p.camera == c), default=0.0) for c in range(len(names))]
+    profiles = [replace(p, width=p.width * p.contrast / most[p.camera]) for p in profiles]
     fits = fit_switch(profiles, True), fit_switch(profiles, False)
     return LinesResult(tuple(lines), names, tuple(profiles), left_out, *fits)
 
@@ -282,7 +300,9 @@ def judge_lines(result: LinesResult) -> CalibrationVerdict:
             f"the profile is off its fit by {100 * fit.rms:.1f} % of the width"
         )
         if fit.delay_sigma > MAX_DELAY_SIGMA:
-            hints.append(f"{word}: ± {1e3 * MAX_DELAY_SIGMA:g} ms is allowed: more lines, and speeds farther apart")
+            hints.append(
+                f"{word}: ± {1e3 * MAX_DELAY_SIGMA:g} ms is allowed: more lines, speeds farther apart, thinner lines"
+            )
         if fit.scatter > MAX_SCATTER:
             hints.append(
                 f"{word}: a scatter of {MAX_SCATTER:g} mm is allowed: it does not repeat; is air in the material?"
@@ -376,20 +396,3 @@ def calibrate_lines(
     else:
         text.append(f"{file}: stays as it was")
     return verdict, "\n".join([*text, f"report: {report}"])
-
-
-def delays_by_hand(lines: Sequence[tuple[float, float, float]], dispenser: DispenserProfile) -> DispenserProfile:
-    """The profile with delays from lines measured with a ruler: (start mm, end mm, speed mm/s) each.
-
-    start and end: from where the nozzle was when it was told to half the width. A ruler shows no lag: all is dead time.
-    """
-    start, end, speed = np.array(lines).T
-    apart = len(set(speed.tolist())) > 1
-    columns = np.stack([speed, np.ones_like(speed)], 1) if apart else speed[:, None]
-    on, off = (float(np.linalg.lstsq(columns, places, rcond=None)[0][0]) for places in (start, end))
-    for name, value in (("start", on), ("end", off)):
-        if not 0 <= value <= MAX_DELAY:
-            raise InputError(
-                "command line", f"--measured: delay by the {name}", f"{value:.3f} s", f"0 to {MAX_DELAY:g} s"
-            )
-    return replace(dispenser, on_dead_time=on, on_lag=0.0, off_dead_time=off, off_lag=0.0)

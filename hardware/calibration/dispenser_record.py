@@ -47,6 +47,7 @@ from hardware.simulator.arm.ports import VirtualDevice
 from hardware.simulator.dispenser import DispenserModel, DispenserPort, VirtualDispenserSettings
 from hardware.simulator.watched_arm import WatchedArm, paint_sheet
 from planning.kinematics import nozzle_from_axes
+from planning.material import MAX_DELAY
 
 SWITCHES_FILE, SWITCH_COLUMNS = "switches.csv", ("stamp_s", "dispenser", "flow_mm3_s", "text")
 RAMP, STEADY, TAIL = 0.3, 0.25, 0.8  # s: speeding up, on until the switch, and on after off
@@ -57,7 +58,7 @@ PREPARE_TIME = 600.0  # s to be ready: a heated syringe takes minutes
 STALL = 0.15  # s without a set-point after which material is stopped
 MIN_LINES = 4
 MIN_LENGTH, MAX_OFF_TRACK = 5.0, 0.15  # mm from on to off; of the nozzle off a straight line at constant speed
-DEPOSIT_STEP = 0.002  # s between the places of a virtual nozzle
+DEPOSIT_STEP = 0.001  # s between the places of a virtual nozzle
 VIRTUAL_DELAYS = (0.08, 0.04, 0.06, 0.05)  # s, of a virtual dispenser: on dead time, on lag, off dead time, off lag
 
 
@@ -366,3 +367,20 @@ def record_virtual(
     half = np.flatnonzero(np.diff(stamps) > LOOK_SETTLE)[0] + 1
     paint_sheet(watched, sheet, places[wet, :2], width[wet] / 2, folder, (stamps[:half], stamps[half:]))
     return model
+
+
+def delays_by_hand(lines: Sequence[tuple[float, float, float]], dispenser: DispenserProfile) -> DispenserProfile:
+    """The profile with delays from lines measured with a ruler: (start mm, end mm, speed mm/s) each.
+
+    start and end: from where the nozzle was when it was told to half the width. A ruler shows no lag: all is dead time.
+    """
+    start, end, speed = np.array(lines).T
+    apart = len(set(speed.tolist())) > 1
+    columns = np.stack([speed, np.ones_like(speed)], 1) if apart else speed[:, None]
+    on, off = (float(np.linalg.lstsq(columns, places, rcond=None)[0][0]) for places in (start, end))
+    for name, value in (("start", on), ("end", off)):
+        if not 0 <= value <= MAX_DELAY:
+            raise InputError(
+                "command line", f"--measured: delay by the {name}", f"{value:.3f} s", f"0 to {MAX_DELAY:g} s"
+            )
+    return replace(dispenser, on_dead_time=on, on_lag=0.0, off_dead_time=off, off_lag=0.0)

@@ -272,8 +272,8 @@ def _numbers(text: str, count: int, words: str) -> tuple[float, ...]:
 
 def _calibrate_dispenser(a: argparse.Namespace) -> int:
     from hardware.calibration.arm_run import check_record
-    from hardware.calibration.dispenser_lines import calibrate_lines, delays_by_hand
-    from hardware.calibration.dispenser_record import LineOptions
+    from hardware.calibration.dispenser_lines import calibrate_lines
+    from hardware.calibration.dispenser_record import LineOptions, delays_by_hand
     from hardware.files.dispenser_file import write_delays
 
     sources = [name for name in LINE_SOURCES if getattr(a, name)]
