@@ -35,6 +35,7 @@ NAMES = {  # named in passing, without what it needs; each is run as a part of a
     *(
         "stillbed arm",
         "stillbed calibrate cameras",
+        "stillbed calibrate dispenser",
         "stillbed dispenser",
         "stillbed live",
         "stillbed plan",
