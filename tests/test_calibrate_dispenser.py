@@ -197,7 +197,7 @@ def test_what_a_picture_must_show(first_line: tuple[DrawnLine, Lenses]) -> None:
 
 def test_the_verdict(measured: LinesResult) -> None:
     for change, words in (
-        ({"scatter_sigma": 0.009}, "more lines"),
+        ({"scatter_sigma": 0.011}, "more lines"),
         ({"places": measured.on.places + [0.9, -0.9, 0.9, -0.9]}, "does not repeat"),
         ({"rms": 0.1}, "no dead time with a lag"),
         ({"dead_time": 0.41, "places": measured.on.places + 0.33 * measured.on.speeds}, "leads 0.4 s"),

@@ -60,7 +60,7 @@ BLUR_NODES = ((-(3.0**0.5), 1 / 6), (0.0, 2 / 3), (3.0**0.5, 1 / 6))  # of a nor
 LN2 = float(np.log(2.0))
 MIN_SPEED_RATIO, MIN_SHARE = 1.5, 0.5  # fastest to slowest; share of the lines that count, at least
 PLACE_DOUBT, END_DOUBT = 0.04, 0.08  # mm, and share of the widths' range, of half the width from slow to fast lines
-MAX_DELAY_SIGMA, MAX_SCATTER, MAX_MISFIT = 0.008, 0.3, 0.08  # s, mm, share of the width: to pass
+MAX_DELAY_SIGMA, MAX_SCATTER, MAX_MISFIT = 0.010, 0.3, 0.08  # s, mm, share of the width: to pass
 MAX_JUMP = 2.0  # s of delay or lag that are sought
 
 

@@ -25,10 +25,9 @@ from planning.fill.bead import (
     travel_length,
     turn_angles,
 )
-from planning.fill.gap_fill import fill_gaps
 from planning.fill.region import Region, check_region, covered_area, roughness
 from planning.fill.rings import ring_levels
-from planning.fill.spiral import BeadRun, nest_rings, order_runs, separate_rings, spiral_runs
+from planning.fill.spiral import BeadRun, fill_gaps, nest_rings, order_runs, separate_rings, spiral_runs
 
 MAX_CUTS = 4  # each halves the turns: a reversal is smooth after four
 SHARP_MARGIN = 0.95  # of SHARP_TURN, so that rounding has no effect
