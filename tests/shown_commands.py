@@ -35,6 +35,7 @@ NAMES = {  # named in passing, without what it needs; each is run as a part of a
     *(
         "stillbed arm",
         "stillbed calibrate cameras",
+        "stillbed calibrate dispenser",
         "stillbed dispenser",
         "stillbed live",
         "stillbed plan",
@@ -70,6 +71,7 @@ PAGE = (
 RECORDED = "stillbed record live.toml -o out/recorded.mcap --seconds 3 --jpeg-quality 0 --no-page"
 MORE = "the same with more said"
 VIRTUAL = "stillbed calibrate arm --virtual --places 5 --swing-s 2 --record try -o arm.toml"
+LINES = "stillbed calibrate dispenser dispenser.toml --virtual --lines 2 --record lines"
 WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 8 --no-page"
 FAULTS = "stillbed bench faults --count 1 --jobs 2 --log faults.csv -o out/faults"
 OUTAGES = "stillbed bench outages --count 1 --processes 1"
@@ -130,6 +132,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench thesis [SESSION...]": ("stillbed bench thesis sessions/monday", LONG),
     "stillbed bench views --seconds 5": ("stillbed bench views --seconds 0.5", LONG),
     "stillbed calibrate arm --virtual --record try -o arm.toml": (VIRTUAL, LONG),
+    "stillbed calibrate dispenser dispenser.toml --virtual --record lines": (LINES, "takes long as it stands"),
     "stillbed calibrate cameras SESSION --board board.toml -o rig.toml": (
         "stillbed calibrate cameras waved --board board.toml -o rig.toml",
         "a session in which a board is waved",
@@ -181,6 +184,8 @@ INSTEAD = {  # (what is run in its place, why)
     },
 }
 MOVED = "tests/test_arm_console.py moves a virtual arm before cameras that see its needle, which takes a minute"
+RECORDED = "--cameras rig.toml --record"
+DRAWN = "tests/test_calibrate_dispenser.py draws lines with a virtual arm and measures the recording"
 MADE = (  # by these tests/workspace.py makes what the others name
     "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
     VIRTUAL,
@@ -196,6 +201,9 @@ NOT_RUN = {  # and why not
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record try --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --device PORT --cameras rig.toml --record DIR --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --virtual --terminal --record try -o arm.toml": MOVED,
+    f"stillbed calibrate dispenser DISPENSER.toml --device PORT --arm ARM.toml {RECORDED} DIR --yes": DRAWN,
+    f"stillbed calibrate dispenser dispenser.toml --device /dev/ttyUSB0 --arm arm.toml {RECORDED} lines --yes": DRAWN,
+    "stillbed calibrate dispenser dispenser.toml --from lines": DRAWN,
     "stillbed train DATASET --network thesis": TRAINED,
     "stillbed train DATASET -o X.onnx": TRAINED,
 }

@@ -138,6 +138,16 @@ calibrate arm --device /dev/x --terminal -o OUT.toml  # --terminal
 calibrate arm --device /dev/x --cameras rig.toml --record r -o OUT.toml  # nobody is within the arm's reach
 calibrate arm empty -o OUT
 calibrate arm --touched typo.toml --cameras rig.toml -o OUT
+calibrate dispenser DISPENSER  # one of --from, --device, --virtual or --measured
+calibrate dispenser DISPENSER --virtual --from moved  # folder and virtual
+calibrate dispenser DISPENSER --virtual  # --record = 'missing'
+calibrate dispenser DISPENSER --virtual --record OUT --name pump  # --name
+calibrate dispenser DISPENSER --virtual --record OUT --speeds 10  # two different ones
+calibrate dispenser DISPENSER --virtual --record OUT --length-mm 11  # a second or more
+calibrate dispenser DISPENSER --device /dev/x --arm ARM --cameras rig.toml --record OUT  # --yes
+calibrate dispenser DISPENSER --from empty  # commanded.csv
+calibrate dispenser DISPENSER --measured 9,1,10  # 0 to 0.4 s
+calibrate dispenser missing --from empty  # missing
 calibrate import empty --format opencv -o OUT
 calibrate import binary.toml --format kalibr -o OUT
 calibrate export missing --format anipose -o OUT
@@ -166,6 +176,7 @@ calibrate board -o OUT.pdf --squares many
 calibrate cameras empty --board b.toml -o OUT --distance-mm a,b,far
 calibrate cameras empty --board b.toml -o OUT --limit-mm nan
 calibrate arm --virtual --record OUT -o OUT.toml --limit-mm nan
+calibrate dispenser d.toml --measured 1,2
 bench growth --dance
 """
 
@@ -193,7 +204,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words(text: str) -> list[str]:
     data = ROOT / "data"
-    named = {"STILL": "scenarios/still.toml", "PATH": "paths/square_10mm.csv", "ARM": "arms/s6h4d.toml"}
+    named = {
+        "STILL": "scenarios/still.toml",
+        "PATH": "paths/square_10mm.csv",
+        "ARM": "arms/s6h4d.toml",
+        "DISPENSER": "dispensers/arduino.toml",
+    }
     return [str(data / named[word]) if word in named else word for word in shlex.split(text, comments=True)]
 
 

@@ -82,7 +82,7 @@ def plan_moves(start: Array, limits: MotionLimits, tick: float, options: MoveOpt
     """Set-points (K, 6), mm and rad, one per tick, from and back to `start` (6,); those of a dwell repeat."""
     parts, at = [], start
     for place in [*places(start, limits, options), start]:
-        parts += list(_straight_move(at, place, tick, options))
+        parts += list(straight_move(at, place, tick, options))
         parts.append(np.repeat(place[None], round(options.dwell / tick), axis=0))
         at = place
     parts.append(_swing(start, limits, tick, options))
@@ -109,8 +109,8 @@ def _halton(index: int, base: int) -> float:
     return out
 
 
-def _straight_move(start: Array, goal: Array, tick: float, options: MoveOptions) -> Iterator[Array]:
-    """A straight minimum-jerk move, if there is any way to go."""
+def straight_move(start: Array, goal: Array, tick: float, options: MoveOptions) -> Iterator[Array]:
+    """Set-points (K, 6) of a straight minimum-jerk move, if there is any way to go."""
     way = goal - start
     length = max(float(np.linalg.norm(way[:3])), 60.0 * float(np.linalg.norm(way[3:])))  # 1 rad/s at 60 mm/s
     if length > 0:
@@ -211,10 +211,12 @@ def _row(path: Path, number: int, line: str) -> Array:
 
 
 class ArmDrive:
-    """Drives an arm and logs its set-points."""
+    """Drives an arm and logs its set-points. beside: what else is polled with the arm, by the instant, s."""
 
-    def __init__(self, arm: Arm, clock: Clock, log: CommandedFile) -> None:
-        self.arm, self._clock, self._log = arm, clock, log
+    def __init__(
+        self, arm: Arm, clock: Clock, log: CommandedFile, beside: Callable[[float], None] = lambda now: None
+    ) -> None:
+        self.arm, self._clock, self._log, self._beside = arm, clock, log, beside
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Wait, while polling the arm."""
@@ -274,13 +276,15 @@ class ArmDrive:
 
     def _look(self, now: float) -> None:
         self.arm.poll(now)
+        self._beside(now)
         self._log.note(self.arm, now)
 
 
 class PictureWriter(threading.Thread):
     """Writes the pictures of live cameras into a session folder, without loss, until `end`.
 
-    count: frame sets so far. A failure is stored, and `check` raises it in the thread that moves the arm.
+    count: frame sets so far. keep: whether those that come are written. A failure is stored, and `check` raises it in
+    the thread that moves the arm.
     """
 
     def __init__(self, live: LiveCameras, rig: Rig, clock: Clock, folder: Path) -> None:
@@ -288,7 +292,7 @@ class PictureWriter(threading.Thread):
         self._live, self._rig, self._clock, self._folder = live, rig, clock, folder
         self._ended = threading.Event()
         self._failed: Exception | None = None
-        self.count = 0
+        self.count, self.keep = 0, True
 
     def run(self) -> None:
         """Until `end`, or until something fails."""
@@ -296,7 +300,7 @@ class PictureWriter(threading.Thread):
             with SessionFolderWriter(self._folder, self._rig, ()) as session:
                 while not self._ended.is_set():
                     frames = self._live.next_set(self._clock.now() + 0.2)
-                    for frame in frames.frames if frames is not None else ():
+                    for frame in frames.frames if frames is not None and self.keep else ():
                         stamp = frame.stamp - self._rig.cameras[frame.camera].clock_offset
                         # lossless: JPEG stores a thin needle's colour at half the resolution
                         session.picture(frame.camera, stamp, *encode(frame.image))
@@ -359,7 +363,7 @@ def record_live(
             report(done, total)
 
         try:
-            _await_pictures(writer, arm, clock)
+            await_pictures(writer, arm, clock)
             move_arm(arm, clock, folder, stands, options, progress)
         finally:
             writer.end()
@@ -367,7 +371,7 @@ def record_live(
     writer.check()
 
 
-def _await_pictures(writer: PictureWriter, arm: Arm, clock: Clock) -> None:
+def await_pictures(writer: PictureWriter, arm: Arm, clock: Clock) -> None:
     """Wait for the first frame sets; InputError where they do not come."""
     end = clock.now() + FIRST_PICTURES_TIMEOUT
     while writer.count < START_FRAME_SETS:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
+from hardware.cli.dispenser import add_calibrate_dispenser
 from hardware.cli.parser import (
     FAILED,
     INTERRUPTED,
@@ -44,7 +45,7 @@ def add_calibrate(commands: Commands) -> None:
     command = commands.add(
         "calibrate",
         None,
-        "calibrate cameras from a printed board, and the arm: board, cameras, arm, import, export",
+        "calibrate cameras from a printed board, the arm, a dispenser: board, cameras, arm, dispenser, import, export",
         "Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
     )
@@ -52,6 +53,7 @@ def add_calibrate(commands: Commands) -> None:
     _add_board(parts)
     _add_cameras(parts)
     _add_arm(parts)
+    add_calibrate_dispenser(parts)
     _add_import(parts)
     _add_export(parts)
 

@@ -1,19 +1,21 @@
-"""`stillbed dispenser`: what a dispenser says, a short opening of it, and a virtual one. Imports lazily."""
+"""`stillbed dispenser` and `stillbed calibrate dispenser`: the command lines. Imports lazily."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, Commands, not_negative, positive, wrong_option
+from hardware.cli.parser import FAILED, Commands, arm_profile, not_negative, positive, progress_bar, wrong_option
 from hardware.process.clock import Clock, WallClock
 from perception.package_data import named_path
 
 if TYPE_CHECKING:
+    from hardware.calibration.dispenser_record import LineOptions
     from hardware.dispenser.dispenser import Dispenser, DispenserProfile
     from hardware.files.dispenser_file import DispenserSettings
 
@@ -22,6 +24,8 @@ MAX_OPEN = 60.0  # s: longer than any test of a nozzle
 PREPARE_TIME = 600.0  # s to be ready: a heated syringe takes minutes
 DISPENSER_POLL = 0.002  # s, as the motion loop
 VIRTUAL_OPTIONS = ("preset", "log", "link", "delays", "ooze", "no_watchdog")
+# of a dispenser's calibration, and the options that each needs
+LINE_SOURCES = {"folder": (), "device": ("cameras", "arm", "record"), "virtual": ("record",), "measured": ()}
 DEVICE_OPTIONS = ("name", "seconds", "on", "flow", "celsius", "yes")
 
 
@@ -201,3 +205,156 @@ def open_for(
 def _tell(dispenser: Dispenser, start: float, say: Callable[[str], None]) -> None:
     for event in dispenser.events():
         say(f"{event.stamp - start:.3f} s: {event.text}")
+
+
+def add_calibrate_dispenser(parts: Commands) -> None:
+    """Add `dispenser` to the sub-commands of `calibrate`."""
+    part = parts.add(
+        "dispenser",
+        _calibrate_dispenser,
+        "how late a dispenser switches, from lines that it draws before the cameras",
+        "Let the arm draw straight lines at several speeds on a sheet of another colour, photograph them, and get\n"
+        "the dispenser's dead times and lags, each with its doubt, and a verdict. The nozzle begins over the middle\n"
+        "of the lines, as high as it prints. If the verdict is PASS the delays are written into the file; of a\n"
+        "virtual one never. Or do that again from a recorded folder; or enter what a ruler says. Exit code 0: PASS;\n"
+        "1: FAIL.",
+        "stillbed calibrate dispenser dispenser.toml --device /dev/ttyUSB0 --arm arm.toml --cameras rig.toml "
+        "--record lines --yes",
+        "stillbed calibrate dispenser dispenser.toml --from lines",
+        "stillbed calibrate dispenser dispenser.toml --virtual --record lines",
+        "stillbed calibrate dispenser dispenser.toml --measured 1.1,0.9,10 --measured 3.2,2.8,30",
+    )
+    add = part.add_argument
+    add("file", type=Path, metavar="DISPENSER.toml", help="where it is, and where the delays are written to")
+    add("--name", metavar="NAME", help="which of them, where there are several")
+    add("--from", dest="folder", type=Path, metavar="FOLDER", help="lines that were recorded before; nothing moves")
+    add("--device", metavar="DEVICE", help="the arm's port: a path, or a URL of pyserial's")
+    add("--virtual", action="store_true", help="an arm, a dispenser and cameras that are simulated, beside the truth")
+    ruler = "mm from the place of on to half the width, the same of off, and mm/s; once for each line"
+    add("--measured", type=_ruled_line, action="append", metavar="START,END,SPEED", help=ruler)
+    add("--arm", type=Path, metavar="ARM.toml", help="the calibrated arm")
+    add("--cameras", type=Path, metavar="RIG.toml", help="the calibrated cameras, with their sources")
+    add("--record", type=Path, metavar="FOLDER", help="new folder for pictures, commands and switches")
+    add("--celsius", type=float, metavar="C", help="its temperature while it draws")
+    add = part.add_argument_group("the lines").add_argument
+    add("--speeds", type=_speeds, default=(10.0, 20.0, 30.0), metavar="A,B,C", help="mm/s; default 10,20,30")
+    add("--lines", type=int, default=4, metavar="N", help="at each speed, to and fro in turn; default 4")
+    add("--length-mm", type=positive, default=40.0, metavar="MM", help="from on to off, along the arm's X; default 40")
+    add("--spacing-mm", type=positive, default=6.0, metavar="MM", help="between lines; default 6")
+    add("--height-mm", type=not_negative, default=0.4, metavar="MM", help="of the nozzle over the sheet; default 0.4")
+    add("--area-mm2", type=positive, default=0.4, metavar="MM2", help="of a metered one's bead; default 0.4")
+    add("--away", default="home", metavar="WHERE", help="out of the pictures: X,Y,Z,A,B,C; default home")
+    add("--stands", metavar="WHERE", help="where a silent arm stands: X,Y,Z,A,B,C or home")
+    add("--yes", action="store_true", help="somebody sees that nobody is within reach, and where the material goes")
+    add("--no-pause-frame", action="store_true", help="its controller knows no frame that stops it")
+
+
+def _ruled_line(text: str) -> tuple[float, float, float]:
+    start, end, speed = _numbers(text, 3, "START,END,SPEED, as 1.1,0.9,10")
+    if not speed > 0:
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is a speed above 0")
+    return start, end, speed
+
+
+def _speeds(text: str) -> tuple[float, ...]:
+    return _numbers(text, text.count(",") + 1, "speeds, as 10,20,30")
+
+
+def _numbers(text: str, count: int, words: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is {words}")
+    return numbers
+
+
+def _calibrate_dispenser(a: argparse.Namespace) -> int:
+    from hardware.calibration.arm_run import check_record
+    from hardware.calibration.dispenser_lines import calibrate_lines
+    from hardware.calibration.dispenser_record import LineOptions, delays_by_hand
+    from hardware.files.dispenser_file import write_delays
+
+    sources = [name for name in LINE_SOURCES if getattr(a, name)]
+    if len(sources) != 1:
+        got, allowed = " and ".join(sources) or "nothing", "one of --from, --device, --virtual or --measured"
+        raise wrong_option("calibrate dispenser", got, allowed)
+    for name in LINE_SOURCES[sources[0]]:
+        if getattr(a, name) is None:
+            raise wrong_option(f"--{name}", "missing", f"given with --{sources[0]}")
+    options = LineOptions(a.speeds, a.lines, a.length_mm, a.spacing_mm, a.height_mm, a.area_mm2)
+    settings = _named(a)
+    if a.virtual:  # its own name, lest `--from` take its delays for the real one's
+        settings = replace(settings, profile=replace(settings.profile, name=VIRTUAL))
+    if a.measured:
+        found = delays_by_hand(a.measured, settings.profile)
+        write_delays(a.file, settings.profile.name, found)
+        late = f"{1e3 * found.on_delay:.0f} ms after on, {1e3 * found.off_delay:.0f} ms after off"
+        print(f"{a.file}: half the flow of {settings.profile.name} {late}, was written")
+        return 0
+    if a.folder is None:
+        if a.device is not None and not a.yes:
+            raise wrong_option("--yes", "missing", "given by whoever sees that nobody is within reach")
+        if settings.line is None:
+            raise wrong_option("dispenser", settings.profile.name, "one with a line of its own; of others --measured")
+        check_record(a.record)
+        print(_draw_virtual(a, settings, options) if a.virtual else _draw(a, settings, options))
+    verdict, text = calibrate_lines(a.folder or a.record, a.file, settings.profile, a.height_mm, not a.virtual)
+    print(text)
+    return 0 if verdict.passed else FAILED
+
+
+def _named(a: argparse.Namespace) -> DispenserSettings:
+    """The one dispenser that is meant."""
+    from hardware.files.dispenser_file import read_dispensers
+
+    found = read_dispensers(a.file)
+    chosen = [each for each in found if a.name in (None, each.profile.name)]
+    if len(chosen) != 1:
+        raise wrong_option("--name", a.name or "missing", f"one of {', '.join(each.profile.name for each in found)}")
+    return chosen[0]
+
+
+def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
+    from hardware.calibration.dispenser_record import VIRTUAL_DELAYS, record_virtual
+    from hardware.process.checks import one_of_text
+    from hardware.simulator.dispenser import DIALECTS, VirtualDispenserSettings
+    from hardware.simulator.watched_arm import watched_arm
+
+    if settings.preset not in DIALECTS:
+        raise wrong_option("--virtual", settings.preset, f"a preset {one_of_text(settings.preset, list(DIALECTS))}")
+    flow = options.area * sum(options.speeds) / len(options.speeds)
+    watchdog = settings.profile.watchdog or math.inf
+    true = VirtualDispenserSettings(settings.preset, *VIRTUAL_DELAYS, flow=flow, watchdog=watchdog)
+    assert settings.line is not None
+    with progress_bar("lines", "ticks") as progress:
+        record_virtual(watched_arm(0), settings.profile, settings.line, true, a.record, options, progress)
+    names = ("on dead time", "on lag", "off dead time", "off lag")
+    return "truth: " + ", ".join(f"{n} {1e3 * v:g} ms" for n, v in zip(names, VIRTUAL_DELAYS, strict=True))
+
+
+def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
+    from hardware.arm.console import axes_from_text
+    from hardware.arm.port import PortOpener
+    from hardware.arm.profile import LinkSettings
+    from hardware.calibration.dispenser_record import record_live
+    from hardware.cameras.live import LiveCameras
+    from hardware.cameras.sources import read_live_rig
+    from hardware.files.dispenser_file import dispenser_from_settings
+
+    clock, profile = WallClock(), arm_profile(a.arm)
+    stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
+    where = stands, axes_from_text(a.away, profile.arm.home)
+    rig, sources = read_live_rig(a.cameras)
+    dispenser = dispenser_from_settings(settings)
+    device, link = PortOpener(a.device, profile.baud), LinkSettings(pause_frame=not a.no_pause_frame)
+    try:
+        with progress_bar("lines", "ticks") as progress:
+            live = LiveCameras(rig, sources, clock)
+            record_live(
+                live, rig, device, profile, dispenser, clock, a.record, where, options, a.celsius, progress, link
+            )
+    finally:
+        device.release()
+    return watchdog_text(settings.profile)

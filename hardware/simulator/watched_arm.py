@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from estimation import se3
-from estimation.rig import Rig
+from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile, placed
@@ -36,6 +36,7 @@ from hardware.simulator.scene.render import StillScene, render
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import cylinder
 from perception.frames import Image
+from perception.lens import undistort
 from perception.mapping.features import grey
 from planning.kinematics import SimpleArm, nozzle_from_axes
 
@@ -146,6 +147,55 @@ def take_pictures(
             for shot, picture in zip(shots, pool.map(picture_of, shots), strict=True):
                 session.picture(shot.camera, shot.stamp + begun, *picture)
             report(number + 1, len(rounds))
+
+
+SHEET_SIZE, SHEET_STEP = (180.0, 120.0), 0.05  # mm, of a painted sheet, and of what it is painted in
+SHEET_COLOUR, LINE_COLOUR = (196.0, 204.0, 208.0), (150.0, 60.0, 40.0)  # BGR
+SHEET_BLUR, SHEET_NOISE = 0.15, 2.0  # mm and grey levels, one sigma
+SHEET_PICTURES = 2  # of each camera, before and after
+MAP_STEP = 8  # px between which a camera's view of the sheet is interpolated: to 0.001 px
+
+
+def paint_sheet(
+    watched: WatchedArm, sheet: Array, places: Array, radii: Array, folder: Path, stamps: tuple[Array, Array]
+) -> None:
+    """Write the session folder of what the cameras see of a sheet at (4, 4), mm, base_from_sheet, the arm away.
+
+    places: (N, 2) mm, the middles of the discs that were laid, and radii (N,). stamps: of pictures before and after, s.
+    """
+    size = tuple(round(v / SHEET_STEP) for v in SHEET_SIZE)
+    laid = np.zeros(size[::-1], np.uint8)
+    middle = np.array(size) / 2
+    drawn = radii / SHEET_STEP - 0.5  # OpenCV's discs are larger by half a pixel
+    sixteenths = np.round(16 * np.column_stack([places / SHEET_STEP + middle, drawn])[drawn > 0]).astype(int)
+    for x, y, radius in sixteenths.tolist():
+        cv2.circle(laid, (x, y), radius, 255, -1, cv2.LINE_AA, 4)
+    laid = np.asarray(cv2.GaussianBlur(laid, (0, 0), SHEET_BLUR / SHEET_STEP))
+    with SessionFolderWriter(folder, watched.rig, ()) as session:
+        for number, camera in enumerate(watched.rig.cameras):
+            x, y = np.moveaxis(_view_of_sheet(camera, sheet) / SHEET_STEP + middle, -1, 0).astype(np.float32)
+            ink = np.asarray(cv2.remap(laid, x, y, cv2.INTER_LINEAR)) / 255.0
+            rng = np.random.default_rng([watched.seed, number])
+            for some, cover in zip(stamps, (np.zeros_like(ink), ink), strict=True):
+                image = SHEET_COLOUR + cover[..., None] * (np.array(LINE_COLOUR) - SHEET_COLOUR)
+                for stamp in some[:: max(len(some) // SHEET_PICTURES, 1)][:SHEET_PICTURES]:
+                    noisy = image + SHEET_NOISE * rng.standard_normal(image.shape)
+                    picture = encode(np.asarray(np.clip(np.round(noisy), 0, 255), np.uint8), LOSSLESS)
+                    session.picture(number, float(stamp) - camera.clock_offset, *picture)
+
+
+def _view_of_sheet(camera: Camera, sheet: Array) -> Array:
+    """Where on the sheet, mm, each pixel of a camera looks: (H, W, 2)."""
+    w, h = camera.size
+    x, y = np.arange(0, w + MAP_STEP, MAP_STEP), np.arange(0, h + MAP_STEP, MAP_STEP)
+    pixels = undistort(camera, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(float))
+    rays = (pixels - camera.matrix[:2, 2]) / camera.matrix[[0, 1], [0, 1]]
+    camera_in_sheet = se3.inverse(sheet) @ camera.base_from_camera
+    ways = np.column_stack([rays, np.ones(len(rays))]) @ camera_in_sheet[:3, :3].T
+    eye = camera_in_sheet[:3, 3]
+    seen = (eye[:2] - ways[:, :2] * (eye[2] / ways[:, 2:])).reshape(len(y), len(x), 2).astype(np.float32)
+    fine = np.meshgrid(np.arange(w, dtype=np.float32) / MAP_STEP, np.arange(h, dtype=np.float32) / MAP_STEP)
+    return np.asarray(cv2.remap(seen, *fine, cv2.INTER_LINEAR))
 
 
 NOISE_MARGIN_PX = 97  # px by which the stored noise is larger than an image, so that each image takes another cut of it
