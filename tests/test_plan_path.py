@@ -94,12 +94,16 @@ def test_travels_keep_clear_of_the_scan(mode: LayerMode) -> None:
     assert (tip[:, 2] - interpolate(plan.wound.grid, plan.wound.bed, tip[:, :2])).min() > 0.2
 
 
-def test_layers_begin_with_their_wait_and_time_adds_up() -> None:
+def test_further_layers_begin_with_their_wait_above_the_last_bead_and_time_adds_up() -> None:
     plan = plan_of()
     way = replace(plan.order.way, wait=30.0)
     waiting = make_plan(plan.wound, replace(plan.order, way=way))
     layers = sum(bool(layer.beads) for layer in plan.layers)
-    assert seconds_to(waiting.points)[-1] - seconds_to(plan.points)[-1] == pytest.approx(30.0 * layers)
+    assert seconds_to(waiting.points)[-1] - seconds_to(plan.points)[-1] == pytest.approx(30.0 * (layers - 1))
+    for i in np.flatnonzero(waiting.points.wait):
+        rest, bead = waiting.points.tip[i - 1], waiting.points.tip[i - 2]  # where it waits, and where it left off
+        assert waiting.points.extrude[i - 2] and not waiting.points.extrude[i - 1]
+        assert np.linalg.norm(rest - bead) == pytest.approx(way.lift, abs=0.01)
     figures = figures_of(plan)
     assert sum(f.seconds for f in figures) == pytest.approx(seconds_to(plan.points)[-1], rel=1e-6)
     assert sum(f.volume for f in figures) == pytest.approx(plan.points.volume.sum())
