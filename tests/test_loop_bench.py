@@ -64,7 +64,7 @@ def test_the_page_shows_every_way_of_every_scenario() -> None:
     one = Print(np.arange(0, 1, 0.001), np.abs(np.sin(np.arange(0, 1, 0.001))))
     never = Print(one.stamps, np.full(1000, np.nan))
     prints = {(name, way): one if way == FORECAST_INPUT else never for name in "ab" for way in MOTION_INPUTS}
-    page = loop_page(prints)
+    page = loop_page(prints, {})
     assert all(page.count(f">{way}: 95 %") == 2 for way in MOTION_INPUTS) and page.count("<h2>") == 2
 
 

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from hardware.files.region_table import RegionBy, RegionSettings, check_region
 from hardware.process.progress import Progress, ProgressReport, prepare_out
 from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from estimation.rig import Rig
     from estimation.se3 import Array
     from hardware.files.pose_file import PoseWriter
+    from hardware.files.region_table import RegionSettings
     from hardware.files.session import Session
     from hardware.operator.shared_state import DrawnRegion
     from hardware.process.system import SharedLatest
@@ -136,6 +136,8 @@ def region_search(
     rig: Rig, region: RegionSettings, drawn: SharedLatest[DrawnRegion], model: Path | None = None
 ) -> Callable[[Executor], FindRegion] | None:
     """What finds a region that is not known before the first picture, to be given one thread; None: nobody asks."""
+    from hardware.files.region_table import RegionBy  # loads numpy
+
     if region.drawn:
         return lambda thread: partial(_drawn_region, rig, drawn)
     if region.by is RegionBy.COLOUR:
@@ -145,6 +147,8 @@ def region_search(
 
 def _drawn_region(rig: Rig, drawn: SharedLatest[DrawnRegion], frames: FrameSet) -> Sequence[Roi] | str:
     """The region that somebody has drawn on the page; InputError where it is of other cameras."""
+    from hardware.files.region_table import RegionBy, RegionSettings, check_region
+
     region = drawn.get()
     if region is None:
         return DRAW_TEXT

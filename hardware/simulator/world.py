@@ -186,7 +186,7 @@ class SimulatedWorld:
                     progress(reported, total)
             complete = True
         finally:
-            self._emit_rows(self._end if complete else self.arm.now)
+            self._emit_rows(self._end if complete else max(self.arm.now, self._time.now()))
 
     @property
     def told_outside(self) -> float:
