@@ -348,7 +348,7 @@ def _figures(scenario: str, prints: dict[tuple[str, str], Print]) -> list[Figure
 
 
 def loop_page(prints: dict[tuple[str, str], Print], beads: Mapping[str, BeadsPrint]) -> str:
-    """The error at the nozzle over time, a plot for each way, one scale for all of a scenario; and where beads lie, if they were laid."""
+    """The error at the nozzle over time, a plot for each way, one scale a scenario; and where beads lie, if any do."""
     body = [beads_section(beads)] if beads else []
     keys = legend([line_key("estimate", "error while extruding, mm"), line_key("limit", f"{MAX_NOZZLE_ERROR:g} mm")])
     for scenario in dict.fromkeys(name for name, _ in prints):
