@@ -203,7 +203,7 @@ FLOODS = {
     "sense": json.dumps({"shown": 1}),
     "requests": json.dumps({"ask": "resume", "turn": 1, "tag": 1}),
     "garbage": '{"ask":',
-    "too long": "x" * 4000,
+    "too long": "x" * (WindowLimits().message + 1),
 }
 
 
