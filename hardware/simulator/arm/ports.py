@@ -221,7 +221,8 @@ def run_virtual_arm(
 
     profile: dialect, home and baud rate; bytes are taken no faster than that, whatever rate a client asks the pty for.
     link: a symbolic link to the device, which is removed at the end. log: a new CSV of the executed axes, each ms,
-    stamped by the machine's monotonic clock. InputError where `link` or `log` would overwrite something. Returns the arm as it was at the end.
+    stamped by the machine's monotonic clock. InputError where `link` or `log` would overwrite something. Returns the
+    arm as it was at the end.
     """
     profile = ArmProfile() if profile is None else profile
     clock, stop = clock or WallClock(), stop or threading.Event()
