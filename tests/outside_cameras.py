@@ -3,6 +3,7 @@
 WHAT they show, to and fro in real time: a printed sheet that is pushed over a table, a calibration board that is waved,
 or a wound that breathes. FOLDER/rig.toml names them; standard output says "ready". Of the wound, FOLDER/shown.csv has a
 line for each picture: stamp_s by the monotonic clock, the camera, and the first three rows of base_from_surface, mm.
+While there is a file FOLDER/hand, something blotchy is before all cameras.
 """
 
 from __future__ import annotations
@@ -96,6 +97,13 @@ def wound() -> Shown:
     return Shown(cameras, [list(images) for images in zip(*sets, strict=True)], WOUND_FPS, poses)
 
 
+def blotches(size: tuple[int, int], seed: int) -> Image:
+    """A picture (H, W, 3) of something near and out of focus; another seed has other noise."""
+    large = np.random.default_rng(1).normal(140, 25, (9, 16, 3)).astype(np.float32)
+    noise = np.random.default_rng(seed).normal(0, 3, (*size[::-1], 3))
+    return np.clip(cv2.resize(large, size, interpolation=cv2.INTER_CUBIC) + noise, 0, 255).astype(np.uint8)
+
+
 SHOWN: dict[str, Callable[[], Shown]] = {"sheet": sheet, "board": board, "wound": wound}
 
 
@@ -103,6 +111,7 @@ def main(folder: Path, what: str = "sheet") -> None:
     """Serve until the standard input ends."""
     shown = SHOWN[what]()
     images = [[cv2.imencode(".jpg", image)[1].tobytes() for image in own] for own in shown.images]
+    hand = [cv2.imencode(".jpg", blotches(shown.rig.cameras[0].size, seed))[1].tobytes() for seed in range(7)]
     log = None if shown.poses is None else (folder / "shown.csv").open("w", encoding="utf-8")
 
     def seen(camera: int) -> bytes:
@@ -113,7 +122,7 @@ def main(folder: Path, what: str = "sheet") -> None:
         if log is not None and shown.poses is not None:
             log.write(",".join(map(repr, [tick / shown.fps, camera, *shown.poses[k, :3].ravel().tolist()])) + "\n")
             log.flush()
-        return images[camera][k]
+        return hand[tick % len(hand)] if (folder / "hand").exists() else images[camera][k]
 
     streams = [HttpCamera(1e3, lambda _, c=c: seen(c)) for c in range(3)]  # their own beat is too fast to matter
     with served(*streams):
