@@ -69,6 +69,8 @@ ELSEWHERE = {  # printed there and not run here
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record try --yes -o arm.toml": (
         "tests/test_arm_console.py: cameras that see the needle"
     ),
+    "stillbed calibrate dispenser dispenser.toml --device /dev/ttyUSB0 --arm arm.toml --cameras rig.toml "
+    "--record lines --yes": "tests/test_calibrate_dispenser.py: cameras that see lines of material",
 }
 
 
@@ -204,9 +206,11 @@ def watched(planned: Table) -> Iterator[Table]:
 
 
 def test_each_command_that_is_printed_is_run_here() -> None:
-    here = Path(__file__).read_text(encoding="utf-8")
+    here = Path(__file__).read_text(encoding="utf-8").replace('"\n    "', "")
     walked = {text for text in PRINTED if f'"{text}"' in here}
     assert set(ELSEWHERE) <= PRINTED == walked
+    named = re.findall(r"tests/\w+\.py", " ".join(ELSEWHERE.values()))
+    assert len(named) == 3 and all((ROOT / file).is_file() for file in named)
 
 
 def test_the_arm_and_the_dispenser_are_tried(table: Table) -> None:
