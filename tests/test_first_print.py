@@ -424,7 +424,7 @@ def test_print(printed: Table) -> None:
     print(f"beads begin within {begins.max():.3f} mm, end within {ends.max():.3f}")
     assert np.percentile(off, 95) < 0.6 and off.max() < 1.2
     assert np.percentile(open_, 95) < 0.6 and open_.max() < 1.0
-    assert begins.max() < 0.5 and ends.max() < 0.5
+    assert begins.max() < 0.4 and ends.max() < 0.4
     stopped, resumed = printed.folder / "monday/run.mcap", printed.folder / "monday/run-2.mcap"
     printed_once(stopped, resumed)
     assert not (truth.flow[~near(truth.flows, SWITCHING)] > 0.01).any(), "no flow but with a bead"
