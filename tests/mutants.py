@@ -284,6 +284,13 @@ MUTANTS = (
         ("test_live_stages.py",),
     ),
     Mutant(
+        "an arm is taken for armed by a report from before it was asked to",
+        "hardware/live/state_machine.py",
+        "self._armed |= motion.tick.stamp > self._ordered",
+        "self._armed = True",
+        ("test_live_stages.py",),
+    ),
+    Mutant(
         "the run goes on though nothing is recorded",
         "hardware/live/state_machine.py",
         "if reports.recorder is not None and reports.recorder.failed",

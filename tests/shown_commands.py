@@ -70,6 +70,7 @@ PAGE = (
 )
 RECORDED = "stillbed record live.toml -o out/recorded.mcap --seconds 3 --jpeg-quality 0 --no-page"
 MORE = "the same with more said"
+WALKED = "tests/test_first_print.py runs it as it stands"
 VIRTUAL = "stillbed calibrate arm --virtual --places 5 --swing-s 2 --record try -o arm.toml"
 LINES = "stillbed calibrate dispenser dispenser.toml --virtual --lines 2 --record lines"
 WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 8 --no-page"
@@ -157,6 +158,11 @@ INSTEAD = {  # (what is run in its place, why)
         'stillbed replay sessions/monday --path path.csv -o out/replay --fault "camera1 off at 3s for 1s"',
         MORE,
     ),
+    "stillbed live --resume monday/run.mcap": ("stillbed live --resume run.mcap", WALKED),
+    "stillbed record monday/session.toml -o try.mcap": (RECORDED, WALKED),
+    "stillbed replay monday/run.mcap -o out/replay": ("stillbed replay run.mcap -o out/replay", WALKED),
+    "stillbed smooth monday/run.mcap -o out/smoothed": ("stillbed smooth run.mcap -o out/smoothed", WALKED),
+    "stillbed track try.mcap -o out/tracked": (TRACKED, WALKED),
     "stillbed replay run.mcap -o OUT": ("stillbed replay run.mcap -o out/replay", "the same to another folder"),
     "stillbed live session.toml --region region.toml": (PAGE, "tests/test_region_live.py runs it with regions"),
     "stillbed record RIG.toml -o X.mcap [--seconds S]": (RECORDED, "for some seconds"),

@@ -31,10 +31,10 @@ BLACK = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
 
 @dataclass
 class HttpCamera:
-    """What a camera on the network sends: `picture_of` a frame's number; the test changes it while it runs."""
+    """What a camera on the network sends: `picture_of` a frame's number, bytes as they are; a test changes it."""
 
     fps: float = 40.0
-    picture_of: Callable[[int], Image] = picture
+    picture_of: Callable[[int], Image | bytes] = picture
     online: bool = True
     stalled: bool = False
     url: str = ""
@@ -45,7 +45,8 @@ class HttpCamera:
         return CameraSource(Identity(SourceKind.STREAM, self.url))
 
     def part(self) -> bytes:
-        data = cv2.imencode(".jpg", self.picture_of(len(self.sent)))[1].tobytes()
+        seen = self.picture_of(len(self.sent))
+        data = seen if isinstance(seen, bytes) else cv2.imencode(".jpg", seen)[1].tobytes()
         self.sent.append(CLOCK.now())
         return b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data) + data + b"\r\n"
 

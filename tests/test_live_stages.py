@@ -134,6 +134,19 @@ def test_a_wish_from_before_a_stop_lets_nothing_go_on() -> None:
     assert run.conductor.answer is not None and not run.conductor.answer.followed
 
 
+def test_a_resume_right_after_a_stop_goes_on_though_the_arm_was_not_seen_to_stop_before() -> None:
+    run = Staged().to_print()
+    run.look(Wish.STOP)
+    run.look(Wish.RESUME)  # the motion has not said yet that it stopped
+    run.arm = ArmState.STOPPED
+    assert {run.look() for _ in range(5)} == {RunStage.APPROACH} and run.orders[-1] is Order.ARM
+    run.arm = ArmState.ARMED
+    run.look()
+    assert run.look() is RunStage.PRINT
+    run.arm = ArmState.STOPPED
+    assert run.look() is RunStage.STOPPED
+
+
 def test_an_arm_that_stops_by_itself_is_not_armed_again_unasked() -> None:
     run = Staged().to_print()
     run.arm = ArmState.STOPPED

@@ -202,7 +202,7 @@ def add_arm(commands: Commands) -> None:
     add("--link", type=Path, metavar="LINK", help="a symbolic link to make to the device")
     add("--replies", choices=("off", "stream", "stray"), default="off", help="what the arm sends")
     add_fault(add, "e.g. 'slow 80%% at 2s for 1s'")
-    add("--log", type=Path, metavar="X.csv", help="write the executed motion, a row a millisecond")
+    add("--log", type=Path, metavar="X.csv", help="write the executed motion, a row a millisecond, at the end")
 
 
 def _run_arm(a: argparse.Namespace) -> int:

@@ -297,7 +297,7 @@ class RunStateMachine:
         if tracking.pose is not None and not tracking.ended and (age := now - tracking.pose.stamp) > self.task.patience:
             return self._stop(f"no pictures for {age:.1f} s", now)
         if status.state is ArmState.ARMED:
-            self._armed = True
+            self._armed |= motion.tick.stamp > self._ordered  # else the report is from before the last order
         elif status.state is ArmState.STOPPED and self._armed and self.stage is not RunStage.HOMING:
             self._enter(RunStage.STOPPED, status.reason, now)
         return []

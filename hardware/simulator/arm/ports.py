@@ -220,19 +220,20 @@ def run_virtual_arm(
     """Serve a virtual arm on a new pty until `stop` is set, Ctrl-C or SIGTERM; say its device name, then a summary.
 
     profile: dialect, home and baud rate; bytes are taken no faster than that, whatever rate a client asks the pty for.
-    link: a symbolic link to the device, which is removed at the end. log: a new CSV of the executed axes, each ms.
-    InputError where `link` or `log` would overwrite something. Returns the arm as it was at the end.
+    link: a symbolic link to the device, which is removed at the end. log: a new CSV of the executed axes, each ms,
+    stamped by the machine's monotonic clock. InputError where `link` or `log` would overwrite something. Returns the
+    arm as it was at the end.
     """
     profile = ArmProfile() if profile is None else profile
     clock, stop = clock or WallClock(), stop or threading.Event()
-    arm = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
-    with _motion_log(log, arm):
+    arm, start = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud), clock.now()
+    with _motion_log(log, arm, start):
         ours, theirs, device = open_pty()
         try:
             os.set_blocking(ours, False)
             with device_link(link, device), stop_on_signals(stop):
                 say(device)
-                _serve(ours, arm, profile.baud / BITS_PER_BYTE, clock, stop)
+                _serve(ours, arm, start, profile.baud / BITS_PER_BYTE, clock, stop)
         finally:
             os.close(theirs)
             os.close(ours)
@@ -241,7 +242,7 @@ def run_virtual_arm(
 
 
 @contextmanager
-def _motion_log(log: Path | None, arm: VirtualArm) -> Iterator[None]:
+def _motion_log(log: Path | None, arm: VirtualArm, begun: float) -> Iterator[None]:
     if log is None:
         yield
         return
@@ -258,7 +259,7 @@ def _motion_log(log: Path | None, arm: VirtualArm) -> Iterator[None]:
             for start in range(0, size, _ROWS_AT_ONCE):
                 stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
                 axes = arm.axes_at(stamps) * [1, 1, 1, *np.rad2deg([1.0, 1, 1])]
-                np.savetxt(file, np.column_stack([stamps, axes]), ["%.3f"] + ["%.6f"] * 6, delimiter=",")
+                np.savetxt(file, np.column_stack([stamps + begun, axes]), "%.6f", delimiter=",")
 
 
 def run_summary(arm: VirtualArm) -> str:
@@ -278,9 +279,12 @@ def run_summary(arm: VirtualArm) -> str:
     )
 
 
-def _serve(port: int, arm: VirtualArm, rate: float, clock: Clock, stop: threading.Event) -> None:
-    """Carry bytes both ways, in at most `rate` a second; what no client reads is lost, as on a line."""
-    start, allowed = clock.now(), 0.0
+def _serve(port: int, arm: VirtualArm, start: float, rate: float, clock: Clock, stop: threading.Event) -> None:
+    """Carry bytes both ways, in at most `rate` a second; what no client reads is lost, as on a line.
+
+    start: s, when the arm's own time begins.
+    """
+    allowed = 0.0
     while not stop.is_set():
         clock.wait_until(start + arm.now + POLL_PERIOD)
         now = clock.now() - start
