@@ -90,7 +90,7 @@ def add_record(commands: Commands) -> None:
     ).add_argument
     add("which", type=Path, metavar="RIG.toml", help="its cameras; or a session.toml, with its rig, region and quality")
     add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
-    add("--seconds", type=positive, metavar="S", help="for so long; default: until Ctrl-C")
+    add("--seconds", type=positive, metavar="S", help="from the first picture on; default: until Ctrl-C")
     add("--jpeg-quality", type=int, metavar="Q", help="1 to 100, default 90; 0 keeps the pictures exactly")
     add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
     add("--no-page", action="store_true", help="without a page")

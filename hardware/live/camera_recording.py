@@ -38,6 +38,7 @@ from hardware.process.system import SPAWN, SharedLatest
 from perception.frames import FrameSet, region_since
 from perception.tracking.wound_step import FindRegion
 
+FIRST_PICTURE_TIME = 10.0  # s in which cameras open; a recording of so many seconds counts from its first picture
 PICTURE_WAIT = 0.1  # s of a wait for pictures, after which signals and the page are looked at
 VIEW_PERIOD = 0.3  # s between views for the page
 SHARPNESS_PERIOD = 1.0  # s between looks at the pictures' sharpness, which takes some ms each
@@ -149,6 +150,7 @@ class CameraRecording:
         self._sets = self._passed = 0
         self._lost: dict[str, None] = {}  # names of cameras that were without pictures for a while, in that order
         self._viewed = self._looked = -1e9
+        self._arrived = nan  # s, when the first set was there
         self._page: RecordingPage | None = None
         self._find: FindRegion | None = None
 
@@ -217,7 +219,8 @@ class CameraRecording:
         if not self._processes.alive(RECORDER):
             self.failed = True
             return f"the recorder {self._processes.ending(RECORDER)}; what was written before is kept"
-        if self._order.seconds is not None and now - self._begun >= self._order.seconds:
+        since = self._begun + FIRST_PICTURE_TIME if isnan(self._arrived) else self._arrived
+        if self._order.seconds is not None and now - since >= self._order.seconds:
             return "the time is over"
         return self.words
 
@@ -239,7 +242,7 @@ class CameraRecording:
     def _take(self, arrived: TimedFrameSet) -> None:
         frames = arrived.frames
         if isnan(self._first):
-            self._first = frames.stamp
+            self._first, self._arrived = frames.stamp, self._clock.now()
         self._last, self._sets = frames.stamp, self._sets + 1
         self._passed += arrived.dropped
         self._sender.put(SetEntry({frame.camera: frame.stamp for frame in frames.frames}, {}, frames.frames))
