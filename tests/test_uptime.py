@@ -57,6 +57,7 @@ def late(recording: Path, request: pytest.FixtureRequest) -> tuple[Path, str]:
     return moved(recording, file, UPTIMES[request.param]), request.param
 
 
+@pytest.mark.slow
 def test_a_late_recording_is_smoothed_at_any_rate_and_compared(
     late: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,6 +78,7 @@ def test_a_late_recording_is_smoothed_at_any_rate_and_compared(
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_late_recording_is_viewed_instant_by_instant(late: tuple[Path, str]) -> None:
     file, first = late[0], UPTIMES[late[1]]
     playback = open_playback(file)
