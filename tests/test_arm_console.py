@@ -173,7 +173,7 @@ def on_a_terminal(watched: WatchedArm) -> Iterator[tuple[str, VirtualArm]]:
     arm = VirtualArm(watched.settings, told.dialect, watched.begin, (), told.baud)
     (ours, theirs, device), stop = open_pty(), threading.Event()
     os.set_blocking(ours, False)
-    serve = threading.Thread(target=_serve, args=(ours, arm, told.baud / BITS_PER_BYTE, CLOCK, stop))
+    serve = threading.Thread(target=_serve, args=(ours, arm, CLOCK.now(), told.baud / BITS_PER_BYTE, CLOCK, stop))
     serve.start()
     try:
         yield device, arm

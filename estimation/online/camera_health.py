@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from estimation import se3
-from estimation.observations import RAYLEIGH_MEDIAN, Observations
+from estimation.observations import Observations
 from estimation.online.bump_detector import BumpDetector
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
@@ -25,6 +25,7 @@ from estimation.se3 import Array, Index, Mask
 
 MAX_OUTLIERS = 2  # cameras that may be wrong at once: exchanged cables
 MIN_DISORDER_PX = 1.5  # median residual; below, it is not asked how much of it a camera's own motion explains
+USUAL_LENGTH_SIGMAS = 1.18  # median length of a track's residual where it is noise alone, rounded up
 MAX_MOTION_SIGMAS = 3.0  # beyond, a pose contradicts the motion; also by how much an outlier must be the clearest
 MIN_SHIFT_PX = 0.25  # by which lens, map and extrinsics may move all tracks of a camera, at least
 USUAL_MEMORY_S = 2.0  # over which it is learned what is usual for a camera
@@ -175,7 +176,7 @@ class FrameTracks:
         for c in range(len(self.rig)):
             mine = self.seen.camera == c
             if np.count_nonzero(mine) >= self.min_tracks:
-                noise = RAYLEIGH_MEDIAN * median(self.seen.sigma[mine])
+                noise = USUAL_LENGTH_SIGMAS * median(self.seen.sigma[mine])
                 off[c] = np.sqrt(max(median(away[mine]) ** 2 - noise**2, 0.0))
         return off
 
