@@ -186,7 +186,10 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed smooth sessions/ -o out/all --scheduler tcp://cluster:8786": (CLUSTER, "a cluster of one's own"),
     **{
         f"make {target}": (f"make --dry-run {target}", INSTALLS)
-        for target in ("audit", "bench", "check", "demo", "fuzz", "hazards", "outages", "references", "slow", "test")
+        for target in (
+            *("audit", "bench", "check", "demo", "fuzz", "hazards", "outages", "references", "slow", "test"),
+            "test PYTHON=python3.12",
+        )
     },
 }
 MOVED = "tests/test_arm_console.py moves a virtual arm before cameras that see its needle, which takes a minute"
