@@ -220,7 +220,7 @@ class FlowCommands:
 
     def __init__(self, plan: MaterialPlan, outlets: Outlets, lag: float, tick: float) -> None:
         """lag: s from one tick after a command until the arm is at its axes. tick: s between calls."""
-        self._plan, self._outlets, self.lag, self._tick = plan, outlets, lag, tick
+        self._plan, self._outlets, self.lag = plan, outlets, lag
         self._steps = np.arange(0.0, tick - SWITCH_STEP / 2, SWITCH_STEP)
         self._flow = 0.0  # mm^3/s last told
         self.begun = math.inf

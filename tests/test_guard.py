@@ -23,10 +23,10 @@ from hardware.bench.campaigns.guard import (
     random_log,
     simple_rules,
 )
-from planning.command import Command, Hold, Move, Refusal, RefusalCode
+from planning.command import MAX_FLOW, Command, Hold, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, joints_from_axes
 from planning.limits import MotionLimits
-from planning.motion.guard import MAX_FLOW, Guard
+from planning.motion.guard import Guard
 from tests.slowly import slowly
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit

@@ -19,17 +19,17 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process.clock import Clock
+from planning.command import MAX_FLOW
+from planning.material import bead_areas, is_metered
 from planning.path import MAX_TEMPERATURE, MIN_TEMPERATURE, Path
 
 MAX_DISPENSER_DELAY = 5.0  # s, of a dead time or a lag: what is slower cannot start a bead where it begins
-MAX_FLOW = 1000.0  # mm^3/s: a bead of 5 mm^2 at the fastest path, 200 mm/s
 MAX_DRAWN_BACK = 100.0  # mm^3: more than any nozzle and needle hold
 MAX_NOZZLE_OFFSET = 200.0  # mm: what hangs on the same tool is no farther away
 KEPT_WITHIN = 1.0  # degrees C by which a path's temperature may differ from one that is kept elsewhere
 CLOSE_TIME = 1.0  # s for which a close insists that the line takes the off
 CLOSE_POLL = 0.002  # s between looks meanwhile
 MAX_DISPENSER_EVENTS = 1000  # kept until they are asked for
-VOLUME_COLUMN, BEAD_COLUMNS = "volume_mm3", ("width_mm", "height_mm")  # of a path, either says how much material flows
 
 
 class DispenserState(Enum):
@@ -344,11 +344,19 @@ def close_dispensers(dispensers: Dispensers, clock: Clock) -> list[str]:
     return [f"{d.profile.name}: {d.status.reason}" for d in dispensers if d.status.state is DispenserState.FAILED]
 
 
+def switch_off(dispensers: Dispensers, clock: Clock) -> list[str]:
+    """Switch off what another process has opened that is gone; of each that could not be, why."""
+    for each in dispensers:
+        each.prepare(clock.now())  # opens the line; an off goes out before what sets it up
+        each.off(clock.now())
+    return close_dispensers(dispensers, clock)
+
+
 def check_path_materials(dispensers: Dispensers, path: Path, file: object) -> None:
     """InputError (file) where a material that the path extrudes has no dispenser, or one that cannot do it.
 
-    Refused are a temperature that its dispenser can neither set nor is kept at, and a metered one on a path that does
-    not say how much is to flow: in a column volume_mm3, or in width_mm and height_mm.
+    Refused are a temperature that its dispenser can neither set nor is kept at; and for a metered one a path that does
+    not say how much is to flow, in a column volume_mm3 or in width_mm and height_mm, or needs a flow that it cannot give.
     """
     for material in dict.fromkeys(path.material[path.extrude].tolist()):
         dispenser = dispensers.for_material(material)
@@ -359,7 +367,15 @@ def check_path_materials(dispensers: Dispensers, path: Path, file: object) -> No
         for celsius in np.unique(path.temperature[printed]).tolist():
             if allowed := dispenser.profile.wrong_temperature(celsius):
                 raise InputError(file, f"temperature_c of material {material}", celsius, allowed)
-        told = VOLUME_COLUMN in path.extra or all(name in path.extra for name in BEAD_COLUMNS)
-        if dispenser.profile.metered and not told:
-            allowed = f"{VOLUME_COLUMN}, or {' and '.join(BEAD_COLUMNS)}, as {dispenser.profile.name} meters its flow"
+        if not dispenser.profile.metered:
+            continue
+        name = dispenser.profile.name
+        if not is_metered(path):
+            allowed = f"volume_mm3, or width_mm and height_mm, as {name} meters its flow"
             raise InputError(file, "columns", ", ".join(path.extra) or "no further column", allowed)
+        low, high = dispenser.profile.flow_range
+        flows = bead_areas(path, file) * path.speed
+        wrong = np.flatnonzero(printed & ~((flows >= low) & (flows <= high)))
+        if len(wrong):
+            allowed = f"{low:g} to {high:g} mm^3/s, what {name} can give: another speed, width or height"
+            raise InputError(file, f"checkpoint {wrong[0]}: flow", f"{flows[wrong[0]]:.3g} mm^3/s", allowed)

@@ -112,7 +112,12 @@ def outlets_from(settings: Sequence[DispenserSettings], where: object = "dispens
 
 def open_dispensers(path: str | Path) -> Dispensers:
     """The drivers of a dispenser file, closed; InputError as `read_dispensers`."""
-    return Dispensers([dispenser_from_settings(each) for each in read_dispensers(path)], path)
+    return drivers_of(read_dispensers(path), path)
+
+
+def drivers_of(settings: Sequence[DispenserSettings], where: object = "dispensers") -> Dispensers:
+    """The drivers of what is in a file, closed."""
+    return Dispensers([dispenser_from_settings(each) for each in settings], where)
 
 
 def _settings(path: Path, table: checks.Table) -> tuple[DispenserSettings, ...]:

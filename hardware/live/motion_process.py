@@ -20,8 +20,7 @@ from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
 from hardware.arm.port import Port, PortOpener
 from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag
-from hardware.dispenser.dispenser import Dispensers
-from hardware.files.dispenser_file import dispenser_from_settings, dispensers_from_text
+from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender
@@ -278,8 +277,7 @@ def material_control(path: Path, dispensers: str, start: float, now: float) -> M
     """The dispensers of a path, by the text of their file, made ready for `start`, in checkpoints; None without one."""
     if not dispensers:
         return None
-    drivers = [dispenser_from_settings(each) for each in dispensers_from_text(dispensers, "dispenser.toml")]
-    control = MaterialControl(Dispensers(drivers), path)
+    control = MaterialControl(drivers_of(dispensers_from_text(dispensers, "dispenser.toml")), path)
     control.begin(start, now)
     return control
 

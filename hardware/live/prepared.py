@@ -26,11 +26,11 @@ from estimation.errors import InputError, StillbedError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
-from hardware.dispenser.dispenser import Dispensers, check_path_materials
+from hardware.dispenser.dispenser import check_path_materials
 from hardware.files.arm_file import far_limits_text, read_arm
 from hardware.files.dispenser_file import (
-    dispenser_from_settings,
     dispensers_from_text,
+    drivers_of,
     outlets_from,
     read_dispensers,
 )
@@ -288,7 +288,7 @@ def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -
     if file is None or path is None or settings.dry_run:
         return "", {}
     read = read_dispensers(file)
-    dispensers = Dispensers([dispenser_from_settings(each) for each in read], file)
+    dispensers = drivers_of(read, file)
     check_path_materials(dispensers, path, where)
     outlets = outlets_from(read, file)
     with_offsets(path, outlets)

@@ -26,8 +26,8 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.link import emergency_stop
 from hardware.arm.profile import ArmProfile
-from hardware.dispenser.dispenser import Dispensers, close_dispensers
-from hardware.files.dispenser_file import dispenser_from_settings, dispensers_from_text
+from hardware.dispenser.dispenser import switch_off
+from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import ProgressWriter
 from hardware.live.checklist import PlacedPath, checks_table
 from hardware.live.fault_injection import FaultInjector
@@ -193,11 +193,7 @@ class LiveRun:
         """Switch the dispensers off in place of the motion process; those with a watchdog did it themselves."""
         if not (text := self._prepared.task.dispensers):
             return
-        drivers = Dispensers([dispenser_from_settings(each) for each in dispensers_from_text(text, "dispenser.toml")])
-        for each in drivers:
-            each.prepare(self._clock.now())
-            each.off(self._clock.now())
-        for words in close_dispensers(drivers, self._clock):
+        for words in switch_off(drivers_of(dispensers_from_text(text, "dispenser.toml")), self._clock):
             self._log(f"a dispenser could not be switched off: {words}: switch it off by hand", WARNING)
 
     def _send(self, orders: Orders) -> None:

@@ -78,17 +78,17 @@ class MaterialControl:
 
     def begin(self, place: float, now: float) -> None:
         """Make the dispenser ready whose material comes next at `place`, in checkpoints, and close the others."""
-        ahead = [i for i in range(math.floor(place) + 1, len(self._extrude)) if self._extrude[i]]
-        if not ahead:
+        ahead = next((i for i in range(math.floor(place) + 1, len(self._extrude)) if self._extrude[i]), None)
+        if ahead is None:
             return
-        self._refused, self._material = "", self._materials[ahead[0]]
+        self._refused, self._material = "", self._materials[ahead]
         wanted = self._dispensers.for_material(self._material)
         if self._current is not wanted:
             self.off(now)
         self._current = wanted
         if wanted is not None:
             sets = wanted.profile.temperature_range is not None
-            self._celsius = self._temperatures[ahead[0]] if sets else None
+            self._celsius = self._temperatures[ahead] if sets else None
             wanted.prepare(now, self._celsius)
 
     def follow(self, command: Command, now: float) -> None:
@@ -143,6 +143,8 @@ class MaterialControl:
         if not flow or current is None or self.reason:
             self.off(now)
             return
+        low, high = current.profile.flow_range
+        flow = min(max(flow, low), high)  # the path keeps its range; where the nozzle is slower than that, it does not
         same = self._told and (not current.profile.metered or abs(flow - self._told) <= FLOW_STEP * self._told)
         if same:
             return

@@ -14,12 +14,11 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import Command, Move, Refusal, RefusalCode
+from planning.command import MAX_FLOW, Command, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
 
 AXIS_NAMES = "XYZABC"
-MAX_FLOW = 2000.0  # mm^3/s: a bead of 10 mm^2 at MAX_SPEED; bioprinting lays 0.1 to 10
 LINEAR_AXES = 3  # X Y Z in mm, the others in rad
 
 
