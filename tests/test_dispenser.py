@@ -30,6 +30,7 @@ from hardware.dispenser.dispenser import (
     DispenserState,
     check_path_materials,
     close_dispensers,
+    switch_off,
 )
 from hardware.dispenser.line_dispenser import LineDispenser
 from hardware.dispenser.messages import PRESETS, DispenserMessages, MessageValues, message_lines
@@ -518,6 +519,21 @@ def test_a_killed_client_leaves_it_off_within_its_watchdog(tmp_path: File) -> No
     assert flow[(stamps > killed - 0.1) & (stamps < killed)] == pytest.approx(1.0, abs=0.01)
     assert flow[stamps > killed + 0.4].max() < 0.01
     assert (switched[stamps < model.closed_itself[0]][-100:] == 1).all() and switched[-1] == 0
+
+
+def test_one_without_a_watchdog_stays_on_after_its_client_and_whoever_is_left_switches_it_off(tmp_path: File) -> None:
+    clock = WallClock()
+    with served(tmp_path, watchdog=float("inf")) as (port, models):
+        client = subprocess.Popen([sys.executable, "-c", CLIENT, str(port)], stdout=subprocess.PIPE, text=True)
+        assert client.stdout is not None and client.stdout.readline() == "on\n"
+        os.kill(client.pid, signal.SIGKILL)
+        client.communicate()
+        clock.wait_until(clock.now() + 0.3)
+        asked = clock.now()
+        assert switch_off(Dispensers([pty_driver(port)]), clock) == []
+    (model,) = models
+    (stamp, flow) = model.switches[-1]
+    assert flow == 0.0 and asked < stamp < asked + 0.1 and not model.on
 
 
 def test_on_and_off_pass_a_pty_and_a_replugged_device_is_off_and_must_be_prepared(tmp_path: File) -> None:

@@ -289,3 +289,16 @@ def test_another_temperature_on_the_path_is_waited_for() -> None:
     assert "preparing" in told(3, 0.1) and not bench.open
     assert told(3, 30.0) == "" and bench.open
     assert bench.model.temperature_at(bench.clock.now()) == pytest.approx(37.0, abs=1.0)
+
+
+@pytest.mark.parametrize(("asked", "told"), [(0.01, 0.5), (2.0, 2.0), (50.0, 4.0)])
+def test_a_metered_flow_keeps_the_range_of_its_dispenser(asked: float, told: float) -> None:
+    bench = Bench("new_era", DispenserProfile("gel", ("1",), metered=True, flow_range=(0.5, 4.0)))
+    material = MaterialControl(Dispensers([bench.driver]), raster())
+    material.begin(0.0, bench.clock.now())
+    bench.run(1.0)
+    now = bench.clock.now()
+    material.follow(Move(now, np.zeros(6), 1.0, 1, extrude=True, flow=asked), now)
+    bench.run(0.5)
+    assert material.reason == "" and bench.driver.status.flow == pytest.approx(told)
+    assert bench.open and bench.model.switches[-1][1] == pytest.approx(told, rel=1e-3)

@@ -356,7 +356,7 @@ def check_path_materials(dispensers: Dispensers, path: Path, file: object) -> No
     """InputError (file) where a material that the path extrudes has no dispenser, or one that cannot do it.
 
     Refused are a temperature that its dispenser can neither set nor is kept at; and for a metered one a path that does
-    not say how much is to flow, in a column volume_mm3 or in width_mm and height_mm, or needs a flow that it cannot give.
+    not say how much is to flow (in volume_mm3, or in width_mm and height_mm), or needs a flow that it cannot give.
     """
     for material in dict.fromkeys(path.material[path.extrude].tolist()):
         dispenser = dispensers.for_material(material)
