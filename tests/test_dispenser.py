@@ -718,6 +718,10 @@ def test_each_material_of_a_path_has_its_dispenser_temperature_and_flow() -> Non
             path([2] * 3, 30.0, width_mm=["1"] * 3),
             "columns = 'width_mm', allowed volume_mm3, or width_mm and height_mm",
         ),
+        (
+            path([2] * 3, 30.0, width_mm=["1", "1", "15"], height_mm=["1", "1", "15"]),
+            "checkpoint 2: flow = '1.12e+03 mm^3/s', allowed 0.001 to 1000 mm^3/s",
+        ),
     ):
         with pytest.raises(InputError, match=r"^p\.csv: ") as caught:
             check_path_materials(both, wrong, "p.csv")
