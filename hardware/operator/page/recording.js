@@ -2,7 +2,7 @@
 import { Drawing } from "./draw.js";
 import { Panes } from "./panes.js";
 import { Line } from "./socket.js";
-import { duration, upper } from "./words.js";
+import { duration, toast, upper } from "./words.js";
 
 const STAGES = {
   record: { word: "Recording", tone: "good", say: "The cameras are being recorded." },
@@ -54,14 +54,6 @@ function tell(seen, news) {
   by("looked").textContent = `${duration(seen.seconds)} · ${seen.sets} frame sets · ${(seen.size / 1e6).toFixed(1)} MB`;
   for (const camera of seen.cameras) panes.of(camera.name).fares(camera);
   document.querySelector("[data-wish=end]").disabled = news !== "live" || !seen.offers.includes("end");
-}
-
-function toast(words, refused) {
-  const box = by("toast");
-  [box.textContent, box.hidden] = [words, false];
-  box.classList.toggle("refused", Boolean(refused));
-  clearTimeout(toast.timer);
-  toast.timer = setTimeout(() => (box.hidden = true), 6000);
 }
 
 const line = new Line(hear);

@@ -1,7 +1,7 @@
 // The page beside a calibration: live pictures with the corners that were found, what each camera still needs, the hint.
 import { unpacked } from "./panes.js";
 import { Line } from "./socket.js";
-import { duration, upper } from "./words.js";
+import { duration, toast, upper } from "./words.js";
 
 const STAGES = {
   wave: { word: "Wave", tone: "wait", say: "Wave the board slowly before the cameras." },
@@ -179,14 +179,6 @@ function tell(seen, news) {
   document.querySelector("[data-wish=end]").disabled = !offers.includes("end");
   document.querySelector("[data-wish=stop]").disabled = !waving;
   for (const each of boards.values()) each.draw();
-}
-
-function toast(words, refused) {
-  const box = by("toast");
-  [box.textContent, box.hidden] = [words, false];
-  box.classList.toggle("refused", Boolean(refused));
-  clearTimeout(toast.timer);
-  toast.timer = setTimeout(() => (box.hidden = true), 6000);
 }
 
 const line = new Line(hear);

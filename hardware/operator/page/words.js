@@ -52,3 +52,12 @@ export function duration(seconds) {
 export function upper(words) {
   return words ? words[0].toUpperCase() + words.slice(1) : "";
 }
+
+/** Shows words for six seconds; refused: in the colour of what was not followed. */
+export function toast(words, refused) {
+  const box = document.getElementById("toast");
+  [box.textContent, box.hidden] = [words, false];
+  box.classList.toggle("refused", Boolean(refused));
+  clearTimeout(toast.timer);
+  toast.timer = setTimeout(() => (box.hidden = true), 6000);
+}
