@@ -158,14 +158,11 @@ FlowOrder = tuple[float, float]  # flow, mm^3/s, and when in the tick it is told
 
 
 class RestsAhead:
-    """Which rest of a path comes next, and what it waits for.
-
-    wanted: material that an operator has to put in before the print goes on; "" if none.
-    """
+    """Which rest of a path comes next, and how much of it is left."""
 
     def __init__(self, plan: MaterialPlan, place: float) -> None:
         """place: mm, where printing begins; a rest there is still to come."""
-        self._plan, self.wanted = plan, ""
+        self._plan = plan
         self._number = sum(rest.place < place - ROUNDING for rest in plan.rests)
         self._until = math.nan  # s, until when it lasts; NaN: it is not reached
 
@@ -173,6 +170,11 @@ class RestsAhead:
     def next(self) -> Rest | None:
         """The rest that comes next or that it is at; None before the end."""
         return self._plan.rests[self._number] if self._number < len(self._plan.rests) else None
+
+    @property
+    def wanted(self) -> str:
+        """Material that an operator has to put in before the print goes on, "" if none: once the rest is reached."""
+        return "" if self.next is None or math.isnan(self._until) else self.next.material
 
     @property
     def end(self) -> float:
@@ -184,15 +186,13 @@ class RestsAhead:
         rest = self.next
         if rest is None or place < rest.place - ROUNDING:
             return 0.0
-        if rest.material:
-            self.wanted = rest.material
         if math.isnan(self._until):
             self._until = now + rest.wait
         return max(self._until - now, 0.0)
 
     def passed(self) -> None:
         """Go on to the next."""
-        self.wanted, self._number, self._until = "", self._number + 1, math.nan
+        self._number, self._until = self._number + 1, math.nan
 
 
 class PlaceTiming(Protocol):
