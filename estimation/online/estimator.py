@@ -20,7 +20,14 @@ from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, Ca
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.local_motion import LocalMotion
-from estimation.online.reported_covariance import CalibrationError, ReportedCovariance, widened
+from estimation.online.reported_covariance import (
+    NO_SHIFTS,
+    CalibrationError,
+    ReportedCovariance,
+    alias_covariance,
+    alias_message,
+    widened,
+)
 from estimation.online.surface_state import Measurement, MotionDetector, PoseStateMachine, StateSettings
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
@@ -298,11 +305,14 @@ class Estimator:
         seen = replace(seen, sigma=np.maximum(seen.sigma, self.settings.floor_sigma))
         surface.reported.learn(seen, fit, self.cameras)
 
-    def accept(self, fit: FrameFit, observations: Observations) -> SurfacePose:
-        """Take a measured fit into the window and give the pose."""
+    def accept(self, fit: FrameFit, observations: Observations, aliases: Array = NO_SHIFTS) -> SurfacePose:
+        """Take a measured fit into the window and give the pose.
+
+        aliases: (K, 3) mm, surface frame, shifts of the pose under which the surface looks as it is seen.
+        """
         assert fit.measured
         surface, sigma = self._surface, np.maximum(observations.sigma, self.settings.floor_sigma)
-        sound = self.may_learn(fit)
+        sound = self.may_learn(fit) and not len(aliases)
         surface.unlearned = fit, observations, fit.stamp - surface.pose.stamp, sound
         if sound and self._smear(fit) < MAX_LEARNING_SMEAR_MM:
             surface.warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
@@ -316,7 +326,7 @@ class Estimator:
             tracks=int(fit.used.sum()),
             sigma=position_sigma(fit.covariance + lasting),
             trouble=self.health.trouble(fit.stamp),
-            caveat=surface.local.message or surface.caveat,
+            caveat=alias_message(aliases) or surface.local.message or surface.caveat,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
         )
         state = self._states.measured(fit.stamp, quality)
@@ -324,7 +334,9 @@ class Estimator:
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        surface.reported_pose = widened(given, surface.local.covariance) if surface.local.active else given
+        if surface.local.active:
+            given = widened(given, surface.local.covariance)
+        surface.reported_pose = widened(given, alias_covariance(aliases)) if len(aliases) else given
         return surface.reported_pose
 
     def _update_health(self, fit: FrameFit) -> None:

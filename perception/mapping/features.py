@@ -283,9 +283,12 @@ def _same_surface(a: Array, b: Array) -> bool:
 
 def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
     """camera_from_surface (4, 4) by RANSAC over points (N, 3) and ideal pixels (N, 2), or None; fixed seed."""
-    ok, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels, matrix, None, iterationsCount=400, reprojectionError=6.0, flags=cv2.SOLVEPNP_SQPNP
-    )
+    try:
+        ok, rotation, translation, inliers = cv2.solvePnPRansac(
+            points, pixels, matrix, None, iterationsCount=400, reprojectionError=6.0, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # SQPNP asserts where points coincide or lie on a line, in whatever sample RANSAC draws
+        return None
     if not ok or inliers is None or len(inliers) < MIN_MATCHES:
         return None
     return se3.make(cv2.Rodrigues(rotation)[0], np.asarray(translation).ravel())

@@ -171,7 +171,7 @@ class Mapping:
     def _realigned(self, tracked: TrackedSet) -> TrackedSet:
         """The frame set aligned and fitted again with a corrected map; as it was where that is no measurement."""
         stamp, start = tracked.fit.stamp, tracked.fit.solution.base_from_surface
-        again = self.align_and_fit(stamp, tracked.pyramids, self._camera_poses(tracked), start)
+        again = self.align_and_fit(stamp, tracked.pyramids, self.camera_poses(tracked), start)
         return again if again.fit.measured else tracked
 
     def offer(self, tracked: TrackedSet, twist: Array) -> None:
@@ -215,14 +215,14 @@ class Mapping:
         return SurfaceSnapshot(
             {c: images[0] for c, images in tracked.pyramids.items()},
             fit.solution.base_from_surface,
-            self._camera_poses(tracked),
+            self.camera_poses(tracked),
             fit.covariance + fit.parts.lasting,
             tracked.observations.only(fit.inlier),
             self._masks.print_head,
             None if pose is None else pose.warp,
         )
 
-    def _camera_poses(self, tracked: TrackedSet) -> dict[int, Array]:
+    def camera_poses(self, tracked: TrackedSet) -> dict[int, Array]:
         """Where the surface was (4, 4) at each camera's own exposure."""
         pose, points, rig = tracked.fit.solution.base_from_surface, self._matcher.map.points, self._lenses.rig
         tracks = tracked.observations
@@ -230,7 +230,7 @@ class Mapping:
 
     def _prove(self, waiting: Probation, tracked: TrackedSet) -> None:
         """Align the new landmarks again; those that move with the surface join the map."""
-        fit, single = tracked.fit, self._camera_poses(tracked)
+        fit, single = tracked.fit, self.camera_poses(tracked)
         waiting.look(self._lenses, fit.stamp, tracked.pyramids, single, fit.covariance + fit.parts.lasting)
         points, reach = waiting.map.points, patch_reach(waiting.new.templates.axes)
         proven = np.flatnonzero(waiting.proven & ~self._masks.ink.covers(points, reach, fit.stamp))
@@ -260,7 +260,7 @@ class Mapping:
         estimator, matcher = self._estimator, self._matcher
         assert self._place is not None and estimator.pose is not None and estimator.map is not None
         pose = tracked.fit.solution.base_from_surface
-        lenses = Lenses(as_at_one_instant(self._lenses.rig, pose, self._camera_poses(tracked)))
+        lenses = Lenses(as_at_one_instant(self._lenses.rig, pose, self.camera_poses(tracked)))
         images = {c: p[0] for c, p in tracked.pyramids.items()}
         place = placing.refine(lenses, images, replace(self._place, base_from_surface=pose))
         self.registration = place

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations
 from estimation.online.estimator import Estimator
@@ -30,6 +31,7 @@ from perception.mapping.mapping import Mapping, TrackedSet
 from perception.mapping.masks import Tool, TrackingMasks
 from perception.mapping.matcher import Matcher
 from perception.mapping.patches import Pyramid
+from perception.mapping.verification import SURE, Grain, Verdict, Verification
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
 # Of a camera: at 0.2 px they give a pose to 0.01 mm, and more landmarks do not reduce the errors that they share.
@@ -98,6 +100,8 @@ class TrackingStep:
         self._masks = TrackingMasks(self._lenses, tool)
         self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, executor, scan)
         self._matcher: Matcher | None = None
+        self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
+        self._unverified: TrackedSet | None = None  # by which the verification is to learn the surface
         self._searched: dict[int, Pyramid] = {}  # images of cameras that `idle` is to search for the surface
         self._relocalised: Array | None = None  # (4, 4), where the last search saw the surface
         self._absent = 0  # frame sets since the surface was last measured
@@ -142,6 +146,10 @@ class TrackingStep:
         self._estimator.learn()
         if self._matcher is not None:
             self._mapping.update()
+        if self._unverified is not None and self._estimator.map is not None:
+            tracked, self._unverified = self._unverified, None
+            poses = self._mapping.camera_poses(tracked)
+            self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
         self._relocalise()
 
     def _report(self, observations: Observations, used: NDArray[np.int64]) -> StepReport:
@@ -176,6 +184,7 @@ class TrackingStep:
             nothing = no_observations(frames.stamp), np.zeros(len(self.rig), np.int64)
             return identity_pose(frames.stamp, started), *nothing
         self._matcher, pose, tracked = started
+        self._grain = Grain(self._lenses)
         return pose, tracked.observations, tracked.fit.used
 
     # -- every frame set after it
@@ -195,25 +204,27 @@ class TrackingStep:
             tracked = self._second_try(tracked, expected.base_from_surface)
             self._add_time("search")
 
-        # the map's confirmation, or its rebuilding on a fast surface
-        fit = tracked.fit
+        # the map's confirmation, or its rebuilding on a fast surface; or else the pose's verification
+        fit, aliases = tracked.fit, np.zeros((0, 3))
         if not estimator.confirmed:
             if len(self._carrying_cameras(tracked)) < 2:
                 if self._mapping.expired(stamp):
                     self._matcher = None
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.hold(stamp, reason), tracked.observations, fit.used
-            tracked = self._mapping.confirm(tracked)
+            tracked = self._unverified = self._mapping.confirm(tracked)
         elif fit.measured and not fit.outliers and estimator.too_fast_for_map(fit):
-            tracked = self._mapping.rebuild(tracked)
+            tracked = self._unverified = self._mapping.rebuild(tracked)
+        elif fit.measured:
+            tracked, aliases = self._verified(tracked)
 
         # the pose
         fit, observations = tracked.fit, tracked.observations
         if fit.measured:
             self._searched = {c: pyramids[c] for c in self._lost_cameras(tracked)}
             self._absent = 0
-            pose = estimator.accept(fit, observations)
-            if not fit.outliers:
+            pose = estimator.accept(fit, observations, aliases)
+            if not (fit.outliers or len(aliases)):
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
         else:
@@ -222,6 +233,44 @@ class TrackingStep:
             self._searched = pyramids
         self._add_time("pose")
         return pose, observations, fit.used
+
+    def _verified(self, tracked: TrackedSet) -> tuple[TrackedSet, Array]:
+        """The frame set at the alias that its pictures prefer, and the shifts (K, 3) mm that they leave open.
+
+        It is no measurement where the surface's grain contradicts its tracks.
+        """
+        poses, verdict = self._look(tracked)
+        if verdict.better is not None:
+            shift = se3.make(np.eye(3), verdict.better)
+            starts = {c: pose @ shift for c, pose in poses.items()}
+            start = tracked.fit.solution.base_from_surface @ shift
+            again = self._mapping.align_and_fit(tracked.fit.stamp, tracked.pyramids, starts, start)
+            if again.fit.measured:
+                its_poses, second = self._look(again)
+                if second.better is None:
+                    tracked, poses, verdict = again, its_poses, second
+        light = self._follows_light(tracked)
+        if light:
+            return replace(tracked, fit=replace(tracked.fit, reason=light)), verdict.alive
+        if not len(verdict.alive):
+            self._verification.take(tracked.fit.stamp, poses)
+            self._grain.learn()
+        return tracked, verdict.alive
+
+    def _follows_light(self, tracked: TrackedSet) -> str:
+        """Why the tracks that carry a fit do not show the surface, or ''."""
+        assert self._matcher is not None
+        fit = tracked.fit
+        tracks, pose = tracked.observations.only(fit.inlier), fit.solution.base_from_surface
+        return self._grain(tracked.pyramids, tracks, pose, self._matcher.map, self._matcher.templates)
+
+    def _look(self, tracked: TrackedSet) -> tuple[dict[int, Array], Verdict]:
+        """Each trusted camera's own pose (4, 4) of a frame set, and what the pictures say of it."""
+        if not len(self._verification.aliases):
+            return {}, SURE
+        poses = self._mapping.camera_poses(tracked)
+        trusted = {c: pose for c, pose in poses.items() if c not in tracked.fit.outliers}
+        return trusted, self._verification(tracked.fit.stamp, tracked.pyramids, trusted)
 
     def _measure(
         self, matcher: Matcher, expected: SurfacePose, pyramids: dict[int, Pyramid]

@@ -1,0 +1,179 @@
+"""The aliases of a surface: the shifts along its tangent plane under which its own picture looks like itself.
+
+Where a surface repeats (a mesh, a board, a row of sutures), its tracks agree on every pose that is off by a period.
+The picture is the surface seen squarely, free of shading; its masked correlation with itself (Padfield 2012) has a top
+at every alias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.spatial import ConvexHull, Delaunay, cKDTree
+
+from estimation import se3
+from estimation.se3 import Array, Index, Mask
+from estimation.surface_map import SurfaceMap
+from perception.lens import Lenses
+from perception.mapping.patches import Pyramid
+
+GRID_SIDE = 160  # cells of the surface's own picture along its longer side: half a millimetre on a palm
+HEIGHT_NEIGHBOURS = 6  # landmarks between which the surface is interpolated
+DETAIL_SIGMA_MM = 4.0  # what is coarser than that is shading, not texture: it is divided out
+MIN_OVERLAP = 0.25  # of the surface with itself, below which a correlation says nothing
+MIN_REPEAT = 0.25  # correlation of the surface with itself, shifted: skin reaches 0.13 by chance
+MIN_ALIAS_MM = 1.5  # nearer to itself the surface only looks smooth
+RIVAL_SHARE = 0.5  # of the strongest alias' correlation: what is weaker is a mark that stands somewhere twice
+MAX_ALIASES = 80  # the nearest: a mesh of 4 mm up to 20 mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aliases:
+    """The shifts under which a surface looks like itself."""
+
+    shifts: Array  # (K, 3) mm, surface frame, along the tangent plane, nearest first
+    likeness: Array  # (K,) correlation with itself there
+
+    def __len__(self) -> int:
+        return len(self.shifts)
+
+    @property
+    def message(self) -> str:
+        """For the operator, or ''."""
+        if not len(self):
+            return ""
+        return f"the surface repeats every {np.linalg.norm(self.shifts[0]):.1f} mm"
+
+
+NO_ALIASES = Aliases(np.zeros((0, 3)), np.zeros(0))
+
+
+class TangentPlane:
+    """The surface through a map's landmarks over their mean plane."""
+
+    def __init__(self, surface_map: SurfaceMap) -> None:
+        points = surface_map.points
+        self.origin = points.mean(0)
+        normal = surface_map.normals.mean(0)
+        self.normal = normal / np.linalg.norm(normal)
+        first = np.cross(self.normal, np.eye(3)[int(np.abs(self.normal).argmin())])
+        first /= np.linalg.norm(first)
+        self.axes = np.stack([first, np.cross(self.normal, first)])  # (2, 3)
+        self.places = (points - self.origin) @ self.axes.T  # (N, 2)
+        self._heights = (points - self.origin) @ self.normal
+        self._normals = surface_map.normals
+        self._tree = cKDTree(self.places)
+        self._hull = Delaunay(self.places[ConvexHull(self.places).vertices])
+
+    def inside(self, places: Array) -> Mask:
+        """Which places (N, 2) mm lie among the landmarks."""
+        return np.asarray(self._hull.find_simplex(places) >= 0)
+
+    def lift(self, places: Array) -> tuple[Array, Array]:
+        """Points (N, 3) mm of the surface over places (N, 2), and their unit normals (N, 3)."""
+        away, near = self._tree.query(places, k=min(HEIGHT_NEIGHBOURS, len(self.places)))
+        weight = 1 / (away + 1.0)
+        weight /= weight.sum(1, keepdims=True)
+        heights = (weight * self._heights[near]).sum(1)
+        normals = np.einsum("nk,nki->ni", weight, self._normals[near])
+        points = self.origin + places @ self.axes + heights[:, None] * self.normal
+        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def beside(self, places: Array) -> Array:
+        """How far (N,) mm places (N, 2) are from the nearest landmark."""
+        return np.asarray(self._tree.query(places)[0])
+
+    def grid(self, side: int, border: float = 0.0) -> tuple[Array, float]:
+        """Places (V, U, 2) mm of a grid over the landmarks and a border, mm, round them, and its step, mm.
+
+        side: cells along the longer side.
+        """
+        low, high = self.places.min(0) - border, self.places.max(0) + border
+        step = float((high - low).max()) / side
+        counts = np.maximum(1, np.ceil((high - low) / step)).astype(int)
+        u, v = np.meshgrid(*(low[i] + step * (np.arange(counts[i]) + 0.5) for i in range(2)))
+        return np.stack([u, v], -1), step
+
+
+class SurfaceGrid:
+    """A fine grid of places (V, U) on the surface."""
+
+    def __init__(self, plane: TangentPlane) -> None:
+        places, self.step = plane.grid(GRID_SIDE)
+        flat = places.reshape(-1, 2)
+        self.axes, self.points = plane.axes, plane.lift(flat)[0]  # (2, 3); (V U, 3) mm
+        self.inside = plane.inside(flat).reshape(places.shape[:2])  # among the landmarks
+
+
+def surface_picture(
+    lenses: Lenses, camera: int, images: Pyramid, base_from_surface: Array, grid: SurfaceGrid
+) -> tuple[Array, Mask]:
+    """The surface (V, U) as seen squarely, in parts of its own contrast, and where it is seen (V, U).
+
+    Shading is taken out: each place counts by how it stands out from what is DETAIL_SIGMA_MM around it.
+    """
+    in_camera = se3.transform_points(lenses.rig.camera_from_base[camera] @ base_from_surface, grid.points)
+    depth = np.where(in_camera[:, 2] > 1.0, in_camera[:, 2], 1.0)
+    imaged, in_lens = lenses.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
+    across, down = imaged.astype(np.float32)
+    width, height = lenses.rig.cameras[camera].size
+    in_image = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
+    seen = grid.inside & (in_lens & in_image).reshape(grid.inside.shape)
+    levels = cv2.remap(images[0], across.reshape(seen.shape), down.reshape(seen.shape), cv2.INTER_LINEAR)
+    picture = np.where(seen, levels.astype(float), 0.0)
+    cells = DETAIL_SIGMA_MM / grid.step
+    weight = gaussian_filter(seen.astype(float), cells) + 1e-6
+    away = np.where(seen, picture - gaussian_filter(picture, cells) / weight, 0.0)
+    spread = np.sqrt(gaussian_filter(away**2, cells) / weight)
+    return np.where(seen, away / (spread + 1.0), 0.0), seen
+
+
+def self_correlation(picture: Array, seen: Mask) -> Array:
+    """Correlation (2V - 1, 2U - 1) of a picture (V, U) with itself at every shift; no shift is in the middle.
+
+    Only what is seen (V, U) counts (Padfield 2012, Eq. 14-19); 0 where too little of it overlaps.
+    """
+    rows, columns = picture.shape
+    shape = (next_fast_len(2 * rows - 1), next_fast_len(2 * columns - 1))
+    mask, first, square = (rfft2(part, shape) for part in (seen.astype(float), picture, picture**2))
+
+    def both(a: Array, b: Array) -> Array:
+        whole = np.roll(irfft2(a * np.conj(b), shape), (rows - 1, columns - 1), (0, 1))
+        return np.asarray(whole[: 2 * rows - 1, : 2 * columns - 1])
+
+    overlap = np.maximum(both(mask, mask), 0.5)
+    sum_a, sum_b = both(first, mask), both(mask, first)
+    product = both(first, first) - sum_a * sum_b / overlap
+    spread_a, spread_b = both(square, mask) - sum_a**2 / overlap, both(mask, square) - sum_b**2 / overlap
+    spread = np.sqrt(np.maximum(spread_a * spread_b, 1e-12))
+    sound = (spread > 1e-3 * float((picture**2).sum())) & (overlap > MIN_OVERLAP * float(seen.sum()))
+    return np.where(sound, product / spread, 0.0)
+
+
+def find_aliases(picture: Array, seen: Mask, grid: SurfaceGrid) -> Aliases:
+    """The shifts under which a surface's picture (V, U) looks like itself; seen: (V, U)."""
+    likeness = self_correlation(picture, seen)
+    middle = np.array(likeness.shape) // 2
+    side = 2 * int(MIN_ALIAS_MM / grid.step / 2) + 1
+    top = (maximum_filter(likeness, max(3, side)) == likeness) & (likeness > MIN_REPEAT)
+    top[[0, -1], :], top[:, [0, -1]] = False, False
+    v, u = np.nonzero(top)
+    shift = grid.step * (np.stack([v, u], -1) - middle + _vertex(likeness, v, u))[:, ::-1]
+    away, score = np.linalg.norm(shift, axis=1), likeness[top]
+    rival = (away > MIN_ALIAS_MM) & (score > RIVAL_SHARE * score[away > MIN_ALIAS_MM].max(initial=0.0))
+    order = np.flatnonzero(rival)[np.argsort(away[rival], kind="stable")][:MAX_ALIASES]
+    return Aliases(shift[order] @ grid.axes, score[order])
+
+
+def _vertex(likeness: Array, v: Index, u: Index) -> Array:
+    """Where between the cells (K, 2) the parabolas through the tops at rows v (K,) and columns u (K,) have theirs."""
+    at = likeness[v, u]
+    below, above = likeness[v - 1, u], likeness[v + 1, u]
+    left, right = likeness[v, u - 1], likeness[v, u + 1]
+    ends = np.stack([above - below, right - left], -1) / 2
+    bends = np.stack([2 * at - above - below, 2 * at - left - right], -1)
+    return np.asarray(np.clip(ends / np.maximum(bends, 1e-9), -0.5, 0.5))

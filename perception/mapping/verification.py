@@ -1,0 +1,294 @@
+"""Whether the tracks of a pose could have contradicted it: a surface that repeats, and light that looks like skin.
+
+A surface that repeats is looked at as a whole in every frame set: probes, spread over it and round it, compare it with
+its first pictures at the pose and at the pose's aliases. An alias that the tissue could have reached since the last
+sure pose, and that the probes do not contradict, is alive; while one is, the pose is not sure. Without aliases that
+costs nothing.
+
+A lamp's pattern or a shadow's edge can be all that a patch is made of, and rests or wanders by itself. The skin's own
+grain is finer: each track is looked at again for what is left of its picture without the coarse part. Where the grain
+is there, as strong as ever, and is not the one that the landmarks had, the tracks follow light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation import se3
+from estimation.observations import Observations
+from estimation.se3 import Array, Index
+from estimation.surface_map import SurfaceMap
+from perception.frames import parallel_map
+from perception.lens import Lenses
+from perception.mapping.aliases import NO_ALIASES, Aliases, SurfaceGrid, TangentPlane, find_aliases, surface_picture
+from perception.mapping.alignment_kernels import PATCH_SIDE, Float32
+from perception.mapping.masks import TrackingMasks
+from perception.mapping.patches import (
+    MIN_PATCH_CONTRAST,
+    Pyramid,
+    Templates,
+    coarse_score,
+    cut_templates,
+    normalise,
+    project_squares,
+    sample,
+)
+
+NEAR_ALIASES = 8  # looked at in every frame set, the nearest; all of them when the surface looks odd
+BORDER_MM = 15.0  # round the landmarks, where a probe sees the edge of what repeats
+PROBE_SIDE = 18  # cells of the grid of places that may become probes
+USUAL_PROBES = 20  # of each camera: those that tell aliases best,
+PROBE_SPACING_MM = 10.0  # so far apart, as long as there are any: one hand or nozzle is not to hide them all
+USUAL_MEMORY_SETS = 30.0  # frame sets over which a probe's likeness is learned
+MAX_TISSUE_SPEED = 300.0  # mm/s: a cough moves skin at 175, a hand waves a board as fast as this
+MIN_LIKENESS = 0.5  # correlation of a probe with its first picture: with less it is covered, or elsewhere
+MAX_PROBE_VOTE = 0.3  # as how much better one probe's place counts at most: some are covered, some repeat by chance
+MIN_EVIDENCE = 1.2  # votes summed: four probes that each rule an alias out
+ODD_LIKENESS = 0.8  # of the probes' usual likeness: below it all aliases are asked
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What the pictures say of a pose."""
+
+    alive: Array  # (K, 3) mm, shifts of the pose, surface frame, that they do not contradict
+    better: Array | None = None  # (3,) mm, a shift that they prefer clearly
+
+
+SURE = Verdict(np.zeros((0, 3)))
+
+
+class Verification:
+    """Remembers a surface's first pictures, its aliases, and the last pose that was sure."""
+
+    def __init__(self, lenses: Lenses, masks: TrackingMasks) -> None:
+        """masks: where the print head hides the surface."""
+        self._lenses, self._masks = lenses, masks
+        self.aliases = NO_ALIASES
+        self._probes: list[_Probes] = []
+        self._centre = np.zeros(3)
+        self._stamp, self._place = float("nan"), np.zeros(3)  # s, mm: of the last sure pose, and its centre there
+
+    def begin(
+        self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array], surface_map: SurfaceMap
+    ) -> None:
+        """Learn a surface by pictures (by camera) in which it stands at `poses` (4, 4), each camera's own."""
+        plane = TangentPlane(surface_map)
+        self._probes, self.aliases = [], NO_ALIASES
+        self._centre = surface_map.points.mean(0)
+        grid = SurfaceGrid(plane)
+        pictures = (surface_picture(self._lenses, c, pyramids[c], poses[c], grid) for c in pyramids)
+        self.aliases = max((find_aliases(*each, grid) for each in pictures), key=len, default=NO_ALIASES)
+        if not len(self.aliases):
+            return
+        for c in pyramids:
+            self._probes.append(_Probes(self._lenses, c, pyramids[c], poses[c], plane, self.aliases))
+        self.take(stamp, poses)
+
+    def __call__(self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array]) -> Verdict:
+        """Look at a pose: `poses` (4, 4) at each camera's exposure. Who takes it for sure says so by `take`."""
+        probes = [p for p in self._probes if p.camera in pyramids and p.camera in poses]
+        if not probes:
+            return SURE
+        shifts = self.aliases.shifts[:NEAR_ALIASES]
+        evidence, likeness = self._evidence(pyramids, poses, probes, shifts)
+        odd = likeness < ODD_LIKENESS
+        if odd or evidence.min() < MIN_EVIDENCE:
+            shifts = self.aliases.shifts
+            evidence, likeness = self._evidence(pyramids, poses, probes, shifts)
+        alive = evidence < MIN_EVIDENCE
+        best = int(evidence.argmin())
+        if evidence[best] < -MIN_EVIDENCE:
+            return Verdict(shifts[alive], shifts[best])
+        there = se3.transform_points(poses[probes[0].camera], self._centre + shifts)
+        near = np.linalg.norm(there - self._place, axis=1) < MAX_TISSUE_SPEED * (stamp - self._stamp)
+        return Verdict(shifts[alive & (near | odd)])
+
+    def take(self, stamp: float, poses: Mapping[int, Array]) -> None:
+        """The poses looked at last, of `stamp`, are right."""
+        self._stamp = stamp
+        self._place = se3.transform_points(poses[self._probes[0].camera], self._centre) if self._probes else self._place
+        for probes in self._probes:
+            probes.learn()
+
+    def _evidence(
+        self, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array], probes: Sequence[_Probes], shifts: Array
+    ) -> tuple[Array, float]:
+        """Votes (K,) for the poses against the same shifted (K, 3); and the probes' likeness, in parts of the usual."""
+        scores = parallel_map(lambda p: p.compare(pyramids[p.camera], poses[p.camera], shifts, self._masks), probes)
+        here = np.concatenate([usual for _, usual in scores], axis=1)
+        votes = np.concatenate([vote for vote, _ in scores], axis=1).sum(1)
+        return votes, float(here[0].sum() / max(here[1].sum(), 1e-9))
+
+
+class _Probes:
+    """Pictures of places on the surface as one camera first saw them, and how much they usually look like that."""
+
+    def __init__(
+        self, lenses: Lenses, camera: int, images: Pyramid, pose: Array, plane: TangentPlane, aliases: Aliases
+    ) -> None:
+        self._lenses, self.camera = lenses, camera
+        flat = plane.grid(PROBE_SIDE, BORDER_MM)[0].reshape(-1, 2)
+        points, normals = plane.lift(flat[plane.beside(flat) < BORDER_MM])
+        templates = cut_templates(lenses, images, camera, pose, points, normals)
+        where = project_squares(lenses, camera, pose, points, normals, templates.axes)
+        good = where.visible & (templates.contrast > MIN_PATCH_CONTRAST)
+        self._points, self._normals, self._templates = points[good], normals[good], templates.take(good)
+        # those that tell aliases best, spread over the surface
+        here, there = self._likeness(images, pose, aliases.shifts[:NEAR_ALIASES], None)
+        power = np.clip(here - there, 0.0, MAX_PROBE_VOTE)
+        best = _spread_choice(np.where(np.isfinite(power), power, 0.0).sum(0), self._points)
+        self._points, self._normals = self._points[best], self._normals[best]
+        self._templates = self._templates.take(best)
+        self._usual = np.ones(len(best))
+        self._newest = np.full(len(best), np.nan)
+
+    def compare(self, images: Pyramid, pose: Array, shifts: Array, masks: TrackingMasks) -> tuple[Array, Array]:
+        """Each probe's vote (K, P) for a pose (4, 4) against it shifted (K, 3); likeness and its usual value (2, P)."""
+        here, there = self._likeness(images, pose, shifts, masks)
+        self._newest = here
+        vote = np.clip(here - there, -MAX_PROBE_VOTE, MAX_PROBE_VOTE)
+        counts = np.isfinite(vote) & (np.fmax(here, there) > MIN_LIKENESS)
+        known = np.isfinite(here)
+        return np.where(counts, vote, 0.0), np.stack([np.where(known, here, 0.0), np.where(known, self._usual, 0.0)])
+
+    def learn(self) -> None:
+        """What was compared last is usual."""
+        known = np.isfinite(self._newest)
+        self._usual[known] += (self._newest - self._usual)[known] / USUAL_MEMORY_SETS
+
+    def _likeness(
+        self, images: Pyramid, pose: Array, shifts: Array, masks: TrackingMasks | None
+    ) -> tuple[Array, Array]:
+        """Correlation (P,) of the probes at a pose (4, 4), and (K, P) at it shifted (K, 3); nan where out of view."""
+        every = np.concatenate([np.zeros((1, 3)), shifts])
+        points = (self._points + every[:, None]).reshape(-1, 3)
+        rows = np.tile(np.arange(len(self._points)), len(every))
+        templates = self._templates.take(rows)
+        where = project_squares(self._lenses, self.camera, pose, points, self._normals[rows], templates.axes)
+        score = coarse_score(templates, images, where, where.centre)
+        free = where.visible if masks is None else where.visible & ~masks.hides(self.camera, where.centre)
+        likeness = np.where(free, score, np.nan).reshape(len(every), -1)
+        return likeness[0], likeness[1:]
+
+
+def _spread_choice(power: Array, points: Array) -> Index:
+    """Rows of up to USUAL_PROBES points (N, 3) with the most power (N,), apart from each other as far as there are."""
+    chosen, order = list[int](), np.argsort(-power, kind="stable")
+    for apart in (PROBE_SPACING_MM, 0.0):
+        for row in order:
+            if len(chosen) == USUAL_PROBES:
+                break
+            if row not in chosen and (np.linalg.norm(points[chosen] - points[row], axis=1) >= apart).all():
+                chosen.append(int(row))
+    return np.array(chosen, np.int64)
+
+
+GRAIN_ORDER = 4  # of the polynomial over a patch that is taken out: shading and soft edges
+GRAIN_STRIDE = 3  # every third landmark is looked at, 40 of a camera: light deceives all of them at once
+GRAIN_MEMORY_SETS = 300.0  # ten seconds, over which it is learned how a landmark's grain usually looks
+MIN_GRAIN_SETS = 5  # frame sets in which it must have been seen before it counts,
+MIN_GRAINS = 12  # and tracks that must count for a verdict
+MIN_GRAIN_SNR = 0.02  # of the usual grain that repeats, in parts of all that is seen: beneath it there is noise alone
+MIN_GRAIN = 0.7  # of the usual grain: with less it is another one, or none,
+OTHER_GRAIN = 0.35  # in parts of the usual grain's energy: so much of another one is seen in its place
+
+
+class Grain:
+    """Remembers how the fine texture of one map's landmarks usually looks in each camera."""
+
+    def __init__(self, lenses: Lenses) -> None:
+        self._lenses = lenses
+        count = len(lenses.rig)
+        # per camera and landmark: grain along its first picture, energy of all grain, contrast of the patch; looks
+        self._usual, self._looks = np.zeros((count, 0, 3)), np.zeros((count, 0))
+        self._newest: tuple[Index, Index, Array] | None = None  # cameras (N,), landmarks (N,), and the same of them
+
+    def __call__(
+        self,
+        pyramids: Mapping[int, Pyramid],
+        tracks: Observations,
+        pose: Array,
+        surface_map: SurfaceMap,
+        templates: Templates,
+    ) -> str:
+        """Why tracks that carry a pose (4, 4) do not show the surface, or ''."""
+        self._extend(len(surface_map))
+        self._newest = None
+        tracks = tracks.only(tracks.track % GRAIN_STRIDE == 0)
+        parts = [self._look(c, pyramids[c], tracks, pose, surface_map, templates) for c in pyramids]
+        seen = np.concatenate(parts)
+        camera = np.repeat(list(pyramids), [len(part) for part in parts])
+        landmark = np.concatenate([tracks.track[tracks.camera == c] for c in pyramids])
+        self._newest = camera, landmark, seen
+        known = self._looks[camera, landmark] >= MIN_GRAIN_SETS
+        if np.count_nonzero(known) < MIN_GRAINS:
+            return ""
+        usual, seen = self._usual[camera, landmark][known], seen[known]
+        gain = float(np.median(seen[:, 2] / usual[:, 2]))  # of the light on it
+        own, energy = float((usual[:, 0] ** 2).sum()), float(usual[:, 1].sum())
+        if own < MIN_GRAIN_SNR * energy:
+            return ""
+        left = float((seen[:, 0] * usual[:, 0]).sum()) / own / gain
+        other = (float(seen[:, 1].sum()) / gain**2 - energy + own) / own - left**2
+        if left >= MIN_GRAIN or other < OTHER_GRAIN:
+            return ""
+        return (
+            f"the skin's grain does not follow the tracks ({100 * max(left, 0.0):.0f} % of it): they may follow light"
+        )
+
+    def learn(self) -> None:
+        """What was looked at last is usual."""
+        if self._newest is None:
+            return
+        camera, landmark, seen = self._newest
+        looks = self._looks[camera, landmark] + 1
+        self._looks[camera, landmark] = looks
+        share = 1 / np.minimum(looks, GRAIN_MEMORY_SETS)
+        self._usual[camera, landmark] += share[:, None] * (seen - self._usual[camera, landmark])
+
+    def _extend(self, count: int) -> None:
+        more = count - self._looks.shape[1]
+        if more > 0:
+            self._usual = np.pad(self._usual, ((0, 0), (0, more), (0, 0)))
+            self._looks = np.pad(self._looks, ((0, 0), (0, more)))
+
+    def _look(
+        self,
+        camera: int,
+        images: Pyramid,
+        tracks: Observations,
+        pose: Array,
+        surface_map: SurfaceMap,
+        templates: Templates,
+    ) -> Array:
+        """(N, 3) of a camera's tracks: grain along the first picture, energy of all grain, contrast; grey levels."""
+        mine = tracks.camera == camera
+        rows, pixels = tracks.track[mine], tracks.pixels[mine]
+        if not len(rows):
+            return np.zeros((0, 3))
+        points, normals = surface_map.points[rows], surface_map.normals[rows]
+        where = project_squares(self._lenses, camera, pose, points, normals, templates.axes[rows])
+        imaged = self._lenses.image(camera, pixels, np.full(len(rows), np.inf))[0]
+        levels, contrast = normalise(sample(images[0], imaged, where.per_sample))
+        now, then = _grain(levels) * contrast[:, None], _grain(templates.picture[rows])
+        then /= np.maximum(np.linalg.norm(then, axis=1, keepdims=True), 1e-9)
+        return np.stack([(now * then).sum(1), (now * now).sum(1), contrast], -1)
+
+
+def _coarse_basis() -> Array:
+    """Orthonormal polynomials (S, B) over a patch, up to GRAIN_ORDER."""
+    u, v = (part.ravel() for part in np.meshgrid(*(np.linspace(-1, 1, PATCH_SIDE),) * 2))
+    powers = [(i, j) for i in range(GRAIN_ORDER + 1) for j in range(GRAIN_ORDER + 1 - i)]
+    return np.asarray(np.linalg.qr(np.stack([u**i * v**j for i, j in powers], -1))[0])
+
+
+_COARSE = _coarse_basis()
+
+
+def _grain(pictures: Float32) -> Array:
+    """Pictures (N, S) without what polynomials explain."""
+    return np.asarray(pictures - (pictures @ _COARSE) @ _COARSE.T)
