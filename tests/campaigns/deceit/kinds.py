@@ -19,6 +19,7 @@ from tests.campaigns.deceit.scenes import (
     Draw,
     Session,
     changed,
+    cloth,
     drawn_region,
     flat,
     ordinary,
@@ -30,7 +31,7 @@ from tests.campaigns.deceit.world import PSF, Decal, Gloss, Sheet
 
 Kind = Callable[[Draw], Session]
 PURE = "a borderless pattern that repeats, moved by its own period between two pictures, looks as if it had not moved"
-OPEN = 420.0  # mm, a board that reaches beyond every picture
+OPEN, OPEN_SCALE = 900.0, 2.0  # mm and texels a mm, of a board that reaches beyond every picture
 COVERED_SETS = 8  # frame sets that a sheet covers the field
 
 
@@ -66,13 +67,11 @@ SQUARE = 12.0  # mm
 def _board(
     draw: Draw, border: bool, marks: bool, fps: float, sets: int, *parts: Callable[[float], np.ndarray]
 ) -> Session:
-    side = 8 * SQUARE if border else OPEN
-    texture = looks.board(side, side, SQUARE, margin=8.0 if border else 0.0, scale=4.0 if border else 3.0)
+    (side, scale), margin = (8 * SQUARE, 4.0) if border else (OPEN, OPEN_SCALE), 8.0 if border else 0.0
+    texture = looks.board(side, side, SQUARE, margin=margin, scale=scale)
     if marks:
-        scale = 4.0 if border else 3.0
-        texture = looks.scribbles(draw.rng, texture, scale, 7 if border else 90)
-    reach = 68.0 if border else 50.0
-    return flat(draw, texture, 4.0 if border else 3.0, *parts, fps=fps, sets=sets, reach=reach, breath=1.5)
+        texture = looks.scribbles(draw.rng, texture, scale, 7 if border else 450)  # seven or so in the region
+    return flat(draw, texture, scale, *parts, fps=fps, sets=sets, reach=68.0 if border else 50.0, breath=1.5)
 
 
 def board_jump(draw: Draw) -> Session:
@@ -90,9 +89,9 @@ def board_covered(draw: Draw) -> Session:
     fps = 30.0
     start, end = start_of(fps), start_of(fps, TRICK + COVERED_SETS)
     made = in_plane(_board(draw, border, marks, fps, SETS + 16), (start + end) / 2, x * SQUARE, y * SQUARE)
-    made = changed(made, sheets=(passing(looks.drape(draw.rng, 340), looks.DRAPE_SCALE, start, end),))
+    made = changed(made, sheets=(cloth(draw.rng, start, end),))
     what = f"{SQUARE * math.hypot(x, y):.1f} mm while covered, {_words(border, marks)}"
-    return told_as(made, what, settled=end + PASSING_S, decidable="" if border or marks else PURE)
+    return told_as(made, what, settled=end + PASSING_S, trick=TRICK - 8, decidable="" if border or marks else PURE)
 
 
 def board_sway(draw: Draw) -> Session:
@@ -157,8 +156,8 @@ def squares_covered(draw: Draw) -> Session:
     fps, far = 30.0, draw.pick(20.0, 40.0, 20.0, 20.0, 20.0)
     start, end = start_of(fps), start_of(fps, TRICK + COVERED_SETS)
     made = in_plane(_squares(draw, fps, SETS + 16), (start + end) / 2, far, 0.0)
-    made = changed(made, sheets=(passing(looks.drape(draw.rng, 340), looks.DRAPE_SCALE, start, end),))
-    return told_as(made, f"{far:g} mm while covered", settled=end + PASSING_S)
+    made = changed(made, sheets=(cloth(draw.rng, start, end),))
+    return told_as(made, f"{far:g} mm while covered", settled=end + PASSING_S, trick=TRICK - 8)
 
 
 def chequerboard_hops(draw: Draw) -> Session:
@@ -245,9 +244,9 @@ def resting_drape(draw: Draw) -> Session:
         draw, part, fps=fps, breath=2.0, contrast=0.08, region=draw.variant == 4, strength=0.7, sets=SETS + 10
     )
     width = draw.uniform(62, 84)
-    cloth = looks.drape(draw.rng, 420, (width, width * 0.85), strong=1.6)
+    sheet = looks.drape(draw.rng, 420, (width, width * 0.85), strong=1.6)
     pose = se3.make(np.eye(3), [0, 0, REST_HEIGHT + 7.0])
-    made = changed(made, sheets=(Sheet(cloth, looks.DRAPE_SCALE, lambda _: pose),))
+    made = changed(made, sheets=(Sheet(sheet, looks.DRAPE_SCALE, lambda _: pose),))
     return told_as(made, f"field glides {far:.0f} mm in a window of {width:.0f} mm at {fps:g} fps", settled=start)
 
 
@@ -278,25 +277,25 @@ def two_patients(draw: Draw) -> Session:
     rng, first, middle = draw.rng, made.world.skin(0.0), (start + end) / 2
     other = looks.with_wound(rng, looks.skin(rng), rng.uniform(13, 19))
     made = changed(made, skin=lambda t: first if t < middle else other)
-    made = changed(made, sheets=(passing(looks.drape(rng, 340), looks.DRAPE_SCALE, start, end),))
-    return told_as(made, "another skin while covered", settled=end, gone=middle)
+    made = changed(made, sheets=(cloth(draw.rng, start, end),))
+    return told_as(made, "another skin while covered", settled=end, trick=TRICK - 8, gone=middle)
 
 
 # -- light
 
 
-LIGHT_SIDE = 520.0  # mm
+LIGHT_SIDE = 700.0  # mm
 
 
 def lamp_at_rest(draw: Draw) -> Session:
     """A lamp's pattern rests while the tissue moves through it."""
-    fps, strength, start = draw.pick(30.0, 13.0), draw.pick(1.0, 0.25, 0.5, 0.25, 0.12), start_of(13.0)
+    fps, strength = draw.pick(30.0, 13.0), draw.pick(1.0, 0.25, 0.5, 0.25, 0.12)
     angle, far = draw.uniform(0, 2 * math.pi), draw.uniform(8, 16)
     start = start_of(fps)
     part = glide(start, start + draw.pick(0.8, 1.5), along(far * math.cos(angle), far * math.sin(angle)))
     made = ordinary(draw, part, fps=fps, breath=2.0, strength=strength, moles=2)
-    light = looks.lamp_pattern(draw.rng, LIGHT_SIDE, 2.0, 0.25, draw.uniform(2.0, 6.0))
-    made = changed(made, light=light, light_scale=2.0)
+    light = looks.lamp_pattern(draw.rng, LIGHT_SIDE, 1.0, 0.125, draw.uniform(2.0, 6.0))
+    made = changed(made, light=light)
     return told_as(made, f"25 % contrast, skin {strength:g}, glides {far:.0f} mm at {fps:g} fps", settled=start)
 
 
@@ -308,7 +307,7 @@ def shadow_drift(draw: Draw) -> Session:
     if draw.variant % 2:
         light = looks.soft_shadow(draw.rng, LIGHT_SIDE, 1.0, draw.uniform(0.35, 0.6), draw.uniform(2, 6))
     else:
-        light = looks.lamp_pattern(draw.rng, LIGHT_SIDE, 1.0, 0.25, draw.uniform(4, 8))
+        light = looks.lamp_pattern(draw.rng, LIGHT_SIDE, 1.0, 0.125, draw.uniform(3, 8))
     made = changed(made, light=light, light_shift=lambda t: (-15 + rate * max(t - start, 0.0), 0.0))
     name = "shadow" if draw.variant % 2 else "pattern"
     return told_as(made, f"{name} at {rate:.0f} mm/s over skin {strength:g}", settled=start)
@@ -413,8 +412,11 @@ def glove(draw: Draw) -> Session:
     start = start_of(fps)
     made = ordinary(draw, fps=fps, sets=SETS + 20)
     colour = draw.pick((0.62, 0.42, 0.2), (0.7, 0.72, 0.75), (0.2, 0.14, 0.1))
-    hand = passing(looks.glove(draw.rng, colour), 3.0, start, start + lasts, draw.uniform(50, 90))
-    return told_as(changed(made, sheets=(hand,)), f"{lasts:g} s", settled=start + lasts + PASSING_S, honest=True)
+    height = draw.uniform(50, 90)
+    hand = passing(looks.glove(draw.rng, colour), 3.0, start, start + lasts, height, way=-420.0)
+    return told_as(
+        changed(made, sheets=(hand,)), f"{lasts:g} s", settled=start + lasts + PASSING_S, trick=TRICK - 8, honest=True
+    )
 
 
 def flicker(draw: Draw) -> Session:

@@ -221,18 +221,18 @@ def drape(
 
 
 def glove(rng: np.random.Generator, colour: Colour = (0.62, 0.42, 0.2)) -> Texture:
-    """A gloved hand that reaches in along x, 200 x 120 mm."""
+    """A gloved hand that reaches in along x, 420 x 130 mm, its palm in the middle."""
     scale = 3.0
-    texture = blank(220, 130, scale, colour, 0.0)
+    texture = blank(420, 130, scale, colour, 0.0)
     h, w = texture.shape[:2]
     cover = np.zeros((h, w), np.float32)
-    wrist, palm = (0, h // 2), (round(110 * scale), h // 2)
+    wrist, palm = (0, h // 2), (w // 2, h // 2)
     cv2.line(cover, wrist, palm, 1.0, round(58 * scale))
     cv2.ellipse(cover, palm, (round(48 * scale), round(42 * scale)), 0, 0, 360, 1.0, -1)
     for k, length in enumerate((70, 84, 80, 62)):
         y = h / 2 + (k - 1.5) * 20 * scale
-        end = (round((110 + length) * scale), round(y + rng.normal(0, 5) * scale))
-        cv2.line(cover, (round(100 * scale), round(y)), end, 1.0, round(17 * scale))
+        end = (round((210 + length) * scale), round(y + rng.normal(0, 5) * scale))
+        cv2.line(cover, (round(200 * scale), round(y)), end, 1.0, round(17 * scale))
     cover = cv2.GaussianBlur(cover, (0, 0), 0.5 * scale)
     body = cv2.GaussianBlur(cover, (0, 0), 5 * scale)
     folds = 0.12 * noise(rng, max(h, w), 3 * scale)[:h, :w] + 0.06 * noise(rng, max(h, w), 0.8 * scale)[:h, :w]
@@ -304,7 +304,8 @@ def tattoo(rng: np.random.Generator, side: float, pitch: float) -> Texture:
 
 
 def lamp_pattern(rng: np.random.Generator, side: float, scale: float, contrast: float, blob: float) -> Field:
-    """Light (N, N) about 1 as a lamp with many reflectors casts it. contrast: of one sigma; blob: mm."""
+    """Light (N, N) about 1 as a lamp with many reflectors casts it. contrast: one sigma of it, so that 0.125
+    is 25 % from peak to valley of what stands out; blob: mm."""
     n = round(side * scale)
     look = noise(rng, n, blob * scale) + 0.5 * noise(rng, n, 0.45 * blob * scale)
     return np.asarray(np.clip(1 + contrast * look / 1.12, 0.15, 2.0), np.float32)

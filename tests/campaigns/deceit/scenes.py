@@ -30,7 +30,7 @@ TRICK = 28  # number of the set with which the trick begins: by then the map is 
 SETS = 60
 REST_HEIGHT = 30.0  # mm, of the tissue above the table
 REGION_BEYOND = 22.0  # mm, by which the drawn region goes beyond the wound
-TABLE_SIDE = 640.0  # mm
+TABLE_SIDE = 900.0  # mm
 FOCAL_WIDTHS = 1.25  # picture widths
 
 
@@ -108,7 +108,7 @@ def flat(
     """A flat printed thing that moves as a whole. reach: mm, radius of the region."""
     half = (texture.shape[1] / scale / 2, texture.shape[0] / scale / 2)
     n = round(2 * max(half) * RELIEF_SCALE)
-    lie = relief(np.zeros((n, n), np.float32), half)
+    lie = replace(relief(np.zeros((n, n), np.float32), half), round=False)
     wave = (breathing(draw.rng, breath, 0.5),) if breath else ()
     motion = moving(rest_pose(draw.rng), *wave, *parts)
     points = np.array([(x, y, 0) for x in (-16.0, 0, 16) for y in (-16.0, 0, 16)])
@@ -213,6 +213,13 @@ def told_as(made: Session, what: str, **changes: object) -> Session:
 
 
 PASSING_S = 0.25  # that a sheet takes to come, and to go
+
+
+def cloth(rng: np.random.Generator, start: float, end: float) -> Sheet:
+    """A green cloth over the whole field from `start` to `end`, s."""
+    texture = looks.drape(rng, 340)
+    texture[..., :3] *= np.array((0.6, 1.2, 0.5), np.float32)
+    return passing(texture, looks.DRAPE_SCALE, start, end)
 
 
 def passing(

@@ -26,8 +26,8 @@ Number = Callable[[float], float]
 Shift = Callable[[float], tuple[float, float]]  # mm, at an instant
 COMPILE = {"cache": True, "nogil": True, "error_model": "numpy"}
 
-# Of the fixed point, from height 0 or from the pixel beside: each leaves 0.4 of the error at the steepest place
-FAR_STEPS, NEAR_STEPS = 8, 3
+# Of the fixed point, from height 0 or from the pixels beside: each leaves 0.4 of the error at the steepest place
+FAR_STEPS, NEAR_STEPS = 8, 2
 RELIEF_SCALE = 2.0  # grid points a mm
 SHUTTER_KNOTS = 9  # poses over the rows of a rolling shutter, straight lines between them
 PSF = 0.55  # px, one sigma of lens and pixel
@@ -35,6 +35,7 @@ SHOT, READ = 1.0e-4, 2.0e-3  # of full scale: variance a unit of light, deviatio
 LAMP_HEIGHT = 900.0  # mm above the table
 AMBIENT = 0.45  # share of the light that comes from everywhere
 TO_LAMP = np.array([0.25, -0.3, 0.92])
+NOISE = np.sqrt(SHOT * np.linspace(0, 1, 4096) + READ**2)  # of photons and of reading
 GAMMA = np.array([round(255 * (i / 4095) ** (1 / 2.2)) for i in range(4096)], np.uint8)
 
 
@@ -57,6 +58,7 @@ class Relief:
 
     grid: Field  # (N, N, 3) mm and slopes along x and y, RELIEF_SCALE points a mm
     half: tuple[float, float]  # mm, half lengths of the outline, a rounded rectangle
+    round: bool = True
     rise: Number = NOTHING  # mm, by which the middle of the bump has risen
     centre: tuple[float, float] = (0.0, 0.0)  # mm, of the bump
     sigma: float = 9.0  # mm, of the bump
@@ -120,7 +122,7 @@ class World:
     table_scale: float
     decals: tuple[Decal, ...] = ()
     sheets: tuple[Sheet, ...] = ()
-    light: Field = field(default_factory=lambda: np.ones((2, 2), np.float32))
+    light: Field = field(default_factory=lambda: np.ones((2, 2), np.float32))  # as it falls on the table; (2, 2): even
     light_scale: float = 1.0  # texels a mm
     light_shift: Shift = still
     gloss: Gloss | None = None
@@ -173,7 +175,7 @@ class Renderer:
         rows = stamp + (np.arange(h) / h - 0.5) * max(world.readout, 0.015)
         gains = view.gain(stamp) * (1 + world.ripple * np.sin(2 * math.pi * 100 * rows))
         image = np.empty(light.shape, np.uint8)
-        _sense(light, gains.astype(np.float32), SHOT, READ, _hash(world.seed, camera, number), GAMMA, image)
+        _sense(light, gains.astype(np.float32), NOISE, _hash(world.seed, camera, number), GAMMA, image)
         if view.flip:
             image = np.ascontiguousarray(image[:, ::-1] if view.flip == "mirror" else image[::-1, ::-1])
         return image
@@ -193,9 +195,10 @@ class Renderer:
         surface_from_camera = np.ascontiguousarray((se3.inverse(base_from_surface) @ base_from_camera)[:, :3])
         hits = np.empty((*shape, 9), np.float32)
         lie = world.relief
+        outline = np.array([*lie.half, float(lie.round)])
         bump = np.array([lie.rise(t), *lie.centre, lie.sigma])
         poses = np.ascontiguousarray(base_from_surface[:, :3])
-        _trace(rays, base_from_camera[:3].copy(), surface_from_camera, poses, lie.grid, np.array(lie.half), bump, hits)
+        _trace(rays, base_from_camera[:3].copy(), surface_from_camera, poses, lie.grid, outline, bump, hits)
         image = self._tables[camera].copy()
         _lay(image, hits, world.skin(t), world.skin_scale, 0.0, 0.0)
         for decal in world.decals:
@@ -273,14 +276,15 @@ def _trace(rays, camera, surface_from_camera, poses, grid, half, bump, hits):  #
     for i in range(rows):
         m = surface_from_camera[i if surface_from_camera.shape[0] > 1 else 0]
         p = poses[i if poses.shape[0] > 1 else 0]
-        near, z = False, 0.0
+        near, z, before = False, 0.0, 0.0
         for j in range(columns):
             a, b = rays[i, j, 0], rays[i, j, 1]
             dx = m[0, 0] * a + m[0, 1] * b + m[0, 2]
             dy = m[1, 0] * a + m[1, 1] * b + m[1, 2]
             dz = m[2, 0] * a + m[2, 1] * b + m[2, 2]
             x, y, steps = 0.0, 0.0, NEAR_STEPS if near else FAR_STEPS
-            z = z if near else 0.0
+            last, z = z, (2.0 * z - before if near else 0.0)
+            before = last if near else 0.0
             near = True
             for _ in range(steps):
                 s = (z - m[2, 3]) / dz
@@ -299,7 +303,7 @@ def _trace(rays, camera, surface_from_camera, poses, grid, half, bump, hits):  #
                     ox, oy = x - bump[1], y - bump[2]
                     z += bump[0] * math.exp(-(ox * ox + oy * oy) / (2 * bump[3] * bump[3]))
             ex, ey = (x / half[0]) ** 2, (y / half[1]) ** 2
-            inside = 1.0 - math.sqrt(math.sqrt(ex * ex + ey * ey))
+            inside = 1.0 - math.sqrt(math.sqrt(ex * ex + ey * ey) if half[2] > 0.0 else max(ex, ey))
             cover = min(max(inside * half[0] / 0.4, 0.0), 1.0)
             hits[i, j, 0] = cover
             if cover <= 0.0:
@@ -383,19 +387,23 @@ def _cover(image, rays, sheet_from_camera, texture, scale):  # type: ignore[no-u
 def _shine(image, hits, light, scale, shift_x, shift_y, lamp, ambient):  # type: ignore[no-untyped-def]
     """Shade by the normal, and by the light's pattern, which lies on the table and falls along the lamp's direction."""
     h, w = light.shape[0], light.shape[1]
+    even = h == 2
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):
+            if even and hits[i, j, 0] <= 0.0:
+                continue
             facing = hits[i, j, 6] * lamp[0] + hits[i, j, 7] * lamp[1] + hits[i, j, 8] * lamp[2]
             shade = ambient + (1.0 - ambient) * max(facing, 0.0) / lamp[2]
-            z = hits[i, j, 5]
-            u = (hits[i, j, 3] - z * lamp[0] / lamp[2] - shift_x) * scale + (w - 1) / 2.0
-            v = (hits[i, j, 4] - z * lamp[1] / lamp[2] - shift_y) * scale + (h - 1) / 2.0
-            u, v = min(max(u, 0.0), w - 1.001), min(max(v, 0.0), h - 1.001)
-            k, q = int(u), int(v)
-            fu, fv = u - k, v - q
-            shade *= (1 - fv) * ((1 - fu) * light[q, k] + fu * light[q, k + 1]) + fv * (
-                (1 - fu) * light[q + 1, k] + fu * light[q + 1, k + 1]
-            )
+            if not even:
+                z = hits[i, j, 5]
+                u = (hits[i, j, 3] - z * lamp[0] / lamp[2] - shift_x) * scale + (w - 1) / 2.0
+                v = (hits[i, j, 4] - z * lamp[1] / lamp[2] - shift_y) * scale + (h - 1) / 2.0
+                u, v = min(max(u, 0.0), w - 1.001), min(max(v, 0.0), h - 1.001)
+                k, q = int(u), int(v)
+                fu, fv = u - k, v - q
+                shade *= (1 - fv) * ((1 - fu) * light[q, k] + fu * light[q, k + 1]) + fv * (
+                    (1 - fu) * light[q + 1, k] + fu * light[q + 1, k + 1]
+                )
             for c in range(3):
                 image[i, j, c] *= np.float32(shade)
 
@@ -432,18 +440,18 @@ def _glisten(image, hits, film, shift_x, shift_y, panel, camera, pose):  # type:
 
 
 @njit(**COMPILE)
-def _sense(light, gains, shot, read, seed, gamma, image):  # type: ignore[no-untyped-def]
-    """Grey values (H, W, 3) of light, with the noise of photons and of reading; gains: (H,) by row."""
-    state = np.uint32(seed | 1)
+def _sense(light, gains, noise_of, seed, gamma, image):  # type: ignore[no-untyped-def]
+    """Grey values (H, W, 3) of light. gains: (H,) by row; noise_of, gamma: (4096,) by light, 0 to 1."""
+    state = np.uint64(seed) * np.uint64(2654435761) | np.uint64(1)
+    mask = np.uint64(1023)
     for i in range(light.shape[0]):
         for j in range(light.shape[1]):
+            state ^= state << np.uint64(13)
+            state ^= state >> np.uint64(7)
+            state ^= state << np.uint64(17)
             for c in range(3):
-                state ^= np.uint32(state << np.uint32(13))
-                state ^= np.uint32(state >> np.uint32(17))
-                state ^= np.uint32(state << np.uint32(5))
-                four = (state & np.uint32(255)) + ((state >> np.uint32(8)) & np.uint32(255))
-                four += ((state >> np.uint32(16)) & np.uint32(255)) + (state >> np.uint32(24))
-                normal = (float(four) - 510.0) / 147.8  # the sum of four bytes: mean 510, deviation 147.8
+                two = ((state >> np.uint64(20 * c)) & mask) + ((state >> np.uint64(20 * c + 10)) & mask)
+                normal = (float(two) - 1023.0) / 418.0  # the sum of two of 0 to 1023: mean 1023, deviation 418
                 value = light[i, j, c] * gains[i]
-                value += normal * math.sqrt(shot * max(value, 0.0) + read * read)
+                value += normal * noise_of[int(min(max(value, 0.0), 1.0) * 4095.0)]
                 image[i, j, c] = gamma[int(min(max(value, 0.0), 1.0) * 4095.0)]
