@@ -265,8 +265,12 @@ class Estimator:
 
     def may_learn(self, fit: FrameFit) -> bool:
         """Whether map, warp and clocks may learn from a fit: what blurred or bumped cameras show would bend them."""
-        blurred = self.health.blurred(fit.used, fit.offsets, fit.allowed, fit.outliers)
-        return not (fit.outliers or self.health.bumps.bumped or blurred) and self.health.has_usual_tracks(fit.used)
+        fine = not (fit.outliers or self.health.bumps.bumped or self.looks_unusual(fit))
+        return fine and self.health.has_usual_tracks(fit.used)
+
+    def looks_unusual(self, fit: FrameFit) -> bool:
+        """Whether all cameras stand off a fit together, with fewer tracks than usual: blurred, covered, or deceived."""
+        return self.health.blurred(fit.used, fit.offsets, fit.allowed, fit.outliers)
 
     def carrying_cameras(self, fit: FrameFit) -> Index:
         """The cameras that carry a fit, by number."""

@@ -45,6 +45,7 @@ PROBE_SPACING_MM = 10.0  # so far apart, as long as there are any: one hand or n
 USUAL_MEMORY_SETS = 30.0  # frame sets over which a probe's likeness is learned
 MAX_TISSUE_SPEED = 300.0  # mm/s: a cough moves skin at 175, a hand waves a board as fast as this
 MIN_LIKENESS = 0.5  # correlation of a probe with its first picture: with less it is covered, or elsewhere
+MIN_PROBE_VOTE = 0.06  # correlation that is lost where a shift is off by a quarter of a pixel: it counts for nothing
 MAX_PROBE_VOTE = 0.3  # as how much better one probe's place counts at most: some are covered, some repeat by chance
 MIN_EVIDENCE = 1.2  # votes summed: four probes that each rule an alias out
 ODD_LIKENESS = 0.8  # of the probes' usual likeness: below it all aliases are asked
@@ -103,14 +104,14 @@ class Verification:
         best = int(evidence.argmin())
         if evidence[best] < -MIN_EVIDENCE:
             return Verdict(shifts[alive], shifts[best])
-        there = se3.transform_points(poses[probes[0].camera], self._centre + shifts)
+        there = se3.transform_points(next(iter(poses.values())), self._centre + shifts)
         near = np.linalg.norm(there - self._place, axis=1) < MAX_TISSUE_SPEED * (stamp - self._stamp)
         return Verdict(shifts[alive & (near | odd)])
 
     def take(self, stamp: float, poses: Mapping[int, Array]) -> None:
         """The poses looked at last, of `stamp`, are right."""
         self._stamp = stamp
-        self._place = se3.transform_points(poses[self._probes[0].camera], self._centre) if self._probes else self._place
+        self._place = se3.transform_points(next(iter(poses.values())), self._centre) if poses else self._place
         for probes in self._probes:
             probes.learn()
 
@@ -139,7 +140,7 @@ class _Probes:
         self._points, self._normals, self._templates = points[good], normals[good], templates.take(good)
         # those that tell aliases best, spread over the surface
         here, there = self._likeness(images, pose, aliases.shifts[:NEAR_ALIASES], None)
-        power = np.clip(here - there, 0.0, MAX_PROBE_VOTE)
+        power = np.maximum(_votes(here, there), 0.0)
         best = _spread_choice(np.where(np.isfinite(power), power, 0.0).sum(0), self._points)
         self._points, self._normals = self._points[best], self._normals[best]
         self._templates = self._templates.take(best)
@@ -150,7 +151,7 @@ class _Probes:
         """Each probe's vote (K, P) for a pose (4, 4) against it shifted (K, 3); likeness and its usual value (2, P)."""
         here, there = self._likeness(images, pose, shifts, masks)
         self._newest = here
-        vote = np.clip(here - there, -MAX_PROBE_VOTE, MAX_PROBE_VOTE)
+        vote = _votes(here, there)
         counts = np.isfinite(vote) & (np.fmax(here, there) > MIN_LIKENESS)
         known = np.isfinite(here)
         return np.where(counts, vote, 0.0), np.stack([np.where(known, here, 0.0), np.where(known, self._usual, 0.0)])
@@ -175,6 +176,12 @@ class _Probes:
         return likeness[0], likeness[1:]
 
 
+def _votes(here: Array, there: Array) -> Array:
+    """How much better a probe fits here (P,) than there (K, P), beyond what a shift's own error makes of it."""
+    more = here - there
+    return np.asarray(np.sign(more) * np.clip(np.abs(more) - MIN_PROBE_VOTE, 0.0, MAX_PROBE_VOTE))
+
+
 def _spread_choice(power: Array, points: Array) -> Index:
     """Rows of up to USUAL_PROBES points (N, 3) with the most power (N,), apart from each other as far as there are."""
     chosen, order = list[int](), np.argsort(-power, kind="stable")
@@ -187,14 +194,17 @@ def _spread_choice(power: Array, points: Array) -> Index:
     return np.array(chosen, np.int64)
 
 
-GRAIN_ORDER = 4  # of the polynomial over a patch that is taken out: shading and soft edges
+GRAIN_ORDER = 5  # of the polynomial over a patch that is taken out: shading and soft edges
 GRAIN_STRIDE = 3  # every third landmark is looked at, 40 of a camera: light deceives all of them at once
 GRAIN_MEMORY_SETS = 300.0  # ten seconds, over which it is learned how a landmark's grain usually looks
 MIN_GRAIN_SETS = 5  # frame sets in which it must have been seen before it counts,
-MIN_GRAINS = 12  # and tracks that must count for a verdict
-MIN_GRAIN_SNR = 0.02  # of the usual grain that repeats, in parts of all that is seen: beneath it there is noise alone
-MIN_GRAIN = 0.7  # of the usual grain: with less it is another one, or none,
-OTHER_GRAIN = 0.35  # in parts of the usual grain's energy: so much of another one is seen in its place
+MIN_GRAIN_SHARE = 0.05  # and how much of its grain repeats from picture to picture: the rest is noise
+MIN_GRAINS = 12  # tracks that must count for a verdict
+# Of the usual grain, how much must be left, and how much of another one tells that it is not blur which took it away.
+# Blur, defocus, shimmer, moving hairs: 0.85 or more is left, and 0.14 or less is another one. While no camera shows the
+# surface as usual, less is asked; and once contradicted, more is asked than before.
+MIN_GRAIN, OTHER_GRAIN = 0.85, 0.2
+MIN_GRAIN_DOUBTED, OTHER_GRAIN_DOUBTED = 0.92, 0.1
 
 
 class Grain:
@@ -206,6 +216,7 @@ class Grain:
         # per camera and landmark: grain along its first picture, energy of all grain, contrast of the patch; looks
         self._usual, self._looks = np.zeros((count, 0, 3)), np.zeros((count, 0))
         self._newest: tuple[Index, Index, Array] | None = None  # cameras (N,), landmarks (N,), and the same of them
+        self._apart = False  # whether the last verdict was against the tracks
 
     def __call__(
         self,
@@ -214,8 +225,12 @@ class Grain:
         pose: Array,
         surface_map: SurfaceMap,
         templates: Templates,
+        doubted: bool = False,
     ) -> str:
-        """Why tracks that carry a pose (4, 4) do not show the surface, or ''."""
+        """Why tracks that carry a pose (4, 4) do not show the surface, or ''.
+
+        doubted: whether no camera shows the surface as usual.
+        """
         self._extend(len(surface_map))
         self._newest = None
         tracks = tracks.only(tracks.track % GRAIN_STRIDE == 0)
@@ -224,21 +239,16 @@ class Grain:
         camera = np.repeat(list(pyramids), [len(part) for part in parts])
         landmark = np.concatenate([tracks.track[tracks.camera == c] for c in pyramids])
         self._newest = camera, landmark, seen
-        known = self._looks[camera, landmark] >= MIN_GRAIN_SETS
+        usual = self._usual[camera, landmark]
+        repeats = usual[:, 0] ** 2 / np.maximum(usual[:, 1], 1e-9)
+        known = (self._looks[camera, landmark] >= MIN_GRAIN_SETS) & (repeats > MIN_GRAIN_SHARE)
         if np.count_nonzero(known) < MIN_GRAINS:
             return ""
-        usual, seen = self._usual[camera, landmark][known], seen[known]
-        gain = float(np.median(seen[:, 2] / usual[:, 2]))  # of the light on it
-        own, energy = float((usual[:, 0] ** 2).sum()), float(usual[:, 1].sum())
-        if own < MIN_GRAIN_SNR * energy:
-            return ""
-        left = float((seen[:, 0] * usual[:, 0]).sum()) / own / gain
-        other = (float(seen[:, 1].sum()) / gain**2 - energy + own) / own - left**2
-        if left >= MIN_GRAIN or other < OTHER_GRAIN:
-            return ""
-        return (
-            f"the skin's grain does not follow the tracks ({100 * max(left, 0.0):.0f} % of it): they may follow light"
-        )
+        left, other = _grain_left(usual[known], seen[known], repeats[known])
+        least, most = (MIN_GRAIN_DOUBTED, OTHER_GRAIN_DOUBTED) if doubted or self._apart else (MIN_GRAIN, OTHER_GRAIN)
+        self._apart = left < least and other > most
+        share = f"{100 * max(left, 0.0):.0f} % of it is left"
+        return f"the skin's grain does not follow the tracks ({share}): they may follow light" if self._apart else ""
 
     def learn(self) -> None:
         """What was looked at last is usual."""
@@ -277,6 +287,19 @@ class Grain:
         now, then = _grain(levels) * contrast[:, None], _grain(templates.picture[rows])
         then /= np.maximum(np.linalg.norm(then, axis=1, keepdims=True), 1e-9)
         return np.stack([(now * then).sum(1), (now * now).sum(1), contrast], -1)
+
+
+def _grain_left(usual: Array, seen: Array, repeats: Array) -> tuple[float, float]:
+    """How much of the usual grain is seen in tracks, and how much of another one, in parts of its energy.
+
+    usual, seen: (N, 3) as `Grain` keeps them. repeats: (N,), how much of each one's grain is not noise.
+    """
+    gain = float(np.median(seen[:, 2] / np.maximum(usual[:, 2], 1e-9)))  # of the light on it
+    ratio = seen[:, 0] / usual[:, 0] / gain
+    energy = (seen[:, 1] / gain**2 - usual[:, 1]) / usual[:, 0] ** 2 + 1  # without the usual noise
+    left = float((repeats * np.clip(ratio, -0.5, 1.5)).sum() / repeats.sum())
+    other = float((repeats * np.clip(energy - ratio**2, -1.0, 2.0)).sum() / repeats.sum())
+    return left, other
 
 
 def _coarse_basis() -> Array:

@@ -262,7 +262,8 @@ class TrackingStep:
         assert self._matcher is not None
         fit = tracked.fit
         tracks, pose = tracked.observations.only(fit.inlier), fit.solution.base_from_surface
-        return self._grain(tracked.pyramids, tracks, pose, self._matcher.map, self._matcher.templates)
+        doubted = self._estimator.looks_unusual(fit)
+        return self._grain(tracked.pyramids, tracks, pose, self._matcher.map, self._matcher.templates, doubted)
 
     def _look(self, tracked: TrackedSet) -> tuple[dict[int, Array], Verdict]:
         """Each trusted camera's own pose (4, 4) of a frame set, and what the pictures say of it."""
