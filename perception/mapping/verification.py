@@ -24,7 +24,7 @@ from estimation.surface_map import SurfaceMap
 from perception.frames import parallel_map
 from perception.lens import Lenses
 from perception.mapping.aliases import NO_ALIASES, Aliases, SurfaceGrid, TangentPlane, find_aliases, surface_picture
-from perception.mapping.alignment_kernels import PATCH_SIDE, Float32
+from perception.mapping.alignment_kernels import PATCH_SAMPLES, PATCH_SIDE, Float32
 from perception.mapping.masks import TrackingMasks
 from perception.mapping.patches import (
     MIN_PATCH_CONTRAST,
@@ -32,12 +32,11 @@ from perception.mapping.patches import (
     Templates,
     coarse_score,
     cut_templates,
-    normalise,
     project_squares,
     sample,
 )
 
-NEAR_ALIASES = 8  # looked at in every frame set, the nearest; all of them when the surface looks odd
+NEAR_ALIASES = 4  # looked at in every frame set, the nearest; all of them when the surface looks odd
 BORDER_MM = 15.0  # round the landmarks, where a probe sees the edge of what repeats
 PROBE_SIDE = 18  # cells of the grid of places that may become probes
 USUAL_PROBES = 20  # of each camera: those that tell aliases best,
@@ -215,6 +214,7 @@ class Grain:
         count = len(lenses.rig)
         # per camera and landmark: grain along its first picture, energy of all grain, contrast of the patch; looks
         self._usual, self._looks = np.zeros((count, 0, 3)), np.zeros((count, 0))
+        self._first: Float32 = np.zeros((0, PATCH_SAMPLES), np.float32)  # (L, S) grain of the landmarks' first pictures
         self._newest: tuple[Index, Index, Array] | None = None  # cameras (N,), landmarks (N,), and the same of them
         self._apart = False  # whether the last verdict was against the tracks
 
@@ -231,13 +231,14 @@ class Grain:
 
         doubted: whether no camera shows the surface as usual.
         """
-        self._extend(len(surface_map))
+        self._extend(templates.picture)
         self._newest = None
-        tracks = tracks.only(tracks.track % GRAIN_STRIDE == 0)
-        parts = [self._look(c, pyramids[c], tracks, pose, surface_map, templates) for c in pyramids]
-        seen = np.concatenate(parts)
-        camera = np.repeat(list(pyramids), [len(part) for part in parts])
-        landmark = np.concatenate([tracks.track[tracks.camera == c] for c in pyramids])
+        some = tracks.only(tracks.track % GRAIN_STRIDE == 0)
+        seen = np.zeros((len(some), 3))
+        for c, images in pyramids.items():
+            mine = some.camera == c
+            seen[mine] = self._look(c, images, some.only(mine), pose, surface_map, templates.axes)
+        camera, landmark = some.camera, some.track
         self._newest = camera, landmark, seen
         usual = self._usual[camera, landmark]
         repeats = usual[:, 0] ** 2 / np.maximum(usual[:, 1], 1e-9)
@@ -260,33 +261,30 @@ class Grain:
         share = 1 / np.minimum(looks, GRAIN_MEMORY_SETS)
         self._usual[camera, landmark] += share[:, None] * (seen - self._usual[camera, landmark])
 
-    def _extend(self, count: int) -> None:
-        more = count - self._looks.shape[1]
+    def _extend(self, pictures: Float32) -> None:
+        """Take the first pictures (L, S) of landmarks that have joined the map."""
+        known, more = len(self._first), len(pictures) - len(self._first)
         if more > 0:
             self._usual = np.pad(self._usual, ((0, 0), (0, more), (0, 0)))
             self._looks = np.pad(self._looks, ((0, 0), (0, more)))
+            new = _grain(pictures[known:])
+            new /= np.maximum(np.linalg.norm(new, axis=1, keepdims=True), 1e-9)
+            self._first = np.concatenate([self._first, new])
 
     def _look(
-        self,
-        camera: int,
-        images: Pyramid,
-        tracks: Observations,
-        pose: Array,
-        surface_map: SurfaceMap,
-        templates: Templates,
+        self, camera: int, images: Pyramid, tracks: Observations, pose: Array, surface_map: SurfaceMap, axes: Array
     ) -> Array:
         """(N, 3) of a camera's tracks: grain along the first picture, energy of all grain, contrast; grey levels."""
-        mine = tracks.camera == camera
-        rows, pixels = tracks.track[mine], tracks.pixels[mine]
+        rows = tracks.track
         if not len(rows):
             return np.zeros((0, 3))
         points, normals = surface_map.points[rows], surface_map.normals[rows]
-        where = project_squares(self._lenses, camera, pose, points, normals, templates.axes[rows])
-        imaged = self._lenses.image(camera, pixels, np.full(len(rows), np.inf))[0]
-        levels, contrast = normalise(sample(images[0], imaged, where.per_sample))
-        now, then = _grain(levels) * contrast[:, None], _grain(templates.picture[rows])
-        then /= np.maximum(np.linalg.norm(then, axis=1, keepdims=True), 1e-9)
-        return np.stack([(now * then).sum(1), (now * now).sum(1), contrast], -1)
+        where = project_squares(self._lenses, camera, pose, points, normals, axes[rows])
+        imaged = self._lenses.image(camera, tracks.pixels, np.full(len(rows), np.inf))[0]
+        levels = sample(images[0], imaged, where.per_sample)
+        grain = _grain(levels)
+        along = np.einsum("ns,ns->n", grain, self._first[rows])
+        return np.stack([along, np.einsum("ns,ns->n", grain, grain), levels.std(1)], -1)
 
 
 def _grain_left(usual: Array, seen: Array, repeats: Array) -> tuple[float, float]:
@@ -302,16 +300,16 @@ def _grain_left(usual: Array, seen: Array, repeats: Array) -> tuple[float, float
     return left, other
 
 
-def _coarse_basis() -> Array:
+def _coarse_basis() -> Float32:
     """Orthonormal polynomials (S, B) over a patch, up to GRAIN_ORDER."""
     u, v = (part.ravel() for part in np.meshgrid(*(np.linspace(-1, 1, PATCH_SIDE),) * 2))
     powers = [(i, j) for i in range(GRAIN_ORDER + 1) for j in range(GRAIN_ORDER + 1 - i)]
-    return np.asarray(np.linalg.qr(np.stack([u**i * v**j for i, j in powers], -1))[0])
+    return np.asarray(np.linalg.qr(np.stack([u**i * v**j for i, j in powers], -1))[0], np.float32)
 
 
 _COARSE = _coarse_basis()
 
 
-def _grain(pictures: Float32) -> Array:
+def _grain(pictures: Float32) -> Float32:
     """Pictures (N, S) without what polynomials explain."""
-    return np.asarray(pictures - (pictures @ _COARSE) @ _COARSE.T)
+    return np.asarray(pictures - (pictures @ _COARSE) @ _COARSE.T, np.float32)

@@ -39,6 +39,7 @@ MAX_ALIGNED_LANDMARKS = 120
 ROUGH_START_SCALES = 4.0, 1.0  # of a fit whose start may be pixels off
 # One sigma of the prediction, px: alignment reaches three of it, on the full image and on the half-size one.
 FINE_REACH_PX, COARSE_REACH_PX = 0.8, 2.5
+MAX_PROBE_OFFSET_PX = 0.5  # by which a camera may stand off the pose: beyond, its own pose is asked for
 FULL_SEARCH_INTERVAL = 10  # frame sets of an absent surface between searches at full size: a far one needs it
 
 
@@ -269,9 +270,12 @@ class TrackingStep:
         """Each trusted camera's own pose (4, 4) of a frame set, and what the pictures say of it."""
         if not len(self._verification.aliases):
             return {}, SURE
-        poses = self._mapping.camera_poses(tracked)
-        trusted = {c: pose for c, pose in poses.items() if c not in tracked.fit.outliers}
-        return trusted, self._verification(tracked.fit.stamp, tracked.pyramids, trusted)
+        fit = tracked.fit
+        exposed = self._estimator.as_exposed(fit.solution.base_from_surface, fit.twist)
+        apart = np.nanmax(fit.offsets, initial=0.0) > MAX_PROBE_OFFSET_PX
+        poses = self._mapping.camera_poses(tracked) if apart else {c: exposed[c] for c in tracked.pyramids}
+        trusted = {c: pose for c, pose in poses.items() if c not in fit.outliers}
+        return trusted, self._verification(fit.stamp, tracked.pyramids, trusted)
 
     def _measure(
         self, matcher: Matcher, expected: SurfacePose, pyramids: dict[int, Pyramid]
