@@ -1,14 +1,17 @@
-"""Images with their stamps, the sets of frames that belong together, and the print head as the arm reports it.
+"""Images with their stamps, the print head as the arm reports it, and which frames belong to one instant: grouped by
+stamp, as they arrive or over a recording.
 
 Light to import: the motion process needs the tool's profile, and must not load OpenCV.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,3 +130,182 @@ def check_profile(where: object, what: str, profile: Array) -> None:
     if not (rising and np.isfinite(profile).all() and (np.diff(profile[:, 0]) > 0).all() and (profile >= 0).all()):
         allowed = "two or more [height, radius] in mm, none negative, heights rising"
         raise InputError(where, what, profile.tolist(), allowed)
+
+
+DEFAULT_PERIOD = 1 / 30  # s, of the thesis's cameras: for recordings in which no camera has two frames
+TOLERANCE_PERIODS = 0.5  # see `pairing_tolerance`
+DELAY_SAMPLES = 5  # frames of a camera, whose median delay behind the first one of their sets is its usual delay
+SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost in a row are rare
+
+
+class Stamped(Protocol):
+    """Anything that a camera took at a stamp."""
+
+    @property
+    def camera(self) -> int:
+        """Number of the camera in the rig."""
+
+    @property
+    def stamp(self) -> float:
+        """Instant, s, on the clock that all cameras share."""
+
+
+StampedItem = TypeVar("StampedItem", bound=Stamped)
+
+
+def frame_period(stamps: Sequence[Array]) -> float:
+    """Frame period, s: the smallest of the cameras' median steps; stamps holds one rising (N,) array per camera.
+
+    The median tolerates the loss of fewer than half of a camera's frames, the minimum a camera that loses more or runs
+    slower.
+    """
+    return min((float(np.median(np.diff(s))) for s in stamps if len(s) > 1), default=DEFAULT_PERIOD)
+
+
+def pairing_tolerance(period: float) -> float:
+    """Largest spread, s, of the stamps of one set: half a frame period.
+
+    Cameras that fire together every `period` with jitter of up to +-j spread by at most 2 j within an instant, and the
+    next one follows after at least period - 2 j. A limit must lie between the two. Half a period does for every j below
+    a quarter of the period; no other limit tolerates more.
+    """
+    return TOLERANCE_PERIODS * period
+
+
+def pair(items: Iterable[StampedItem], tolerance: float, cameras: int) -> Iterator[tuple[StampedItem, ...]]:
+    """Sets of items, each in the rig's order, from items in order of stamp; every item comes out exactly once.
+
+    A set ends when it holds all `cameras`, when a camera would come a second time, or when an item is more than
+    `tolerance` (s) younger than the set's first. It comes out as early as possible, without looking ahead.
+    """
+    current: dict[int, StampedItem] = {}
+    first = 0.0
+    for item in items:
+        if current and (item.camera in current or item.stamp - first > tolerance):
+            yield _in_rig_order(current)
+            current = {}
+        if not current:
+            first = item.stamp
+        current[item.camera] = item
+        if len(current) == cameras:
+            yield _in_rig_order(current)
+            current = {}
+    if current:
+        yield _in_rig_order(current)
+
+
+def _in_rig_order(by_camera: dict[int, StampedItem]) -> tuple[StampedItem, ...]:
+    return tuple(by_camera[camera] for camera in sorted(by_camera))
+
+
+def mean_stamp(items: Sequence[Stamped]) -> float:
+    """Mean of the stamps, s, taken about the first so that a large epoch costs no digits."""
+    first = items[0].stamp
+    return first + sum(item.stamp - first for item in items) / len(items)
+
+
+def frame_set(frames: Sequence[Frame]) -> FrameSet:
+    """The frames of one instant as a set, at the mean of their stamps."""
+    return FrameSet(mean_stamp(frames), tuple(sorted(frames, key=lambda f: f.camera)))
+
+
+class Pairing:
+    """Frame sets from live frames, which arrive in any order between cameras, some late, some never.
+
+    A set is complete when every camera that is alive is in it, or has since delivered a younger frame. An incomplete
+    set is given out `patience` s after the arrival of its first frame. The patience is half a period. Where a camera's
+    usual delay is longer, it is added, at most one period: else the frames of a camera that is always late would never
+    be used. A camera that is silent for SILENT_PERIODS is not waited for.
+
+    Sets come out in order of stamp; a frame that is too late for that is dropped and counted in `late`. The frames of
+    one camera are assumed to arrive in order.
+    """
+
+    def __init__(self, cameras: int, period: float) -> None:
+        """cameras: number of them in the rig. period: s, of their frames."""
+        self.late = 0
+        self.retime(period)
+        self._open: list[_OpenSet] = []  # oldest first
+        self._last_stamp = [-math.inf] * cameras
+        self._last_arrival: list[float | None] = [None] * cameras  # s
+        self._last_set: _OpenSet | None = None  # that was given out
+        self._delays: list[deque[float]] = [deque(maxlen=DELAY_SAMPLES) for _ in range(cameras)]  # s, see `_add_delay`
+
+    def retime(self, period: float) -> None:
+        """The cameras' frames come every `period` s from now on."""
+        self.patience = pairing_tolerance(period)
+        self._period, self._tolerance, self._silent = period, pairing_tolerance(period), SILENT_PERIODS * period
+
+    def add(self, frame: Frame, now: float) -> list[FrameSet]:
+        """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
+        self._last_stamp[frame.camera], self._last_arrival[frame.camera] = frame.stamp, now
+        last = self._last_set
+        belongs_to_last = last is not None and last.takes(frame, self._tolerance)
+        if last is not None and (belongs_to_last or frame.stamp <= last.last):
+            self.late += 1
+            if belongs_to_last:
+                self._add_delay(frame.camera, now - last.arrived)
+        else:
+            self._place(frame, now)
+        return self.due(now)
+
+    def due(self, now: float) -> list[FrameSet]:
+        """The sets that are complete, or must not be waited for any longer, at `now`, s."""
+        self._last_arrival = [now if arrival is None else arrival for arrival in self._last_arrival]
+        # with a set that is finished all before it are given out, so that stamps rise
+        count = max((i for i, group in enumerate(self._open, 1) if self._is_finished(group, now)), default=0)
+        out, self._open = self._open[:count], self._open[count:]
+        if out:
+            self._last_set = out[-1]
+        return [frame_set(list(group.frames.values())) for group in out]
+
+    def _add_delay(self, camera: int, delay: float) -> None:
+        """Take a frame's delay, s, behind the first one of its set; a camera's usual delay is the median of them."""
+        self._delays[camera].append(delay)
+        usual = [float(np.median(d)) for d in self._delays if len(d) == DELAY_SAMPLES]
+        longest = min(max(usual, default=0.0), self._period)
+        self.patience = self._tolerance + (longest if longest > self._tolerance else 0.0)
+
+    def _place(self, frame: Frame, now: float) -> None:
+        for i, group in enumerate(self._open):
+            rises = all(frame.stamp < later.last for later in self._open[i + 1 :])
+            if rises and group.takes(frame, self._tolerance):
+                group.frames[frame.camera] = frame
+                self._add_delay(frame.camera, now - group.arrived)
+                return
+        if any(group.first <= frame.stamp <= group.last for group in self._open):  # amid a set that it is no part of
+            self.late += 1
+            return
+        self._open.append(_OpenSet(now, now + self.patience, {frame.camera: frame}))
+        self._open.sort(key=lambda group: group.first)
+
+    def _is_finished(self, group: _OpenSet, now: float) -> bool:
+        missing = [camera for camera in range(len(self._last_stamp)) if camera not in group.frames]
+        return now >= group.until or not any(self._may_come(group, camera, now) for camera in missing)
+
+    def _may_come(self, group: _OpenSet, camera: int, now: float) -> bool:
+        arrival = self._last_arrival[camera]
+        alive = arrival is not None and now - arrival <= self._silent
+        return alive and self._last_stamp[camera] < group.first + self._tolerance
+
+
+@dataclass(slots=True)
+class _OpenSet:
+    """A set that is being gathered."""
+
+    arrived: float  # s, when its first frame came
+    until: float  # s, waited for
+    frames: dict[int, Frame]  # by camera
+
+    @property
+    def first(self) -> float:
+        return min(frame.stamp for frame in self.frames.values())
+
+    @property
+    def last(self) -> float:
+        return max(frame.stamp for frame in self.frames.values())
+
+    def takes(self, frame: Frame, tolerance: float) -> bool:
+        """Whether a frame belongs here: its camera is not there yet, and no two stamps are further than `tolerance`."""
+        near = max(frame.stamp, self.last) - min(frame.stamp, self.first) <= tolerance
+        return near and frame.camera not in self.frames

@@ -23,8 +23,16 @@ from hardware.cli.main import main
 from hardware.files.rig_file import read_board, read_rig, write_board
 from hardware.process.progress import no_progress
 from hardware.simulator.scene.ground_truth_views import BoardView
-from perception.boards.board import Board, charuco_board, ink_cells, undistort, whole_view
-from perception.boards.corners import CornerFinder, thin_instants, usable_views
+from perception.boards.board import (
+    Board,
+    CornerFinder,
+    charuco_board,
+    ink_cells,
+    thin_instants,
+    undistort,
+    usable_views,
+    whole_view,
+)
 from perception.frames import Image
 from tests.board_session import BOARD, LENSES, OFFSETS, rendered, small_rig
 

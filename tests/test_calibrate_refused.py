@@ -23,8 +23,7 @@ from hardware.cli.main import main
 from hardware.files.rig_file import ImageSource, write_board, write_rig
 from hardware.process.progress import no_progress
 from hardware.recording.session_reader import open_session
-from perception.boards.board import Board
-from perception.boards.corners import usable_views
+from perception.boards.board import Board, usable_views
 from perception.frames import Image
 from tests.board_session import BOARD, rendered, small_rig
 

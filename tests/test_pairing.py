@@ -10,11 +10,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perception.frames import Frame, FrameSet
-from perception.pairing import (
+from perception.frames import (
     DEFAULT_PERIOD,
     DELAY_SAMPLES,
     SILENT_PERIODS,
+    Frame,
+    FrameSet,
     Pairing,
     frame_period,
     frame_set,

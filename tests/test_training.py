@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch", reason="torch is in the extra [train]")
 pytest.importorskip("onnx", reason="onnx is in the extra [train]")
 
 from estimation.errors import StillbedError
-from perception.training.augmentation import Augmentation, sample_pyramid
+from perception.training.dataset import Augmentation, sample_pyramid
 from perception.training.export import export
 from perception.training.loop import (
     Curve,

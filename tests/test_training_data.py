@@ -18,15 +18,19 @@ from perception.frames import FrameSet, Image, Roi
 from perception.mapping.features import polygon_mask
 from perception.tracking.step import TrackingStep
 from perception.tracking.wound_step import MAX_EMPTY_LOOKS, RegionSearch, RegionTrackingStep
-from perception.training.augmentation import Augmentation, cover_sample, draw_sample, relight, sample_pyramid
 from perception.training.dataset import (
     PIECE_SIDES_PX,
     WOUND_MARGIN_PX,
+    Augmentation,
     Labelled,
+    cover_sample,
+    draw_sample,
     healthy_pieces,
     hold_out_groups,
     picture_groups,
     read_dataset,
+    relight,
+    sample_pyramid,
 )
 from perception.training.metrics import dice_before_and_after_cover, half_covered, scores, silent_share
 from perception.wound.network import shipped_model

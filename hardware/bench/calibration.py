@@ -29,8 +29,7 @@ from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, no_progress
 from hardware.simulator.scene.ground_truth_views import BoardView
 from hardware.simulator.watched_arm import watched_arm
-from perception.boards.board import Board
-from perception.boards.corners import CornerFinder, CornerTable, empty_table, usable_views
+from perception.boards.board import Board, CornerFinder, CornerTable, empty_table, usable_views
 
 BOARD = Board(squares=(8, 11), square=30.0)
 PICTURE_SIZE = (1280, 720)

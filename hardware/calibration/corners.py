@@ -24,8 +24,7 @@ from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_from_terms,
 from estimation.se3 import Array
 from hardware.files.session import Session
 from hardware.process.progress import ProgressReport
-from perception.boards.board import Board
-from perception.boards.corners import BoardCorners, CornerFinder, CornerTable, empty_table
+from perception.boards.board import Board, BoardCorners, CornerFinder, CornerTable, empty_table
 from perception.frames import Image
 
 CORNERS_VERSION = 3  # of the corner search, whose stored results are valid for this version only

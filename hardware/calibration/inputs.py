@@ -25,8 +25,7 @@ from hardware.files.rig_file import ImageSource, is_calibrated, read_rig, read_u
 from hardware.files.session import Session
 from hardware.files.session_folder import open_folder
 from hardware.recording.session_reader import open_session
-from perception.boards.board import DICTIONARIES, Board
-from perception.boards.corners import MAX_BLUR, MIN_CORNERS, CornerFinder, CornerTable
+from perception.boards.board import DICTIONARIES, MAX_BLUR, MIN_CORNERS, Board, CornerFinder, CornerTable
 from perception.frames import Image
 
 SAMPLE_PICTURES = 5  # in which other boards are searched

@@ -41,8 +41,7 @@ from hardware.operator.shared_state import OperatorLink
 from hardware.operator.view import RequestAnswer, WavingCamera, WavingStage, WavingView, Wish, refusal
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
-from perception.boards.board import Board
-from perception.boards.corners import CornerTable
+from perception.boards.board import Board, CornerTable
 from perception.frames import FrameSet, Image
 
 INITIAL_VIEW = WavingView(0.0, 1, WavingStage.WAVE)

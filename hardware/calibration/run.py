@@ -28,8 +28,7 @@ from hardware.files.rig_file import read_board, write_rig
 from hardware.operator.view import WavingStage
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress, ProgressReport
-from perception.boards.board import Board, thumbnail, undistort
-from perception.boards.corners import CornerTable, usable_views
+from perception.boards.board import Board, CornerTable, thumbnail, undistort, usable_views
 
 SURFACE_SPEED = 20.0  # mm/s, for the effect of clock errors: the peak of a deep breath
 PICTURE_WIDTH = 640  # px, of a picture in the report

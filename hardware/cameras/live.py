@@ -17,8 +17,7 @@ from estimation.se3 import Array
 from hardware.cameras.feed import Arrival, CameraPlace, Feed, LiveHealth
 from hardware.cameras.sources import CameraSource, identity_from_text, read_live_rig
 from hardware.process.clock import Clock
-from perception.frames import Frame, FrameSet
-from perception.pairing import DEFAULT_PERIOD, Pairing, frame_set
+from perception.frames import DEFAULT_PERIOD, Frame, FrameSet, Pairing, frame_set
 
 MAX_WAITING_FRAMES = 4  # per camera that nobody has fetched yet; older ones are dropped
 SET_POLL = 0.005  # s between checks whether an incomplete set is due

@@ -14,8 +14,7 @@ from estimation import se3
 from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from perception.frames import Frame, FrameSet, Image, PrintHead, Roi
-from perception.pairing import frame_period, frame_set, pair, pairing_tolerance
+from perception.frames import Frame, FrameSet, Image, PrintHead, Roi, frame_period, frame_set, pair, pairing_tolerance
 
 SURFACE_SUFFIXES = (".ply", ".stl", ".obj")
 HEAD_STAMP_TOLERANCE = 0.002  # s from a row to its frame set: the rounding of stamps, far below a frame's period

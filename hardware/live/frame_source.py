@@ -19,8 +19,7 @@ import numpy as np
 from estimation.errors import StillbedError
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
-from perception.frames import Frame, FrameSet, Image, PrintHead, parallel_map
-from perception.pairing import frame_set
+from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set, parallel_map
 
 if TYPE_CHECKING:
     from hardware.cameras.feed import LiveHealth

@@ -26,8 +26,7 @@ from hardware.process.clock import WallClock
 from hardware.process.faults import Fault
 from hardware.process.system import set_up_process
 from hardware.recording.session_reader import open_session
-from perception.frames import Frame, FrameSet
-from perception.pairing import frame_set
+from perception.frames import Frame, FrameSet, frame_set
 
 TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
 REQUEST_POLL_PERIOD = 0.02  # s between looks whether the tracker asks for frames

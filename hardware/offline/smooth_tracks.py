@@ -26,7 +26,7 @@ from hardware.process.progress import Progress
 from hardware.recording.mcap_file import AttachedFile, ChunkMessages, walk
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import read_observations, read_poses
-from perception.pairing import mean_stamp
+from perception.frames import mean_stamp
 from perception.tracking.reobservation import KnownMotion, ReferencePictures, Reobserver, joined_observations
 
 SOURCE_ATTACHMENT = "made_of.txt"  # name of the attachment with the hash, the recording's first record

@@ -65,7 +65,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
             write_shape_model(out, fit_shapes(parts.trained, options.seed, progress))
         return f"{out} is written; judge it with stillbed bench segmentation"
     from perception.training import loop
-    from perception.training.augmentation import sample_pyramid
+    from perception.training.dataset import sample_pyramid
     from perception.training.export import NetworkOrigin, export
     from perception.training.metrics import chosen_settings
 

@@ -44,8 +44,7 @@ from hardware.recording.session_reader import (
     used_inputs,
 )
 from hardware.report.evaluation import associate
-from perception.frames import Frame, FrameSet
-from perception.pairing import frame_set, mean_stamp
+from perception.frames import Frame, FrameSet, frame_set, mean_stamp
 from planning.command import Move
 from planning.path import Path as Toolpath
 

@@ -28,8 +28,7 @@ from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.appearance import Sensor
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState
-from perception.frames import Frame, FrameSet, Image, PrintHead
-from perception.pairing import Pairing
+from perception.frames import Frame, FrameSet, Image, Pairing, PrintHead
 from perception.tracking.step import StepReport
 
 Action = Callable[[float], None]  # of the instant, s

@@ -24,13 +24,12 @@ from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.frames import DuplicateFilter, FrameSet
+from perception.frames import DuplicateFilter, FrameSet, frame_period, pairing_tolerance
 from perception.lens import Lenses
 from perception.mapping.features import grey
 from perception.mapping.first_map import on_rays
 from perception.mapping.matcher import Matcher
 from perception.mapping.patches import MIN_PATCH_CONTRAST, Pyramid, Templates, cut_templates, join
-from perception.pairing import frame_period, pairing_tolerance
 from perception.tracking.step import COARSE_REACH_PX, FINE_REACH_PX, ROUGH_START_SCALES
 
 STAMP_TOLERANCE_S = 1e-6  # s: stamps of one frame set, as stored and as read again

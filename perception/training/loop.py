@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from perception.training.augmentation import Augmentation, SamplePyramid, draw_sample
-from perception.training.dataset import Labelled
+from perception.training.dataset import Augmentation, Labelled, SamplePyramid, draw_sample
 from perception.wound.network import Looks, wound_logits
 from perception.wound.segmentation import dice
 

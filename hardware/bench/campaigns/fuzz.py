@@ -53,8 +53,7 @@ from hardware.recording.session_reader import open_session
 from hardware.simulator.arm.settings import ArmSettings, read_virtual_arm, write_virtual_arm
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.trace_file import read_trace
-from perception.boards.board import Board
-from perception.boards.corners import CornerTable
+from perception.boards.board import Board, CornerTable
 from perception.frames import Frame, Image
 from perception.tracking.step import STAGES, report_without_offsets
 from perception.wound.network import WoundNetwork, shipped_model
