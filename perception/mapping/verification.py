@@ -36,7 +36,8 @@ from perception.mapping.patches import (
     sample,
 )
 
-NEAR_ALIASES = 4  # looked at in every frame set, the nearest; all of them when the surface looks odd
+NEAR_ALIASES = 4  # looked at in every frame set, the nearest: all of them when the surface looks odd,
+NEAR_MM = 15.0  # and those within reach when that is farther, as after a gap
 BORDER_MM = 15.0  # round the landmarks, where a probe sees the edge of what repeats
 PROBE_SIDE = 18  # cells of the grid of places that may become probes
 USUAL_PROBES = 20  # of each camera: those that tell aliases best,
@@ -47,7 +48,7 @@ MIN_LIKENESS = 0.5  # correlation of a probe with its first picture: with less i
 MIN_PROBE_VOTE = 0.06  # correlation that is lost where a shift is off by a quarter of a pixel: it counts for nothing
 MAX_PROBE_VOTE = 0.3  # as how much better one probe's place counts at most: some are covered, some repeat by chance
 MIN_EVIDENCE = 1.2  # votes summed: four probes that each rule an alias out
-ODD_LIKENESS = 0.8  # of the probes' usual likeness: below it all aliases are asked
+ODD_LIKENESS = 0.9  # of the probes' usual likeness: below it all aliases are asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +94,9 @@ class Verification:
         probes = [p for p in self._probes if p.camera in pyramids and p.camera in poses]
         if not probes:
             return SURE
-        shifts = self.aliases.shifts[:NEAR_ALIASES]
+        reach = MAX_TISSUE_SPEED * (stamp - self._stamp)
+        within = int(np.count_nonzero(np.linalg.norm(self.aliases.shifts, axis=1) < reach))
+        shifts = self.aliases.shifts[: NEAR_ALIASES if reach < NEAR_MM else max(NEAR_ALIASES, within)]
         evidence, likeness = self._evidence(pyramids, poses, probes, shifts)
         odd = likeness < ODD_LIKENESS
         if odd or evidence.min() < MIN_EVIDENCE:
@@ -104,7 +107,7 @@ class Verification:
         if evidence[best] < -MIN_EVIDENCE:
             return Verdict(shifts[alive], shifts[best])
         there = se3.transform_points(next(iter(poses.values())), self._centre + shifts)
-        near = np.linalg.norm(there - self._place, axis=1) < MAX_TISSUE_SPEED * (stamp - self._stamp)
+        near = np.linalg.norm(there - self._place, axis=1) < reach
         return Verdict(shifts[alive & (near | odd)])
 
     def take(self, stamp: float, poses: Mapping[int, Array]) -> None:
