@@ -285,6 +285,10 @@ class Estimator:
         surface = self._surface
         surface.pose = surface.reported_pose = replace(surface.pose, twist=twist)
 
+    def forget_motion(self) -> None:
+        """The next fit is elsewhere than the last pose was followed to: between both lies no motion to be learned."""
+        self._smoother.reset()
+
     def hold(self, stamp: float, reason: str) -> SurfacePose:
         """The first map is not confirmed at `stamp`: the pose stands still and counts for nothing."""
         surface = self._surface

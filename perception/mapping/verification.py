@@ -48,18 +48,23 @@ MIN_LIKENESS = 0.5  # correlation of a probe with its first picture: with less i
 MIN_PROBE_VOTE = 0.06  # correlation that is lost where a shift is off by a quarter of a pixel: it counts for nothing
 MAX_PROBE_VOTE = 0.3  # as how much better one probe's place counts at most: some are covered, some repeat by chance
 MIN_EVIDENCE = 1.2  # votes summed: four probes that each rule an alias out
-ODD_LIKENESS = 0.9  # of the probes' usual likeness: below it all aliases are asked
+ODD_LIKENESS = 0.95  # of the probes' usual likeness, which is steady to 0.01: below it all aliases are asked,
+ODD_EVIDENCE = 5.0  # and only so many votes rule one out: a shift alone need not fit a curved surface
+MAX_RIVALS = 3  # aliases that are fitted anew, 6 ms each
+BETTER_LIKENESS = 0.02  # in parts of the usual, by which a rival must look more like the surface,
+WORSE_LIKENESS = 0.1  # and by which less, to be ruled out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
     """What the pictures say of a pose."""
 
-    alive: Array  # (K, 3) mm, shifts of the pose, surface frame, that they do not contradict
-    better: Array | None = None  # (3,) mm, a shift that they prefer clearly
+    alive: Array  # (K, 3) mm, shifts of the pose, surface frame, that they do not contradict, the likeliest first
+    rivals: int  # of these, to be fitted anew: on a curved surface tracks agree near an alias, not at it
+    likeness: float  # of the surface with its first pictures, in parts of the usual
 
 
-SURE = Verdict(np.zeros((0, 3)))
+SURE = Verdict(np.zeros((0, 3)), 0, 1.0)
 
 
 class Verification:
@@ -102,13 +107,12 @@ class Verification:
         if odd or evidence.min() < MIN_EVIDENCE:
             shifts = self.aliases.shifts
             evidence, likeness = self._evidence(pyramids, poses, probes, shifts)
-        alive = evidence < MIN_EVIDENCE
-        best = int(evidence.argmin())
-        if evidence[best] < -MIN_EVIDENCE:
-            return Verdict(shifts[alive], shifts[best])
-        there = se3.transform_points(next(iter(poses.values())), self._centre + shifts)
-        near = np.linalg.norm(there - self._place, axis=1) < reach
-        return Verdict(shifts[alive & (near | odd)])
+        alive = evidence < (ODD_EVIDENCE if odd else MIN_EVIDENCE)
+        if evidence.min() >= -MIN_EVIDENCE:
+            there = se3.transform_points(next(iter(poses.values())), self._centre + shifts)
+            alive &= (np.linalg.norm(there - self._place, axis=1) < reach) | odd
+        left = shifts[alive][np.argsort(evidence[alive], kind="stable")]
+        return Verdict(left, MAX_RIVALS if odd or evidence.min() < -MIN_EVIDENCE else 0, likeness)
 
     def take(self, stamp: float, poses: Mapping[int, Array]) -> None:
         """The poses looked at last, of `stamp`, are right."""

@@ -31,7 +31,14 @@ from perception.mapping.mapping import Mapping, TrackedSet
 from perception.mapping.masks import Tool, TrackingMasks
 from perception.mapping.matcher import Matcher
 from perception.mapping.patches import Pyramid
-from perception.mapping.verification import SURE, Grain, Verdict, Verification
+from perception.mapping.verification import (
+    BETTER_LIKENESS,
+    SURE,
+    WORSE_LIKENESS,
+    Grain,
+    Verdict,
+    Verification,
+)
 
 STAGES = ("prepare", "flow", "align", "pose", "search")
 # Of a camera: at 0.2 px they give a pose to 0.01 mm, and more landmarks do not reduce the errors that they share.
@@ -241,22 +248,28 @@ class TrackingStep:
         It is no measurement where the surface's grain contradicts its tracks.
         """
         poses, verdict = self._look(tracked)
-        if verdict.better is not None:
-            shift = se3.make(np.eye(3), verdict.better)
-            starts = {c: pose @ shift for c, pose in poses.items()}
-            start = tracked.fit.solution.base_from_surface @ shift
-            again = self._mapping.align_and_fit(tracked.fit.stamp, tracked.pyramids, starts, start)
-            if again.fit.measured:
-                its_poses, second = self._look(again)
-                if second.better is None:
-                    tracked, poses, verdict = again, its_poses, second
+        given, first, alive = tracked, poses, list(verdict.alive)
+        for rival in verdict.alive[: verdict.rivals]:
+            shift = se3.make(np.eye(3), rival)
+            starts, pose = {c: pose @ shift for c, pose in first.items()}, given.fit.solution.base_from_surface
+            again = self._mapping.align_and_fit(given.fit.stamp, given.pyramids, starts, pose @ shift)
+            if not again.fit.measured:
+                continue
+            there, second = self._look(again)
+            if second.likeness > verdict.likeness + BETTER_LIKENESS:
+                tracked, poses, verdict, alive = again, there, second, list(second.alive)
+            elif second.likeness < verdict.likeness - WORSE_LIKENESS and tracked is given:
+                alive = [other for other in alive if other is not rival]
+        if tracked is not given:
+            self._estimator.forget_motion()
+        aliases = np.array(alive).reshape(-1, 3)
         light = self._follows_light(tracked)
         if light:
-            return replace(tracked, fit=replace(tracked.fit, reason=light)), verdict.alive
-        if not len(verdict.alive):
+            return replace(tracked, fit=replace(tracked.fit, reason=light)), aliases
+        if not len(aliases):
             self._verification.take(tracked.fit.stamp, poses)
             self._grain.learn()
-        return tracked, verdict.alive
+        return tracked, aliases
 
     def _follows_light(self, tracked: TrackedSet) -> str:
         """Why the tracks that carry a fit do not show the surface, or ''."""
