@@ -20,7 +20,7 @@ from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, Ca
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.local_motion import LocalMotion
-from estimation.online.reported_covariance import CalibrationError, ReportedCovariance, widened
+from estimation.online.reported_covariance import CalibrationError, ReportedCovariance
 from estimation.online.surface_state import Measurement, MotionDetector, PoseStateMachine, StateSettings
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
@@ -60,7 +60,7 @@ class _MappedSurface:
     def __init__(self, surface_map: SurfaceMap, cameras: int, caveat: str) -> None:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
-        self.detector, self.local = MotionDetector(surface_map.points.mean(0)), LocalMotion()
+        self.detector, self.local = MotionDetector(surface_map.points.mean(0)), LocalMotion(cameras)
         self.predictor = Predictor(surface_map.points)
         self.reported, self.calibration = ReportedCovariance(cameras), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
@@ -324,8 +324,8 @@ class Estimator:
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        surface.reported_pose = widened(given, surface.local.covariance) if surface.local.active else given
-        return surface.reported_pose
+        surface.reported_pose = given
+        return given
 
     def _update_health(self, fit: FrameFit) -> None:
         used = fit.used if fit.measured else np.zeros_like(fit.used)
@@ -359,6 +359,7 @@ class Estimator:
             reason,
             surface.detector.motion,
             surface.warp.warp,
+            local=surface.local.error,
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
         surface.pose = surface.measured = surface.reported_pose = entered
