@@ -156,14 +156,19 @@ class LocalError:
     variance: Array  # (K,) mm^2 there, along every direction
     growth: Array  # (K,) mm^2/s, by which that grows unseen
     reach: Array  # (K,) mm, one sigma of each bell
+    support: Array  # (S, 3) mm, where landmarks show that the surface is there
+    span: float  # mm from the nearest of them within which a place moves with it
+    unsupported: float  # mm^2, at twice that distance and beyond; no support at all: everywhere
 
     def later(self, seconds: float) -> LocalError:
         """The same `seconds` s from its stamp, before or after."""
         return replace(self, variance=self.variance + abs(seconds) * self.growth)
 
     def variance_at(self, points: Array) -> Array:
-        """Variance (N,), mm^2, along every direction, of the places of points (N, 3): the bell that says most there."""
-        return np.asarray((bells(points, self.centres, self.reach) * self.variance).max(1, initial=0.0))
+        """Variance (N,), mm^2, along every direction, of the places of points (N, 3): by bells or support, the larger."""
+        by_bells = (bells(points, self.centres, self.reach) * self.variance).max(1, initial=0.0)
+        away = np.sqrt(((points[:, None] - self.support) ** 2).sum(-1).min(1, initial=np.inf))
+        return np.asarray(np.maximum(by_bells, self.unsupported * np.clip(away / self.span - 1.0, 0.0, 1.0)))
 
 
 def bells(points: Array, control: Array, reach: float | Array) -> Array:

@@ -20,6 +20,7 @@ from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, Ca
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.local_motion import LocalMotion
+from estimation.online.parted_texture import Elsewhere, PartedTexture
 from estimation.online.reported_covariance import CalibrationError, ReportedCovariance
 from estimation.online.surface_state import Measurement, MotionDetector, PoseStateMachine, StateSettings
 from estimation.online.window import MeasuredPose, Smoother
@@ -57,12 +58,13 @@ class _MappedSurface:
     reported_pose: SurfacePose  # the same with the reported covariance
     measured: SurfacePose  # the last one that was measured
 
-    def __init__(self, surface_map: SurfaceMap, cameras: int, caveat: str) -> None:
+    def __init__(self, surface_map: SurfaceMap, rig: Rig, region: bool, caveat: str) -> None:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
-        self.detector, self.local = MotionDetector(surface_map.points.mean(0)), LocalMotion(cameras)
+        self.detector, self.local = MotionDetector(surface_map.points.mean(0)), LocalMotion(len(rig), region)
+        self.parted = PartedTexture(rig, len(surface_map), region)
         self.predictor = Predictor(surface_map.points)
-        self.reported, self.calibration = ReportedCovariance(cameras), CalibrationError()
+        self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
         self.accepted = 0  # poses measured since the first map
         self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
@@ -78,8 +80,9 @@ class Estimator:
     `begin` takes the first map. Before it only `map`, `pose`, `confirmed`, `deforms`, `sigma` and `learn` may be used.
     """
 
-    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None) -> None:
-        self.rig = rig
+    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None, region: bool = True) -> None:
+        """region: whether it is known what the surface is: all landmarks of the first map lie on it."""
+        self.rig, self._region = rig, region
         self.settings, self.cameras = settings or EstimatorSettings(), CameraErrors(len(rig))
         self.health = CameraHealth([camera.name for camera in rig.cameras])
         self._earlier_cameras = CameraErrorHistory(self.cameras)
@@ -249,7 +252,7 @@ class Estimator:
 
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
-        self._mapped = _MappedSurface(surface_map, len(self.rig), caveat)
+        self._mapped = _MappedSurface(surface_map, self.rig, self._region, caveat)
         self._smoother.reset()
         self.health.begin()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
@@ -298,8 +301,13 @@ class Estimator:
         seen = replace(seen, sigma=np.maximum(seen.sigma, self.settings.floor_sigma))
         surface.reported.learn(seen, fit, self.cameras)
 
-    def accept(self, fit: FrameFit, observations: Observations) -> SurfacePose:
-        """Take a measured fit into the window and give the pose."""
+    def elsewhere(self, fit: FrameFit, observations: Observations) -> Elsewhere | None:
+        """Landmarks to be looked for away from a measured fit, for `accept`; None: all are where it puts them."""
+        surface = self._surface
+        return surface.parted.sought(observations, fit, surface.warp.points(surface.map))
+
+    def accept(self, fit: FrameFit, observations: Observations, elsewhere: Observations | None = None) -> SurfacePose:
+        """Take a measured fit into the window and give the pose. elsewhere: what was found of `elsewhere`, if any."""
         assert fit.measured
         surface, sigma = self._surface, np.maximum(observations.sigma, self.settings.floor_sigma)
         sound = self.may_learn(fit)
@@ -310,13 +318,14 @@ class Estimator:
         surface.detector(fit.stamp, fit.solution.base_from_surface, fit.parts.noise)
         self._update_health(fit)
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
+        surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
         quality = Measurement(
             cameras=tuple(self.rig.cameras[c].name for c in self.carrying_cameras(fit)),
             tracks=int(fit.used.sum()),
             sigma=position_sigma(fit.covariance + lasting),
             trouble=self.health.trouble(fit.stamp),
-            caveat=surface.local.message or surface.caveat,
+            caveat=surface.parted.message or surface.local.message or surface.caveat,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
         )
         state = self._states.measured(fit.stamp, quality)
@@ -324,8 +333,8 @@ class Estimator:
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        surface.reported_pose = given
-        return given
+        surface.reported_pose = surface.parted.covering(given)
+        return surface.reported_pose
 
     def _update_health(self, fit: FrameFit) -> None:
         used = fit.used if fit.measured else np.zeros_like(fit.used)
@@ -377,7 +386,7 @@ class Estimator:
             stays = surface.measured.predict(surface.measured.stamp + self.settings.states.coast)
             predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6), forecast=None)
         surface.pose = replace(predicted, state=state, reason=reason)
-        surface.reported_pose = surface.reported.missed(surface.pose)
+        surface.reported_pose = surface.parted.covering(surface.reported.missed(surface.pose))
         return surface.reported_pose
 
     def replace_map(self, surface_map: SurfaceMap, crooked: bool = False, bent: bool = False) -> None:

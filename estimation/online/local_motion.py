@@ -20,11 +20,11 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.fit import FrameFit
+from estimation.online.fit import FrameFit, displacement_sums, solve_symmetric3, unusual_displacements
 from estimation.pose_solver import GATE
-from estimation.runtime import CONTIGUOUS, compiled, median
-from estimation.se3 import Array, Index, Mask
-from estimation.surface_map import LocalError, SurfaceMap, bells
+from estimation.runtime import CONTIGUOUS, median
+from estimation.se3 import Array, Mask
+from estimation.surface_map import LocalError, SurfaceMap, bells, farthest_points
 
 BELL_SIGMA_MM = 6.0  # of a bell, at least: about a dozen landmarks of a dense map, and a fold of the skin
 MAX_BELL_SIGMA_MM = 15.0  # of a bell where landmarks are sparse: what lies farther apart does not move as one
@@ -47,7 +47,6 @@ CLEAR_DISPLACEMENT_MM = 0.4  # likewise: no usual error is as large, so it count
 SMEAR_SIGMAS = 3.0  # of the exposures, whose motion looks like a displacement: the pose cannot fit it everywhere
 HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it grows by until the arm has obeyed
 DISPLACEMENT_RIDGE = 1.0  # mm^-2: prior of a landmark's place, also along a line that all its cameras share
-DISPLACEMENT_FLOOR = 1e-3  # mm^-2: prior of a displacement along a line that all cameras look along
 AT_ONE_REACH = float(np.exp(0.5))  # times a bell's height that is told, so that it holds one sigma away from its middle
 STILL_BELL = 0.3  # value of a bell below which a landmark is not part of it
 RIGID_STEPS = 5  # reweighted fits of a map's change
@@ -63,13 +62,17 @@ MISSING_SETS = 2  # in so many frame sets in a row
 USUAL_MISSING = 0.05, 0.25  # lowest and highest share that counts as usual
 NEAR_MM = 0.3  # what is found so near to its place is there: half of what the guard allows, and a bit
 BEYOND_REACH_MM = 0.6  # one sigma: the fine alignment finds what lies within two pixels, and these are not found
+REGION_SPAN_MM, PICTURE_SPAN_MM = 25.0, 15.0  # from a landmark, within which tissue moves with it: a region is one
+# surface, and a wound in it may have little texture; whole pictures may hold several, and a window in a drape is larger
+ANCHOR_SHARE, MAX_ANCHORS = 0.3, 128  # of that: landmarks nearer to each other need not be told apart
 MAX_UNSEEN_MM = 10.0  # one sigma: tissue goes no farther by itself, and the number need not grow for ever
 
 
 class LocalMotion:
     """Remembers how the landmarks of one map usually lie, and whether a part of them is displaced or missing now."""
 
-    def __init__(self, cameras: int) -> None:
+    def __init__(self, cameras: int, region: bool = True) -> None:
+        """region: whether somebody says that all of the map is one surface: then it is so between landmarks, too."""
         self.size = 0.0  # mm, largest mean displacement under a bell while a part moves by itself, else 0
         self.error: LocalError | None = None  # of places, at the last frame set; None: nothing to add
         self._points, self._centres = np.zeros((0, 3)), np.zeros((0, 3))
@@ -80,6 +83,11 @@ class LocalMotion:
         self._place = np.zeros((0, 3))  # mm, where it usually was after PLACED_SETS, nan before
         self._usual, self._learned = np.zeros(0), np.zeros(0)  # per bell: mean chi square per axis, and looks
         self._moving = np.zeros(0, bool)  # per bell
+        self._span = REGION_SPAN_MM if region else PICTURE_SPAN_MM
+        self._anchors, self._near = (
+            np.zeros((0, 3)),
+            np.zeros((0, 0)),
+        )  # (S, 3) mm, and (S, N) whose landmarks are whose
         self._gate = 0.1  # mm, at which the last fit took landmarks for outliers
         self._support = SupportedPlaces(cameras)
 
@@ -120,10 +128,10 @@ class LocalMotion:
         """Take the sigma, mm, of each bell (C,), by its displacement and as it is not seen."""
         sigma = np.maximum(moved, unseen)
         told = np.flatnonzero(sigma)
-        self.error = None
-        if len(told):
-            variance, growth = AT_ONE_REACH * sigma[told] ** 2, AT_ONE_REACH * 2 * sigma[told] * TISSUE_SPEED
-            self.error = LocalError(self._centres[told], variance, growth, self._reach[told])
+        variance, growth = AT_ONE_REACH * sigma[told] ** 2, AT_ONE_REACH * 2 * sigma[told] * TISSUE_SPEED
+        support = self._anchors[self._near @ self._support.present > 0]
+        bells_told = self._centres[told], variance, growth, self._reach[told]
+        self.error = LocalError(*bells_told, support, self._span, MAX_UNSEEN_MM**2)
 
     def _take(self, surface_map: SurfaceMap) -> None:
         """Follow a map that was refined or has grown: rows keep their meaning, and landmarks their places."""
@@ -151,6 +159,15 @@ class LocalMotion:
             self._reach = bell_reaches(points, self._centres)
             self._bells = np.ascontiguousarray(bells(points, self._centres, self._reach).T)
             self._squares = self._bells**2
+            self._set_anchors(points)
+
+    def _set_anchors(self, points: Array) -> None:
+        """Take landmarks at (N, 3) mm as what shows the surface; those near each other stand for one another."""
+        apart = ANCHOR_SHARE * self._span
+        self._anchors = points[farthest_points(points, 0, MAX_ANCHORS, apart)]
+        away = np.linalg.norm(points[:, None] - self._anchors, axis=2)
+        self._near = np.zeros((len(self._anchors), len(points)))
+        self._near[away.argmin(1), np.arange(len(points))] = 1.0
 
     def _landmarks(self, observations: Observations, fit: FrameFit, sigma: Array) -> tuple[Array, Array, Array, Array]:
         """Each landmark's displacement: normal equations (N, 3, 3) and (N, 3), weight (N,), right sides less usual."""
@@ -217,16 +234,18 @@ class SupportedPlaces:
         self._rate, self._looks = np.zeros((cameras, 0)), np.zeros((cameras, 0))  # share found, and looks
         self._usual, self._lost = np.zeros(0), np.zeros(0, np.int64)  # per bell: missing share; sets in a row
         self._supported = np.zeros(0)  # per bell, s, stamp at which it was last not lost
+        self.present = np.zeros(0)  # (N,) 1 for landmarks that were found when they were last looked for, else 0
 
     def __call__(self, observations: Observations, fit: FrameFit, bell: Array, squares: Array) -> Array:
         """Sigma (K,) mm of the bells' places: 0 where landmarks are found. bell, squares: (K, N) and its squares."""
-        self._extend(*bell.shape, fit.stamp)
+        self._extend(bell.shape[0], bell.shape[1], fit.stamp)
         found, sought = self._sights(observations, fit)
         expected = sought & (self._rate > USUALLY_FOUND) & (self._looks >= MIN_LANDMARK_SETS)
         there = found & expected
         expected &= (there.sum(1) >= MIN_PICTURE_SHARE * expected.sum(1))[:, None]
         eyes = expected.sum(0)
         counts, present = (eyes > 0) * 1.0, (there & expected).sum(0) >= np.clip(eyes, 1, MIN_VIEWS)
+        self.present = np.where(counts > 0, present, self.present)
         asked, seen = (bell @ np.stack([counts, counts * present], 1)).T
         weight = asked**2 / np.maximum(squares @ counts, 1e-9)
         missing = 1 - seen / np.maximum(asked, 1e-9)
@@ -242,6 +261,7 @@ class SupportedPlaces:
         more, bells_more = landmarks - self._rate.shape[1], count - len(self._usual)
         if more > 0:
             wider = np.zeros((len(self._rate), more))
+            self.present = np.append(self.present, np.ones(more))
             self._rate, self._looks = np.hstack([self._rate, wider]), np.hstack([self._looks, wider])
         if bells_more > 0:
             self._usual = np.append(self._usual, np.zeros(bells_more))
@@ -311,68 +331,3 @@ def bell_centres(points: Array, centres: Array) -> Array:
         chosen.append(points[int(np.argmax(away))])
         away = np.minimum(away, np.linalg.norm(points - chosen[-1], axis=1))
     return np.array(chosen).reshape(-1, 3)
-
-
-@compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
-def displacement_sums(
-    landmarks: int, landmark: Index, jacobian: Array, residual: Array, precision: Array
-) -> tuple[Array, Array, Array, Index]:
-    """Normal equations (L, 3, 3) and (L, 3) of each landmark's own displacement in the surface frame, mm.
-
-    Then the weighted square (L,) of its residuals (N, 2) px, predicted minus seen, and how many cameras see it (L,).
-    landmark: (N,) below L. precision: (N,) px^-2, 0 for tracks that do not count.
-    """
-    normal, right = np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3))
-    square, views = np.zeros(landmarks), np.zeros(landmarks, np.int64)
-    for i in range(len(landmark)):
-        own, weight = landmark[i], precision[i]
-        views[own] += weight > 0
-        for k in range(2):
-            left = -residual[i, k]
-            square[own] += weight * left * left
-            for a in range(3):
-                scaled = weight * jacobian[i, k, 3 + a]
-                right[own, a] += scaled * left
-                for b in range(3):
-                    normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
-    return normal, right, square, views
-
-
-@compiled("f8[:,::1](f8[:,:,::1], f8[:,::1])")
-def solve_symmetric3(normal: Array, right: Array) -> Array:
-    """Solutions (N, 3) of positive definite normal equations (N, 3, 3) and (N, 3): Cramer's rule."""
-    out = np.empty_like(right)
-    for i in range(len(right)):
-        m, r = normal[i], right[i]
-        p, q, s = m[1, 1] * m[2, 2] - m[1, 2] ** 2, m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2], m[0, 1] * m[1, 2]
-        s -= m[0, 2] * m[1, 1]
-        t, u, v = m[0, 0] * m[2, 2] - m[0, 2] ** 2, m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1]
-        v -= m[0, 1] ** 2
-        whole = m[0, 0] * p + m[0, 1] * q + m[0, 2] * s
-        out[i, 0] = (p * r[0] + q * r[1] + s * r[2]) / whole
-        out[i, 1] = (q * r[0] + t * r[1] + u * r[2]) / whole
-        out[i, 2] = (s * r[0] + u * r[1] + v * r[2]) / whole
-    return out
-
-
-@compiled("Tuple((f8[:,::1], f8[::1], f8[::1]))(f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,::1])")
-def unusual_displacements(
-    normal: Array, right: Array, square: Array, usual_normal: Array, usual_right: Array
-) -> tuple[Array, Array, Array]:
-    """What landmarks' displacements are beside their usual ones, all from `displacement_sums`; usual_normal: definite.
-
-    The right sides (L, 3) without what is usual, the square (L,) of the residuals about that, and how much of it (L,)
-    a displacement explains.
-    """
-    usual = solve_symmetric3(usual_normal, usual_right)
-    plain, about = right.copy(), square.copy()
-    for i in range(len(right)):
-        for a in range(3):
-            for b in range(3):
-                plain[i, a] -= normal[i, a, b] * usual[i, b]
-            about[i] -= (right[i, a] + plain[i, a]) * usual[i, a]
-    ridged = normal.copy()
-    for a in range(3):
-        ridged[:, a, a] += DISPLACEMENT_FLOOR
-    moved = solve_symmetric3(ridged, plain)
-    return plain, about, (moved * plain).sum(1)

@@ -38,7 +38,8 @@ _POSE_SHAPES = {
 _FORECAST: dict[str, tuple[int, ...]] = {"horizons": (), "increments": (6,), "covariances": (6, 6)}  # of each horizon
 _WARP_ARRAYS = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # 1: (K, 3), 2: (3K, 3K); K points
 _WARP_NUMBERS = ("reach", "deformation", "deformation_sigma")
-_LOCAL = {"centres": (3,), "variance": (), "growth": (), "reach": ()}  # shapes of one bell's entries
+_LOCAL = {"centres": (3,), "variance": (), "growth": (), "reach": (), "support": (3,)}  # shapes of one entry
+_LOCAL_NUMBERS = ("span", "unsupported")
 _M_PER_MM = 1e-3  # viewers count in metres
 
 
@@ -133,7 +134,10 @@ def message_from_pose(pose: SurfacePose) -> Message:
             **{name: 0.0 if pose.warp is None else getattr(pose.warp, name) for name in _WARP_NUMBERS},
         },
         "forecast": {name: [] if pose.forecast is None else _flat(getattr(pose.forecast, name)) for name in _FORECAST},
-        "local": {name: [] if pose.local is None else _flat(getattr(pose.local, name)) for name in _LOCAL},
+        "local": {
+            **{name: [] if pose.local is None else _flat(getattr(pose.local, name)) for name in _LOCAL},
+            **{name: 0.0 if pose.local is None else getattr(pose.local, name) for name in _LOCAL_NUMBERS},
+        },
     }
 
 
@@ -164,9 +168,10 @@ def _forecast_from_message(message: Message) -> Forecast | None:
 
 
 def _local_from_message(message: Message) -> LocalError | None:
-    count = len(message["centres"]) // 3
-    arrays = (_array(message[name], (count, *shape)) for name, shape in _LOCAL.items())
-    return LocalError(*arrays) if count else None
+    if not message["span"]:
+        return None
+    arrays: dict[str, Any] = {name: np.reshape(message[name], (-1, *shape)) for name, shape in _LOCAL.items()}
+    return LocalError(**arrays, **{name: message[name] for name in _LOCAL_NUMBERS})
 
 
 def _warp_from_message(message: Message) -> Warp | None:

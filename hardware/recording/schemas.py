@@ -98,11 +98,14 @@ FORECAST = _part(
     covariances=_finite_array("Hx6x6, rad, mm"),
 )
 LOCAL = _part(
-    "What single places may be off by beyond the rest, K bells, surface frame; K = 0: nothing",
+    "What single places may be off by beyond the rest, by K bells, and away from S supports; span = 0: nothing",
     centres=_finite_array("K x 3, mm"),
     variance=_finite_array("K, mm^2, along every direction"),
     growth=_finite_array("K, mm^2/s, by which that grows"),
     reach=_finite_array("K, mm, one sigma of each bell"),
+    support=_finite_array("S x 3, mm, where landmarks show the surface"),
+    span=_described(NUMBER, "mm from the nearest support within which a place moves with it"),
+    unsupported=_described(NUMBER, "mm^2, at twice that distance and beyond"),
 )
 WARP: Schema = {
     "type": "object",

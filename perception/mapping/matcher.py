@@ -310,6 +310,20 @@ class Matcher:
         missing = number[np.concatenate([position[~fits], lacking])], np.concatenate([row[~fits], absent])
         return Observations(stamp, camera, row[fits], pixels, result.sigma[fits], MissedLandmarks(*missing))
 
+    def align_at(
+        self, stamp: float, pyramids: dict[int, Pyramid], pose: Array, rows: NDArray[np.int64], points: Array
+    ) -> Observations:
+        """Measure landmarks (rows, (R,)) as if they lay at points (R, 3) mm of the surface at a pose (4, 4)."""
+        cameras, some = list(pyramids), self.templates.take(rows)
+        poses = np.broadcast_to(pose, (len(cameras), 4, 4))
+        where = project_into(self.lenses, cameras, poses, points, self.map.normals[rows], some.axes)
+        counts, number = [len(rows)] * len(cameras), np.repeat(cameras, len(rows))
+        tiled, images = self.templates.take(np.tile(rows, len(cameras))), [pyramids[c] for c in cameras]
+        result = align_in(tiled, images, counts, where, where.centre, coarse=True)
+        fits, track = result.found, np.tile(rows, len(cameras))
+        pixels = self._ideal(number[fits], result.pixels[fits])
+        return Observations(stamp, number[fits], track[fits], pixels, result.sigma[fits])
+
     def _some(self, visible: NDArray[np.bool_], rows: NDArray[np.int64], most: int) -> NDArray[np.bool_]:
         """Of what is visible (C * N,), at most so many landmarks of each camera: the first in the order of spread."""
         rank = np.argsort(self._order)[rows]

@@ -195,7 +195,7 @@ def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:
     drift = (pose.twist_covariance, pose.acceleration_psd)
     warp = () if (w := pose.warp) is None else (w.control, w.coefficients, w.covariance, w.growth)
     ahead = () if (f := pose.forecast) is None else (f.horizons, f.increments, f.covariances)
-    local = () if (e := pose.local) is None else (e.centres, e.variance, e.growth, e.reach)
+    local = () if (e := pose.local) is None else (e.centres, e.variance, e.growth, e.reach, e.support, e.span)
     return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp, *ahead, *local
 
 
@@ -214,7 +214,9 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     worst = float(np.linalg.eigvalsh(spread)[-1])
     if (local := pose.local) is not None:
         away = ((local.centres - place) ** 2).sum(1) / (2 * local.reach**2)
-        worst += float(((local.variance + ahead * local.growth) * np.exp(-away)).max(initial=0.0))
+        moved = float(((local.variance + ahead * local.growth) * np.exp(-away)).max(initial=0.0))
+        nearest = math.sqrt(float(((local.support - place) ** 2).sum(1).min(initial=math.inf)))
+        worst += max(moved, local.unsupported * min(max(nearest / local.span - 1.0, 0.0), 1.0))
     return math.sqrt(worst) if worst >= 0 else math.nan
 
 
