@@ -165,7 +165,7 @@ class LocalError:
         return replace(self, variance=self.variance + abs(seconds) * self.growth)
 
     def variance_at(self, points: Array) -> Array:
-        """Variance (N,), mm^2, along every direction, of the places of points (N, 3): by bells or support, the larger."""
+        """Variance (N,), mm^2, along every direction, of points (N, 3): by bells or support, the larger."""
         by_bells = (bells(points, self.centres, self.reach) * self.variance).max(1, initial=0.0)
         away = np.sqrt(((points[:, None] - self.support) ** 2).sum(-1).min(1, initial=np.inf))
         return np.asarray(np.maximum(by_bells, self.unsupported * np.clip(away / self.span - 1.0, 0.0, 1.0)))

@@ -16,7 +16,7 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.fit import FrameFit
-from estimation.online.local_motion import MIN_VIEWS, NEAR_MM
+from estimation.online.local_motion import MAX_UNSEEN_MM, MIN_VIEWS, NEAR_MM
 from estimation.online.reported_covariance import widened
 from estimation.pose import SurfacePose
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, solve_pose
@@ -34,6 +34,9 @@ MAX_PARTED_SHARE = 0.5  # of the landmarks that say what the surface is: with mo
 GROUP_TIMEOUT_S = 0.5  # after which a motion no longer tells where a group is
 PARTED_MEMORY_S = 10.0  # some breaths: groups that met again may part again
 MAX_SOUGHT = 40  # landmarks that are looked for elsewhere
+VANISHED = np.diag([0.0] * 3 + [MAX_UNSEEN_MM**2] * 3)  # (6, 6) while half of it is lost: that may be the surface
+REGION_HINT = "the region holds both: draw it tighter"
+PICTURE_HINT = "no region says which is the surface: draw one"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,14 +63,18 @@ class PartedTexture:
         self._lost: Index = np.zeros(0, np.int64)  # rows that have left
         self._found: tuple[float, Array, Array] | None = None  # s, base_from_group (4, 4), its twist (6,)
         self._sets = 0  # in a row in which the group was found
-        self._apart: tuple[float, Array] | None = None  # s, and tangent (6,) from the surface to the group
+        self._torn = False  # whether what is lost was seen to move on as a group, and has not come back
+        self._vanished = False  # whether so much is lost, and not found as a group, that it may have been the surface
+        self._apart: tuple[float, Array] | None = None  # s, and covariance (6, 6) that held both groups then
 
     def covariance(self, stamp: float) -> Array | None:
         """(6, 6) to be added to that of a pose: either group may be the surface; None where that is known."""
+        gone = VANISHED if self._vanished else None
         if self._apart is None:
-            return None
-        since, along = self._apart
-        return np.outer(along, along) * float(np.exp(-2 * max(stamp - since, 0.0) / PARTED_MEMORY_S))
+            return gone
+        since, known = self._apart
+        left = known * float(np.exp(-2 * max(stamp - since, 0.0) / PARTED_MEMORY_S))
+        return left if gone is None else left + gone
 
     def covering(self, pose: SurfacePose) -> SurfacePose:
         """The pose, reported so that its covariance holds where it would be by the other group, if there is one."""
@@ -112,13 +119,20 @@ class PartedTexture:
             tracks = PointTracks(camera, points[track], pixels, np.maximum(sigma, MIN_GROUP_SIGMA_PX))
             group = self._group(tracks, track, fit, len(points))
         self._sets = 0 if group is None else self._sets + 1
+        self._vanished = False
         if group is not None:
             self._take(group[0], group[1], fit, points)
-        elif self._found is not None and fit.stamp - self._found[0] > GROUP_TIMEOUT_S:
+        unsure = self._unsure(self._lost)
+        self._torn = unsure and (self._torn or group is not None)
+        if unsure and self._sets < GROUP_SETS and (self._torn or not self._core):
+            self._vanished = True
+            side = self._side(points[self._lost].mean(0) - self._middle(points), fit.solution.base_from_surface)
+            self.message = f"texture on the {side} no longer moves with the rest; {self._hint}"
+        if group is None and self._found is not None and fit.stamp - self._found[0] > GROUP_TIMEOUT_S:
             self._found = None
         if self._apart is not None and fit.stamp - self._apart[0] > 2 * PARTED_MEMORY_S:
             self._apart = None
-        if not self._members.any():
+        if not self._members.any() and self._apart is None and not self._vanished:
             self.message = ""
 
     def _expected(self, stamp: float) -> Array | None:
@@ -153,20 +167,31 @@ class PartedTexture:
         if self._sets < GROUP_SETS or size < MIN_APART_MM:
             return
         self._members |= rows
-        here = self._here & ~self._members
-        core = slice(0, self._core)
-        unsure = self._members[core].sum() >= MAX_PARTED_SHARE * max(int(here[core].sum()), 1)
-        side = self._side(own.mean(0) - points[here].mean(0) if here.any() else np.zeros(3), surface)
+        side = self._side(own.mean(0) - self._middle(points), surface)
         self.message = f"texture on the {side} moves by itself, by {size:.1f} mm"
-        if not unsure:
-            return
-        hint = (
-            "the region holds both: draw it tighter" if self._core else "no region says which is the surface: draw one"
-        )
-        self.message = f"{self.message}; {hint}"
-        known = self.covariance(fit.stamp)
-        if known is None or along[3:] @ along[3:] >= np.trace(known[3:, 3:]):
-            self._apart = fit.stamp, along
+        if not self._core or self._unsure(np.flatnonzero(self._members)):
+            self.message = f"{self.message}; {self._hint}"
+            self._hold(fit.stamp, np.outer(along, along))
+
+    @property
+    def _hint(self) -> str:
+        return REGION_HINT if self._core else PICTURE_HINT
+
+    def _unsure(self, rows: Index) -> bool:
+        """Whether so many landmarks (rows, (R,)) have parted that the rest need not be the surface."""
+        count = self._core or len(self._here)
+        return int((rows < count).sum()) >= MAX_PARTED_SHARE * max(int(self._here[:count].sum()), 1)
+
+    def _hold(self, stamp: float, both: Array) -> None:
+        """Take a covariance (6, 6) that holds both groups, unless the one from before says more."""
+        known = self.covariance(stamp)
+        if known is None or np.trace(both[3:, 3:]) >= np.trace(known[3:, 3:]):
+            self._apart = stamp, both
+
+    def _middle(self, points: Array) -> Array:
+        """The middle (3,) mm of the landmarks (N, 3) that agree with the pose."""
+        here = self._here & ~self._members
+        return np.asarray(points[here].mean(0)) if here.any() else np.zeros(3)
 
     def _side(self, away: Array, base_from_surface: Array) -> str:
         """Where a direction (3,), surface frame, points in the first camera's picture, in words."""
