@@ -61,17 +61,15 @@ class _MappedSurface:
     def __init__(self, surface_map: SurfaceMap, rig: Rig, region: bool, caveat: str) -> None:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
-        self.detector, self.local = MotionDetector(surface_map.points.mean(0)), LocalMotion(len(rig), region)
-        self.parted = PartedTexture(rig, len(surface_map), region)
-        self.predictor = Predictor(surface_map.points)
+        self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
+        self.local, self.parted = LocalMotion(len(rig), region), PartedTexture(rig, len(surface_map), region)
         self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
-        self.accepted = 0  # poses measured since the first map
         self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
-        # the accepted fit from which the cameras' errors are still to be learned: its observations, s since the fit
-        # before, and whether clocks may learn from it
+        # the fit that cameras' errors are to be learned from, its tracks, s since the one before, whether clocks may
         self.unlearned: tuple[FrameFit, Observations, float, bool] | None = None
-        self.map_held = False  # against a deformation, during which clocks are not learned
+        # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
+        self.accepted, self.map_held = 0, False
 
 
 class Estimator:
@@ -86,8 +84,7 @@ class Estimator:
         self.settings, self.cameras = settings or EstimatorSettings(), CameraErrors(len(rig))
         self.health = CameraHealth([camera.name for camera in rig.cameras])
         self._earlier_cameras = CameraErrorHistory(self.cameras)
-        self._states = PoseStateMachine(self.settings.states)
-        self._smoother = Smoother()
+        self._states, self._smoother = PoseStateMachine(self.settings.states), Smoother()
         self._mapped: _MappedSurface | None = None
         self._measured_stamp = -np.inf  # s, of the last pose that was measured, by whatever map
         self._ahead: tuple[SurfacePose, SurfacePose] | None = None  # the pose, and as last predicted from it
@@ -239,8 +236,7 @@ class Estimator:
             return f"only {agreed} of {count} tracks agree"
         if used.max() < self._min_camera_tracks() or self.health.hidden(used):
             return f"no camera sees more than {used.max()} of {len(self._surface.map)} landmarks"
-        bent = not self.confirmed  # first maps of a moving surface are
-        if incoherent > s.disorder * (3.0 if bent else 1.0):
+        if incoherent > s.disorder * (1.0 if self.confirmed else 3.0):  # first maps of a moving surface are bent
             return f"the tracks of a camera disagree among themselves by {incoherent:.1f} px"
         spread = position_sigma(covariance)
         if not spread <= s.sigma_measured:
@@ -285,10 +281,9 @@ class Estimator:
 
     def learn(self) -> None:
         """Learn the cameras' errors from the last accepted fit: no pose waits for it, but the next fit needs it."""
-        if self._mapped is None or self._mapped.unlearned is None:
+        if (surface := self._mapped) is None or surface.unlearned is None:
             return
-        surface, (fit, seen, seconds, sound) = self._mapped, self._mapped.unlearned
-        surface.unlearned = None
+        (fit, seen, seconds, sound), surface.unlearned = surface.unlearned, None
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
         points = surface.warp.points(surface.map)[seen.track]
@@ -303,8 +298,7 @@ class Estimator:
 
     def elsewhere(self, fit: FrameFit, observations: Observations) -> Elsewhere | None:
         """Landmarks to be looked for away from a measured fit, for `accept`; None: all are where it puts them."""
-        surface = self._surface
-        return surface.parted.sought(observations, fit, surface.warp.points(surface.map))
+        return self._surface.parted.sought(observations, fit, self._surface.warp.points(self._surface.map))
 
     def accept(self, fit: FrameFit, observations: Observations, elsewhere: Observations | None = None) -> SurfacePose:
         """Take a measured fit into the window and give the pose. elsewhere: what was found of `elsewhere`, if any."""
@@ -328,8 +322,8 @@ class Estimator:
             caveat=surface.parted.message or surface.local.message or surface.caveat,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
         )
-        state = self._states.measured(fit.stamp, quality)
-        pose = self._enter(fit.stamp, fit.solution.base_from_surface, fit.parts.noise, fit.parts.smear, lasting, *state)
+        place, parts, state = fit.solution.base_from_surface, fit.parts, self._states.measured(fit.stamp, quality)
+        pose = self._enter(fit.stamp, place, parts.noise, parts.smear, lasting, *state)
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
@@ -378,8 +372,8 @@ class Estimator:
         """No measurement at `fit.stamp`: predict from the last one. The pose's reason tells why, and since when."""
         surface = self._surface
         self._update_health(fit)
-        trouble = self.health.trouble(fit.stamp, at_once=True)
-        state, reason = self._states.missed(fit.stamp, f"{fit.reason}; {trouble}" if trouble else fit.reason)
+        why = "; ".join(filter(None, (fit.reason, self.health.trouble(fit.stamp, at_once=True))))
+        state, reason = self._states.missed(fit.stamp, why)
         predicted = surface.measured.predict(fit.stamp)
         if state is TrackState.LOST:  # so old a velocity would carry the pose away; which camera was wrong is as old
             self.health.left_out = frozenset()

@@ -263,3 +263,31 @@ def unusual_displacements(
         ridged[:, a, a] += DISPLACEMENT_FLOOR
     moved = solve_symmetric3(ridged, plain)
     return plain, about, (moved * plain).sum(1)
+
+
+@compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
+def landmark_sights(
+    cameras: int,
+    landmarks: int,
+    camera: Index,
+    track: Index,
+    jacobian: Array,
+    residual: Array,
+    agrees: Mask,
+    near: float,
+) -> tuple[Mask, Mask]:
+    """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
+
+    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm from the place, at which a
+    landmark is there though it does not agree.
+    """
+    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
+    for i in range(len(camera)):
+        away, by_point = 0.0, 0.0
+        for k in range(2):
+            away += residual[i, k] * residual[i, k]
+            for b in range(3):
+                by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
+        seen[camera[i], track[i]] = True
+        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
+    return found, seen

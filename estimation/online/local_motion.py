@@ -20,7 +20,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.fit import FrameFit, displacement_sums, solve_symmetric3, unusual_displacements
+from estimation.online.fit import FrameFit, displacement_sums, landmark_sights, solve_symmetric3, unusual_displacements
 from estimation.pose_solver import GATE
 from estimation.runtime import CONTIGUOUS, median
 from estimation.se3 import Array, Mask
@@ -49,6 +49,7 @@ HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it g
 DISPLACEMENT_RIDGE = 1.0  # mm^-2: prior of a landmark's place, also along a line that all its cameras share
 AT_ONE_REACH = float(np.exp(0.5))  # times a bell's height that is told, so that it holds one sigma away from its middle
 STILL_BELL = 0.3  # value of a bell below which a landmark is not part of it
+GATE_TRACKS = 32  # tracks, about, by which it is judged how far an outlier is away
 RIGID_STEPS = 5  # reweighted fits of a map's change
 TISSUE_SPEED = 5.0  # mm/s, one sigma: how fast tissue moves against its surroundings, as a deep breath lifts a chest
 
@@ -118,8 +119,9 @@ class LocalMotion:
         usual = (chance > limit) & (beyond > least * MIN_DISPLACEMENT_MM)
         self._moving = enough & (usual | (square > limit) & (beyond > least * CLEAR_DISPLACEMENT_MM))
         self.size = float(far[self._moving].max(initial=0.0))
-        along = np.sqrt((fit.solution.jacobians[:, :, 3:] ** 2).sum((1, 2)) / 2)  # px per mm
-        self._gate = GATE * fit.solution.scale * median(sigma) / max(median(along), 1e-9)
+        by_point = fit.solution.jacobians[:: 1 + len(sigma) // GATE_TRACKS, :, 3:]
+        along = float(np.sqrt((by_point * by_point).mean() * 3))  # px per mm
+        self._gate = GATE * fit.solution.scale * median(sigma) / max(along, 1e-9)
         unseen = self._support(observations, fit, self._bells, self._squares)
         self._learn(normal, right, weight, square, enough)
         self._set_error(np.where(self._moving, HEIGHT_RATIO * np.maximum(far, MIN_DISPLACEMENT_MM), 0.0), unseen)
@@ -234,6 +236,7 @@ class SupportedPlaces:
         self._rate, self._looks = np.zeros((cameras, 0)), np.zeros((cameras, 0))  # share found, and looks
         self._usual, self._lost = np.zeros(0), np.zeros(0, np.int64)  # per bell: missing share; sets in a row
         self._supported = np.zeros(0)  # per bell, s, stamp at which it was last not lost
+        self._asked = np.zeros(0), np.zeros(0), np.zeros(0)  # those asked for (N,), their sum and count by bell (K,)
         self.present = np.zeros(0)  # (N,) 1 for landmarks that were found when they were last looked for, else 0
 
     def __call__(self, observations: Observations, fit: FrameFit, bell: Array, squares: Array) -> Array:
@@ -246,11 +249,19 @@ class SupportedPlaces:
         eyes = expected.sum(0)
         counts, present = (eyes > 0) * 1.0, (there & expected).sum(0) >= np.clip(eyes, 1, MIN_VIEWS)
         self.present = np.where(counts > 0, present, self.present)
-        asked, seen = (bell @ np.stack([counts, counts * present], 1)).T
-        weight = asked**2 / np.maximum(squares @ counts, 1e-9)
-        missing = 1 - seen / np.maximum(asked, 1e-9)
+        if (
+            len(asked_of := self._asked[0]) != len(counts)
+            or (asked_of != counts).any()
+            or len(self._asked[1]) != len(bell)
+        ):
+            whole = np.maximum(bell @ counts, 1e-9)
+            self._asked = counts, whole, whole**2 / np.maximum(squares @ counts, 1e-9)
+        _, asked, weight = self._asked
+        missing = 1 - bell @ (counts * present) / asked
         known = weight >= MIN_MISSING_LANDMARKS
-        lost = known & (missing >= MIN_MISSING_SHARE) & (weight * self._surprise(missing) > MISSING_SURPRISE)
+        lost = known & (missing >= MIN_MISSING_SHARE)
+        if lost.any():
+            lost &= weight * self._surprise(missing) > MISSING_SURPRISE
         self._lost = np.where(lost, self._lost + 1, np.where(known, 0, self._lost))
         self._supported = np.where(self._lost > 0, self._supported, fit.stamp)
         self._learn(found, sought, missing, known & ~lost, bell)
@@ -270,13 +281,12 @@ class SupportedPlaces:
 
     def _sights(self, observations: Observations, fit: FrameFit) -> tuple[Mask, Mask]:
         """Which landmarks each camera (C, N) has found where the pose puts them, and has looked for."""
-        found, sought = np.zeros(self._rate.shape, bool), np.zeros(self._rate.shape, bool)
-        by_point = (fit.solution.jacobians[:, :, 3:] ** 2).sum((1, 2)) / 2  # px^2 per mm^2
-        near = (fit.solution.residuals**2).sum(1) < NEAR_MM**2 * by_point
-        agrees = fit.inlier | near
-        found[observations.camera[agrees], observations.track[agrees]] = True
-        sought[observations.camera, observations.track] = True
-        sought[observations.missed.camera, observations.missed.track] = True
+        shape, missed = self._rate.shape, observations.missed
+        camera, track = (np.require(a, np.int64, CONTIGUOUS) for a in (observations.camera, observations.track))
+        jacobian = np.require(fit.solution.jacobians, float, CONTIGUOUS)
+        residual = np.require(fit.solution.residuals, float, CONTIGUOUS)
+        found, sought = landmark_sights(shape[0], shape[1], camera, track, jacobian, residual, fit.inlier, NEAR_MM)
+        sought[missed.camera, missed.track] = True
         out = list(fit.outliers)
         found[out], sought[out] = False, False
         return found, sought

@@ -110,6 +110,8 @@ class PartedTexture:
         self, observations: Observations, fit: FrameFit, elsewhere: Observations | None, points: Array
     ) -> None:
         """Take the accepted fit that `sought` was asked with, and what was found elsewhere. points: (N, 3) mm."""
+        if len(self._lost) < MIN_GROUP_LANDMARKS and not self.message:
+            return
         beside = ~fit.inlier & np.isin(observations.track, self._lost)
         parts = [observations.only(beside)] + ([] if elsewhere is None else [elsewhere])
         names = ("camera", "track", "pixels", "sigma")
