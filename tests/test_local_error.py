@@ -183,7 +183,8 @@ def test_a_place_without_a_landmark_around_it_is_not_known(region: bool, span: f
     follow = Followed(hole, 30.0, breathing, region=region)
     pose = [follow(0 * hole) for _ in range(30)][-1]
     assert pose.state is TrackState.TRACKING and pose.error_at(MIDDLE)[0] > LIMIT_MM
-    beside = np.array([[0.6 * span, 0.0, 0.0], hole[0]])
+    rim = hole[np.linalg.norm(hole, axis=1).argmin()]
+    beside = np.stack([rim * (1 - 0.6 * span / np.linalg.norm(rim)), rim, hole[0]])
     assert pose.error_at(beside).max() < LIMIT_MM
 
 
