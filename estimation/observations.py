@@ -12,6 +12,17 @@ RAYLEIGH_MEDIAN = 1.1774  # sqrt(2 ln 2): median length of a vector whose two en
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MissedLandmarks:
+    """Landmarks that were looked for, with nothing known to hide them, and not found: M parallel rows."""
+
+    camera: Index  # (M,) number in the rig
+    track: Index  # (M,) id of the landmark
+
+
+NOTHING_MISSED = MissedLandmarks(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """The N tracks of one frame set, as parallel arrays."""
 
@@ -20,12 +31,13 @@ class Observations:
     track: Index  # (N,) id of the landmark
     pixels: Array  # (N, 2) undistorted px of the camera's own matrix
     sigma: Array  # (N,) px, one standard deviation per axis
+    missed: MissedLandmarks = NOTHING_MISSED  # of the same frame set; not recorded
 
     def __len__(self) -> int:
         return len(self.camera)
 
     def only(self, rows: Mask) -> Observations:
-        """The same of some rows (N,)."""
+        """The same of some rows (N,), without what was missed."""
         return Observations(self.stamp, self.camera[rows], self.track[rows], self.pixels[rows], self.sigma[rows])
 
 

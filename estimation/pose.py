@@ -15,7 +15,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.se3 import Array
-from estimation.surface_map import Warp
+from estimation.surface_map import LocalError, Warp
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -150,6 +150,7 @@ class SurfacePose:
     motion: MotionState = MotionState()
     warp: Warp | None = None  # how the surface departs from a rigid body; None while it does not
     forecast: Forecast | None = None  # where it is known better than by the twist
+    local: LocalError | None = None  # what single places may be off by beyond all that; None: nothing
 
     @property
     def deformation(self) -> float:
@@ -195,6 +196,7 @@ class SurfacePose:
             twist=body_rate(increments[0], rates[0]),
             twist_covariance=self.twist_covariance + np.diag(self.acceleration_psd) * ahead,
             warp=None if self.warp is None else self.warp.later(ahead),
+            local=None if self.local is None else self.local.later(ahead),
             forecast=forecast.after(ahead) if onwards else None,
         )
 
@@ -213,6 +215,7 @@ class SurfacePose:
             covariance=(grown + grown.T) / 2,
             twist_covariance=twist_grown,
             warp=None if self.warp is None else self.warp.later(dt),
+            local=None if self.local is None else self.local.later(dt),
             forecast=None if dt else self.forecast,
         )
 
@@ -227,7 +230,8 @@ class SurfacePose:
             return self.predict(stamp).error_at(points_surface)
         covariance = self.forecast.covariance(self.covariance, dt)
         warp = None if self.warp is None else self.warp.later(dt)
-        return replace(self, covariance=covariance, warp=warp).error_at(points_surface)
+        local = None if self.local is None else self.local.later(dt)
+        return replace(self, covariance=covariance, warp=warp, local=local).error_at(points_surface)
 
     def radius_at(self, points_surface: Array, share: float = 0.9) -> Array:
         """Radius (N,), mm, about points (N, 3), surface frame, that holds their true places in `share` of cases."""
@@ -237,7 +241,10 @@ class SurfacePose:
         """Covariances (N, 3, 3), mm^2, of the positions of points (N, 3)."""
         jacobian = se3.point_jacobians(points_surface)
         spread = np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2))
-        return spread if self.warp is None else np.asarray(spread + self.warp.spread(points_surface))
+        spread = spread if self.warp is None else spread + self.warp.spread(points_surface)
+        if self.local is not None:
+            spread = spread + self.local.variance_at(points_surface)[:, None, None] * np.eye(3)
+        return np.asarray(spread)
 
 
 def identity_pose(stamp: float, reason: str) -> SurfacePose:

@@ -1,4 +1,4 @@
-"""The map of landmarks against which every frame set is matched, and the warp of soft tissue."""
+"""The map of landmarks against which each frame set is matched, the warp of soft tissue, and what places may err by."""
 
 from __future__ import annotations
 
@@ -148,7 +148,30 @@ class Warp:
         return np.asarray((bell[:, None, None] @ weighted)[:, :, 0])  # matrix products: einsum plans each call anew
 
 
-def bells(points: Array, control: Array, reach: float) -> Array:
-    """Value (N, K) at points (N, 3) of the bell about each control point (K, 3), of one sigma `reach`, mm."""
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalError:
+    """By how much single places may be off beside the pose's own error: the tissue there may have moved by itself."""
+
+    centres: Array  # (K, 3) mm, surface frame, each the middle of a bell
+    variance: Array  # (K,) mm^2 there, along every direction
+    growth: Array  # (K,) mm^2/s, by which that grows unseen
+    reach: Array  # (K,) mm, one sigma of each bell
+    support: Array  # (S, 3) mm, where landmarks show that the surface is there
+    span: float  # mm from the nearest of them within which a place moves with it
+    unsupported: float  # mm^2, at twice that distance and beyond; no support at all: everywhere
+
+    def later(self, seconds: float) -> LocalError:
+        """The same `seconds` s from its stamp, before or after."""
+        return replace(self, variance=self.variance + abs(seconds) * self.growth)
+
+    def variance_at(self, points: Array) -> Array:
+        """Variance (N,), mm^2, along every direction, of points (N, 3): by bells or support, the larger."""
+        by_bells = (bells(points, self.centres, self.reach) * self.variance).max(1, initial=0.0)
+        away = np.sqrt(((points[:, None] - self.support) ** 2).sum(-1).min(1, initial=np.inf))
+        return np.asarray(np.maximum(by_bells, self.unsupported * np.clip(away / self.span - 1.0, 0.0, 1.0)))
+
+
+def bells(points: Array, control: Array, reach: float | Array) -> Array:
+    """Value (N, K) at points (N, 3) of the bell about each control point (K, 3), of one sigma `reach`, mm (or (K,))."""
     square = ((points[:, None] - control) ** 2).sum(-1)
     return np.asarray(np.exp(-square / (2 * reach**2)))

@@ -74,6 +74,15 @@ def whole_pictures(sizes: Sequence[tuple[int, int]], stamp: float) -> tuple[Roi,
     return tuple(Roi(camera, stamp, corners * size) for camera, size in enumerate(sizes))
 
 
+def of_whole_pictures(roi: Sequence[Roi], sizes: Sequence[tuple[int, int]]) -> bool:
+    """Whether regions, if any, leave out nothing of any picture, and so do not tell what the surface is."""
+    for region in roi:
+        low, high = region.polygon.min(0), region.polygon.max(0)
+        if (low > 0).any() or (high < sizes[region.camera]).any() or len(region.polygon) != 4:
+            return False
+    return True
+
+
 def region_polygons(roi: Sequence[Roi], frames: FrameSet, sizes: Sequence[tuple[int, int]]) -> dict[int, Array] | str:
     """The region of interest (N, 2) px in each image of the set, by camera, or why it is not known yet.
 

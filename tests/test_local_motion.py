@@ -66,7 +66,7 @@ def followed(heights: Array, seed: int) -> list[SurfacePose]:
 
 def watched(tell: Callable[[int], Observations], count: int) -> list[float]:
     """What is found moving by itself, mm, in so many fits to what is told of each frame set."""
-    estimator, local, found = begun(), LocalMotion(), []
+    estimator, local, found = begun(), LocalMotion(len(RIG)), []
     for number in range(1, count + 1):
         seen = tell(number)
         local(seen, estimator.fit(seen, breathing(seen.stamp)), seen.sigma, estimator.map, 0.0)
@@ -117,7 +117,7 @@ def test_a_map_that_was_wrong_from_the_beginning_is_none() -> None:
 
 
 def test_what_the_map_takes_in_is_displaced_no_more() -> None:
-    estimator, local, folded = begun(), LocalMotion(), LANDMARKS + FOLD.displacement(LANDMARKS, 2.0)
+    estimator, local, folded = begun(), LocalMotion(len(RIG)), LANDMARKS + FOLD.displacement(LANDMARKS, 2.0)
     for number in range(1, 60):
         seen = look(number, 2.0, 8)
         if number == 30:

@@ -17,7 +17,7 @@ from hardware.files.arm_file import read_arm
 from hardware.files.path_file import read_path, write_path
 from hardware.report.page import Plot
 from planning.kinematics import POSTURES, JointModel, nozzle_from_joints
-from planning.reach import REACH_REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
+from planning.path import REACH_REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
 from tests.moving import path_through, raster
 
 ARMS = Path(__file__).parents[1] / "data" / "arms"

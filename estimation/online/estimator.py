@@ -20,6 +20,7 @@ from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, Ca
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.local_motion import LocalMotion
+from estimation.online.parted_texture import Elsewhere, PartedTexture
 from estimation.online.reported_covariance import (
     NO_SHIFTS,
     CalibrationError,
@@ -64,19 +65,18 @@ class _MappedSurface:
     reported_pose: SurfacePose  # the same with the reported covariance
     measured: SurfacePose  # the last one that was measured
 
-    def __init__(self, surface_map: SurfaceMap, cameras: int, caveat: str) -> None:
+    def __init__(self, surface_map: SurfaceMap, rig: Rig, region: bool, caveat: str) -> None:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
-        self.detector, self.local = MotionDetector(surface_map.points.mean(0)), LocalMotion()
-        self.predictor = Predictor(surface_map.points)
-        self.reported, self.calibration = ReportedCovariance(cameras), CalibrationError()
+        self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
+        self.local, self.parted = LocalMotion(len(rig), region), PartedTexture(rig, len(surface_map), region)
+        self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
-        self.accepted = 0  # poses measured since the first map
         self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
-        # the accepted fit from which the cameras' errors are still to be learned: its observations, s since the fit
-        # before, and whether clocks may learn from it
+        # the fit that cameras' errors are to be learned from, its tracks, s since the one before, whether clocks may
         self.unlearned: tuple[FrameFit, Observations, float, bool] | None = None
-        self.map_held = False  # against a deformation, during which clocks are not learned
+        # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
+        self.accepted, self.map_held = 0, False
 
 
 class Estimator:
@@ -85,13 +85,13 @@ class Estimator:
     `begin` takes the first map. Before it only `map`, `pose`, `confirmed`, `deforms`, `sigma` and `learn` may be used.
     """
 
-    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None) -> None:
-        self.rig = rig
+    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None, region: bool = True) -> None:
+        """region: whether it is known what the surface is: all landmarks of the first map lie on it."""
+        self.rig, self._region = rig, region
         self.settings, self.cameras = settings or EstimatorSettings(), CameraErrors(len(rig))
         self.health = CameraHealth([camera.name for camera in rig.cameras])
         self._earlier_cameras = CameraErrorHistory(self.cameras)
-        self._states = PoseStateMachine(self.settings.states)
-        self._smoother = Smoother()
+        self._states, self._smoother = PoseStateMachine(self.settings.states), Smoother()
         self._mapped: _MappedSurface | None = None
         self._measured_stamp = -np.inf  # s, of the last pose that was measured, by whatever map
         self._ahead: tuple[SurfacePose, SurfacePose] | None = None  # the pose, and as last predicted from it
@@ -243,8 +243,7 @@ class Estimator:
             return f"only {agreed} of {count} tracks agree"
         if used.max() < self._min_camera_tracks() or self.health.hidden(used):
             return f"no camera sees more than {used.max()} of {len(self._surface.map)} landmarks"
-        bent = not self.confirmed  # first maps of a moving surface are
-        if incoherent > s.disorder * (3.0 if bent else 1.0):
+        if incoherent > s.disorder * (1.0 if self.confirmed else 3.0):  # first maps of a moving surface are bent
             return f"the tracks of a camera disagree among themselves by {incoherent:.1f} px"
         spread = position_sigma(covariance)
         if not spread <= s.sigma_measured:
@@ -256,7 +255,7 @@ class Estimator:
 
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
-        self._mapped = _MappedSurface(surface_map, len(self.rig), caveat)
+        self._mapped = _MappedSurface(surface_map, self.rig, self._region, caveat)
         self._smoother.reset()
         self.health.begin()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
@@ -297,10 +296,9 @@ class Estimator:
 
     def learn(self) -> None:
         """Learn the cameras' errors from the last accepted fit: no pose waits for it, but the next fit needs it."""
-        if self._mapped is None or self._mapped.unlearned is None:
+        if (surface := self._mapped) is None or surface.unlearned is None:
             return
-        surface, (fit, seen, seconds, sound) = self._mapped, self._mapped.unlearned
-        surface.unlearned = None
+        (fit, seen, seconds, sound), surface.unlearned = surface.unlearned, None
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
         points = surface.warp.points(surface.map)[seen.track]
@@ -313,10 +311,20 @@ class Estimator:
         seen = replace(seen, sigma=np.maximum(seen.sigma, self.settings.floor_sigma))
         surface.reported.learn(seen, fit, self.cameras)
 
-    def accept(self, fit: FrameFit, observations: Observations, aliases: Array = NO_SHIFTS) -> SurfacePose:
+    def elsewhere(self, fit: FrameFit, observations: Observations) -> Elsewhere | None:
+        """Landmarks to be looked for away from a measured fit, for `accept`; None: all are where it puts them."""
+        return self._surface.parted.sought(observations, fit, self._surface.warp.points(self._surface.map))
+
+    def accept(
+        self,
+        fit: FrameFit,
+        observations: Observations,
+        elsewhere: Observations | None = None,
+        aliases: Array = NO_SHIFTS,
+    ) -> SurfacePose:
         """Take a measured fit into the window and give the pose.
 
-        aliases: (K, 3) mm, surface frame, shifts of the pose under which the surface looks as it is seen.
+        elsewhere: what was found of `elsewhere`. aliases: (K, 3) mm, shifts of the pose that may be as right.
         """
         assert fit.measured
         surface, sigma = self._surface, np.maximum(observations.sigma, self.settings.floor_sigma)
@@ -328,23 +336,24 @@ class Estimator:
         surface.detector(fit.stamp, fit.solution.base_from_surface, fit.parts.noise)
         self._update_health(fit)
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
+        surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
         quality = Measurement(
             cameras=tuple(self.rig.cameras[c].name for c in self.carrying_cameras(fit)),
             tracks=int(fit.used.sum()),
             sigma=position_sigma(fit.covariance + lasting),
             trouble=self.health.trouble(fit.stamp),
-            caveat=alias_message(aliases) or surface.local.message or surface.caveat,
+            caveat=alias_message(aliases) or surface.parted.message or surface.local.message or surface.caveat,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
         )
-        state = self._states.measured(fit.stamp, quality)
-        pose = self._enter(fit.stamp, fit.solution.base_from_surface, fit.parts.noise, fit.parts.smear, lasting, *state)
+        place, parts, state = fit.solution.base_from_surface, fit.parts, self._states.measured(fit.stamp, quality)
+        pose = self._enter(fit.stamp, place, parts.noise, parts.smear, lasting, *state)
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        if surface.local.active:
-            given = widened(given, surface.local.covariance)
-        surface.reported_pose = widened(given, alias_covariance(aliases)) if len(aliases) else given
+        if len(aliases):
+            given = widened(given, alias_covariance(aliases))
+        surface.reported_pose = surface.parted.covering(given)
         return surface.reported_pose
 
     def _update_health(self, fit: FrameFit) -> None:
@@ -379,6 +388,7 @@ class Estimator:
             reason,
             surface.detector.motion,
             surface.warp.warp,
+            local=surface.local.error,
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
         surface.pose = surface.measured = surface.reported_pose = entered
@@ -388,15 +398,15 @@ class Estimator:
         """No measurement at `fit.stamp`: predict from the last one. The pose's reason tells why, and since when."""
         surface = self._surface
         self._update_health(fit)
-        trouble = self.health.trouble(fit.stamp, at_once=True)
-        state, reason = self._states.missed(fit.stamp, f"{fit.reason}; {trouble}" if trouble else fit.reason)
+        why = "; ".join(filter(None, (fit.reason, self.health.trouble(fit.stamp, at_once=True))))
+        state, reason = self._states.missed(fit.stamp, why)
         predicted = surface.measured.predict(fit.stamp)
         if state is TrackState.LOST:  # so old a velocity would carry the pose away; which camera was wrong is as old
             self.health.left_out = frozenset()
             stays = surface.measured.predict(surface.measured.stamp + self.settings.states.coast)
             predicted = replace(predicted, base_from_surface=stays.base_from_surface, twist=np.zeros(6), forecast=None)
         surface.pose = replace(predicted, state=state, reason=reason)
-        surface.reported_pose = surface.reported.missed(surface.pose)
+        surface.reported_pose = surface.parted.covering(surface.reported.missed(surface.pose))
         return surface.reported_pose
 
     def replace_map(self, surface_map: SurfaceMap, crooked: bool = False, bent: bool = False) -> None:

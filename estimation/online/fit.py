@@ -15,6 +15,7 @@ from estimation.surface_map import SurfaceMap
 
 PRIOR_RESIDUALS = 20.0  # for which the stated sigmas count when the scatter is estimated
 MIN_WEIGHT_SLOPE = 0.1  # of the weights' sum: with less of it most tracks are outliers, and the rest tells nothing
+DISPLACEMENT_FLOOR = 1e-3  # mm^-2: prior of a displacement along a line that all cameras look along
 UNCERTAIN_MM = 0.3  # along some direction: landmarks of two cameras are better known, those of one alone are not
 
 
@@ -197,3 +198,96 @@ def pose_pulls(
                 for b in range(3):
                     by_landmark[a, landmark[i], b] += weighted * row[3 + b]
     return by_landmark, by_camera
+
+
+@compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
+def displacement_sums(
+    landmarks: int, landmark: Index, jacobian: Array, residual: Array, precision: Array
+) -> tuple[Array, Array, Array, Index]:
+    """Normal equations (L, 3, 3) and (L, 3) of each landmark's own displacement in the surface frame, mm.
+
+    Then the weighted square (L,) of its residuals (N, 2) px, predicted minus seen, and how many cameras see it (L,).
+    landmark: (N,) below L. precision: (N,) px^-2, 0 for tracks that do not count.
+    """
+    normal, right = np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3))
+    square, views = np.zeros(landmarks), np.zeros(landmarks, np.int64)
+    for i in range(len(landmark)):
+        own, weight = landmark[i], precision[i]
+        views[own] += weight > 0
+        for k in range(2):
+            left = -residual[i, k]
+            square[own] += weight * left * left
+            for a in range(3):
+                scaled = weight * jacobian[i, k, 3 + a]
+                right[own, a] += scaled * left
+                for b in range(3):
+                    normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
+    return normal, right, square, views
+
+
+@compiled("f8[:,::1](f8[:,:,::1], f8[:,::1])")
+def solve_symmetric3(normal: Array, right: Array) -> Array:
+    """Solutions (N, 3) of positive definite normal equations (N, 3, 3) and (N, 3): Cramer's rule."""
+    out = np.empty_like(right)
+    for i in range(len(right)):
+        m, r = normal[i], right[i]
+        p, q, s = m[1, 1] * m[2, 2] - m[1, 2] ** 2, m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2], m[0, 1] * m[1, 2]
+        s -= m[0, 2] * m[1, 1]
+        t, u, v = m[0, 0] * m[2, 2] - m[0, 2] ** 2, m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1]
+        v -= m[0, 1] ** 2
+        whole = m[0, 0] * p + m[0, 1] * q + m[0, 2] * s
+        out[i, 0] = (p * r[0] + q * r[1] + s * r[2]) / whole
+        out[i, 1] = (q * r[0] + t * r[1] + u * r[2]) / whole
+        out[i, 2] = (s * r[0] + u * r[1] + v * r[2]) / whole
+    return out
+
+
+@compiled("Tuple((f8[:,::1], f8[::1], f8[::1]))(f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,::1])")
+def unusual_displacements(
+    normal: Array, right: Array, square: Array, usual_normal: Array, usual_right: Array
+) -> tuple[Array, Array, Array]:
+    """What landmarks' displacements are beside their usual ones, all from `displacement_sums`; usual_normal: definite.
+
+    The right sides (L, 3) without what is usual, the square (L,) of the residuals about that, and how much of it (L,)
+    a displacement explains.
+    """
+    usual = solve_symmetric3(usual_normal, usual_right)
+    plain, about = right.copy(), square.copy()
+    for i in range(len(right)):
+        for a in range(3):
+            for b in range(3):
+                plain[i, a] -= normal[i, a, b] * usual[i, b]
+            about[i] -= (right[i, a] + plain[i, a]) * usual[i, a]
+    ridged = normal.copy()
+    for a in range(3):
+        ridged[:, a, a] += DISPLACEMENT_FLOOR
+    moved = solve_symmetric3(ridged, plain)
+    return plain, about, (moved * plain).sum(1)
+
+
+@compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
+def landmark_sights(
+    cameras: int,
+    landmarks: int,
+    camera: Index,
+    track: Index,
+    jacobian: Array,
+    residual: Array,
+    agrees: Mask,
+    near: float,
+) -> tuple[Mask, Mask]:
+    """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
+
+    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm from the place, at which a
+    landmark is there though it does not agree.
+    """
+    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
+    for i in range(len(camera)):
+        away, by_point = 0.0, 0.0
+        for k in range(2):
+            away += residual[i, k] * residual[i, k]
+            for b in range(3):
+                by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
+        seen[camera[i], track[i]] = True
+        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
+    return found, seen

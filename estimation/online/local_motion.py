@@ -1,23 +1,34 @@
-"""A part of the surface that moves by itself: the residuals of one place, together, show a displacement.
+"""Parts of the surface that move by themselves, and parts that nobody sees any more: the error of single places.
 
 The robust fit takes a fold of the skin for outliers, and rightly: the pose and its covariance stay those of the rest.
 But outliers of tracking are independent from camera to camera and from landmark to landmark. So each landmark's
 displacement is estimated from all cameras; landmarks whose cameras do not agree on one are set aside; the others are
 averaged under bells over the surface, relative to the usual displacement there. A mean that chance does not explain is
-a part that moves by itself. It has no pose: the reported covariance of every place grows by its displacement.
+a part that moves by itself. It has no pose: the places under its bell are known no better than by its displacement.
+
+What is usual is learned only within what a map may err by: a slow rise is not usual, nor is it undone by a refined map
+that has taken it in, since the path was laid on the surface as it was.
+
+A part that rises fast leaves the reach of the alignment, and its landmarks are no longer found. So it is also learned
+which landmarks each camera usually finds. Where most of those under a bell are missing, more than chance and the
+camera's whole picture explain, the place is known only as well as tissue keeps still since it was last seen.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from estimation import se3
 from estimation.observations import Observations
-from estimation.online.fit import FrameFit
-from estimation.runtime import CONTIGUOUS, compiled
-from estimation.se3 import Array, Index, Mask
-from estimation.surface_map import SurfaceMap, bells
+from estimation.online.fit import FrameFit, displacement_sums, landmark_sights, solve_symmetric3, unusual_displacements
+from estimation.pose_solver import GATE
+from estimation.runtime import CONTIGUOUS, median
+from estimation.se3 import Array, Mask
+from estimation.surface_map import LocalError, SurfaceMap, bells, farthest_points
 
-BELL_SIGMA_MM = 6.0  # of a bell: about a dozen landmarks, and a fold of the skin
+BELL_SIGMA_MM = 6.0  # of a bell, at least: about a dozen landmarks of a dense map, and a fold of the skin
+MAX_BELL_SIGMA_MM = 15.0  # of a bell where landmarks are sparse: what lies farther apart does not move as one
+BELL_NEIGHBOURS, NEIGHBOUR_SHARE = 5, 0.6  # a bell is that part of the way to its fifth landmark wide: six count
 MAX_BELLS = 96  # spread over the surface, BELL_SIGMA_MM apart
 MIN_VIEWS = 2  # cameras that must see a landmark: one alone may have lost it
 MAX_VIEW_SIGMAS = 3.0  # to which one displacement must explain what all cameras see,
@@ -25,27 +36,61 @@ NONLINEAR_SHARE = 0.02  # and of the square of what they see: cameras expose apa
 MAX_LANDMARK_SIGMAS = 3.0  # a landmark counts as no more: what strayed alike in two cameras is no part of the surface
 USUAL_MEMORY_SETS = 100  # frame sets over which it is learned what is usual,
 MIN_LANDMARK_SETS = 10  # and in which a landmark must have been seen before it counts
+PLACED_SETS = 20  # frame sets after which a landmark's usual place is known: from there it may wander by
+MAX_USUAL_DRIFT_MM = 0.2  # and by the map's own two sigmas: by lenses, and as patches are seen from other sides
 MAX_USUAL_RISE = 3.0  # times the usual, as which one frame set counts at most: a fold must not become usual
 MIN_BELL_LANDMARKS = 4.0  # as which those under a bell must count
 ONSET_CHI2 = 36.0  # three degrees of freedom: 7e-8, and there are dozens of bells; times what is usual there
 END_CHI2 = 16.3  # likewise, 1e-3: it is over
 MIN_DISPLACEMENT_MM = 0.2  # of a bell's mean: a fold twice as high, since it is no wider than the bell
+CLEAR_DISPLACEMENT_MM = 0.4  # likewise: no usual error is as large, so it counts whatever is usual there
 SMEAR_SIGMAS = 3.0  # of the exposures, whose motion looks like a displacement: the pose cannot fit it everywhere
 HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it grows by until the arm has obeyed
 DISPLACEMENT_RIDGE = 1.0  # mm^-2: prior of a landmark's place, also along a line that all its cameras share
-DISPLACEMENT_FLOOR = 1e-3  # mm^-2: prior of a displacement along a line that all cameras look along
+AT_ONE_REACH = float(np.exp(0.5))  # times a bell's height that is told, so that it holds one sigma away from its middle
+STILL_BELL = 0.3  # value of a bell below which a landmark is not part of it
+GATE_TRACKS = 32  # tracks, about, by which it is judged how far an outlier is away
+RIGID_STEPS = 5  # reweighted fits of a map's change
+TISSUE_SPEED = 5.0  # mm/s, one sigma: how fast tissue moves against its surroundings, as a deep breath lifts a chest
+
+FOUND_MEMORY_SETS = 1000  # over which that is learned: a slow rise takes landmark after landmark
+USUALLY_FOUND = 0.7  # share of the frame sets: a landmark found less often tells nothing by its absence
+MIN_PICTURE_SHARE = 0.5  # of what a camera usually finds: with less, its picture is at fault, not a place
+MIN_MISSING_LANDMARKS = 2.5  # as which those that are looked for under a bell must count
+MIN_MISSING_SHARE = 0.5  # of them
+MISSING_SURPRISE = 6.9  # nats beyond the usual share of missing ones, one in a thousand,
+MISSING_SETS = 2  # in so many frame sets in a row
+USUAL_MISSING = 0.05, 0.25  # lowest and highest share that counts as usual
+NEAR_MM = 0.3  # what is found so near to its place is there: half of what the guard allows, and a bit
+BEYOND_REACH_MM = 0.6  # one sigma: the fine alignment finds what lies within two pixels, and these are not found
+REGION_SPAN_MM, PICTURE_SPAN_MM = 25.0, 15.0  # from a landmark, within which tissue moves with it: a region is one
+# surface, and a wound in it may have little texture; whole pictures may hold several, and a window in a drape is larger
+ANCHOR_SHARE, MAX_ANCHORS = 0.3, 128  # of that: landmarks nearer to each other need not be told apart
+MAX_UNSEEN_MM = 10.0  # one sigma: tissue goes no farther by itself, and the number need not grow for ever
 
 
 class LocalMotion:
-    """Remembers how the landmarks of one map usually lie, and whether a part of them is displaced now."""
+    """Remembers how the landmarks of one map usually lie, and whether a part of them is displaced or missing now."""
 
-    def __init__(self) -> None:
+    def __init__(self, cameras: int, region: bool = True) -> None:
+        """region: whether somebody says that all of the map is one surface: then it is so between landmarks, too."""
         self.size = 0.0  # mm, largest mean displacement under a bell while a part moves by itself, else 0
+        self.error: LocalError | None = None  # of places, at the last frame set; None: nothing to add
         self._points, self._centres = np.zeros((0, 3)), np.zeros((0, 3))
+        self._reach, self._known = np.zeros(0), np.zeros(0)  # per bell, mm; per landmark, mm, by the map's covariance
         self._bells = self._squares = np.zeros((0, 0))  # (C, N)
         # per landmark: normal equations of its usual displacement, and in how many frame sets it was seen
         self._normal, self._right, self._looks = np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._place = np.zeros((0, 3))  # mm, where it usually was after PLACED_SETS, nan before
         self._usual, self._learned = np.zeros(0), np.zeros(0)  # per bell: mean chi square per axis, and looks
+        self._moving = np.zeros(0, bool)  # per bell
+        self._span = REGION_SPAN_MM if region else PICTURE_SPAN_MM
+        self._anchors, self._near = (
+            np.zeros((0, 3)),
+            np.zeros((0, 0)),
+        )  # (S, 3) mm, and (S, N) whose landmarks are whose
+        self._gate = 0.1  # mm, at which the last fit took landmarks for outliers
+        self._support = SupportedPlaces(cameras)
 
     @property
     def active(self) -> bool:
@@ -56,11 +101,6 @@ class LocalMotion:
     def message(self) -> str:
         """For the operator, or ''."""
         return f"a part of the surface moves by itself, by {self.size:.1f} mm" if self.active else ""
-
-    @property
-    def covariance(self) -> Array:
-        """(6, 6), what it adds to a pose's covariance while active: no place is known better than that part."""
-        return np.diag([0.0] * 3 + [(HEIGHT_RATIO * max(self.size, MIN_DISPLACEMENT_MM)) ** 2] * 3)
 
     def __call__(
         self, observations: Observations, fit: FrameFit, sigma: Array, surface_map: SurfaceMap, smeared: float
@@ -73,33 +113,63 @@ class LocalMotion:
         normal, right, weight, plain = self._landmarks(observations, fit, sigma)
         moved, square, enough = self._means(normal, plain, weight, (weight > 0) & (self._looks >= MIN_LANDMARK_SETS))
         chance = square / np.maximum(self._usual, 1.0)
-        far = np.linalg.norm(moved, axis=1)
-        limit, least = (END_CHI2, MIN_DISPLACEMENT_MM / 2) if self.active else (ONSET_CHI2, MIN_DISPLACEMENT_MM)
-        by_itself = enough & (chance > limit) & (far > least + SMEAR_SIGMAS * smeared)
-        self.size = float(far[by_itself].max(initial=0.0))
-        if not self.active:
-            self._learn(normal, right, weight, square, enough)
+        far, moves = np.linalg.norm(moved, axis=1), self._moving
+        limit, least = np.where(moves, END_CHI2, ONSET_CHI2), np.where(moves, 0.5, 1.0)
+        beyond = far - SMEAR_SIGMAS * smeared
+        usual = (chance > limit) & (beyond > least * MIN_DISPLACEMENT_MM)
+        self._moving = enough & (usual | (square > limit) & (beyond > least * CLEAR_DISPLACEMENT_MM))
+        self.size = float(far[self._moving].max(initial=0.0))
+        by_point = fit.solution.jacobians[:: 1 + len(sigma) // GATE_TRACKS, :, 3:]
+        along = float(np.sqrt((by_point * by_point).mean() * 3))  # px per mm
+        self._gate = GATE * fit.solution.scale * median(sigma) / max(along, 1e-9)
+        unseen = self._support(observations, fit, self._bells, self._squares)
+        self._learn(normal, right, weight, square, enough)
+        self._set_error(np.where(self._moving, HEIGHT_RATIO * np.maximum(far, MIN_DISPLACEMENT_MM), 0.0), unseen)
+
+    def _set_error(self, moved: Array, unseen: Array) -> None:
+        """Take the sigma, mm, of each bell (C,), by its displacement and as it is not seen."""
+        sigma = np.maximum(moved, unseen)
+        told = np.flatnonzero(sigma)
+        variance, growth = AT_ONE_REACH * sigma[told] ** 2, AT_ONE_REACH * 2 * sigma[told] * TISSUE_SPEED
+        support = self._anchors[self._near @ self._support.present > 0]
+        bells_told = self._centres[told], variance, growth, self._reach[told]
+        self.error = LocalError(*bells_told, support, self._span, MAX_UNSEEN_MM**2)
 
     def _take(self, surface_map: SurfaceMap) -> None:
-        """Follow a map that was refined or has grown: rows keep their meaning."""
+        """Follow a map that was refined or has grown: rows keep their meaning, and landmarks their places."""
         points, known = surface_map.points, len(self._points)
         if points is self._points:
             return
-        change = points[:known] - self._points
-        other = np.linalg.norm(change, axis=1) > MIN_DISPLACEMENT_MM / 2
-        if known and np.linalg.norm(change.mean(0)) > MIN_DISPLACEMENT_MM / 4:  # which the pose had taken for a shift
-            other[:] = True
-        self._normal[other], self._right[other], self._looks[other] = 0.0, 0.0, 0.0
+        if known:
+            change = points[:known] - self._points
+            rigid = rigid_part(self._points, change, self._gate)
+            self._place = self._place + rigid
+            usual = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
+            self._right = self._right - (usual @ (change - rigid)[..., None])[..., 0]
         self._points, further = points, len(points) - known
+        own = np.diag(surface_map.covariance).reshape(-1, 3).max(1)
+        self._known = MAX_USUAL_DRIFT_MM + 2 * np.sqrt(np.maximum(own, 0.0))
         if further:
             self._normal = np.concatenate([self._normal, np.zeros((further, 3, 3))])
             self._right = np.concatenate([self._right, np.zeros((further, 3))])
+            self._place = np.concatenate([self._place, np.full((further, 3), np.nan)])
             self._looks = np.append(self._looks, np.zeros(further))
             self._centres = bell_centres(points, self._centres)
             more = np.zeros(len(self._centres) - len(self._usual))
             self._usual, self._learned = np.append(self._usual, more), np.append(self._learned, more)
-            self._bells = np.ascontiguousarray(bells(points, self._centres, BELL_SIGMA_MM).T)
+            self._moving = np.append(self._moving, more > 0)
+            self._reach = bell_reaches(points, self._centres)
+            self._bells = np.ascontiguousarray(bells(points, self._centres, self._reach).T)
             self._squares = self._bells**2
+            self._set_anchors(points)
+
+    def _set_anchors(self, points: Array) -> None:
+        """Take landmarks at (N, 3) mm as what shows the surface; those near each other stand for one another."""
+        apart = ANCHOR_SHARE * self._span
+        self._anchors = points[farthest_points(points, 0, MAX_ANCHORS, apart)]
+        away = np.linalg.norm(points[:, None] - self._anchors, axis=2)
+        self._near = np.zeros((len(self._anchors), len(points)))
+        self._near[away.argmin(1), np.arange(len(points))] = 1.0
 
     def _landmarks(self, observations: Observations, fit: FrameFit, sigma: Array) -> tuple[Array, Array, Array, Array]:
         """Each landmark's displacement: normal equations (N, 3, 3) and (N, 3), weight (N,), right sides less usual."""
@@ -131,15 +201,134 @@ class LocalMotion:
         return moved, square, sums[:, 12] ** 2 > MIN_BELL_LANDMARKS * spread[:, 9]
 
     def _learn(self, normal: Array, right: Array, weight: Array, square: Array, enough: Mask) -> None:
-        """Learn what is usual, while nothing moves by itself."""
+        """Learn what is usual, except under bells that move by themselves."""
+        still = ~self._moving
         seen = weight > 0
+        if self.active:
+            seen &= self._bells[self._moving].max(0) < STILL_BELL
         forgets = seen / USUAL_MEMORY_SETS
-        self._normal += weight[:, None, None] * normal - forgets[:, None, None] * self._normal
-        self._right += weight[:, None] * right - forgets[:, None] * self._right
+        self._normal += (seen * weight)[:, None, None] * normal - forgets[:, None, None] * self._normal
+        self._right += (seen * weight)[:, None] * right - forgets[:, None] * self._right
         self._looks += seen
+        enough = enough & still
         self._learned = np.minimum(self._learned + enough, USUAL_MEMORY_SETS)
         now = np.minimum(square / 3, MAX_USUAL_RISE * np.maximum(self._usual, 1.0))
         self._usual += enough * (now - self._usual) / np.maximum(self._learned, 1.0)
+        self._bound()
+
+    def _bound(self) -> None:
+        """Keep usual displacements near the places where landmarks usually were at first."""
+        held = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
+        usual = solve_symmetric3(held, self._right)
+        placed = (self._looks == PLACED_SETS) & np.isnan(self._place[:, 0])
+        self._place[placed] = (self._points + usual)[placed]
+        drift = self._points + usual - self._place
+        far = np.flatnonzero((drift * drift).sum(1) > self._known**2)  # not where one is unknown
+        if len(far):
+            back = drift[far] * (1 - self._known[far] / np.linalg.norm(drift[far], axis=1))[:, None]
+            self._right[far] -= (held[far] @ back[..., None])[..., 0]
+
+
+class SupportedPlaces:
+    """Remembers which landmarks each camera usually finds, and where most of them are missing."""
+
+    def __init__(self, cameras: int) -> None:
+        self._rate, self._looks = np.zeros((cameras, 0)), np.zeros((cameras, 0))  # share found, and looks
+        self._usual, self._lost = np.zeros(0), np.zeros(0, np.int64)  # per bell: missing share; sets in a row
+        self._supported = np.zeros(0)  # per bell, s, stamp at which it was last not lost
+        self._asked = np.zeros(0), np.zeros(0), np.zeros(0)  # those asked for (N,), their sum and count by bell (K,)
+        self.present = np.zeros(0)  # (N,) 1 for landmarks that were found when they were last looked for, else 0
+
+    def __call__(self, observations: Observations, fit: FrameFit, bell: Array, squares: Array) -> Array:
+        """Sigma (K,) mm of the bells' places: 0 where landmarks are found. bell, squares: (K, N) and its squares."""
+        self._extend(bell.shape[0], bell.shape[1], fit.stamp)
+        found, sought = self._sights(observations, fit)
+        expected = sought & (self._rate > USUALLY_FOUND) & (self._looks >= MIN_LANDMARK_SETS)
+        there = found & expected
+        expected &= (there.sum(1) >= MIN_PICTURE_SHARE * expected.sum(1))[:, None]
+        eyes = expected.sum(0)
+        counts, present = (eyes > 0) * 1.0, (there & expected).sum(0) >= np.clip(eyes, 1, MIN_VIEWS)
+        self.present = np.where(counts > 0, present, self.present)
+        if (
+            len(asked_of := self._asked[0]) != len(counts)
+            or (asked_of != counts).any()
+            or len(self._asked[1]) != len(bell)
+        ):
+            whole = np.maximum(bell @ counts, 1e-9)
+            self._asked = counts, whole, whole**2 / np.maximum(squares @ counts, 1e-9)
+        _, asked, weight = self._asked
+        missing = 1 - bell @ (counts * present) / asked
+        known = weight >= MIN_MISSING_LANDMARKS
+        lost = known & (missing >= MIN_MISSING_SHARE)
+        if lost.any():
+            lost &= weight * self._surprise(missing) > MISSING_SURPRISE
+        self._lost = np.where(lost, self._lost + 1, np.where(known, 0, self._lost))
+        self._supported = np.where(self._lost > 0, self._supported, fit.stamp)
+        self._learn(found, sought, missing, known & ~lost, bell)
+        unseen = BEYOND_REACH_MM + TISSUE_SPEED * (fit.stamp - self._supported)
+        return np.where(self._lost >= MISSING_SETS, np.minimum(unseen, MAX_UNSEEN_MM), 0.0)
+
+    def _extend(self, count: int, landmarks: int, stamp: float) -> None:
+        more, bells_more = landmarks - self._rate.shape[1], count - len(self._usual)
+        if more > 0:
+            wider = np.zeros((len(self._rate), more))
+            self.present = np.append(self.present, np.ones(more))
+            self._rate, self._looks = np.hstack([self._rate, wider]), np.hstack([self._looks, wider])
+        if bells_more > 0:
+            self._usual = np.append(self._usual, np.zeros(bells_more))
+            self._lost = np.append(self._lost, np.zeros(bells_more, np.int64))
+            self._supported = np.append(self._supported, np.full(bells_more, stamp))
+
+    def _sights(self, observations: Observations, fit: FrameFit) -> tuple[Mask, Mask]:
+        """Which landmarks each camera (C, N) has found where the pose puts them, and has looked for."""
+        shape, missed = self._rate.shape, observations.missed
+        camera, track = (np.require(a, np.int64, CONTIGUOUS) for a in (observations.camera, observations.track))
+        jacobian = np.require(fit.solution.jacobians, float, CONTIGUOUS)
+        residual = np.require(fit.solution.residuals, float, CONTIGUOUS)
+        found, sought = landmark_sights(shape[0], shape[1], camera, track, jacobian, residual, fit.inlier, NEAR_MM)
+        sought[missed.camera, missed.track] = True
+        out = list(fit.outliers)
+        found[out], sought[out] = False, False
+        return found, sought
+
+    def _surprise(self, missing: Array) -> Array:
+        """Kullback-Leibler divergence (K,), nats, of the missing shares from the usual ones; 0 below those."""
+        usual, share = np.clip(self._usual, *USUAL_MISSING), np.clip(missing, 1e-6, 1 - 1e-6)
+        nats = share * np.log(share / usual) + (1 - share) * np.log((1 - share) / (1 - usual))
+        return np.where(share > usual, nats, 0.0)
+
+    def _learn(self, found: Mask, sought: Mask, missing: Array, usual: Mask, bell: Array) -> None:
+        """Learn which landmarks are usually found, except where they are missing now."""
+        lost = self._lost > 0
+        if lost.any():
+            sought = sought & (found | (bell[lost].max(0) < STILL_BELL))
+        self._looks += sought
+        known = np.where(self._looks > PLACED_SETS, FOUND_MEMORY_SETS, np.maximum(self._looks, 1.0))
+        self._rate += sought * (found - self._rate) / known
+        self._usual += usual * (missing - self._usual) / FOUND_MEMORY_SETS
+
+
+def rigid_part(points: Array, change: Array, gate: float) -> Array:
+    """The part (N, 3) mm of a map's change (N, 3) at points (N, 3) that turns or shifts most landmarks alike.
+
+    gate: mm, at which a landmark is an outlier: as in the fit of the pose, which takes that part up.
+    """
+    jacobian = se3.point_jacobians(points)  # (N, 3, 6)
+    moved = np.zeros_like(change)
+    for _ in range(RIGID_STEPS):
+        weight = 1 / (1 + ((change - moved) ** 2).sum(1) / gate**2) ** 2  # Geman-McClure's
+        weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
+        whole = jacobian.reshape(-1, 6)
+        step = np.linalg.solve(weighted.T @ whole + 1e-9 * np.eye(6), weighted.T @ change.ravel())
+        moved = (whole @ step).reshape(-1, 3)
+    return moved
+
+
+def bell_reaches(points: Array, centres: Array) -> Array:
+    """One sigma (C,) mm of the bells about centres (C, 3): wider where points (N, 3) are sparse."""
+    away = np.linalg.norm(points - centres[:, None], axis=2)
+    nth = min(BELL_NEIGHBOURS, len(points) - 1)
+    return np.clip(NEIGHBOUR_SHARE * np.partition(away, nth, axis=1)[:, nth], BELL_SIGMA_MM, MAX_BELL_SIGMA_MM)
 
 
 def bell_centres(points: Array, centres: Array) -> Array:
@@ -152,68 +341,3 @@ def bell_centres(points: Array, centres: Array) -> Array:
         chosen.append(points[int(np.argmax(away))])
         away = np.minimum(away, np.linalg.norm(points - chosen[-1], axis=1))
     return np.array(chosen).reshape(-1, 3)
-
-
-@compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
-def displacement_sums(
-    landmarks: int, landmark: Index, jacobian: Array, residual: Array, precision: Array
-) -> tuple[Array, Array, Array, Index]:
-    """Normal equations (L, 3, 3) and (L, 3) of each landmark's own displacement in the surface frame, mm.
-
-    Then the weighted square (L,) of its residuals (N, 2) px, predicted minus seen, and how many cameras see it (L,).
-    landmark: (N,) below L. precision: (N,) px^-2, 0 for tracks that do not count.
-    """
-    normal, right = np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3))
-    square, views = np.zeros(landmarks), np.zeros(landmarks, np.int64)
-    for i in range(len(landmark)):
-        own, weight = landmark[i], precision[i]
-        views[own] += weight > 0
-        for k in range(2):
-            left = -residual[i, k]
-            square[own] += weight * left * left
-            for a in range(3):
-                scaled = weight * jacobian[i, k, 3 + a]
-                right[own, a] += scaled * left
-                for b in range(3):
-                    normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
-    return normal, right, square, views
-
-
-@compiled("f8[:,::1](f8[:,:,::1], f8[:,::1])")
-def solve_symmetric3(normal: Array, right: Array) -> Array:
-    """Solutions (N, 3) of positive definite normal equations (N, 3, 3) and (N, 3): Cramer's rule."""
-    out = np.empty_like(right)
-    for i in range(len(right)):
-        m, r = normal[i], right[i]
-        p, q, s = m[1, 1] * m[2, 2] - m[1, 2] ** 2, m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2], m[0, 1] * m[1, 2]
-        s -= m[0, 2] * m[1, 1]
-        t, u, v = m[0, 0] * m[2, 2] - m[0, 2] ** 2, m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1]
-        v -= m[0, 1] ** 2
-        whole = m[0, 0] * p + m[0, 1] * q + m[0, 2] * s
-        out[i, 0] = (p * r[0] + q * r[1] + s * r[2]) / whole
-        out[i, 1] = (q * r[0] + t * r[1] + u * r[2]) / whole
-        out[i, 2] = (s * r[0] + u * r[1] + v * r[2]) / whole
-    return out
-
-
-@compiled("Tuple((f8[:,::1], f8[::1], f8[::1]))(f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,::1])")
-def unusual_displacements(
-    normal: Array, right: Array, square: Array, usual_normal: Array, usual_right: Array
-) -> tuple[Array, Array, Array]:
-    """What landmarks' displacements are beside their usual ones, all from `displacement_sums`; usual_normal: definite.
-
-    The right sides (L, 3) without what is usual, the square (L,) of the residuals about that, and how much of it (L,)
-    a displacement explains.
-    """
-    usual = solve_symmetric3(usual_normal, usual_right)
-    plain, about = right.copy(), square.copy()
-    for i in range(len(right)):
-        for a in range(3):
-            for b in range(3):
-                plain[i, a] -= normal[i, a, b] * usual[i, b]
-            about[i] -= (right[i, a] + plain[i, a]) * usual[i, a]
-    ridged = normal.copy()
-    for a in range(3):
-        ridged[:, a, a] += DISPLACEMENT_FLOOR
-    moved = solve_symmetric3(ridged, plain)
-    return plain, about, (moved * plain).sum(1)

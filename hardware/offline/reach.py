@@ -28,8 +28,7 @@ from hardware.report.page import (
     spanning,
 )
 from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
-from planning.path import Path
-from planning.reach import REACH_REASONS, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
+from planning.path import REACH_REASONS, Path, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
 
 PAGE_WIDTH_PX = 900
 PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS = "estimate", "off", "aside"  # classes of report.css

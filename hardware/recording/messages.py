@@ -16,7 +16,7 @@ from estimation.observations import Observations
 from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
-from estimation.surface_map import Warp
+from estimation.surface_map import LocalError, Warp
 from hardware.files.rig_file import rig_from_table, table_from_rig
 from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
@@ -38,6 +38,8 @@ _POSE_SHAPES = {
 _FORECAST: dict[str, tuple[int, ...]] = {"horizons": (), "increments": (6,), "covariances": (6, 6)}  # of each horizon
 _WARP_ARRAYS = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  # 1: (K, 3), 2: (3K, 3K); K points
 _WARP_NUMBERS = ("reach", "deformation", "deformation_sigma")
+_LOCAL = {"centres": (3,), "variance": (), "growth": (), "reach": (), "support": (3,)}  # shapes of one entry
+_LOCAL_NUMBERS = ("span", "unsupported")
 _M_PER_MM = 1e-3  # viewers count in metres
 
 
@@ -132,6 +134,10 @@ def message_from_pose(pose: SurfacePose) -> Message:
             **{name: 0.0 if pose.warp is None else getattr(pose.warp, name) for name in _WARP_NUMBERS},
         },
         "forecast": {name: [] if pose.forecast is None else _flat(getattr(pose.forecast, name)) for name in _FORECAST},
+        "local": {
+            **{name: [] if pose.local is None else _flat(getattr(pose.local, name)) for name in _LOCAL},
+            **{name: 0.0 if pose.local is None else getattr(pose.local, name) for name in _LOCAL_NUMBERS},
+        },
     }
 
 
@@ -145,6 +151,7 @@ def pose_from_message(message: Message) -> SurfacePose:
         motion=_motion_from_message(message["motion"]) if "motion" in message else MotionState(),
         warp=_warp_from_message(message["warp"]) if "warp" in message else None,
         forecast=_forecast_from_message(message["forecast"]) if "forecast" in message else None,
+        local=_local_from_message(message["local"]) if "local" in message else None,
         **arrays,
     )
 
@@ -158,6 +165,13 @@ def _forecast_from_message(message: Message) -> Forecast | None:
     count = len(message["horizons"])
     arrays = (_array(message[name], (count, *shape)) for name, shape in _FORECAST.items())
     return Forecast(*arrays) if count else None
+
+
+def _local_from_message(message: Message) -> LocalError | None:
+    if not message["span"]:
+        return None
+    arrays: dict[str, Any] = {name: np.reshape(message[name], (-1, *shape)) for name, shape in _LOCAL.items()}
+    return LocalError(**arrays, **{name: message[name] for name in _LOCAL_NUMBERS})
 
 
 def _warp_from_message(message: Message) -> Warp | None:

@@ -97,6 +97,16 @@ FORECAST = _part(
     increments=_finite_array("Hx6, tangent at the pose"),
     covariances=_finite_array("Hx6x6, rad, mm"),
 )
+LOCAL = _part(
+    "What single places may be off by beyond the rest, by K bells, and away from S supports; span = 0: nothing",
+    centres=_finite_array("K x 3, mm"),
+    variance=_finite_array("K, mm^2, along every direction"),
+    growth=_finite_array("K, mm^2/s, by which that grows"),
+    reach=_finite_array("K, mm, one sigma of each bell"),
+    support=_finite_array("S x 3, mm, where landmarks show the surface"),
+    span=_described(NUMBER, "mm from the nearest support within which a place moves with it"),
+    unsupported=_described(NUMBER, "mm^2, at twice that distance and beyond"),
+)
 WARP: Schema = {
     "type": "object",
     "description": "Departure from a rigid body: Gaussian bells about K points, surface frame; K = 0: none",
@@ -166,6 +176,7 @@ TOPICS: dict[str, Schema] = {
         motion=MOTION,
         warp=WARP,
         forecast=FORECAST,
+        local=LOCAL,
     ),
     "/move": _message(
         "stillbed.Move",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.observations import Observations, no_observations
+from estimation.observations import MissedLandmarks, Observations, no_observations
 from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
@@ -286,23 +286,43 @@ class Matcher:
         cameras = [c for c in pyramids if c in poses]
         if not cameras:
             return no_observations(stamp)
-        rows = np.nonzero(self.agrees & ~self._inked)[0]
-        surface_map, axes = self.map, self.templates.axes[rows]
+        rows = np.nonzero(~self._inked)[0]
+        surface_map, axes, worth = self.map, self.templates.axes[rows], self.agrees[rows]
         starts = np.stack([poses[c] for c in cameras])
         where = project_into(self.lenses, cameras, starts, surface_map.points[rows], surface_map.normals[rows], axes)
         centres = where.centre.reshape(len(cameras), -1, 2)
         hidden = np.concatenate([self._masks.hides(c, at) for c, at in zip(cameras, centres, strict=True)])
         visible = where.visible & ~hidden
+        dropped = np.nonzero(visible & ~np.tile(worth, len(cameras)))[0]
+        visible &= np.tile(worth, len(cameras))
         chosen = np.nonzero(visible if most is None else self._some(visible, rows, most))[0]
         position, row = np.divmod(chosen, len(rows))
+        lacking, absent = np.divmod(dropped, len(rows))
+        absent = rows[absent]
         where, row = where.take(chosen), rows[row]
         counts = np.bincount(position, minlength=len(cameras))
         images = [pyramids[c] for c in cameras]
         result = align_in(self._pictures(row), images, counts.tolist(), where, where.centre, coarse=coarse)
-        fits = result.found
-        camera = np.array(cameras, np.int64)[position[fits]]
+        fits, number = result.found, np.array(cameras, np.int64)
+        camera = number[position[fits]]
         pixels = self._ideal(camera, result.pixels[fits])
-        return Observations(stamp, camera, row[fits], pixels, result.sigma[fits])
+        # what the refinement has dropped is missed as well: the surface may have left the place that the map gives it
+        missing = number[np.concatenate([position[~fits], lacking])], np.concatenate([row[~fits], absent])
+        return Observations(stamp, camera, row[fits], pixels, result.sigma[fits], MissedLandmarks(*missing))
+
+    def align_at(
+        self, stamp: float, pyramids: dict[int, Pyramid], pose: Array, rows: NDArray[np.int64], points: Array
+    ) -> Observations:
+        """Measure landmarks (rows, (R,)) as if they lay at points (R, 3) mm of the surface at a pose (4, 4)."""
+        cameras, some = list(pyramids), self.templates.take(rows)
+        poses = np.broadcast_to(pose, (len(cameras), 4, 4))
+        where = project_into(self.lenses, cameras, poses, points, self.map.normals[rows], some.axes)
+        counts, number = [len(rows)] * len(cameras), np.repeat(cameras, len(rows))
+        tiled, images = self.templates.take(np.tile(rows, len(cameras))), [pyramids[c] for c in cameras]
+        result = align_in(tiled, images, counts, where, where.centre, coarse=True)
+        fits, track = result.found, np.tile(rows, len(cameras))
+        pixels = self._ideal(number[fits], result.pixels[fits])
+        return Observations(stamp, number[fits], track[fits], pixels, result.sigma[fits])
 
     def _some(self, visible: NDArray[np.bool_], rows: NDArray[np.int64], most: int) -> NDArray[np.bool_]:
         """Of what is visible (C * N,), at most so many landmarks of each camera: the first in the order of spread."""

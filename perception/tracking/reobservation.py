@@ -313,4 +313,5 @@ def _first_views(motion: KnownMotion) -> dict[tuple[int, int], Observations]:
 def joined_observations(first: Observations, second: Observations) -> Observations:
     """Both, at the first one's stamp."""
     names = ("camera", "track", "pixels", "sigma")
-    return Observations(first.stamp, *(np.concatenate([getattr(o, name) for o in (first, second)]) for name in names))
+    arrays = [np.concatenate([getattr(o, name) for o in (first, second)]) for name in names]
+    return Observations(first.stamp, arrays[0], arrays[1], arrays[2], arrays[3])

@@ -24,7 +24,7 @@ from estimation.scans.registration import Registration
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.frames import DuplicateFilter, FrameSet, Image, Roi, parallel_map
+from perception.frames import DuplicateFilter, FrameSet, Image, Roi, of_whole_pictures, parallel_map
 from perception.lens import Lenses, unfiltered
 from perception.mapping.features import Relocaliser, grey
 from perception.mapping.mapping import Mapping, TrackedSet
@@ -102,7 +102,9 @@ class TrackingStep:
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
         self._lenses, self._prefilter = Lenses(rig), prefilter
-        self._estimator = Estimator(rig)
+        self._estimator = Estimator(
+            rig, region=not of_whole_pictures(self.roi, [camera.size for camera in rig.cameras])
+        )
         self._is_new = DuplicateFilter()
         self._search = Relocaliser(self._lenses)
         self._masks = TrackingMasks(self._lenses, tool)
@@ -231,7 +233,10 @@ class TrackingStep:
         if fit.measured:
             self._searched = {c: pyramids[c] for c in self._lost_cameras(tracked)}
             self._absent = 0
-            pose = estimator.accept(fit, observations, aliases)
+            away = estimator.elsewhere(fit, observations)
+            place = fit.solution.base_from_surface
+            apart = None if away is None else matcher.align_at(stamp, pyramids, place, away.rows, away.points)
+            pose = estimator.accept(fit, observations, apart, aliases)
             if not (fit.outliers or len(aliases)):
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from estimation.rig import Rig
 from estimation.scans.registration import Registration
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from perception.frames import FrameSet, Image, Roi, whole_pictures
+from perception.frames import FrameSet, Image, Roi, of_whole_pictures, whole_pictures
 from perception.tracking.step import STAGES, StepReport, TrackingStep, empty_report
 from perception.wound.segmentation import (
     Box,
@@ -119,6 +119,7 @@ def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, 
 MAX_EMPTY_LOOKS = 2  # without a wound in two cameras; then the whole pictures are taken for the surface
 MAX_PARTIAL_LOOKS = 5  # at a frame or patch that some camera does not see, as the first sets lack cameras
 SKIN_MARGIN_SHARE = 0.6  # of the wound's box on every side: the skin beside it moves with it, and has more to track
+WHOLE_PICTURES = "no region and no wound: whole pictures are tracked as one surface; better draw a region"
 WOUND_SOUGHT, PATCH_SOUGHT = "the wound is being looked for", "the coloured frame is being looked for"
 
 FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, known from this frame set on, or why it is not
@@ -176,6 +177,7 @@ class RegionTrackingStep:
         """make_step: the step for a region. find: asked with each frame set until it knows the region."""
         self._rig, self._make_step, self._find = rig, make_step, find
         self._step: TrackingStep | None = None
+        self._caveat = ""  # of poses that nothing else is said of
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp`; INITIALISING while the region is looked for."""
@@ -185,9 +187,11 @@ class RegionTrackingStep:
                 self.last = empty_report(frames.stamp, len(self._rig), np.zeros(len(STAGES)))
                 return identity_pose(frames.stamp, found)
             self._step = self._make_step(found)
+            whole = of_whole_pictures(found, [camera.size for camera in self._rig.cameras])
+            self._caveat = WHOLE_PICTURES if whole else ""
         pose = self._step(frames)
         self.last = self._step.last
-        return pose
+        return pose if pose.reason else replace(pose, reason=self._caveat)
 
     @property
     def map(self) -> SurfaceMap | None:

@@ -195,7 +195,8 @@ def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:
     drift = (pose.twist_covariance, pose.acceleration_psd)
     warp = () if (w := pose.warp) is None else (w.control, w.coefficients, w.covariance, w.growth)
     ahead = () if (f := pose.forecast) is None else (f.horizons, f.increments, f.covariances)
-    return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp, *ahead
+    local = () if (e := pose.local) is None else (e.centres, e.variance, e.growth, e.reach, e.support, e.span)
+    return pose.stamp, pose.base_from_surface, pose.covariance, pose.twist, *drift, *warp, *ahead, *local
 
 
 def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
@@ -211,6 +212,11 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     if pose.warp is not None:
         spread = spread + pose.warp.later(ahead).spread(place[None])[0]
     worst = float(np.linalg.eigvalsh(spread)[-1])
+    if (local := pose.local) is not None:
+        away = ((local.centres - place) ** 2).sum(1) / (2 * local.reach**2)
+        moved = float(((local.variance + ahead * local.growth) * np.exp(-away)).max(initial=0.0))
+        nearest = math.sqrt(float(((local.support - place) ** 2).sum(1).min(initial=math.inf)))
+        worst += max(moved, local.unsupported * min(max(nearest / local.span - 1.0, 0.0), 1.0))
     return math.sqrt(worst) if worst >= 0 else math.nan
 
 

@@ -395,4 +395,6 @@ def _finite(pose: SurfacePose) -> bool:
         arrays += [pose.warp.control, pose.warp.coefficients, pose.warp.covariance, pose.warp.growth]
     if pose.forecast is not None:
         arrays += [pose.forecast.horizons, pose.forecast.increments, pose.forecast.covariances]
+    if pose.local is not None:
+        arrays += [pose.local.centres, pose.local.variance, pose.local.growth, pose.local.reach, pose.local.support]
     return bool(np.isfinite(pose.stamp) and all(np.isfinite(a).all() for a in arrays))
