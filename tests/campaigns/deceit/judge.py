@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from tests.campaigns.deceit.world import Renderer
 
 WRONG_MM, WRONG_RATIO, SHARE = 1.0, 3.0, 0.95  # issue's words: off by > 1 mm and > 3 times the claimed 95 % radius
 RISEN_MM = 2.0  # of the wound alone, from which it has to be told
-GUARD_MM = MotionLimits.__dataclass_fields__["pose_error"].default  # one sigma, above which the guard holds
+GUARD_MM = next(f.default for f in fields(MotionLimits) if f.name == "pose_error")  # one sigma: above it nothing moves
 LETTERS = {"INITIALISING": "i", "TRACKING": "T", "DEGRADED": "d", "COASTING": "c", "LOST": "L"}
 
 
@@ -166,12 +166,5 @@ def _verdict(session: Session, sets: list[SetVerdict], pictures: dict[int, list[
     told = -2
     if risen and first < risen[0]:
         told = next((i - risen[0] for i in risen if sets[i].covered), -1)
-    fields = session.kind, session.index, session.seed, session.what, session.decidable == "", session.honest
-    return Verdict(*fields, tuple(sets), first, again, told, pictures)
-
-
-def shifted(pose: SurfacePose, shift: Array) -> SurfacePose:
-    """A pose (of a test) whose surface lies elsewhere by `shift` (3,), mm, base frame."""
-    moved = pose.base_from_surface.copy()
-    moved[:3, 3] += shift
-    return replace(pose, base_from_surface=moved)
+    known = session.kind, session.index, session.seed, session.what, session.decidable == "", session.honest
+    return Verdict(*known, tuple(sets), first, again, told, pictures)

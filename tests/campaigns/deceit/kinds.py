@@ -108,8 +108,9 @@ def _words(border: bool, marks: bool) -> str:
 
 
 def _gauze(draw: Draw, fps: float, *parts: Callable[[float], np.ndarray]) -> Session:
-    made = ordinary(draw, *parts, fps=fps, breath=2.0)
-    mesh = looks.gauze(draw.rng, looks.SKIN_SIDE, 4.0, draw.uniform(0.0, 0.05))
+    strength, contrast = draw.pick((0.4, 0.15), (1.0, 1.0), (0.3, 1.0), (0.5, 0.1), (0.25, 0.15))
+    made = ordinary(draw, *parts, fps=fps, breath=2.0, strength=strength, contrast=contrast, moles=3)
+    mesh = looks.gauze(draw.rng, looks.SKIN_SIDE, 4.0, draw.uniform(0.0, 0.05), haze=draw.uniform(0.1, 0.4))
     return changed(made, decals=(Decal(mesh, looks.SKIN_SCALE),))
 
 
@@ -138,7 +139,9 @@ def gauze_slip(draw: Draw) -> Session:
 
 
 def _squares(draw: Draw, fps: float, sets: int) -> Session:
-    made = ordinary(draw, fps=fps, breath=2.0, sets=sets, strength=0.5, moles=4)
+    contrast = draw.pick(0.1, 0.1, 1.0, 0.3, 0.1)
+    strength = draw.uniform(0.3, 0.5)
+    made = ordinary(draw, fps=fps, breath=2.0, sets=sets, strength=strength, moles=3, contrast=contrast)
     faint = looks.board(looks.SKIN_SIDE, looks.SKIN_SIDE, 10.0, contrast=draw.uniform(0.12, 0.25))
     return changed(made, decals=(Decal(faint, looks.BOARD_SCALE),))
 
@@ -180,10 +183,12 @@ def chequerboard_hops(draw: Draw) -> Session:
 
 def printed_beads(draw: Draw) -> Session:
     """A printed patch of parallel beads over the wound, jumping across them."""
-    fps, pitch = 30.0, draw.uniform(1.8, 3.0)
+    fps, pitch = 30.0, draw.uniform(1.8, 4.0)
     periods = draw.pick(1, 2, 3, 5, 4)
-    made = in_plane(ordinary(draw, fps=fps, breath=2.0, strength=0.4, moles=3), start_of(fps), 0.0, periods * pitch)
-    patch = looks.beads(draw.rng, 46, 46, pitch)
+    strength, side = draw.pick((0.8, 30.0), (0.5, 26.0), (0.5, 40.0))
+    made = ordinary(draw, fps=fps, breath=2.0, strength=strength, moles=3)
+    made = in_plane(made, start_of(fps), 0.0, periods * pitch)
+    patch = looks.beads(draw.rng, side, side, pitch)
     made = changed(made, decals=(Decal(patch, 6.0),))
     return told_as(made, f"{periods} periods of {pitch:.2f} mm", settled=start_of(fps))
 

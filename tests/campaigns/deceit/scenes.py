@@ -131,9 +131,9 @@ def session(
     rng = draw.rng
     rig = draw_rig(rng, draw.size)
     views = tuple(View(offset=float(o)) for o in np.clip(rng.normal(0, 0.001, 3), -0.002, 0.002))
-    table = looks.drape(rng, TABLE_SIDE)
+    table = looks.drape(rng, TABLE_SIDE, scale=looks.TABLE_SCALE)
     seed = int(rng.integers(1 << 31))
-    world = World(rig, motion, lie, lambda _: texture, scale, table, looks.DRAPE_SCALE, views=views, seed=seed)
+    world = World(rig, motion, lie, lambda _: texture, scale, table, looks.TABLE_SCALE, views=views, seed=seed)
     stamps = np.arange(sets) / fps
     made = Session("", 0, 0, "", world, rig, stamps, (), points)
     return replace(made, roi=drawn_region(made, reach)) if region else made
