@@ -55,7 +55,7 @@ class Verdict:
     honest: bool
     sets: tuple[SetVerdict, ...]
     first: int  # number of the first set that is TRACKING; the sessions' length where there is none
-    again: int  # sets after the trick's end until one is TRACKING and right; -1: none is
+    again: int  # sets after the trick's end until one is TRACKING and right; -1: none is; -2: no such end
     told: int  # sets from a rise of 2 mm until the claim covers it or nothing is printed; -1: never; -2: no rise
     pictures: dict[int, list[Image]]  # of the sets asked for
 
@@ -161,7 +161,7 @@ def _verdict(session: Session, sets: list[SetVerdict], pictures: dict[int, list[
     first = next((i for i, s in enumerate(sets) if s.state == "TRACKING"), len(sets))
     settled = int(np.searchsorted(session.stamps, session.settled))
     fine = [i for i, s in enumerate(sets) if i >= max(first, settled) and s.state == "TRACKING" and not s.wrong]
-    again = fine[0] - settled if fine else -1
+    again = -2 if session.settled < 0 else fine[0] - settled if fine else -1
     risen = [i for i, t in enumerate(session.stamps) if session.world.relief.rise(t) >= RISEN_MM]
     told = -2
     if risen and first < risen[0]:
