@@ -40,7 +40,7 @@ def darkness(made: Session, t: float, cameras: range = range(3)) -> list[Array]:
     for dot in DOTS:
         dotted[..., :3] *= 1 - 0.9 * np.exp(-((x - dot[0]) ** 2 + (y - dot[1]) ** 2) / (2 * 0.6**2))[..., None]
     bright, dark = (Renderer(changed(made, skin=lambda _, s=s: s).world) for s in (skin, dotted))
-    return [1 - dark.radiance(c, t)[..., 1] / bright.radiance(c, t)[..., 1] for c in cameras]
+    return [1 - dark.radiance(c, t)[..., 1] / (bright.radiance(c, t)[..., 1] + 1e-9) for c in cameras]
 
 
 def darkest(dark: Array, about: Array, reach: int = 6) -> Array:

@@ -31,7 +31,7 @@ from tests.campaigns.deceit.world import PSF, Decal, Gloss, Sheet
 
 Kind = Callable[[Draw], Session]
 PURE = "a borderless pattern that repeats, moved by its own period between two pictures, looks as if it had not moved"
-OPEN, OPEN_SCALE = 900.0, 2.0  # mm and texels a mm, of a board that reaches beyond every picture
+OPEN, OPEN_SCALE = 900.0, 1.5  # mm and texels a mm, of a board that reaches beyond every picture
 COVERED_SETS = 8  # frame sets that a sheet covers the field
 
 
