@@ -332,6 +332,7 @@ def wet_film(rng: np.random.Generator, side: float, rough: float, gloss: float, 
     wave = noise(rng, n, grain * scale)
     film = np.empty((n, n, 3), np.float32)
     film[..., 0], film[..., 1] = np.gradient(wave, axis=1), np.gradient(wave, axis=0)
+    film[..., :2] = cv2.GaussianBlur(film[..., :2], (0, 0), grain * scale / 3)  # no kinks, which highlights show
     film[..., :2] *= rough / film[..., 0].std()
     film[..., 2] = gloss * np.clip(1 + 0.5 * noise(rng, n, 8 * scale), 0, 2)
     return film
