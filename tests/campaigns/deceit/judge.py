@@ -77,6 +77,12 @@ class Verdict:
         return sum(s.state == "TRACKING" for s in after) / len(after) if after else 0.0
 
     @property
+    def followed(self) -> float:
+        """Share of the frame sets from the first TRACKING one on that are measured."""
+        after = self.sets[self.first :]
+        return sum(s.state in ("TRACKING", "DEGRADED") for s in after) / len(after) if after else 0.0
+
+    @property
     def states(self) -> str:
         """A letter a set, upper case W or D where it is silently wrong."""
         return "".join(
