@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from tests.campaigns.deceit.world import Renderer
 
 WRONG_MM, WRONG_RATIO, SHARE = 1.0, 3.0, 0.95  # issue's words: off by > 1 mm and > 3 times the claimed 95 % radius
 RISEN_MM = 2.0  # of the wound alone, from which it has to be told
-GUARD_MM = MotionLimits.__dataclass_fields__["pose_error"].default  # one sigma, above which the guard holds
+GUARD_MM = next(f.default for f in fields(MotionLimits) if f.name == "pose_error")  # one sigma: above it nothing moves
 LETTERS = {"INITIALISING": "i", "TRACKING": "T", "DEGRADED": "d", "COASTING": "c", "LOST": "L"}
 
 
@@ -55,7 +55,7 @@ class Verdict:
     honest: bool
     sets: tuple[SetVerdict, ...]
     first: int  # number of the first set that is TRACKING; the sessions' length where there is none
-    again: int  # sets after the trick's end until one is TRACKING and right; -1: none is
+    again: int  # sets after the trick's end until one is TRACKING and right; -1: none is; -2: no such end
     told: int  # sets from a rise of 2 mm until the claim covers it or nothing is printed; -1: never; -2: no rise
     pictures: dict[int, list[Image]]  # of the sets asked for
 
@@ -75,6 +75,12 @@ class Verdict:
         """Share of the frame sets from the first TRACKING one on that are TRACKING."""
         after = self.sets[self.first :]
         return sum(s.state == "TRACKING" for s in after) / len(after) if after else 0.0
+
+    @property
+    def followed(self) -> float:
+        """Share of the frame sets from the first TRACKING one on that are measured."""
+        after = self.sets[self.first :]
+        return sum(s.state in ("TRACKING", "DEGRADED") for s in after) / len(after) if after else 0.0
 
     @property
     def states(self) -> str:
@@ -161,17 +167,10 @@ def _verdict(session: Session, sets: list[SetVerdict], pictures: dict[int, list[
     first = next((i for i, s in enumerate(sets) if s.state == "TRACKING"), len(sets))
     settled = int(np.searchsorted(session.stamps, session.settled))
     fine = [i for i, s in enumerate(sets) if i >= max(first, settled) and s.state == "TRACKING" and not s.wrong]
-    again = fine[0] - settled if fine else -1
+    again = -2 if session.settled < 0 else fine[0] - settled if fine else -1
     risen = [i for i, t in enumerate(session.stamps) if session.world.relief.rise(t) >= RISEN_MM]
     told = -2
     if risen and first < risen[0]:
         told = next((i - risen[0] for i in risen if sets[i].covered), -1)
-    fields = session.kind, session.index, session.seed, session.what, session.decidable == "", session.honest
-    return Verdict(*fields, tuple(sets), first, again, told, pictures)
-
-
-def shifted(pose: SurfacePose, shift: Array) -> SurfacePose:
-    """A pose (of a test) whose surface lies elsewhere by `shift` (3,), mm, base frame."""
-    moved = pose.base_from_surface.copy()
-    moved[:3, 3] += shift
-    return replace(pose, base_from_surface=moved)
+    known = session.kind, session.index, session.seed, session.what, session.decidable == "", session.honest
+    return Verdict(*known, tuple(sets), first, again, told, pictures)

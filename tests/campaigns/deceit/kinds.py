@@ -12,6 +12,7 @@ from estimation import se3
 from tests.campaigns.deceit import looks
 from tests.campaigns.deceit.motions import cough, glide, smooth_step, steps, sway
 from tests.campaigns.deceit.scenes import (
+    BUMP_SHARE,
     PASSING_S,
     REST_HEIGHT,
     SETS,
@@ -31,7 +32,7 @@ from tests.campaigns.deceit.world import PSF, Decal, Gloss, Sheet
 
 Kind = Callable[[Draw], Session]
 PURE = "a borderless pattern that repeats, moved by its own period between two pictures, looks as if it had not moved"
-OPEN, OPEN_SCALE = 900.0, 2.0  # mm and texels a mm, of a board that reaches beyond every picture
+OPEN, OPEN_SCALE = 900.0, 1.5  # mm and texels a mm, of a board that reaches beyond every picture
 COVERED_SETS = 8  # frame sets that a sheet covers the field
 
 
@@ -108,8 +109,9 @@ def _words(border: bool, marks: bool) -> str:
 
 
 def _gauze(draw: Draw, fps: float, *parts: Callable[[float], np.ndarray]) -> Session:
-    made = ordinary(draw, *parts, fps=fps, breath=2.0)
-    mesh = looks.gauze(draw.rng, looks.SKIN_SIDE, 4.0, draw.uniform(0.0, 0.05))
+    strength, contrast = draw.pick((0.4, 0.15), (1.0, 1.0), (0.3, 1.0), (0.5, 0.1), (0.25, 0.15))
+    made = ordinary(draw, *parts, fps=fps, breath=2.0, strength=strength, contrast=contrast, moles=3)
+    mesh = looks.gauze(draw.rng, looks.SKIN_SIDE, 4.0, draw.uniform(0.0, 0.05), haze=draw.uniform(0.1, 0.4))
     return changed(made, decals=(Decal(mesh, looks.SKIN_SCALE),))
 
 
@@ -138,8 +140,10 @@ def gauze_slip(draw: Draw) -> Session:
 
 
 def _squares(draw: Draw, fps: float, sets: int) -> Session:
-    made = ordinary(draw, fps=fps, breath=2.0, sets=sets, strength=0.5, moles=4)
-    faint = looks.board(looks.SKIN_SIDE, looks.SKIN_SIDE, 10.0, contrast=draw.uniform(0.12, 0.25))
+    contrast = draw.pick(0.1, 0.1, 1.0, 0.3, 0.1)
+    strength = draw.uniform(0.15, 0.4)
+    made = ordinary(draw, fps=fps, breath=2.0, sets=sets, strength=strength, moles=3, contrast=contrast)
+    faint = looks.board(looks.SKIN_SIDE, looks.SKIN_SIDE, 10.0, contrast=draw.uniform(0.15, 0.4))
     return changed(made, decals=(Decal(faint, looks.BOARD_SCALE),))
 
 
@@ -180,48 +184,56 @@ def chequerboard_hops(draw: Draw) -> Session:
 
 def printed_beads(draw: Draw) -> Session:
     """A printed patch of parallel beads over the wound, jumping across them."""
-    fps, pitch = 30.0, draw.uniform(1.8, 3.0)
+    fps, pitch = 30.0, draw.uniform(1.8, 4.0)
     periods = draw.pick(1, 2, 3, 5, 4)
-    made = in_plane(ordinary(draw, fps=fps, breath=2.0, strength=0.4, moles=3), start_of(fps), 0.0, periods * pitch)
-    patch = looks.beads(draw.rng, 46, 46, pitch)
+    strength, side, beyond = draw.pick((0.8, 30.0, 22.0), (0.4, 32.0, 10.0), (0.3, 40.0, 14.0))
+    made = ordinary(draw, fps=fps, breath=2.0, strength=strength, moles=3, beyond=beyond)
+    made = in_plane(made, start_of(fps), 0.0, periods * pitch)
+    patch = looks.beads(draw.rng, side, side, pitch)
     made = changed(made, decals=(Decal(patch, 6.0),))
     return told_as(made, f"{periods} periods of {pitch:.2f} mm", settled=start_of(fps))
 
 
 def suture_row(draw: Draw) -> Session:
     """A row of stitches on weak skin, jumping along the row by whole stitches."""
-    fps, pitch, count = 30.0, draw.uniform(5, 8), draw.pick(1, 2, 1, 3, 1)
-    made = in_plane(
-        ordinary(draw, fps=fps, breath=2.0, strength=0.3, moles=2, contrast=0.1), start_of(fps), count * pitch, 0
-    )
+    fps, pitch, count, strength = 30.0, draw.uniform(5, 8), draw.pick(1, 2, 1, 3, 1), draw.uniform(0.12, 0.3)
+    made = ordinary(draw, fps=fps, breath=2.0, strength=strength, moles=2, contrast=0.1, beyond=14.0)
     row = looks.sutures(draw.rng, 11, pitch)
-    return told_as(
-        changed(made, decals=(Decal(row, 6.0),)), f"{count} stitches of {pitch:.1f} mm", settled=start_of(fps)
-    )
+    made = changed(in_plane(made, start_of(fps), count * pitch, 0.0), decals=(Decal(row, 6.0),))
+    return told_as(made, f"{count} stitches of {pitch:.1f} mm, skin {strength:.2f}", settled=start_of(fps))
 
 
 def tattoo(draw: Draw) -> Session:
     """An ornament in the skin that repeats, jumping by its period."""
-    fps, pitch = 30.0, draw.uniform(9, 14)
+    fps, pitch, strength = 30.0, draw.uniform(9, 14), draw.uniform(0.15, 0.5)
     x, y = draw.pick((1, 0), (2, 0), (1, 1), (0, 1), (0, 2))
-    made = in_plane(ordinary(draw, fps=fps, breath=2.0, strength=0.5, moles=3), start_of(fps), x * pitch, y * pitch)
+    made = ordinary(draw, fps=fps, breath=2.0, strength=strength, moles=3, contrast=draw.pick(0.2, 1.0))
     ink = looks.tattoo(draw.rng, looks.SKIN_SIDE, pitch)
-    return told_as(
-        changed(made, decals=(Decal(ink, 5.0),)), f"{x}, {y} periods of {pitch:.1f} mm", settled=start_of(fps)
-    )
+    made = changed(in_plane(made, start_of(fps), x * pitch, y * pitch), decals=(Decal(ink, 5.0),))
+    return told_as(made, f"{x}, {y} periods of {pitch:.1f} mm, skin {strength:.2f}", settled=start_of(fps))
 
 
 # -- what is drawn on the tissue, what lies on it, what rests beside it
 
 
 def _rising(draw: Draw, region: bool) -> Session:
-    high, lasts, fps = draw.pick(
-        (2.0, 1.0, 13.0), (6.0, 2.3, 30.0), (2.0, 1.0, 30.0), (3.0, 2.4, 13.0), (3.0, 1.0, 30.0)
+    high, lasts, fps, narrow = draw.pick(
+        (2.0, 1.0, 13.0, 0.3),
+        (6.0, 2.3, 30.0, 0.4),
+        (2.0, 1.0, 30.0, 0.5),
+        (3.0, 2.4, 13.0, 0.3),
+        (3.0, 1.0, 30.0, 0.35),
     )
-    start = start_of(fps)
-    made = ordinary(draw, fps=fps, breath=draw.pick(2.0, 2.0, 1.0), sets=TRICK + 12 + round(fps * lasts), region=region)
-    lie = replace(made.world.relief, rise=lambda t: high * smooth_step((t - start) / lasts))
-    return told_as(changed(made, relief=lie), f"{high:g} mm in {lasts:g} s at {fps:g} fps", settled=start)
+    start, seen = start_of(fps), region or draw.variant % 2 == 0  # by the network that looks for the wound
+    contrast, strength = (1.0 if seen else 0.1), draw.uniform(0.5, 1.0)
+    breath, sets, beyond = (2.0 if seen else 0.0), TRICK + 12 + round(fps * lasts), draw.uniform(25, 45)
+    made = ordinary(
+        draw, fps=fps, breath=breath, sets=sets, region=region, contrast=contrast, strength=strength, beyond=beyond
+    )
+    lie = made.world.relief
+    lie = replace(lie, rise=lambda t: high * smooth_step((t - start) / lasts), sigma=narrow * lie.sigma / BUMP_SHARE)
+    what = f"{high:g} mm in {lasts:g} s at {fps:g} fps, {lie.sigma:.1f} mm wide, {'a' if seen else 'no'} red wound"
+    return told_as(changed(made, relief=lie), what, settled=start)
 
 
 def wound_rise(draw: Draw) -> Session:
@@ -496,7 +508,8 @@ def one_frozen(draw: Draw) -> Session:
 
 def gauze_at_rest(draw: Draw) -> Session:
     """Gauze that breathes with the skin below."""
-    return told_as(_gauze(draw, draw.pick(30.0, 13.0)), "breathing", honest=True)
+    plainer = replace(draw, variant=1 + draw.variant % 2)  # of the skins those that show
+    return told_as(_gauze(plainer, draw.pick(30.0, 13.0)), "breathing", honest=True)
 
 
 def ordinary_cough(draw: Draw) -> Session:

@@ -21,7 +21,7 @@ FINEST_MM = 0.25  # one sigma of the finest detail
 SKIN_SCALE = 5.0  # texels a mm, of skin and what is drawn on it
 SKIN_SIDE = 170.0  # mm
 BOARD_SCALE = 4.0  # texels a mm
-DRAPE_SCALE = 2.5  # texels a mm
+DRAPE_SCALE, TABLE_SCALE = 2.5, 1.25  # texels a mm, of cloth near and far
 SKIN: Colour = (0.26, 0.36, 0.62)
 WOUND: Colour = (0.035, 0.045, 0.26)
 WHITE: Colour = (0.8, 0.82, 0.84)
@@ -158,8 +158,8 @@ def scribbles(rng: np.random.Generator, texture: Texture, scale: float, count: i
     return softened(drawn, scale)
 
 
-def gauze(rng: np.random.Generator, side: float, pitch: float, irregular: float = 0.03) -> Texture:
-    """A woven mesh through which skin shows. irregular: mm, by which threads lie off."""
+def gauze(rng: np.random.Generator, side: float, pitch: float, irregular: float = 0.03, haze: float = 0.12) -> Texture:
+    """A woven mesh through which skin shows. irregular: mm, by which threads lie off; haze: how white its holes are."""
     scale = 5.0
     texture = blank(side, side, scale, (0.78, 0.8, 0.82), 0.0)
     n = len(texture)
@@ -171,7 +171,7 @@ def gauze(rng: np.random.Generator, side: float, pitch: float, irregular: float 
     round_ = [1 - 0.5 * np.minimum(a / 0.6, 1) ** 2 for a in across]
     light = np.where(over > 0.5, threads[0] * round_[0] + (1 - threads[0]) * round_[1], round_[1])
     texture[..., :3] *= light[..., None]
-    texture[..., 3] = 0.12 + 0.75 * np.maximum(*threads)
+    texture[..., 3] = haze + (0.88 - haze) * np.maximum(*threads)
     return softened(texture, scale, 0.2)
 
 
@@ -201,10 +201,13 @@ def dressing(rng: np.random.Generator, width: float, height: float) -> Texture:
 
 
 def drape(
-    rng: np.random.Generator, side: float, window: tuple[float, float] | None = None, strong: float = 1.0
+    rng: np.random.Generator,
+    side: float,
+    window: tuple[float, float] | None = None,
+    strong: float = 1.0,
+    scale: float = DRAPE_SCALE,
 ) -> Texture:
     """Blue cloth with weave, creases and specks. window: mm, of the opening through which the field is seen."""
-    scale = DRAPE_SCALE
     n = round(side * scale)
     texture = blank(side, side, scale, (0.42, 0.25, 0.12))
     weave = 0.10 * noise(rng, n, 0.9) + 0.08 * noise(rng, n, 2.0 * scale)
@@ -217,7 +220,7 @@ def drape(
         x, y = grid(texture.shape, scale)
         inside = (np.abs(2 * x / window[0]) ** 4 + np.abs(2 * y / window[1]) ** 4) ** 0.25
         texture[..., 3] = within((1 - inside) * window[0] / 2, 0.4)
-    return softened(texture, scale, 0.3)
+    return softened(texture, scale, max(0.3, 0.6 / scale))
 
 
 def glove(rng: np.random.Generator, colour: Colour = (0.62, 0.42, 0.2)) -> Texture:
@@ -329,6 +332,7 @@ def wet_film(rng: np.random.Generator, side: float, rough: float, gloss: float, 
     wave = noise(rng, n, grain * scale)
     film = np.empty((n, n, 3), np.float32)
     film[..., 0], film[..., 1] = np.gradient(wave, axis=1), np.gradient(wave, axis=0)
+    film[..., :2] = cv2.GaussianBlur(film[..., :2], (0, 0), grain * scale / 3)  # no kinks, which highlights show
     film[..., :2] *= rough / film[..., 0].std()
     film[..., 2] = gloss * np.clip(1 + 0.5 * noise(rng, n, 8 * scale), 0, 2)
     return film

@@ -42,12 +42,6 @@ def sway(
     return lambda t: way * math.sin(2 * math.pi * rate * (t - max(start, 0.0))) * (t > start)
 
 
-def jump(at: float, change: Sequence[float]) -> Part:
-    """Elsewhere from an instant on. change: (6,)."""
-    there = np.array(change, float)
-    return lambda t: there * (t > at)
-
-
 def glide(start: float, end: float, change: Sequence[float]) -> Part:
     """Smoothly elsewhere between two instants, s. change: (6,)."""
     there = np.array(change, float)

@@ -56,7 +56,7 @@ def table(verdicts: Sequence[Verdict]) -> str:
         count = f"{len(wrong)}" + (f" ({open_} of them cannot be decided)" if open_ else "")
         figures = f"{_text(worst and worst.error, 1)} | {_text(worst and worst.claim, 2)} | {100 * share:.0f} %"
         title = name.replace("_", " ") + (" (honest)" if of[0].honest else "")
-        again, told = _range([v.again for v in of]), _range([v.told for v in of if v.told != -2])
+        again, told = _range([v.again for v in of]), _range([v.told for v in of])
         lines.append(f"| {title} | {len(of)} | {count} | {figures} | {again} | {told} |\n")
     can = [v for v in verdicts if v.decidable]
     honest = [v for v in verdicts if v.honest]
@@ -68,7 +68,8 @@ def table(verdicts: Sequence[Verdict]) -> str:
 
 
 def _range(counts: Sequence[int]) -> str:
-    """Frame sets, from the least to the most; "never" where one of them has none."""
+    """Frame sets, from the least to the most, and how many sessions never came to it; -2 does not count."""
+    counts = [c for c in counts if c != -2]
     ended = [c for c in counts if c >= 0]
     parts = [f"{min(ended)} to {max(ended)}"] if ended else []
     never = len(counts) - len(ended)
@@ -85,25 +86,38 @@ def shown_sets(session: Session) -> tuple[int, ...]:
     return max(session.trick - 1, 0), min(session.trick + max(4, (last - session.trick) // 4), last - 1), last
 
 
-def contact_strip(verdict: Verdict) -> Image:
+def contact_strip(verdict: Verdict, cameras: slice = slice(None)) -> Image:
     """The session's kept pictures side by side, each with its state; wrong ones in red."""
     shown = []
     for number, images in sorted(verdict.pictures.items()):
         judged = verdict.sets[number]
-        for image in images:
+        for image in images[cameras]:
             height = round(image.shape[0] * SHEET_WIDTH / image.shape[1])
             small = cv2.resize(image, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
             text = f"{number} {judged.state}" + ("" if np.isnan(judged.error) else f" {judged.error:.1f}")
-            colour = (40, 40, 255) if judged.wrong else (255, 255, 255)
-            cv2.putText(small, text, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.putText(small, text, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.36, colour, 1, cv2.LINE_AA)
+            _write(small, text, height - 6, (40, 40, 255) if judged.wrong else (255, 255, 255))
             shown.append(small)
-    return np.concatenate(shown, axis=1)
+    strip = np.concatenate(shown, axis=1)
+    _write(strip, f"{verdict.kind.replace('_', ' ')}: {verdict.what}", 12, (255, 255, 255))
+    return strip
+
+
+def _write(image: Image, text: str, y: int, colour: tuple[int, int, int]) -> None:
+    for ink, width in (((0, 0, 0), 3), (colour, 1)):
+        cv2.putText(image, text, (4, y), cv2.FONT_HERSHEY_SIMPLEX, 0.36, ink, width, cv2.LINE_AA)
+
+
+OVERVIEW_COLUMNS = 4  # kinds side by side
 
 
 def write_sheets(folder: Path, verdicts: Sequence[Verdict]) -> None:
-    """A contact sheet a kind, its sessions below each other."""
+    """A contact sheet a kind, its sessions below each other; and one of all kinds, the middle camera only."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in dict.fromkeys(v.kind for v in verdicts):
+    tiles = []
+    for name in dict.fromkeys(v.kind for v in sorted(verdicts, key=lambda v: v.index)):
         of = sorted((v for v in verdicts if v.kind == name and v.pictures), key=lambda v: v.index)
         cv2.imwrite(str(folder / f"{name}.png"), np.concatenate([contact_strip(v) for v in of]))
+        tiles.append(contact_strip(of[0], slice(1, 2)))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % OVERVIEW_COLUMNS)
+    rows = [np.concatenate(tiles[i : i + OVERVIEW_COLUMNS], axis=1) for i in range(0, len(tiles), OVERVIEW_COLUMNS)]
+    cv2.imwrite(str(folder / "all.jpg"), np.concatenate(rows), [cv2.IMWRITE_JPEG_QUALITY, 80])

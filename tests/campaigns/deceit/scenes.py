@@ -30,6 +30,7 @@ TRICK = 28  # number of the set with which the trick begins: by then the map is 
 SETS = 60
 REST_HEIGHT = 30.0  # mm, of the tissue above the table
 REGION_BEYOND = 22.0  # mm, by which the drawn region goes beyond the wound
+BUMP_SHARE = 0.55  # of the radius of the wound: one sigma of the bump as which it rises
 TABLE_SIDE = 900.0  # mm
 FOCAL_WIDTHS = 1.25  # picture widths
 
@@ -50,7 +51,7 @@ class Session:
     decidable: str = ""  # why no three cameras can decide it; "": they can
     honest: bool = False  # hard, but to be followed
     trick: int = TRICK  # number of the first set of the trick
-    settled: float = 0.0  # s, from which the pictures are good again, so that the pose may be
+    settled: float = -1.0  # s, from which the pictures are good again, so that the pose may be; below 0: always
     gone: float = math.inf  # s, from which on the mapped tissue is no longer there
 
     def truth(self, stamp: float) -> Array:
@@ -86,10 +87,11 @@ def ordinary(
     contrast: float = 1.0,
     region: bool = True,
     breath: float = 3.0,
+    beyond: float = REGION_BEYOND,
 ) -> Session:
     """Ordinary skin with a wound, which breathes and moves by `parts`. strength, contrast: as skin and with_wound say.
 
-    breath: mm; 0 is none.
+    breath: mm; 0 is none. beyond: mm, by which the region goes beyond the wound.
     """
     rng = draw.rng
     radius = rng.uniform(13, 19)
@@ -99,7 +101,7 @@ def ordinary(
     motion = moving(rest_pose(rng), *wave, *parts)
     ring = [(r * math.cos(a), r * math.sin(a)) for r, n in ((0.45, 4), (0.8, 8)) for a in np.arange(n) * 2 * np.pi / n]
     points = on_tissue(lie, radius * np.array([(0, 0), *ring]))
-    return session(draw, skin, looks.SKIN_SCALE, lie, motion, points, radius + REGION_BEYOND, fps, sets, region)
+    return session(draw, skin, looks.SKIN_SCALE, lie, motion, points, radius + beyond, fps, sets, region)
 
 
 def flat(
@@ -131,9 +133,9 @@ def session(
     rng = draw.rng
     rig = draw_rig(rng, draw.size)
     views = tuple(View(offset=float(o)) for o in np.clip(rng.normal(0, 0.001, 3), -0.002, 0.002))
-    table = looks.drape(rng, TABLE_SIDE)
+    table = looks.drape(rng, TABLE_SIDE, scale=looks.TABLE_SCALE)
     seed = int(rng.integers(1 << 31))
-    world = World(rig, motion, lie, lambda _: texture, scale, table, looks.DRAPE_SCALE, views=views, seed=seed)
+    world = World(rig, motion, lie, lambda _: texture, scale, table, looks.TABLE_SCALE, views=views, seed=seed)
     stamps = np.arange(sets) / fps
     made = Session("", 0, 0, "", world, rig, stamps, (), points)
     return replace(made, roi=drawn_region(made, reach)) if region else made
@@ -175,7 +177,7 @@ def tissue_relief(rng: np.random.Generator, radius: float) -> Relief:
     heights = 1.6 * noise(rng, n, 22 * RELIEF_SCALE) + 0.15 * noise(rng, n, 4 * RELIEF_SCALE)
     heights -= 0.0016 * (x**2 + 1.4 * y**2) * rng.uniform(0.5, 1.2)  # it curves down to its sides
     heights -= rng.uniform(2, 4) * np.exp(-((np.hypot(x, y) / radius) ** 4))
-    return replace(relief(heights - heights[n // 2, n // 2], half), sigma=0.55 * radius)
+    return replace(relief(heights - heights[n // 2, n // 2], half), sigma=BUMP_SHARE * radius)
 
 
 def drawn_region(made: Session, reach: float) -> tuple[Roi, ...]:

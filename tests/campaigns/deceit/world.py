@@ -282,11 +282,10 @@ def _trace(rays, camera, surface_from_camera, poses, grid, half, bump, hits):  #
             dx = m[0, 0] * a + m[0, 1] * b + m[0, 2]
             dy = m[1, 0] * a + m[1, 1] * b + m[1, 2]
             dz = m[2, 0] * a + m[2, 1] * b + m[2, 2]
-            x, y, steps = 0.0, 0.0, NEAR_STEPS if near else FAR_STEPS
-            last, z = z, (2.0 * z - before if near else 0.0)
-            before = last if near else 0.0
+            x, y, far = 0.0, 0.0, not near
+            before, z = z, (0.0 if far else 2.0 * z - before)
             near = True
-            for _ in range(steps):
+            for _ in range(FAR_STEPS if far else NEAR_STEPS):
                 s = (z - m[2, 3]) / dz
                 x, y = m[0, 3] + s * dx, m[1, 3] + s * dy
                 if abs(x) > half[0] + 10 or abs(y) > half[1] + 10:
@@ -302,6 +301,7 @@ def _trace(rays, camera, surface_from_camera, poses, grid, half, bump, hits):  #
                 if bump[0] != 0.0:
                     ox, oy = x - bump[1], y - bump[2]
                     z += bump[0] * math.exp(-(ox * ox + oy * oy) / (2 * bump[3] * bump[3]))
+            before = z if far else before
             ex, ey = (x / half[0]) ** 2, (y / half[1]) ** 2
             inside = 1.0 - math.sqrt(math.sqrt(ex * ex + ey * ey) if half[2] > 0.0 else max(ex, ey))
             cover = min(max(inside * half[0] / 0.4, 0.0), 1.0)
