@@ -10,8 +10,8 @@ import pytest
 
 from estimation import se3
 from estimation.observations import Observations, no_observations
-from estimation.online.estimator import Estimator, EstimatorSettings
-from estimation.online.surface_state import StateSettings
+from estimation.online.estimator import Estimator
+from estimation.online.surface_state import EstimatorSettings, StateSettings
 from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap

@@ -8,7 +8,7 @@ given out, since the path is placed in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from estimation.online.reported_covariance import (
     alias_message,
     widened,
 )
-from estimation.online.surface_state import Measurement, MotionDetector, PoseStateMachine, StateSettings
+from estimation.online.surface_state import EstimatorSettings, Measurement, MotionDetector, PoseStateMachine
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
@@ -42,20 +42,6 @@ MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what
 MAX_LEARNING_SMEAR_MM = 0.1  # between the cameras' instants: beyond, a late camera cannot be told from a bent surface
 MAX_MAP_SMEAR_MM = 0.5  # likewise: a map bent by more is no good for printing
 ACCELERATION_PERSISTENCE_S = 0.2  # breathing accelerates alike for so long, which adds up to more than white noise does
-
-
-@dataclass(frozen=True, slots=True)
-class EstimatorSettings:
-    """When a fit counts as a measurement."""
-
-    least_tracks: int = 10  # six unknowns need three tracks; ten leave room to see an outlier
-    least_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
-    camera_tracks: int = 6  # fewer say nothing of that camera,
-    camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
-    disorder: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
-    sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
-    floor_sigma: float = 0.1  # px: alignment claims less on clean images, but interpolation and lens model err by it
-    states: StateSettings = field(default_factory=StateSettings)  # what a measured pose is called
 
 
 class _MappedSurface:

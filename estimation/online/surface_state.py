@@ -13,7 +13,7 @@ noise that lasts over frames, both show there. The place of rest stays fixed, so
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -224,6 +224,20 @@ class StateSettings:
     first: int = 4  # poses that are averaged before one is given out: what that is off by, all later ones are
     settle: float = 0.06  # s without a fault until TRACKING again: the second frame set of 30 a second
     coast: float = 0.5  # s without a measurement until LOST
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorSettings:
+    """When a fit counts as a measurement."""
+
+    least_tracks: int = 10  # six unknowns need three tracks; ten leave room to see an outlier
+    least_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
+    camera_tracks: int = 6  # fewer say nothing of that camera,
+    camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
+    disorder: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
+    sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
+    floor_sigma: float = 0.1  # px: alignment claims less on clean images, but interpolation and lens model err by it
+    states: StateSettings = field(default_factory=StateSettings)  # what a measured pose is called
 
 
 @dataclass(frozen=True, slots=True)
