@@ -160,6 +160,17 @@ class LocalError:
     span: float  # mm from the nearest of them within which a place moves with it
     unsupported: float  # mm^2, at twice that distance and beyond; no support at all: everywhere
 
+    def with_bells(self, centres: Array, variance: float, reach: float) -> LocalError:
+        """The same with further bells about centres (K, 3), of one variance, mm^2, and one reach, mm."""
+        more, every = len(centres), np.ones(len(centres))
+        return replace(
+            self,
+            centres=np.concatenate([self.centres, centres]),
+            variance=np.append(self.variance, variance * every),
+            growth=np.append(self.growth, np.zeros(more)),
+            reach=np.append(self.reach, reach * every),
+        )
+
     def later(self, seconds: float) -> LocalError:
         """The same `seconds` s from its stamp, before or after."""
         return replace(self, variance=self.variance + abs(seconds) * self.growth)
@@ -169,6 +180,9 @@ class LocalError:
         by_bells = (bells(points, self.centres, self.reach) * self.variance).max(1, initial=0.0)
         away = np.sqrt(((points[:, None] - self.support) ** 2).sum(-1).min(1, initial=np.inf))
         return np.asarray(np.maximum(by_bells, self.unsupported * np.clip(away / self.span - 1.0, 0.0, 1.0)))
+
+
+NO_LOCAL_ERROR = LocalError(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)), 1.0, 0.0)
 
 
 def bells(points: Array, control: Array, reach: float | Array) -> Array:

@@ -374,7 +374,7 @@ class Estimator:
             reason,
             surface.detector.motion,
             surface.warp.warp,
-            local=surface.local.error,
+            local=surface.parted.with_holes(surface.local.error, surface.map.points),
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
         surface.pose = surface.measured = surface.reported_pose = entered
