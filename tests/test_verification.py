@@ -150,13 +150,18 @@ def test_a_board_repeats_by_its_squares(square: float) -> None:
 @pytest.mark.parametrize("strength", [0.4, 1.0])
 def test_skin_repeats_nowhere(seed: int, strength: float) -> None:
     assert not len(aliases(skin(seed, strength)))
-    assert aliases(skin(seed, strength)).message == ""
 
 
 def test_a_faint_pattern_over_skin_repeats_too() -> None:
     found = aliases(skin(4, 0.8) + 0.3 * (board(10.0) - 130.0))
     assert np.linalg.norm(found.shifts, axis=1).min() == pytest.approx(np.sqrt(200.0), abs=0.4)
-    assert "repeats every 14" in found.message
+
+
+def test_the_operator_is_told_that_it_repeats_and_whether_marks_tell() -> None:
+    assert learned(skin(1)).message == ""
+    told = learned(marked(board(12.0))).message
+    assert "repeats every 16.9 mm" in told and "own marks tell" in told
+    assert "hardly a mark" in learned(board(12.0)).message
 
 
 # -- the verdict on a pose

@@ -41,13 +41,6 @@ class Aliases:
     def __len__(self) -> int:
         return len(self.shifts)
 
-    @property
-    def message(self) -> str:
-        """For the operator, or ''."""
-        if not len(self):
-            return ""
-        return f"the surface repeats every {np.linalg.norm(self.shifts[0]):.1f} mm"
-
 
 NO_ALIASES = Aliases(np.zeros((0, 3)), np.zeros(0))
 

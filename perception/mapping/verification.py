@@ -76,6 +76,7 @@ class Verification:
         self.aliases = NO_ALIASES
         self._probes: list[_Probes] = []
         self._centre = np.zeros(3)
+        self._marked = False  # whether the surface has marks of its own that rule out the nearest aliases
         self._stamp, self._place = float("nan"), np.zeros(3)  # s, mm: of the last sure pose, and its centre there
 
     def begin(
@@ -92,7 +93,19 @@ class Verification:
             return
         for c in pyramids:
             self._probes.append(_Probes(self._lenses, c, pyramids[c], poses[c], plane, self.aliases))
+        evidence, _ = self._evidence(pyramids, poses, self._probes, self.aliases.shifts[:NEAR_ALIASES])
+        self._marked = bool(evidence.min() >= 2 * MIN_EVIDENCE)
         self.take(stamp, poses)
+
+    @property
+    def message(self) -> str:
+        """For the operator: that the surface repeats, and whether its own marks tell where on it this is; or ''."""
+        if not len(self.aliases):
+            return ""
+        every = f"the surface repeats every {np.linalg.norm(self.aliases.shifts[0]):.1f} mm"
+        if self._marked:
+            return f"{every}; its own marks tell which repeat this is"
+        return f"{every} and has hardly a mark of its own: a jump by that cannot be seen; put a sticker on it"
 
     def __call__(self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array]) -> Verdict:
         """Look at a pose: `poses` (4, 4) at each camera's exposure. Who takes it for sure says so by `take`."""
@@ -257,6 +270,15 @@ class Grain:
         self._apart = left < least and other > most
         share = f"{100 * max(left, 0.0):.0f} % of it is left"
         return f"the skin's grain does not follow the tracks ({share}): they may follow light" if self._apart else ""
+
+    @property
+    def message(self) -> str:
+        """For the operator, where the surface has so little grain that it could not contradict light; or ''."""
+        repeats = self._usual[..., 0] ** 2 > MIN_GRAIN_SHARE * self._usual[..., 1]
+        known = self._looks >= MIN_GRAIN_SETS
+        if known.sum() < 2 * MIN_GRAINS or (repeats & known).sum() >= MIN_GRAINS:
+            return ""
+        return "the surface has hardly any fine texture: light that moves could be taken for it; light it evenly"
 
     def learn(self) -> None:
         """What was looked at last is usual."""

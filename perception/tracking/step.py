@@ -18,7 +18,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations
 from estimation.online.estimator import Estimator
-from estimation.pose import SurfacePose, identity_pose
+from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.rig import Rig
 from estimation.scans.registration import Registration
 from estimation.scans.scan import Scan
@@ -139,7 +139,8 @@ class TrackingStep:
                 if bead is not None:
                     self._matcher.cover(bead)
         self.last = self._report(observations, used)
-        return pose
+        note = pose.reason or self._verification.message or self._grain.message
+        return replace(pose, reason=note) if pose.state is TrackState.TRACKING else pose
 
     @property
     def map(self) -> SurfaceMap | None:
