@@ -220,3 +220,11 @@ def test_the_grain_that_is_left_is_free_of_the_light_on_it(gain: float, share: f
     replaced = usual.copy()
     replaced[:, 0] = share * grain  # as much of it as ever, but of another surface
     assert _grain_left(usual, replaced, repeats) == pytest.approx((share, 1 - share**2), abs=1e-9)
+
+
+def test_landmarks_on_one_line_are_no_surface_that_could_repeat() -> None:
+    line = SurfaceMap(np.c_[np.arange(240.0) / 6, np.zeros((240, 2))], flat_map().normals, np.zeros((720, 720)))
+    lenses = Lenses(rig())
+    verification = Verification(lenses, TrackingMasks(lenses))
+    verification.begin(0.0, pictures(board(12.0), np.eye(4)), poses(np.eye(4)), line)
+    assert not len(verification.aliases)

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import QhullError
 
 from estimation import se3
 from estimation.observations import Observations
@@ -83,8 +84,11 @@ class Verification:
         self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array], surface_map: SurfaceMap
     ) -> None:
         """Learn a surface by pictures (by camera) in which it stands at `poses` (4, 4), each camera's own."""
-        plane = TangentPlane(surface_map)
         self._probes, self.aliases = [], NO_ALIASES
+        try:
+            plane = TangentPlane(surface_map)
+        except QhullError:  # landmarks on one line: no surface whose repeats could be looked for
+            return
         self._centre = surface_map.points.mean(0)
         grid = SurfaceGrid(plane)
         pictures = (surface_picture(self._lenses, c, pyramids[c], poses[c], grid) for c in pyramids)

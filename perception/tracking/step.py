@@ -195,7 +195,7 @@ class TrackingStep:
             nothing = no_observations(frames.stamp), np.zeros(len(self.rig), np.int64)
             return identity_pose(frames.stamp, started), *nothing
         self._matcher, pose, tracked = started
-        self._grain = Grain(self._lenses)
+        self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
         return pose, tracked.observations, tracked.fit.used
 
     # -- every frame set after it
