@@ -157,11 +157,9 @@ def test_a_faint_pattern_over_skin_repeats_too() -> None:
     assert np.linalg.norm(found.shifts, axis=1).min() == pytest.approx(np.sqrt(200.0), abs=0.4)
 
 
-def test_the_operator_is_told_that_it_repeats_and_whether_marks_tell() -> None:
-    assert learned(skin(1)).message == ""
-    told = learned(marked(board(12.0))).message
-    assert "repeats every 16.9 mm" in told and "own marks tell" in told
-    assert "hardly a mark" in learned(board(12.0)).message
+def test_the_operator_is_told_of_a_surface_that_repeats_and_has_no_marks() -> None:
+    assert learned(skin(1)).message == learned(marked(board(12.0))).message == ""
+    assert "repeats every 16.9 mm" in (told := learned(board(12.0)).message) and "hardly a mark" in told
 
 
 # -- the verdict on a pose

@@ -13,23 +13,24 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import se3
-from estimation.forecast.predictor import Predictor
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
 from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, CameraHealth, FrameTracks, motion_sigmas
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
-from estimation.online.local_motion import LocalMotion
-from estimation.online.parted_texture import Elsewhere, PartedTexture
+from estimation.online.parted_texture import Elsewhere
 from estimation.online.reported_covariance import (
     NO_SHIFTS,
-    CalibrationError,
-    ReportedCovariance,
     alias_covariance,
     alias_message,
     widened,
 )
-from estimation.online.surface_state import EstimatorSettings, Measurement, MotionDetector, PoseStateMachine
+from estimation.online.surface_state import (
+    EstimatorSettings,
+    MappedSurface,
+    Measurement,
+    PoseStateMachine,
+)
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
@@ -42,27 +43,6 @@ MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what
 MAX_LEARNING_SMEAR_MM = 0.1  # between the cameras' instants: beyond, a late camera cannot be told from a bent surface
 MAX_MAP_SMEAR_MM = 0.5  # likewise: a map bent by more is no good for printing
 ACCELERATION_PERSISTENCE_S = 0.2  # breathing accelerates alike for so long, which adds up to more than white noise does
-
-
-class _MappedSurface:
-    """What is known of the surface since its first map; the next first map begins it anew."""
-
-    pose: SurfacePose  # the last one, with the covariance that decisions are made by
-    reported_pose: SurfacePose  # the same with the reported covariance
-    measured: SurfacePose  # the last one that was measured
-
-    def __init__(self, surface_map: SurfaceMap, rig: Rig, region: bool, caveat: str) -> None:
-        self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
-        self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
-        self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
-        self.local, self.parted = LocalMotion(len(rig), region), PartedTexture(rig, len(surface_map), region)
-        self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
-        self.psd = np.zeros(6)  # of the acceleration from pose to pose
-        self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
-        # the fit that cameras' errors are to be learned from, its tracks, s since the one before, whether clocks may
-        self.unlearned: tuple[FrameFit, Observations, float, bool] | None = None
-        # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
-        self.accepted, self.map_held = 0, False
 
 
 class Estimator:
@@ -78,12 +58,12 @@ class Estimator:
         self.health = CameraHealth([camera.name for camera in rig.cameras])
         self._earlier_cameras = CameraErrorHistory(self.cameras)
         self._states, self._smoother = PoseStateMachine(self.settings.states), Smoother()
-        self._mapped: _MappedSurface | None = None
+        self._mapped: MappedSurface | None = None
         self._measured_stamp = -np.inf  # s, of the last pose that was measured, by whatever map
         self._ahead: tuple[SurfacePose, SurfacePose] | None = None  # the pose, and as last predicted from it
 
     @property
-    def _surface(self) -> _MappedSurface:
+    def _surface(self) -> MappedSurface:
         assert self._mapped is not None, "only after the first map"
         return self._mapped
 
@@ -241,7 +221,7 @@ class Estimator:
 
         caveat: what is not known of that frame's place on the tissue; as long as it stands no pose is TRACKING.
         """
-        self._mapped = _MappedSurface(surface_map, self.rig, self._region, caveat)
+        self._mapped = MappedSurface(surface_map, self.rig, self._region, caveat)
         self._smoother.reset()
         self.health.begin()
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here

@@ -18,8 +18,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation import se3
-from estimation.pose import MotionState, TrackState
+from estimation.forecast.predictor import Predictor
+from estimation.observations import Observations
+from estimation.online.deformation import WarpFilter
+from estimation.online.fit import FrameFit, MapError
+from estimation.online.local_motion import LocalMotion
+from estimation.online.parted_texture import PartedTexture
+from estimation.online.reported_covariance import CalibrationError, ReportedCovariance
+from estimation.pose import MotionState, SurfacePose, TrackState
+from estimation.rig import Rig
 from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
 
 AVERAGED_POSES = (2, 4, 8)  # newest poses looked at together; one alone may be a glitch
 POSES_BEFORE = 16  # before the newest ones, to which a step is compared too: lasting noise is alike in both
@@ -305,3 +314,24 @@ class PoseStateMachine:
         self._bad_stamp = stamp
         self.state = TrackState.LOST if away > self.settings.coast else TrackState.COASTING
         return self.state, f"{why}; {away:.2f} s since the last measurement"
+
+
+class MappedSurface:
+    """What is known of the surface since its first map; the next first map begins it anew."""
+
+    pose: SurfacePose  # the last one, with the covariance that decisions are made by
+    reported_pose: SurfacePose  # the same with the reported covariance
+    measured: SurfacePose  # the last one that was measured
+
+    def __init__(self, surface_map: SurfaceMap, rig: Rig, region: bool, caveat: str) -> None:
+        self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
+        self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
+        self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
+        self.local, self.parted = LocalMotion(len(rig), region), PartedTexture(rig, len(surface_map), region)
+        self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
+        self.psd = np.zeros(6)  # of the acceleration from pose to pose
+        self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
+        # the fit that cameras' errors are to be learned from, its tracks, s since the one before, whether clocks may
+        self.unlearned: tuple[FrameFit, Observations, float, bool] | None = None
+        # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
+        self.accepted, self.map_held = 0, False

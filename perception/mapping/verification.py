@@ -103,12 +103,10 @@ class Verification:
 
     @property
     def message(self) -> str:
-        """For the operator: that the surface repeats, and whether its own marks tell where on it this is; or ''."""
-        if not len(self.aliases):
+        """For the operator, where a surface repeats and has no marks of its own that tell where on it this is; or ''."""
+        if self._marked or not len(self.aliases):
             return ""
         every = f"the surface repeats every {np.linalg.norm(self.aliases.shifts[0]):.1f} mm"
-        if self._marked:
-            return f"{every}; its own marks tell which repeat this is"
         return f"{every} and has hardly a mark of its own: a jump by that cannot be seen; put a sticker on it"
 
     def __call__(self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array]) -> Verdict:
@@ -219,7 +217,7 @@ def _spread_choice(power: Array, points: Array) -> Index:
 
 GRAIN_ORDER = 5  # of the polynomial over a patch that is taken out: shading and soft edges
 GRAIN_STRIDE = 3  # every third landmark is looked at, 40 of a camera: light deceives all of them at once
-GRAIN_MEMORY_SETS = 300.0  # ten seconds, over which it is learned how a landmark's grain usually looks
+GRAIN_MEMORY_SETS = 40.0  # over which it is learned how a landmark's grain looks: from another side it looks otherwise
 MIN_GRAIN_SETS = 5  # frame sets in which it must have been seen before it counts,
 MIN_GRAIN_SHARE = 0.05  # and how much of its grain repeats from picture to picture: the rest is noise
 MIN_GRAINS = 12  # tracks that must count for a verdict
