@@ -177,7 +177,7 @@ def test_the_guard_refuses_a_pose_whose_local_error_is_not_finite() -> None:
     assert not np.isfinite(np.concatenate([np.ravel(a) for a in guard._numbers(pose)])).all() and not _finite(pose)
 
 
-@pytest.mark.parametrize(("region", "span"), [(True, 25.0), (False, 8.0)])
+@pytest.mark.parametrize(("region", "span"), [(True, 25.0), (False, 10.0)])
 def test_a_place_without_a_landmark_around_it_is_not_known(region: bool, span: float) -> None:
     hole = DENSE[np.linalg.norm(DENSE[:, :2], axis=1) > 1.5 * span]
     follow = Followed(hole, 30.0, breathing, region=region)

@@ -129,13 +129,14 @@ def test_the_correlation_is_that_of_what_is_seen_in_both(seed: int) -> None:
     draw = np.random.default_rng(seed)
     inside = draw.random((9, 7)) < 0.9
     picture = np.where(inside, draw.normal(size=inside.shape), 0.0)
-    found = self_correlation(picture, inside)
+    found, overlap = self_correlation(picture, inside)
     for v, u in ((0, 0), (2, 1), (-3, 2), (1, -2)):
         rows, columns = slice(max(0, v), 9 + min(0, v)), slice(max(0, u), 7 + min(0, u))
         back = slice(max(0, -v), 9 - max(0, v)), slice(max(0, -u), 7 - max(0, u))
         both = inside[rows, columns] & inside[back]
         expected = np.corrcoef(picture[rows, columns][both], picture[back][both])[0, 1]
         assert found[8 + v, 6 + u] == pytest.approx(expected, abs=1e-6)
+        assert overlap[8 + v, 6 + u] == pytest.approx(both.sum() / inside.sum(), abs=1e-9)
 
 
 @pytest.mark.parametrize("square", [8.0, 12.0, 20.0])

@@ -63,7 +63,7 @@ MISSING_SETS = 2  # in so many frame sets in a row
 USUAL_MISSING = 0.05, 0.25  # lowest and highest share that counts as usual
 NEAR_MM = 0.3  # what is found so near to its place is there: half of what the guard allows, and a bit
 BEYOND_REACH_MM = 0.6  # one sigma: the fine alignment finds what lies within two pixels, and these are not found
-REGION_SPAN_MM, PICTURE_SPAN_MM = 25.0, 8.0  # from a landmark, within which tissue moves with it: a region is one
+REGION_SPAN_MM, PICTURE_SPAN_MM = 25.0, 10.0  # from a landmark, within which tissue moves with it: a region is one
 # surface, and a wound in it may have little texture; whole pictures may hold several, and a window in a drape is larger
 ANCHOR_SHARE, MAX_ANCHORS = 0.3, 128  # of that: landmarks nearer to each other need not be told apart
 MAX_UNSEEN_MM = 10.0  # one sigma: tissue goes no farther by itself, and the number need not grow for ever

@@ -25,7 +25,9 @@ GRID_SIDE = 160  # cells of the surface's own picture along its longer side: hal
 HEIGHT_NEIGHBOURS = 6  # landmarks between which the surface is interpolated
 DETAIL_SIGMA_MM = 4.0  # what is coarser than that is shading, not texture: it is divided out
 MIN_OVERLAP = 0.25  # of the surface with itself, below which a correlation says nothing
-MIN_REPEAT = 0.25  # correlation of the surface with itself, shifted: skin reaches 0.13 by chance
+# Correlation of the whole surface with itself, shifted; of a part of it, more by the root of that part, as chance makes
+# of fewer spots. Skin reaches 0.13 by chance.
+MIN_REPEAT = 0.25
 MIN_ALIAS_MM = 1.5  # nearer to itself the surface only looks smooth
 RIVAL_SHARE = 0.5  # of the strongest alias' correlation: what is weaker is a mark that stands somewhere twice
 MAX_ALIASES = 80  # the nearest: a mesh of 4 mm up to 20 mm
@@ -125,8 +127,10 @@ def surface_picture(
     return np.where(seen, away / (spread + 1.0), 0.0), seen
 
 
-def self_correlation(picture: Array, seen: Mask) -> Array:
-    """Correlation (2V - 1, 2U - 1) of a picture (V, U) with itself at every shift; no shift is in the middle.
+def self_correlation(picture: Array, seen: Mask) -> tuple[Array, Array]:
+    """Correlation of a picture (V, U) with itself at every shift, and how much of it overlaps there, 0 to 1.
+
+    Both (2V - 1, 2U - 1); no shift is in the middle.
 
     Only what is seen (V, U) counts (Padfield 2012, Eq. 14-19); 0 where too little of it overlaps.
     """
@@ -143,16 +147,17 @@ def self_correlation(picture: Array, seen: Mask) -> Array:
     product = both(first, first) - sum_a * sum_b / overlap
     spread_a, spread_b = both(square, mask) - sum_a**2 / overlap, both(mask, square) - sum_b**2 / overlap
     spread = np.sqrt(np.maximum(spread_a * spread_b, 1e-12))
-    sound = (spread > 1e-3 * float((picture**2).sum())) & (overlap > MIN_OVERLAP * float(seen.sum()))
-    return np.where(sound, product / spread, 0.0)
+    share = overlap / max(float(seen.sum()), 1.0)
+    sound = (spread > 1e-3 * float((picture**2).sum())) & (share > MIN_OVERLAP)
+    return np.where(sound, product / spread, 0.0), share
 
 
 def find_aliases(picture: Array, seen: Mask, grid: SurfaceGrid) -> Aliases:
     """The shifts under which a surface's picture (V, U) looks like itself; seen: (V, U)."""
-    likeness = self_correlation(picture, seen)
+    likeness, overlap = self_correlation(picture, seen)
     middle = np.array(likeness.shape) // 2
     side = 2 * int(MIN_ALIAS_MM / grid.step / 2) + 1
-    top = (maximum_filter(likeness, max(3, side)) == likeness) & (likeness > MIN_REPEAT)
+    top = (maximum_filter(likeness, max(3, side)) == likeness) & (likeness * np.sqrt(overlap) > MIN_REPEAT)
     top[[0, -1], :], top[:, [0, -1]] = False, False
     v, u = np.nonzero(top)
     shift = grid.step * (np.stack([v, u], -1) - middle + _vertex(likeness, v, u))[:, ::-1]

@@ -103,7 +103,7 @@ class Verification:
 
     @property
     def message(self) -> str:
-        """For the operator, where a surface repeats and has no marks of its own that tell where on it this is; or ''."""
+        """For the operator, where a surface repeats and has no marks of its own that tell them apart; or ''."""
         if self._marked or not len(self.aliases):
             return ""
         every = f"the surface repeats every {np.linalg.norm(self.aliases.shifts[0]):.1f} mm"
