@@ -36,7 +36,8 @@ GROUP_TIMEOUT_S = 0.5  # after which a motion no longer tells where a group is
 PARTED_MEMORY_S = 10.0  # some breaths: groups that met again may part again
 HOLE_MM = 4.0  # round a lost landmark, in which it counts how many others are lost,
 MIN_HOLE_LANDMARKS, MIN_HOLE_SHARE = 3, 0.6  # for a hole: single ones are lost to noise and glare
-STEADY_SETS, GONE_SETS = 20, 2  # one that was seen so often and is lost so often in a row is a hole by itself
+STEADY_SETS, GONE_SETS = 20, 3  # one that was seen so often and is lost so often in a row is a hole by itself
+COMPANY_MM = 10.0  # within which a landmark that parted has another one: alone, a group's motion fits it by chance
 HOLE_SIGMA_MM = 1.0  # in a hole, at least: alignment finds what is nearer
 MAX_SOUGHT = 40  # landmarks that are looked for elsewhere
 VANISHED = np.diag([0.0] * 3 + [MAX_UNSEEN_MM**2] * 3)  # (6, 6) while half of it is lost: that may be the surface
@@ -98,10 +99,11 @@ class PartedTexture:
         lost = np.zeros(len(points), bool)
         lost[self._lost] = True
         gone = points[self._lost]
-        near = ((gone[:, None] - points) ** 2).sum(-1) < HOLE_MM**2
+        square = ((gone[:, None] - points) ** 2).sum(-1)
+        near, company = square < HOLE_MM**2, (square < COMPANY_MM**2) @ self._members
         known = lost | self._here
         hole = (near @ lost >= MIN_HOLE_LANDMARKS) & (near @ lost >= MIN_HOLE_SHARE * (near @ known))
-        hole |= self._members[self._lost] | (self._gone[self._lost] >= GONE_SETS)
+        hole |= (self._members[self._lost] & (company > 1)) | (self._gone[self._lost] >= GONE_SETS)
         if not hole.any():
             return error
         return (error or NO_LOCAL_ERROR).with_bells(gone[hole], max(self._size, HOLE_SIGMA_MM) ** 2, HOLE_MM)
