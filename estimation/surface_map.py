@@ -155,21 +155,10 @@ class LocalError:
     centres: Array  # (K, 3) mm, surface frame, each the middle of a bell
     variance: Array  # (K,) mm^2 there, along every direction
     growth: Array  # (K,) mm^2/s, by which that grows unseen
-    reach: Array  # (K,) mm, one sigma of each bell
+    reach: Array  # (K,) mm, of each bell: it ends at twice that, however far what lies under it may have gone
     support: Array  # (S, 3) mm, where landmarks show that the surface is there
     span: float  # mm from the nearest of them within which a place moves with it
     unsupported: float  # mm^2, at twice that distance and beyond; no support at all: everywhere
-
-    def with_bells(self, centres: Array, variance: float, reach: float) -> LocalError:
-        """The same with further bells about centres (K, 3), of one variance, mm^2, and one reach, mm."""
-        more, every = len(centres), np.ones(len(centres))
-        return replace(
-            self,
-            centres=np.concatenate([self.centres, centres]),
-            variance=np.append(self.variance, variance * every),
-            growth=np.append(self.growth, np.zeros(more)),
-            reach=np.append(self.reach, reach * every),
-        )
 
     def later(self, seconds: float) -> LocalError:
         """The same `seconds` s from its stamp, before or after."""
@@ -177,12 +166,10 @@ class LocalError:
 
     def variance_at(self, points: Array) -> Array:
         """Variance (N,), mm^2, along every direction, of points (N, 3): by bells or support, the larger."""
-        by_bells = (bells(points, self.centres, self.reach) * self.variance).max(1, initial=0.0)
+        square = ((points[:, None] - self.centres) ** 2).sum(-1)
+        by_bells = (np.maximum(1 - square / (2 * self.reach) ** 2, 0.0) * self.variance).max(1, initial=0.0)
         away = np.sqrt(((points[:, None] - self.support) ** 2).sum(-1).min(1, initial=np.inf))
         return np.asarray(np.maximum(by_bells, self.unsupported * np.clip(away / self.span - 1.0, 0.0, 1.0)))
-
-
-NO_LOCAL_ERROR = LocalError(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)), 1.0, 0.0)
 
 
 def bells(points: Array, control: Array, reach: float | Array) -> Array:

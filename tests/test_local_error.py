@@ -152,7 +152,8 @@ def test_a_place_is_known_as_pose_guard_and_a_recording_tell_alike(seed: int, ah
     place = draw.uniform(-25, 25, 3)
     then, alone = pose.predict(1.0 + ahead), plain.predict(1.0 + ahead)
     best = max(
-        (sizes[0][k] + ahead * sizes[1][k]) * np.exp(-((place - centres[k]) ** 2).sum() / (2 * (5 + sizes[2][k]) ** 2))
+        (sizes[0][k] + ahead * sizes[1][k])
+        * max(0.0, 1 - ((place - centres[k]) ** 2).sum() / (10 + 2 * sizes[2][k]) ** 2)
         for k in range(5)
     )
     best = max(best, 9.0 * np.clip(np.linalg.norm(support - place, axis=1).min() / 10.0 - 1.0, 0.0, 1.0))
@@ -169,6 +170,16 @@ def test_a_place_is_known_as_pose_guard_and_a_recording_tell_alike(seed: int, ah
     old = message_from_pose(plain)
     del old["local"]
     assert pose_from_message(old).local is None
+
+
+@given(st.floats(1.0, 15.0), st.floats(1e-6, 1e6), st.floats(1.0, 3.0).filter(lambda away: abs(away - 2) > 1e-9))
+def test_however_far_a_place_may_have_gone_nothing_is_said_of_one_beyond_twice_its_reach(
+    reach: float, variance: float, away: float
+) -> None:
+    local = LocalError(np.zeros((1, 3)), np.array([variance]), np.zeros(1), np.array([reach]), DENSE, 25.0, 9.0)
+    place = np.array([[away * reach, 0.0, 0.0]])
+    assert (local.variance_at(place)[0] > 0) == (away < 2)
+    assert local.variance_at(place / away)[0] == pytest.approx(0.75 * variance)
 
 
 def test_the_guard_refuses_a_pose_whose_local_error_is_not_finite() -> None:

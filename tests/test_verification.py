@@ -24,7 +24,8 @@ from perception.mapping.aliases import (
     surface_picture,
 )
 from perception.mapping.masks import TrackingMasks
-from perception.mapping.patches import Pyramid
+from perception.mapping.matcher import Matcher
+from perception.mapping.patches import Pyramid, cut_templates
 from perception.mapping.verification import MAX_TISSUE_SPEED, Verification, _grain_left
 
 SIDE_MM, TEXEL_MM = 160.0, 0.2
@@ -198,6 +199,32 @@ def test_ordinary_skin_is_sure_without_a_look() -> None:
 
 
 # -- grain
+
+
+@cache
+def matcher() -> Matcher:
+    """Of landmarks cut from the first camera's picture of a skin."""
+    lenses, surface_map = Lenses(rig()), flat_map()
+    templates = cut_templates(
+        lenses, pictures(skin(1), np.eye(4))[0], 0, np.eye(4), surface_map.points, surface_map.normals
+    )
+    return Matcher(lenses, surface_map, templates)
+
+
+def missed(texture: Array, light: Array | float = 1.0) -> tuple[int, int]:
+    """How many landmarks the first camera finds in a picture of a skin under a light, and how many it misses."""
+    looks = {0: pictures(texture * light, np.eye(4), 1)[0]}
+    seen = matcher().align(0.0, looks, {0: np.eye(4)})
+    return len(seen), len(seen.missed.track)
+
+
+def test_a_shadow_hides_no_landmark_but_another_skin_does() -> None:
+    x, _ = places()
+    soft = 1 - 0.7 / (1 + np.exp(-5 * np.sin(x / 3.0)))  # edges some millimetres wide, everywhere
+    plain, shadowed, other = missed(skin(1)), missed(skin(1), soft), missed(skin(7))
+    assert plain[1] == 0 and plain[0] > 200
+    assert shadowed[0] < 0.6 * plain[0] and shadowed[1] < 0.1 * plain[0]  # not found, and yet not missed
+    assert other[1] > 0.9 * plain[0]
 
 
 def usual_of(grain: Array, noise: float, gain: float = 1.0) -> Array:

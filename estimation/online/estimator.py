@@ -354,7 +354,7 @@ class Estimator:
             reason,
             surface.detector.motion,
             surface.warp.warp,
-            local=surface.parted.with_holes(surface.local.error, surface.map.points),
+            local=surface.local.error,
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
         surface.pose = surface.measured = surface.reported_pose = entered

@@ -47,6 +47,7 @@ class FrameFit:
     offsets: Array  # (C,) px by which each camera stands off the pose, nan where it does not see the surface
     allowed: Array  # (C,) px, one sigma of that
     outliers: frozenset[int] = frozenset()  # cameras that were left out
+    lit: Mask | None = None  # (N,) outliers whose grain is where the pose puts it: a shadow's edge has bent the track
 
     @property
     def measured(self) -> bool:

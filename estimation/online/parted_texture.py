@@ -22,7 +22,6 @@ from estimation.pose import SurfacePose
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
-from estimation.surface_map import NO_LOCAL_ERROR, LocalError
 
 MIN_GROUP_LANDMARKS = 6  # that part together: a rigid motion through fewer could be chance
 MIN_GROUP_SETS = 5  # frame sets in which a landmark must have agreed before it can part
@@ -34,11 +33,6 @@ MIN_APART_MM = 0.5  # by which it must be apart to be told: what the guard allow
 MAX_PARTED_SHARE = 0.5  # of the landmarks that say what the surface is: with more of them parted, nobody knows
 GROUP_TIMEOUT_S = 0.5  # after which a motion no longer tells where a group is
 PARTED_MEMORY_S = 10.0  # some breaths: groups that met again may part again
-HOLE_MM = 4.0  # round a lost landmark, in which it counts how many others are lost,
-MIN_HOLE_LANDMARKS, MIN_HOLE_SHARE = 3, 0.6  # for a hole: single ones are lost to noise and glare
-STEADY_SETS, GONE_SETS = 20, 3  # one that was seen so often and is lost so often in a row is a hole by itself
-COMPANY_MM = 10.0  # within which a landmark that parted has another one: alone, a group's motion fits it by chance
-HOLE_SIGMA_MM = 1.0  # in a hole, at least: alignment finds what is nearer
 MAX_SOUGHT = 40  # landmarks that are looked for elsewhere
 VANISHED = np.diag([0.0] * 3 + [MAX_UNSEEN_MM**2] * 3)  # (6, 6) while half of it is lost: that may be the surface
 REGION_HINT = "the region holds both: draw it tighter"
@@ -63,9 +57,7 @@ class PartedTexture:
         """landmarks: of the first map, which all lie in the region, if one is known: then those say what counts."""
         self._rig, self._core = rig, landmarks if region else 0
         self.message = ""  # for the operator; "" while all moves as one
-        self._members = np.zeros(0, bool)  # (N,) landmarks that have parted,
-        self._size = 0.0  # mm, on average, by so much
-        self._gone = np.zeros(0, np.int64)  # (N,) frame sets in a row in which a steady landmark was lost
+        self._members = np.zeros(0, bool)  # (N,) landmarks that have parted
         self._agreed, self._looks = np.zeros((0, 4, 4)), np.zeros(0, np.int64)  # last poses agreed with, and how often
         self._here = np.zeros(0, bool)  # (N,) landmarks that two cameras or more agree on
         self._lost: Index = np.zeros(0, np.int64)  # rows that have left
@@ -89,25 +81,6 @@ class PartedTexture:
         apart = self.covariance(pose.stamp)
         return pose if apart is None else widened(pose, apart)
 
-    def with_holes(self, error: LocalError | None, points: Array) -> LocalError | None:
-        """The error of single places, larger where landmarks have left together; points: (N, 3) mm of the map.
-
-        A bump no wider than a few landmarks is smaller than what `LocalMotion` averages over.
-        """
-        if not len(self._lost):
-            return error
-        lost = np.zeros(len(points), bool)
-        lost[self._lost] = True
-        gone = points[self._lost]
-        square = ((gone[:, None] - points) ** 2).sum(-1)
-        near, company = square < HOLE_MM**2, (square < COMPANY_MM**2) @ self._members
-        known = lost | self._here
-        hole = (near @ lost >= MIN_HOLE_LANDMARKS) & (near @ lost >= MIN_HOLE_SHARE * (near @ known))
-        hole |= (self._members[self._lost] & (company > 1)) | (self._gone[self._lost] >= GONE_SETS)
-        if not hole.any():
-            return error
-        return (error or NO_LOCAL_ERROR).with_bells(gone[hole], max(self._size, HOLE_SIGMA_MM) ** 2, HOLE_MM)
-
     def sought(self, observations: Observations, fit: FrameFit, points: Array) -> Elsewhere | None:
         """What is to be looked for elsewhere in this frame set, too; None: nothing. points: (N, 3) of the map, mm."""
         pose, count = fit.solution.base_from_surface, len(points)
@@ -115,17 +88,14 @@ class PartedTexture:
             self._agreed = np.concatenate([self._agreed, np.tile(pose, (more, 1, 1))])
             self._looks = np.append(self._looks, np.zeros(more, np.int64))
             self._members = np.append(self._members, np.zeros(more, bool))
-            self._gone = np.append(self._gone, np.zeros(more, np.int64))
         here = np.bincount(observations.track[fit.inlier], minlength=count)
         away = np.bincount(observations.track[~fit.inlier], minlength=count)
         away += np.bincount(observations.missed.track, minlength=count)
         agrees = self._here = here >= MIN_VIEWS
         self._agreed[agrees], self._members = pose, self._members & ~agrees
         self._looks += agrees
-        self._size = self._size if self._members.any() else 0.0
         gone = (here < MIN_VIEWS) & (away >= MIN_VIEWS) & (self._looks >= MIN_GROUP_SETS)
         self._lost = np.flatnonzero(gone | self._members)
-        self._gone = np.where(gone & (self._looks >= STEADY_SETS), self._gone + 1, 0)
         if len(self._lost) < MIN_GROUP_LANDMARKS:
             return None
         rows = self._lost[:: 1 + len(self._lost) // MAX_SOUGHT]
@@ -198,7 +168,7 @@ class PartedTexture:
         size = np.linalg.norm(se3.transform_points(se3.inverse(surface) @ pose, own) - own, axis=1).mean()
         if self._sets < GROUP_SETS or size < MIN_APART_MM:
             return
-        self._members, self._size = self._members | rows, size
+        self._members |= rows
         side = self._side(own.mean(0) - self._middle(points), surface)
         self.message = f"texture on the {side} moves by itself, by {size:.1f} mm"
         if not self._core or self._unsure(np.flatnonzero(self._members)):

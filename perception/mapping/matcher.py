@@ -19,7 +19,16 @@ from perception.frames import Image, parallel_map
 from perception.lens import Lenses, undistort
 from perception.mapping.features import bounding_box
 from perception.mapping.masks import TrackingMasks, near_bead, patch_reach
-from perception.mapping.patches import Pyramid, Templates, align_in, join, project_into
+from perception.mapping.patches import (
+    Projection,
+    Pyramid,
+    Templates,
+    align_in,
+    grain_of,
+    join,
+    project_into,
+    sample,
+)
 
 FLOW_WINDOW_PX = 21
 MIN_WINDOW_SPREAD = 2.0  # grey levels: a flatter window gives no gain
@@ -125,6 +134,7 @@ def _windows(image: Image, pixels: Array) -> Array:
 CAMERA_POSE_PRIOR = np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3)
 MAX_FLOW_TRACKS = 80  # a camera: enough for a start, and flow is only that
 UNCERTAINTY_LANDMARKS = 8  # landmarks of a camera by which the uncertainty of all is judged
+MIN_SHOWN_GRAIN = 0.5  # correlation of a landmark's grain with its own: other skin has 0.1 by chance
 COMPLETE_SHARE = 0.8  # of a camera's landmarks: where fewer are measured, the start may have been wrong
 FLOW_POSE_TOLERANCE = 1e-3  # rad, mm: a start for the alignment need not be better
 
@@ -306,9 +316,37 @@ class Matcher:
         fits, number = result.found, np.array(cameras, np.int64)
         camera = number[position[fits]]
         pixels = self._ideal(camera, result.pixels[fits])
+        shown = fits.copy()  # what shows its grain is there, though nothing measures it
+        for at, pictures in enumerate(images):
+            mine = np.flatnonzero(~fits & (position == at))
+            for spots in (where.centre[mine], result.pixels[mine]):
+                shown[mine] |= self._shows_grain(pictures, where.take(mine), spots, row[mine])
+        lost = np.flatnonzero(~shown)
         # what the refinement has dropped is missed as well: the surface may have left the place that the map gives it
-        missing = number[np.concatenate([position[~fits], lacking])], np.concatenate([row[~fits], absent])
+        missing = number[np.concatenate([position[lost], lacking])], np.concatenate([row[lost], absent])
         return Observations(stamp, camera, row[fits], pixels, result.sigma[fits], MissedLandmarks(*missing))
+
+    def lit(
+        self, pyramids: dict[int, Pyramid], poses: Array, tracks: Observations, outlier: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Which tracks (N,), of those that are outliers (N,), show their grain where poses (C, 4, 4) put them."""
+        shown = np.zeros(len(tracks), bool)
+        for c, images in pyramids.items():
+            mine = np.flatnonzero(outlier & (tracks.camera == c))
+            rows, axes = tracks.track[mine], self.templates.axes
+            at = self.map.points[rows], self.map.normals[rows], axes[rows]
+            where = project_into(self.lenses, [c], poses[c][None], *at)
+            shown[mine] = self._shows_grain(images, where, where.centre, rows)
+        return shown
+
+    def _shows_grain(
+        self, images: Pyramid, where: Projection, spots: Array, rows: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Which landmarks (rows, (M,)) show their grain at spots (M, 2) px: a shadow's edge hides the rest of them."""
+        now = grain_of(sample(images[0], spots, where.per_sample))
+        first = grain_of(self.templates.picture[rows])
+        alike, sizes = (now * first).sum(1), (now * now).sum(1) * (first * first).sum(1)
+        return np.asarray(alike > MIN_SHOWN_GRAIN * np.sqrt(sizes))
 
     def align_at(
         self, stamp: float, pyramids: dict[int, Pyramid], pose: Array, rows: NDArray[np.int64], points: Array

@@ -95,6 +95,24 @@ def normalise(pictures: Float32) -> tuple[Float32, Float32]:
     return centred / np.maximum(contrast, 1e-3)[:, None], contrast
 
 
+GRAIN_ORDER = 5  # of the polynomial over a patch that is taken out: shading and soft edges
+
+
+def _coarse_basis() -> Float32:
+    """Orthonormal polynomials (S, B) over a patch, up to GRAIN_ORDER."""
+    u, v = (part.ravel() for part in np.meshgrid(*(np.linspace(-1, 1, PATCH_SIDE),) * 2))
+    powers = [(i, j) for i in range(GRAIN_ORDER + 1) for j in range(GRAIN_ORDER + 1 - i)]
+    return np.asarray(np.linalg.qr(np.stack([u**i * v**j for i, j in powers], -1))[0], np.float32)
+
+
+_COARSE = _coarse_basis()
+
+
+def grain_of(pictures: Float32) -> Float32:
+    """Pictures (N, S) without what polynomials explain."""
+    return np.asarray(pictures - (pictures @ _COARSE) @ _COARSE.T, np.float32)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
     """Where squares fall in one camera, or in several one after the other."""

@@ -25,7 +25,7 @@ from estimation.surface_map import SurfaceMap
 from perception.frames import parallel_map
 from perception.lens import Lenses
 from perception.mapping.aliases import NO_ALIASES, Aliases, SurfaceGrid, TangentPlane, find_aliases, surface_picture
-from perception.mapping.alignment_kernels import PATCH_SAMPLES, PATCH_SIDE, Float32
+from perception.mapping.alignment_kernels import PATCH_SAMPLES, Float32
 from perception.mapping.masks import TrackingMasks
 from perception.mapping.patches import (
     MIN_PATCH_CONTRAST,
@@ -33,6 +33,7 @@ from perception.mapping.patches import (
     Templates,
     coarse_score,
     cut_templates,
+    grain_of,
     project_squares,
     sample,
 )
@@ -215,7 +216,6 @@ def _spread_choice(power: Array, points: Array) -> Index:
     return np.array(chosen, np.int64)
 
 
-GRAIN_ORDER = 5  # of the polynomial over a patch that is taken out: shading and soft edges
 GRAIN_STRIDE = 3  # every third landmark is looked at, 40 of a camera: light deceives all of them at once
 GRAIN_MEMORY_SETS = 40.0  # over which it is learned how a landmark's grain looks: from another side it looks otherwise
 MIN_GRAIN_SETS = 5  # frame sets in which it must have been seen before it counts,
@@ -298,7 +298,7 @@ class Grain:
         if more > 0:
             self._usual = np.pad(self._usual, ((0, 0), (0, more), (0, 0)))
             self._looks = np.pad(self._looks, ((0, 0), (0, more)))
-            new = _grain(pictures[known:])
+            new = grain_of(pictures[known:])
             new /= np.maximum(np.linalg.norm(new, axis=1, keepdims=True), 1e-9)
             self._first = np.concatenate([self._first, new])
 
@@ -313,7 +313,7 @@ class Grain:
         where = project_squares(self._lenses, camera, pose, points, normals, axes[rows])
         imaged = self._lenses.image(camera, tracks.pixels, np.full(len(rows), np.inf))[0]
         levels = sample(images[0], imaged, where.per_sample)
-        grain = _grain(levels)
+        grain = grain_of(levels)
         along = np.einsum("ns,ns->n", grain, self._first[rows])
         return np.stack([along, np.einsum("ns,ns->n", grain, grain), levels.std(1)], -1)
 
@@ -329,18 +329,3 @@ def _grain_left(usual: Array, seen: Array, repeats: Array) -> tuple[float, float
     left = float((repeats * np.clip(ratio, -0.5, 1.5)).sum() / repeats.sum())
     other = float((repeats * np.clip(energy - ratio**2, -1.0, 2.0)).sum() / repeats.sum())
     return left, other
-
-
-def _coarse_basis() -> Float32:
-    """Orthonormal polynomials (S, B) over a patch, up to GRAIN_ORDER."""
-    u, v = (part.ravel() for part in np.meshgrid(*(np.linspace(-1, 1, PATCH_SIDE),) * 2))
-    powers = [(i, j) for i in range(GRAIN_ORDER + 1) for j in range(GRAIN_ORDER + 1 - i)]
-    return np.asarray(np.linalg.qr(np.stack([u**i * v**j for i, j in powers], -1))[0], np.float32)
-
-
-_COARSE = _coarse_basis()
-
-
-def _grain(pictures: Float32) -> Float32:
-    """Pictures (N, S) without what polynomials explain."""
-    return np.asarray(pictures - (pictures @ _COARSE) @ _COARSE.T, np.float32)

@@ -213,8 +213,8 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
         spread = spread + pose.warp.later(ahead).spread(place[None])[0]
     worst = float(np.linalg.eigvalsh(spread)[-1])
     if (local := pose.local) is not None:
-        away = ((local.centres - place) ** 2).sum(1) / (2 * local.reach**2)
-        moved = float(((local.variance + ahead * local.growth) * np.exp(-away)).max(initial=0.0))
+        share = 1 - ((local.centres - place) ** 2).sum(1) / (2 * local.reach) ** 2
+        moved = float(((local.variance + ahead * local.growth) * np.maximum(share, 0.0)).max(initial=0.0))
         nearest = math.sqrt(float(((local.support - place) ** 2).sum(1).min(initial=math.inf)))
         worst += max(moved, local.unsupported * min(max(nearest / local.span - 1.0, 0.0), 1.0))
     return math.sqrt(worst) if worst >= 0 else math.nan
