@@ -160,6 +160,17 @@ class LocalError:
     span: float  # mm from the nearest of them within which a place moves with it
     unsupported: float  # mm^2, at twice that distance and beyond; no support at all: everywhere
 
+    def with_bells(self, centres: Array, variance: float, reach: float) -> LocalError:
+        """The same with further bells about centres (K, 3), of one variance, mm^2, and one reach, mm."""
+        every = np.ones(len(centres))
+        return replace(
+            self,
+            centres=np.concatenate([self.centres, centres]),
+            variance=np.append(self.variance, variance * every),
+            growth=np.append(self.growth, 0 * every),
+            reach=np.append(self.reach, reach * every),
+        )
+
     def later(self, seconds: float) -> LocalError:
         """The same `seconds` s from its stamp, before or after."""
         return replace(self, variance=self.variance + abs(seconds) * self.growth)

@@ -354,7 +354,7 @@ class Estimator:
             reason,
             surface.detector.motion,
             surface.warp.warp,
-            local=surface.local.error,
+            local=surface.parted.at_its_places(surface.local.error, surface.map.points),
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
         surface.pose = surface.measured = surface.reported_pose = entered

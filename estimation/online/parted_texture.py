@@ -22,6 +22,7 @@ from estimation.pose import SurfacePose
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
+from estimation.surface_map import LocalError
 
 MIN_GROUP_LANDMARKS = 6  # that part together: a rigid motion through fewer could be chance
 MIN_GROUP_SETS = 5  # frame sets in which a landmark must have agreed before it can part
@@ -33,6 +34,8 @@ MIN_APART_MM = 0.5  # by which it must be apart to be told: what the guard allow
 MAX_PARTED_SHARE = 0.5  # of the landmarks that say what the surface is: with more of them parted, nobody knows
 GROUP_TIMEOUT_S = 0.5  # after which a motion no longer tells where a group is
 PARTED_MEMORY_S = 10.0  # some breaths: groups that met again may part again
+COMPANY_MM = 10.0  # within which a landmark that parted has another one: alone, a group's motion fits it by chance
+PLACE_MM = 4.0  # reach of what it says about its place: landmarks stand that far apart
 MAX_SOUGHT = 40  # landmarks that are looked for elsewhere
 VANISHED = np.diag([0.0] * 3 + [MAX_UNSEEN_MM**2] * 3)  # (6, 6) while half of it is lost: that may be the surface
 REGION_HINT = "the region holds both: draw it tighter"
@@ -57,7 +60,8 @@ class PartedTexture:
         """landmarks: of the first map, which all lie in the region, if one is known: then those say what counts."""
         self._rig, self._core = rig, landmarks if region else 0
         self.message = ""  # for the operator; "" while all moves as one
-        self._members = np.zeros(0, bool)  # (N,) landmarks that have parted
+        self._members = np.zeros(0, bool)  # (N,) landmarks that have parted,
+        self._size = 0.0  # mm, by so much on average, when they were last seen to
         self._agreed, self._looks = np.zeros((0, 4, 4)), np.zeros(0, np.int64)  # last poses agreed with, and how often
         self._here = np.zeros(0, bool)  # (N,) landmarks that two cameras or more agree on
         self._lost: Index = np.zeros(0, np.int64)  # rows that have left
@@ -80,6 +84,18 @@ class PartedTexture:
         """The pose, reported so that its covariance holds where it would be by the other group, if there is one."""
         apart = self.covariance(pose.stamp)
         return pose if apart is None else widened(pose, apart)
+
+    def at_its_places(self, error: LocalError | None, points: Array) -> LocalError | None:
+        """The error of single places, larger where a group has parted; points: (N, 3) mm of the map.
+
+        A bump no wider than a few landmarks is smaller than what `LocalMotion` averages over.
+        """
+        parted = points[self._members]
+        near = ((parted[:, None] - parted) ** 2).sum(-1) < COMPANY_MM**2
+        parted = parted[near.sum(1) > 1]
+        if error is None or not len(parted):
+            return error
+        return error.with_bells(parted, max(self._size, MIN_APART_MM) ** 2, PLACE_MM)
 
     def sought(self, observations: Observations, fit: FrameFit, points: Array) -> Elsewhere | None:
         """What is to be looked for elsewhere in this frame set, too; None: nothing. points: (N, 3) of the map, mm."""
@@ -168,7 +184,7 @@ class PartedTexture:
         size = np.linalg.norm(se3.transform_points(se3.inverse(surface) @ pose, own) - own, axis=1).mean()
         if self._sets < GROUP_SETS or size < MIN_APART_MM:
             return
-        self._members |= rows
+        self._members, self._size = self._members | rows, size
         side = self._side(own.mean(0) - self._middle(points), surface)
         self.message = f"texture on the {side} moves by itself, by {size:.1f} mm"
         if not self._core or self._unsure(np.flatnonzero(self._members)):

@@ -12,29 +12,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as the comma
 import argparse
 import multiprocessing
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 
-import cv2
-
-from tests.campaigns.deceit.judge import Verdict, run
-from tests.campaigns.deceit.kinds import NAMES, make_session
-from tests.campaigns.deceit.report import row, shown_sets, table, write_rows, write_sheets
+from tests.campaigns.deceit.judge import Verdict, run_one
+from tests.campaigns.deceit.kinds import NAMES
+from tests.campaigns.deceit.report import row, table, write_rows, write_sheets
 
 DEFAULT_COUNT = 200
 SIZES = {"large": (640, 480), "small": (480, 360)}
-
-
-def run_one(seed: int, size: tuple[int, int], sheets: bool, index: int) -> tuple[Verdict, float]:
-    """One session, and the seconds that it took."""
-    cv2.setNumThreads(1)
-    start = time.perf_counter()
-    session = make_session(seed, index, size)
-    verdict = run(session, shown_sets(session) if sheets else ())
-    return verdict, time.perf_counter() - start
 
 
 def run_all(indices: list[int], jobs: int, one: partial[tuple[Verdict, float]]) -> Iterator[tuple[Verdict, float]]:

@@ -7,10 +7,12 @@ of 100 cases. The first pose given as TRACKING places the path, so errors are re
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
+import cv2
 import numpy as np
 
 from estimation import se3
@@ -21,6 +23,7 @@ from perception.frames import FrameSet, Image
 from perception.tracking.step import TrackingStep
 from perception.tracking.wound_step import RegionSearch, RegionTrackingStep
 from planning.limits import MotionLimits
+from tests.campaigns.deceit.kinds import make_session
 from tests.campaigns.deceit.scenes import Session
 from tests.campaigns.deceit.world import Renderer
 
@@ -161,6 +164,21 @@ def run(session: Session, keep: tuple[int, ...] = ()) -> Verdict:
         if number in keep:
             pictures[number] = [frame.image for frame in frames.frames]
     return _verdict(session, sets, pictures)
+
+
+def shown_sets(session: Session) -> tuple[int, ...]:
+    """Numbers of the sets on a contact sheet: before the trick, within it, at the end."""
+    last = len(session.stamps) - 1
+    return max(session.trick - 1, 0), min(session.trick + max(4, (last - session.trick) // 4), last - 1), last
+
+
+def run_one(seed: int, size: tuple[int, int], sheets: bool, index: int) -> tuple[Verdict, float]:
+    """One session of a campaign, and the seconds that it took. sheets: whether pictures of it are kept."""
+    cv2.setNumThreads(1)  # sessions run beside each other
+    start = time.perf_counter()
+    session = make_session(seed, index, size)
+    verdict = run(session, shown_sets(session) if sheets else ())
+    return verdict, time.perf_counter() - start
 
 
 def _verdict(session: Session, sets: list[SetVerdict], pictures: dict[int, list[Image]]) -> Verdict:

@@ -11,7 +11,6 @@ import numpy as np
 
 from perception.frames import Image
 from tests.campaigns.deceit.judge import Verdict
-from tests.campaigns.deceit.scenes import Session
 
 COLUMNS = (
     *("index", "kind", "seed", "what", "decidable", "honest", "wrong", "worst_mm", "claim_mm", "tracking", "first"),
@@ -78,12 +77,6 @@ def _range(counts: Sequence[int]) -> str:
 
 def _text(value: float | None, digits: int) -> str:
     return "-" if value is None or np.isnan(value) else f"{value:.{digits}f}"
-
-
-def shown_sets(session: Session) -> tuple[int, ...]:
-    """Numbers of the sets on a contact sheet: before the trick, within it, at the end."""
-    last = len(session.stamps) - 1
-    return max(session.trick - 1, 0), min(session.trick + max(4, (last - session.trick) // 4), last - 1), last
 
 
 def contact_strip(verdict: Verdict, cameras: slice = slice(None)) -> Image:
