@@ -8,16 +8,25 @@ One Kalman filter holds what stays, offsets and shifts together, so that a shift
 What varies is learned as two variances. A delay common to all cameras cannot be seen: the reference is their mean.
 Only the offsets are corrected. The map is made through the same lenses, so a shift that stays is in the map too, and
 correcting it would carry the pose away from the map (measured: 0.04 mm on a surface at rest that had no shift at all).
+
+Pictures that hang, or come late all of a sudden, are no such offset. They show the surface where it once was, and two
+cameras that hang agree with each other. So cameras that carry the pose are believed against others (`RivalWatch`) only
+once they have been seen to move, and not along the way that the others went before: pictures are late, never early.
 """
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation import se3
+from estimation.online.fit import RivalPose
 from estimation.pose_solver import SharedErrors, SharedFit
+from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array, Index
 
 
@@ -191,3 +200,198 @@ class CameraErrorHistory:
     def before(self) -> CameraErrors:
         """As known INTERVAL_S ago or earlier."""
         return copy.deepcopy(self._before)
+
+
+MIN_VISIBLE_PX = 0.5  # root mean square over the anchors: twice what lens and map may shift a picture by,
+VISIBLE_SIGMAS = 5.0  # and so many of the pose's own noise there
+RIVAL_MEMORY_S = 2.0  # looked back for what has moved; half a slow breath
+MAX_LAG_S, LAG_STEP_S = 0.5, 0.01  # by which pictures may come late, a dozen of them queued; and the step of its search
+LAG_WINDOW_S = 0.25  # of the newest poses, which a lag must explain
+LAG_SHARE = 0.5  # of what they stand apart: a lag that leaves less explains it
+STEADY_SHARE = 0.3  # of what the carriers moved: cameras that stand apart by a steadier distance move in step
+RIVAL_HOLD_S = 0.5  # that a verdict stays after its rival is out of sight, or passes by
+
+
+@dataclass(slots=True)
+class _Verdict:
+    """What is known of the carriers against one rival."""
+
+    rival: RivalPose  # as last seen
+    since: float  # s, when the carriers were last known to be right, or the rival was first seen
+    seen: float  # s, when the rival was last seen
+    trusted: bool = False  # whether the carriers are believed
+    stood: bool = False  # whether they have stood still while the rival moved
+    still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
+    late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
+
+
+@dataclass(slots=True)
+class RivalWatch:
+    """Remembers where carriers and rivals saw the surface lately, and which carriers may be believed."""
+
+    anchors: Array  # (K, 3) mm, surface frame: where motion is looked for
+    _looks: deque[tuple[float, Array, dict[frozenset[int], Array]]] = field(default_factory=deque)  # s, carried, own
+    _verdicts: dict[frozenset[int], _Verdict] = field(default_factory=dict)
+
+    def update(self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose]) -> None:
+        """Take a frame set with the pose (4, 4) by those that carry it, and those that contradict it."""
+        carried = rivals[0].carried if rivals else carried
+        self._looks.append((stamp, carried, {rival.cameras: rival.own for rival in rivals}))
+        while self._looks[0][0] < stamp - RIVAL_MEMORY_S:
+            self._looks.popleft()
+        for rival in rivals:
+            verdict = self._verdicts.get(rival.cameras)
+            if verdict is None or verdict.rival.carriers != rival.carriers:
+                verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp)
+            verdict.rival, verdict.seen = rival, stamp
+            self._judge(rig, stamp, verdict)
+        self._verdicts = {
+            key: verdict for key, verdict in self._verdicts.items() if stamp - verdict.seen <= RIVAL_HOLD_S
+        }
+
+    @property
+    def doubted(self) -> list[RivalPose]:
+        """Rivals against which the carriers are not believed."""
+        return [verdict.rival for verdict in self._verdicts.values() if not verdict.trusted]
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) that covers the poses of all rivals that may be right."""
+        apart = [rival.difference for rival in self.doubted]
+        return sum((np.outer(d, d) for d in apart), np.zeros((6, 6)))
+
+    @property
+    def untimely(self) -> frozenset[int]:
+        """Rival cameras that stand still or come late while the carriers are believed: they are to be left out."""
+        wrong = (v.still | v.late[0] for v in self._verdicts.values() if v.trusted)
+        return frozenset().union(*wrong) & frozenset().union(*self._verdicts)
+
+    def starts(self) -> dict[int, Array]:
+        """Where each rival camera last saw the surface (4, 4), moved on as it moved from the look before."""
+        found: dict[int, Array] = {}
+        if not self._verdicts:
+            return found
+        before = self._looks[-2][2] if len(self._looks) > 1 else {}
+        for cameras, own in self._looks[-1][2].items():
+            moved = se3.inverse(before[cameras]) @ own if cameras in before else np.eye(4)
+            found.update(dict.fromkeys(cameras, own @ moved))
+        return found
+
+    def still_or_late(self, camera: int) -> str:
+        """What a rival camera that is not believed does, or ''."""
+        for cameras, verdict in self._verdicts.items():
+            if camera in cameras and verdict.trusted:
+                if camera in verdict.still:
+                    return "shows no motion while the others move"
+                if camera in verdict.late[0]:
+                    return f"shows what the others showed {verdict.late[1]:.2f} s before"
+        return ""
+
+    def doubts(self, names: Sequence[str]) -> list[str]:
+        """Why the carriers are not believed: a text for each rival. names: of all cameras."""
+        open_ = [verdict for verdict in self._verdicts.values() if not verdict.trusted]
+        newest = max((verdict.seen for verdict in open_), default=0.0)
+        return [_doubt_text(verdict, names) for verdict in open_ if verdict.seen == newest]
+
+    def _judge(self, rig: Rig, stamp: float, verdict: _Verdict) -> None:
+        """Who has moved since the carriers were last known to be right, and whether one side trails the other."""
+        key, carriers = verdict.rival.cameras, verdict.rival.carriers
+        looks = [look for look in self._looks if look[0] >= verdict.since]
+        _, a, b = _series(looks, key)
+        moved = any(_moved(self._pixels(rig, c, a), verdict.rival.noise[0]) for c in carriers)
+        rival_moved = any(_moved(self._pixels(rig, c, b), verdict.rival.noise[1]) for c in key)
+        if moved or rival_moved:  # else as it was
+            verdict.still = frozenset() if moved == rival_moved else key if moved else carriers
+            lag = self._lag(rig, verdict) if moved and rival_moved else 0.0
+            verdict.late = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
+        verdict.stood |= rival_moved and not moved
+        calm = stamp - verdict.since >= LAG_WINDOW_S and (not verdict.stood or self._steady(rig, verdict))
+        if (rival_moved and not moved) or verdict.late[0] == carriers or len(key) > len(carriers):
+            verdict.trusted = False
+        elif moved and (not rival_moved or verdict.late[0] == key or calm):
+            verdict.trusted = True
+        if verdict.trusted and moved:
+            verdict.since, verdict.stood = stamp, False
+
+    def _pixels(self, rig: Rig, camera: int, poses: Array) -> Array:
+        """Where the anchors fall in a camera at poses (T, 4, 4): (T, K, 2) px."""
+        points = self.anchors @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+        return ideal_pixels(rig.cameras[camera], points.reshape(-1, 3))[0].reshape(len(poses), -1, 2)
+
+    def _newest(self, rig: Rig, verdict: _Verdict) -> tuple[int, Array, Array, Array]:
+        """Looks that count, and stamps (T,) and anchors (T, 2K) px by carriers and by rival in the rival's picture."""
+        stamps, a, b = _series(self._looks, verdict.rival.cameras)
+        start = max(verdict.since + 1e-9, stamps[-1] - LAG_WINDOW_S)
+        camera = min(verdict.rival.cameras)
+        count = int((stamps >= start).sum())
+        return count, stamps, *(self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
+
+    def _lag(self, rig: Rig, verdict: _Verdict) -> float:
+        """By how much, s, the carriers show later what the rival shows; negative: the rival is late; 0: no lag."""
+        count, stamps, a, b = self._newest(rig, verdict)
+        apart = _rms(a[-count:] - b[-count:])
+        lags = np.arange(LAG_STEP_S, min(MAX_LAG_S, stamps[-count] - stamps[0]) + 1e-9, LAG_STEP_S)
+        if not len(lags) or apart < MIN_VISIBLE_PX / 2:
+            return 0.0
+        behind = [_lagged(stamps, count, x, y, lags) for x, y in ((a, b), (b, a))]
+        best = [int(np.argmin(left)) for left in behind]
+        carriers, rival = behind[0][best[0]], behind[1][best[1]]
+        if min(carriers, rival) > LAG_SHARE * apart:
+            return 0.0
+        both = max(carriers, rival) < LAG_SHARE * apart  # a way to and fro: the shorter lag
+        first = best[0] <= best[1] if both else carriers < rival
+        return float(lags[best[0]] if first else -lags[best[1]])
+
+    def _steady(self, rig: Rig, verdict: _Verdict) -> bool:
+        """Whether the rival's picture stands apart by the same distance while the carriers move."""
+        count, _, a, b = self._newest(rig, verdict)
+        apart, way = (a - b)[-count:], a[-count:]
+        moved = _rms(way - way.mean(0))
+        return moved > MIN_VISIBLE_PX / 2 and _rms(apart - apart.mean(0)) < STEADY_SHARE * moved
+
+
+def spread_anchors(points: Array) -> Array:
+    """Of points (N, 3), the one in the middle and those that lie farthest out to four sides: (5, 3)."""
+    away = points - points.mean(0)
+    axes = np.linalg.svd(away, full_matrices=False)[2][:2]
+    along = away @ axes.T
+    rows = [int(np.argmin((away**2).sum(1))), *np.argmin(along, 0).tolist(), *np.argmax(along, 0).tolist()]
+    return np.asarray(points[rows])
+
+
+def _series(
+    looks: Sequence[tuple[float, Array, dict[frozenset[int], Array]]], key: frozenset[int]
+) -> tuple[Array, Array, Array]:
+    """Stamps (T,) and poses (T, 4, 4) by carriers and by rival; before they parted they were the same."""
+    own = np.stack([look[2].get(key, look[1]) for look in looks])
+    return np.array([look[0] for look in looks]), np.stack([look[1] for look in looks]), own
+
+
+def _moved(pixels: Array, noise: float) -> bool:
+    """Whether anchors (T, K, 2) px have visibly left where they first were."""
+    away = np.sqrt(((pixels - pixels[0]) ** 2).sum(2).mean(1))
+    return bool(away.max() > max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
+
+
+def _rms(away: Array) -> float:
+    """Root mean square length, px, of (T, 2K) flat pixels."""
+    return float(np.sqrt(2 * np.mean(away**2)))
+
+
+def _lagged(stamps: Array, count: int, late: Array, early: Array, lags: Array) -> Array:
+    """What is left (L,), px, of the newest `count` looks of one side against the other's so much earlier."""
+    at = stamps[-count:] - lags[:, None]
+    then = np.stack([np.interp(at, stamps, column) for column in early.T], -1)
+    return np.asarray(np.sqrt(2 * ((late[-count:] - then) ** 2).mean((1, 2))))
+
+
+def _doubt_text(verdict: _Verdict, names: Sequence[str]) -> str:
+    carriers, key = verdict.rival.carriers, verdict.rival.cameras
+    first = verdict.still or verdict.late[0] or key
+    one, other = (", ".join(names[c] for c in sorted(side)) for side in (first, key if first == carriers else carriers))
+    said = f"{one} against {other}"
+    if verdict.still:
+        said = f"no motion in {one} while {other} moved"
+    elif verdict.late[0]:
+        said = f"{one} late by {verdict.late[1]:.2f} s against {other}"
+    return f"{said}: no majority can be trusted"

@@ -8,7 +8,7 @@ usually stand apart is learned, since no calibration is perfect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -17,6 +17,8 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.bump_detector import BumpDetector
+from estimation.online.camera_errors import RivalWatch, spread_anchors
+from estimation.online.fit import RivalPose
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
@@ -47,11 +49,12 @@ class CameraHealth:
         self.bumps = BumpDetector(names)
         self._fresh = frozenset(range(len(self._names)))  # cameras with a new picture; all until `set_pictures`
         self._repeated: frozenset[int] = frozenset()
-        self.begin()
+        self.begin(np.zeros((1, 3)))
 
-    def begin(self) -> None:
-        """Forget everything, as for a new map."""
+    def begin(self, points: Array) -> None:
+        """Forget everything, as for a new map with landmarks (N, 3), surface frame."""
         count = len(self._names)
+        self.rivals = RivalWatch(spread_anchors(points))
         self.bumps.begin()
         self.left_out: frozenset[int] = frozenset()
         self._usual, self._tracks = np.zeros(count), np.zeros(count)  # px off, and tracks
@@ -99,6 +102,36 @@ class CameraHealth:
         fewer = used.sum() < SHARP_SHARE * self._tracks.sum()
         return bool(fewer and self.blur_offsets(offsets, allowed, outliers).any())
 
+    def solve(
+        self, tracks: FrameTracks, start: Array, scales: tuple[float, ...], allowed: Array, expected: SurfacePose | None
+    ) -> tuple[PoseFit, frozenset[int], Array]:
+        """The pose of the cameras that agree with each other, those left out, and offsets (C,), px, from the pose.
+
+        allowed: (C,) px. expected: by the motion until now; None where no other camera is to be left out.
+        """
+        outliers = self.left_out | self.rivals.untimely
+        solution = tracks.fit(start, scales, outliers)
+        offsets = tracks.offsets(solution)
+        if expected is None:
+            return solution, outliers, offsets
+        limit = OUTLIER_RATIO * allowed
+        apart = any(offsets[c] > limit[c] for c in range(len(limit)) if c not in outliers)
+        # a camera may have moved, though the others follow it
+        if apart or motion_sigmas(solution, expected) > MAX_MOTION_SIGMAS:
+            stay, within = (1, np.inf) if apart else (2, MAX_MOTION_SIGMAS)
+            better = tracks.without_outliers(outliers, limit, expected, stay, within)
+            if better is not None:
+                outliers, solution = tracks.along_motion(*better, limit, expected) if apart else better
+                return solution, outliers, tracks.offsets(solution)
+        return solution, outliers, offsets
+
+    def rival_poses(
+        self, tracks: FrameTracks, fit: PoseFit, outliers: frozenset[int], allowed: Array
+    ) -> tuple[RivalPose, ...]:
+        """What the cameras that are left out, or look bumped, say against the fit. allowed: (C,) px."""
+        apart = outliers | self.bumps.bumped.keys()
+        return tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.starts()) if apart else ()
+
     def update(
         self, stamp: float, used: Index, least: float, offsets: Array, allowed: Array, outliers: Collection[int]
     ) -> None:
@@ -116,6 +149,7 @@ class CameraHealth:
         share = min(1.0, (stamp - self._stamp) / USUAL_MEMORY_S) if np.isfinite(self._stamp) else 1.0
         self._stamp = stamp
         known = carrying & np.isfinite(offsets)
+        known[list(self.bumps.bumped)] = False  # a camera that hangs before a slow motion stands off ever farther
         self._usual[known] += share * (np.minimum(offsets, 2 * allowed)[known] - self._usual[known])
         self._tracks[carrying] += share * (used[carrying] - self._tracks[carrying])
         # which cameras stay left out
@@ -131,8 +165,11 @@ class CameraHealth:
         late = (self._missed >= 2) & (stamp - self._carried > MAX_GAP_S)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
         off = self.left_out | self.bumps.messages.keys()
-        troubled = (c for c in range(len(self._names)) if named[c] or c in off or self._apart[c])
-        reasons = [f"{self._names[c]} {self._why(c)}" for c in troubled]
+        doubted = {c for rival in self.rivals.doubted for c in rival.cameras | rival.carriers}
+        troubled = (
+            c for c in range(len(self._names)) if named[c] or ((c in off or self._apart[c]) and c not in doubted)
+        )
+        reasons = [*self.rivals.doubts(self._names), *(f"{self._names[c]} {self._why(c)}" for c in troubled)]
         return ", ".join(reasons or ["no camera shows the surface as usual"] * self._blurred)
 
     def _why(self, camera: int) -> str:
@@ -140,6 +177,8 @@ class CameraHealth:
             return "shows the same picture again"
         if camera not in self._fresh:
             return "delivers no picture"
+        if said := self.rivals.still_or_late(camera):
+            return said
         if camera in self.bumps.messages:
             return self.bumps.messages[camera]
         if camera in self.left_out or self._apart[camera]:
@@ -203,6 +242,59 @@ class FrameTracks:
                 sure = len(fits) == 1 or fits[1][0] > MAX_MOTION_SIGMAS * fits[0][0]
                 return fits[0][1:] if sure and fits[0][0] <= within else None
         return None
+
+    def along_motion(
+        self, without: frozenset[int], fit: PoseFit, allowed: Array, expected: SurfacePose
+    ) -> tuple[frozenset[int], PoseFit]:
+        """The cameras to be left out and the fit, once those without which the others agree are chosen.
+
+        Where the others contradict the motion until now, and one camera that stands apart continues it, that one is
+        followed: cameras that hang, or come late together, agree with each other.
+        """
+        present = {int(c) for c in np.unique(self.seen.camera)}
+        apart = sorted(present & without)
+        if motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS or len(apart) != 1:
+            return without, fit
+        others = frozenset(present - without) | (without - set(apart))
+        alone = self.fit(expected.base_from_surface, (4.0, 1.0), others)
+        sound = self.offsets(alone)[apart[0]] <= allowed[apart[0]]
+        continues = motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
+        return (others, alone) if sound and continues else (without, fit)
+
+    def rivals(
+        self, fit: PoseFit, apart: Collection[int], allowed: Array, starts: Mapping[int, Array]
+    ) -> tuple[RivalPose, ...]:
+        """What cameras `apart` say against the others, together where they agree, else each by itself.
+
+        allowed: (C,) px by which cameras that agree may stand off. starts: (4, 4) by camera, where it last saw the
+        surface.
+        """
+        counts = np.bincount(self.seen.camera, minlength=len(self.rig))
+        seen = frozenset(np.flatnonzero(counts >= self.min_tracks).tolist())
+        rivals, carriers = sorted(seen & set(apart)), seen - set(apart)
+        if not rivals or not carriers:
+            return ()
+        carried, noise = self._only(carriers, fit.base_from_surface)
+        alone: list[RivalPose] = []
+        for group in ([rivals] if len(rivals) > 1 else []) + [[c] for c in rivals]:
+            key = frozenset(group)
+            own, own_noise = self._only(key, starts.get(group[0], fit.base_from_surface))
+            if (self.offsets(own)[group] <= allowed[group]).all():
+                alone.append(
+                    RivalPose(key, carriers, carried.base_from_surface, own.base_from_surface, (noise, own_noise))
+                )
+                if len(group) > 1:
+                    break
+        return tuple(alone)
+
+    def _only(self, cameras: frozenset[int], start: Array) -> tuple[PoseFit, float]:
+        """The fit of these cameras' tracks alone, and its noise, px, in their pictures."""
+        fit = self.fit(start, (4.0, 1.0), set(range(len(self.rig))) - cameras)
+        mine = np.isin(self.seen.camera, list(cameras))
+        damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)
+        jacobians = fit.jacobians[mine]
+        spread = np.einsum("nki,nki->", jacobians @ np.linalg.inv(damped), jacobians) / len(jacobians)
+        return fit, float(np.sqrt(spread))
 
     def weak_fit_reason(self, fit: PoseFit, outliers: Collection[int], torn: bool, expected: SurfacePose) -> str:
         """What speaks against a fit that stands on little, or ''.

@@ -16,7 +16,7 @@ from estimation import se3
 from estimation.forecast.predictor import Predictor
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
-from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, CameraHealth, FrameTracks, motion_sigmas
+from estimation.online.camera_health import CameraHealth, FrameTracks
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.local_motion import LocalMotion
@@ -24,7 +24,7 @@ from estimation.online.reported_covariance import CalibrationError, ReportedCova
 from estimation.online.surface_state import Measurement, MotionDetector, PoseStateMachine, StateSettings
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
-from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
+from estimation.pose_solver import INLIER_WEIGHT, project
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index
@@ -151,7 +151,8 @@ class Estimator:
         allowed = self.health.allowed(np.full(len(self.rig), smear))
         shared = self.cameras.shared(twist)
         tracks = FrameTracks(self.rig, seen, points, shared, self._min_camera_tracks())
-        solution, outliers, offsets = self._solve(tracks, start, scales, allowed)
+        expected = self.expected(seen.stamp) if self.confirmed else None  # a bent first map sets cameras apart
+        solution, outliers, offsets = self.health.solve(tracks, start, scales, allowed, expected)
         inlier = solution.weights > INLIER_WEIGHT
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
         parts = fit_covariance(seen, solution, shared, surface.map_error, surface.warp)
@@ -175,26 +176,8 @@ class Estimator:
             offsets=offsets,
             allowed=allowed,
             outliers=outliers,
+            rivals=self.health.rival_poses(tracks, solution, outliers, allowed),
         )
-
-    def _solve(
-        self, tracks: FrameTracks, start: Array, scales: tuple[float, ...], allowed: Array
-    ) -> tuple[PoseFit, frozenset[int], Array]:
-        """The pose of the cameras that agree with each other, those left out, and offsets (C,), px, from the pose."""
-        outliers = self.health.left_out
-        solution = tracks.fit(start, scales, outliers)
-        offsets = tracks.offsets(solution)
-        if not self.confirmed:  # a bent first map sets cameras apart
-            return solution, outliers, offsets
-        limit, expected = OUTLIER_RATIO * allowed, self.expected(tracks.seen.stamp)
-        apart = any(offsets[c] > limit[c] for c in range(len(self.rig)) if c not in outliers)
-        # a camera may have moved, though the others follow it
-        if apart or motion_sigmas(solution, expected) > MAX_MOTION_SIGMAS:
-            stay, within = (1, np.inf) if apart else (2, MAX_MOTION_SIGMAS)
-            better = tracks.without_outliers(outliers, limit, expected, stay, within)
-            if better is not None:
-                return better[1], better[0], tracks.offsets(better[1])
-        return solution, outliers, offsets
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
         """Velocity (6,) at `stamp` and its variance (6,): the window's and the chord's to `start`, as each is known."""
@@ -251,7 +234,7 @@ class Estimator:
         """
         self._mapped = _MappedSurface(surface_map, len(self.rig), caveat)
         self._smoother.reset()
-        self.health.begin()
+        self.health.begin(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         zero = np.zeros((6, 6))
         return self._enter(stamp, base_from_surface, covariance, zero, zero, *self._states.begin(stamp))
@@ -309,6 +292,7 @@ class Estimator:
         surface.accepted += 1
         surface.detector(fit.stamp, fit.solution.base_from_surface, fit.parts.noise)
         self._update_health(fit)
+        self.health.rivals.update(self.rig, fit.stamp, fit.solution.base_from_surface, fit.rivals)
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
         quality = Measurement(
@@ -324,7 +308,8 @@ class Estimator:
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        surface.reported_pose = widened(given, surface.local.covariance) if surface.local.active else given
+        given = widened(given, surface.local.covariance) if surface.local.active else given
+        surface.reported_pose = widened(given, self.health.rivals.covariance) if self.health.rivals.doubted else given
         return surface.reported_pose
 
     def _update_health(self, fit: FrameFit) -> None:

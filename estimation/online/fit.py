@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation import se3
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
 from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors
@@ -32,6 +33,22 @@ class FitCovariance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RivalPose:
+    """Where cameras that do not carry the pose see the surface, against those that do."""
+
+    cameras: frozenset[int]  # that agree among themselves
+    carriers: frozenset[int]  # that carry the pose
+    carried: Array  # (4, 4) base_from_surface by the carriers alone
+    own: Array  # (4, 4) base_from_surface by `cameras` alone
+    noise: tuple[float, float]  # px, one sigma, of what both poses do to their own pictures: carriers', own
+
+    @property
+    def difference(self) -> Array:
+        """(6,) the tangent vector from the carried pose to the own one."""
+        return se3.log(se3.inverse(self.carried) @ self.own)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameFit:
     """A fit to one frame set of C cameras, and whether it is a measurement."""
 
@@ -46,6 +63,7 @@ class FrameFit:
     offsets: Array  # (C,) px by which each camera stands off the pose, nan where it does not see the surface
     allowed: Array  # (C,) px, one sigma of that
     outliers: frozenset[int] = frozenset()  # cameras that were left out
+    rivals: tuple[RivalPose, ...] = ()  # what cameras that are left out, or look bumped, say against it
 
     @property
     def measured(self) -> bool:
