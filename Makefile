@@ -1,4 +1,4 @@
-# make demo | test | slow | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser | deceit: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -9,7 +9,7 @@ DEMO   := demo
 # Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test slow mutants bench check format install outages faults fuzz hazards references audit browser
+.PHONY: demo test slow mutants bench check format install outages faults fuzz hazards references audit browser deceit
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -35,6 +35,9 @@ faults: $(STAMP)
 
 fuzz: $(STAMP)
 	$(BIN)/stillbed bench fuzz --count 1000000 --jobs 2 --log out/fuzz.csv -o out/fuzz --force
+
+deceit: $(STAMP)
+	$(BIN)/python -m tests.campaigns.deceit --count 200 --seed 1 --jobs 2 --sheets -o out/deceit
 
 hazards: $(STAMP)
 	$(BIN)/python -m tests.hazard_table --run

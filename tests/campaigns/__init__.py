@@ -1,0 +1,1 @@
+"""Campaigns: many seeded sessions against the whole tracker, each a package that is run by `python -m`."""
