@@ -9,10 +9,15 @@ The usual values are learned of all cameras together and subtracted from the res
 cameras see the surface. A camera whose usual values are not known yet is not judged, and does not judge others. A
 number that the pose could absorb almost whole (two cameras of three, along the plane of their rays) cannot be told
 from small errors of the map, and is held at zero.
+
+A camera that hangs before a slow motion stands off by little for long, most of all where the motion is along its axis
+or along that of the one that does not hang. So the way of each picture within a second, by a pose of the camera's own,
+is compared with the way by the pose of the others (`UnequalMotion`): errors of lens and map hardly change in a second.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,6 +42,16 @@ USUAL_CHANGE_RATIO = 5.0  # and at least so many times the usual change
 NEXT_CAMERA_RATIO = 1.2  # times what the next camera explains
 BUMP_LASTS_S = 0.2  # that a change must last
 BUMP_OVER_S = 0.06  # that single looks must be below half the limit until it is over
+
+
+MIN_UNEQUAL_PX = (
+    0.2  # root mean square over the anchors by which ways in a picture must differ: lens and map err by it,
+)
+UNEQUAL_SIGMAS = 6.0  # so many times the noise of both ways and what late exposures make of them,
+UNEQUAL_SHARE = 0.3  # and such a part of the longer one: what does not follow at all is sought, not what errs a little
+WAY_MEMORY_S = 1.0  # over which ways are compared
+MIN_UNEQUAL_LOOKS = 2  # one after the other
+EQUAL_AGAIN_S = 0.5  # that ways must be alike until the camera is like the others again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +97,7 @@ class BumpDetector:
         self._learned = np.zeros(count)  # s in which a camera's usual values were learned
         self._first, self._stamp, self._count = np.nan, np.nan, 0
         self._outliers: frozenset[int] = frozenset()
+        self.unequal = UnequalMotion()
 
     @property
     def messages(self) -> dict[int, str]:
@@ -96,18 +112,20 @@ class BumpDetector:
         exposed: Array,
         jacobians: Array,
         outliers: frozenset[int],
+        smear: Array | None = None,
     ) -> None:
         """Take an accepted frame set.
 
         points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
         jacobians: (N, 2, 6) px by the pose. outliers: cameras so far off that the pose is without them; their change is
-        forgotten once they are back.
+        forgotten once they are back. smear: (6,) one sigma by which the surface moves in an exposure's delay.
         """
         if observations.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
             return
         self._forget(self._outliers - outliers)
         self._outliers = outliers
         parts = camera_equations(rig, observations, points, exposed, jacobians)
+        self.unequal.update(rig, observations.stamp, points, exposed, parts, np.zeros(6) if smear is None else smear)
         if np.isnan(self._first):
             self._first = self._stamp = observations.stamp
         step, self._stamp = max(observations.stamp - self._stamp, 0.0), observations.stamp
@@ -188,6 +206,94 @@ class CameraEquations:
     def moved(self, numbers: Array) -> float:
         """Root mean square, px, by which these numbers (4,) move its tracks."""
         return float(np.sqrt(np.mean(((self.slopes @ numbers) ** 2).sum(-1))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PictureWay:
+    """Where the anchors stand in one camera's picture in one look."""
+
+    stamp: float  # s
+    own: Array  # (2K,) px, by the camera's own pose
+    others: Array  # (2K,) px, by the pose of the others
+    doubt: float  # px, of their difference: noise and late exposures
+
+
+class UnequalMotion:
+    """Remembers how each camera's picture moved within a second, and which camera does not move as the others do."""
+
+    def __init__(self) -> None:
+        self.apart: frozenset[int] = frozenset()  # the camera that moves least like the others, if any
+        self._looks, self._since = 0, np.nan  # in which one was unequal, in a row; s, stamp of the last
+        self.forget()
+
+    def forget(self) -> None:
+        """Compare with no earlier picture, as after a change of the map."""
+        self._ways: dict[int, deque[_PictureWay]] = {}
+        self._anchors: Array | None = None  # (K, 3) mm, surface frame
+
+    def update(
+        self, rig: Rig, stamp: float, points: Array, exposed: Array, parts: dict[int, CameraEquations], smear: Array
+    ) -> None:
+        """Take a look. points: (N, 3) mm. exposed: (C, 4, 4). smear: (6,) mm and rad, of late exposures."""
+        if self._anchors is None:
+            self._anchors = spread_anchors(points)
+        worst, largest = -1, 0.0
+        for camera in parts if len(parts) > 1 else ():
+            way = self._way(rig, stamp, camera, exposed[camera], parts, smear)
+            ways = self._ways.setdefault(camera, deque())
+            while ways and ways[0].stamp < stamp - WAY_MEMORY_S:
+                ways.popleft()
+            unequal = _unequal(way, ways)
+            ways.append(way)
+            if unequal > largest:
+                worst, largest = camera, unequal
+        if worst >= 0:
+            self._looks, self._since = self._looks + 1, stamp
+            if self._looks >= MIN_UNEQUAL_LOOKS:
+                self.apart = self.apart or frozenset([worst])
+        else:
+            self._looks = 0
+            if stamp - self._since > EQUAL_AGAIN_S:
+                self.apart = frozenset()
+
+    def _way(
+        self, rig: Rig, stamp: float, camera: int, pose: Array, parts: dict[int, CameraEquations], smear: Array
+    ) -> _PictureWay:
+        assert self._anchors is not None
+        pixels, _, jacobian = project(rig, np.full(len(self._anchors), camera), pose, self._anchors)
+        flat, mine = jacobian.reshape(-1, 6), parts[camera]
+        rest = [part for c, part in parts.items() if c != camera]
+        sides = [(mine.pose, mine.pulled), (sum(p.pose for p in rest), sum(p.pulled for p in rest))]
+        moved, square = [], float(np.mean((flat @ smear) ** 2))
+        for information, pulled in sides:
+            known = np.linalg.inv(information + (1e-9 * np.trace(information) + 1e-12) * np.eye(6))
+            moved.append(pixels.ravel() + flat @ (known @ pulled))
+            square += float(np.einsum("ki,ij,kj->", flat, known, flat)) / len(flat)
+        return _PictureWay(stamp, moved[0], moved[1], np.sqrt(2 * square))
+
+
+def _unequal(now: _PictureWay, before: Collection[_PictureWay]) -> float:
+    """By how much, px, the longest unequal way since one of those looks differs by the own pose and by the others'."""
+    if not before:
+        return 0.0
+    own, others = now.own - np.stack([w.own for w in before]), now.others - np.stack([w.others for w in before])
+    doubt = np.hypot(now.doubt, [w.doubt for w in before])
+    differ, size = _lengths(own - others), np.maximum(_lengths(own), _lengths(others))
+    clear = (differ > np.maximum(MIN_UNEQUAL_PX, UNEQUAL_SIGMAS * doubt)) & (differ > UNEQUAL_SHARE * size)
+    return float(differ[clear].max(initial=0.0))
+
+
+def _lengths(ways: Array) -> Array:
+    """Root mean square (T,), px, over the anchors of ways (T, 2K)."""
+    return np.asarray(np.sqrt(2 * np.mean(ways**2, axis=1)))
+
+
+def spread_anchors(points: Array) -> Array:
+    """Of points (N, 3), the one in the middle and those that lie farthest out to four sides: (5, 3)."""
+    away = points - points.mean(0)
+    along = away @ np.linalg.svd(away, full_matrices=False)[2][:2].T
+    rows = [int(np.argmin((away**2).sum(1))), *np.argmin(along, 0).tolist(), *np.argmax(along, 0).tolist()]
+    return np.asarray(points[rows])
 
 
 def camera_equations(

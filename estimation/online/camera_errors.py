@@ -202,7 +202,7 @@ class CameraErrorHistory:
         return copy.deepcopy(self._before)
 
 
-MIN_VISIBLE_PX = 0.5  # root mean square over the anchors: twice what lens and map may shift a picture by,
+MIN_VISIBLE_PX = 0.3  # root mean square over the anchors: more than lens and map change in a second,
 VISIBLE_SIGMAS = 5.0  # and so many of the pose's own noise there
 RIVAL_MEMORY_S = 2.0  # looked back for what has moved; half a slow breath
 MAX_LAG_S, LAG_STEP_S = 0.5, 0.01  # by which pictures may come late, a dozen of them queued; and the step of its search
@@ -224,6 +224,11 @@ class _Verdict:
     still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
     late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
 
+    def remembered(self, stamp: float) -> bool:
+        """Whether a rival that is not seen at `stamp`, s, still counts."""
+        known = self.stood or bool(self.still or self.late[0])
+        return known and stamp - self.seen <= RIVAL_HOLD_S
+
 
 @dataclass(slots=True)
 class RivalWatch:
@@ -233,8 +238,14 @@ class RivalWatch:
     _looks: deque[tuple[float, Array, dict[frozenset[int], Array]]] = field(default_factory=deque)  # s, carried, own
     _verdicts: dict[frozenset[int], _Verdict] = field(default_factory=dict)
 
-    def update(self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose]) -> None:
-        """Take a frame set with the pose (4, 4) by those that carry it, and those that contradict it."""
+    def update(
+        self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose], left_out: frozenset[int]
+    ) -> None:
+        """Take a frame set with the pose (4, 4) by those that carry it, those that contradict it, and those left out.
+
+        A rival that is left out remains one while it is out of sight; one that agrees again does not, unless somebody
+        has been seen to hang.
+        """
         carried = rivals[0].carried if rivals else carried
         self._looks.append((stamp, carried, {rival.cameras: rival.own for rival in rivals}))
         while self._looks[0][0] < stamp - RIVAL_MEMORY_S:
@@ -246,7 +257,9 @@ class RivalWatch:
             verdict.rival, verdict.seen = rival, stamp
             self._judge(rig, stamp, verdict)
         self._verdicts = {
-            key: verdict for key, verdict in self._verdicts.items() if stamp - verdict.seen <= RIVAL_HOLD_S
+            key: verdict
+            for key, verdict in self._verdicts.items()
+            if verdict.seen == stamp or key & left_out or verdict.remembered(stamp)
         }
 
     @property
@@ -296,7 +309,7 @@ class RivalWatch:
     def _judge(self, rig: Rig, stamp: float, verdict: _Verdict) -> None:
         """Who has moved since the carriers were last known to be right, and whether one side trails the other."""
         key, carriers = verdict.rival.cameras, verdict.rival.carriers
-        looks = [look for look in self._looks if look[0] >= verdict.since]
+        looks = [look for look in self._looks if look[0] >= verdict.since and key in look[2]]
         _, a, b = _series(looks, key)
         moved = any(_moved(self._pixels(rig, c, a), verdict.rival.noise[0]) for c in carriers)
         rival_moved = any(_moved(self._pixels(rig, c, b), verdict.rival.noise[1]) for c in key)
@@ -308,7 +321,7 @@ class RivalWatch:
         calm = stamp - verdict.since >= LAG_WINDOW_S and (not verdict.stood or self._steady(rig, verdict))
         if (rival_moved and not moved) or verdict.late[0] == carriers or len(key) > len(carriers):
             verdict.trusted = False
-        elif moved and (not rival_moved or verdict.late[0] == key or calm):
+        elif moved and (not rival_moved or (verdict.late[0] == key and not verdict.stood) or calm):
             verdict.trusted = True
         if verdict.trusted and moved:
             verdict.since, verdict.stood = stamp, False
@@ -323,7 +336,7 @@ class RivalWatch:
         stamps, a, b = _series(self._looks, verdict.rival.cameras)
         start = max(verdict.since + 1e-9, stamps[-1] - LAG_WINDOW_S)
         camera = min(verdict.rival.cameras)
-        count = int((stamps >= start).sum())
+        count = next((n for n, look in enumerate(reversed(self._looks)) if look[0] < start or not look[2]), len(stamps))
         return count, stamps, *(self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
 
     def _lag(self, rig: Rig, verdict: _Verdict) -> float:
@@ -331,7 +344,7 @@ class RivalWatch:
         count, stamps, a, b = self._newest(rig, verdict)
         apart = _rms(a[-count:] - b[-count:])
         lags = np.arange(LAG_STEP_S, min(MAX_LAG_S, stamps[-count] - stamps[0]) + 1e-9, LAG_STEP_S)
-        if not len(lags) or apart < MIN_VISIBLE_PX / 2:
+        if not len(lags) or apart < MIN_VISIBLE_PX:
             return 0.0
         behind = [_lagged(stamps, count, x, y, lags) for x, y in ((a, b), (b, a))]
         best = [int(np.argmin(left)) for left in behind]
@@ -348,15 +361,6 @@ class RivalWatch:
         apart, way = (a - b)[-count:], a[-count:]
         moved = _rms(way - way.mean(0))
         return moved > MIN_VISIBLE_PX / 2 and _rms(apart - apart.mean(0)) < STEADY_SHARE * moved
-
-
-def spread_anchors(points: Array) -> Array:
-    """Of points (N, 3), the one in the middle and those that lie farthest out to four sides: (5, 3)."""
-    away = points - points.mean(0)
-    axes = np.linalg.svd(away, full_matrices=False)[2][:2]
-    along = away @ axes.T
-    rows = [int(np.argmin((away**2).sum(1))), *np.argmin(along, 0).tolist(), *np.argmax(along, 0).tolist()]
-    return np.asarray(points[rows])
 
 
 def _series(

@@ -16,11 +16,11 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.bump_detector import BumpDetector
-from estimation.online.camera_errors import RivalWatch, spread_anchors
+from estimation.online.bump_detector import BumpDetector, spread_anchors
+from estimation.online.camera_errors import RivalWatch
 from estimation.online.fit import RivalPose
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
+from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index, Mask
@@ -38,6 +38,8 @@ MAX_GAP_S = 0.08  # and also two frame sets, that a camera may miss: drivers dro
 MIN_USUAL_SHARE = 0.3  # of the tracks a camera usually has: with fewer it is missed
 HIDDEN_SHARE = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
 SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them are found
+MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
+MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
 
 
@@ -65,6 +67,23 @@ class CameraHealth:
         self._apart = np.zeros(count, bool)
         self._blurred = False  # all cameras stand off together
         self._stamp = np.nan
+        self._shown = np.zeros(count, np.int64)  # pictures
+        self._blind: frozenset[int] = frozenset()  # cameras that show nothing of the map, though it is in their view
+        self._hint = ""  # at their calibration
+
+    @property
+    def unseen(self) -> frozenset[int]:
+        """Cameras that have given pictures, and have never carried the pose."""
+        return frozenset(np.flatnonzero(np.isnan(self._carried) & (self._shown >= MIN_SHOWN_PICTURES)).tolist())
+
+    def set_unseen(self, cameras: frozenset[int], hint: str) -> None:
+        """Which cameras show nothing of the map, though it is in their view, and a hint at the cause, or ''."""
+        self._blind, self._hint = cameras, hint
+
+    @property
+    def at_odds(self) -> bool:
+        """Whether cameras contradict each other, bumped or not, though none may be left out."""
+        return bool(self.bumps.bumped or self.bumps.unequal.apart or self.rivals.doubted)
 
     def set_pictures(self, fresh: Collection[int], repeated: Collection[int]) -> None:
         """Which cameras delivered a new picture for the coming frame set, and which the last one again."""
@@ -126,11 +145,26 @@ class CameraHealth:
         return solution, outliers, offsets
 
     def rival_poses(
-        self, tracks: FrameTracks, fit: PoseFit, outliers: frozenset[int], allowed: Array
+        self, tracks: FrameTracks, fit: PoseFit, outliers: frozenset[int], allowed: Array, expected: SurfacePose | None
     ) -> tuple[RivalPose, ...]:
-        """What the cameras that are left out, or look bumped, say against the fit. allowed: (C,) px."""
-        apart = outliers | self.bumps.bumped.keys()
-        return tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.starts()) if apart else ()
+        """What cameras say against the fit: those left out; else those that look bumped, or move unlike the others.
+
+        allowed: (C,) px. expected: by the motion until now, which is a rival, too, where the fit contradicts it without
+        cameras that carried the pose until now; None before the map is confirmed.
+        """
+        if expected is None:
+            return ()
+        apart = outliers or frozenset(self.bumps.bumped) or self.bumps.unequal.apart or tracks.out_of_step(fit)
+        rivals = tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.starts()) if apart else ()
+        found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
+        lost = np.flatnonzero((found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0))
+        lost_now = frozenset(lost.tolist()) & self._fresh - outliers
+        carriers = frozenset(np.flatnonzero(found).tolist()) - lost_now
+        if rivals or not lost_now or motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS:
+            return rivals
+        nothing = np.zeros(len(fit.weights), bool)
+        pose = fit.base_from_surface
+        return (RivalPose(lost_now, carriers, pose, expected.base_from_surface, (0.0, 0.0), nothing),)
 
     def update(
         self, stamp: float, used: Index, least: float, offsets: Array, allowed: Array, outliers: Collection[int]
@@ -144,6 +178,7 @@ class CameraHealth:
         required = np.maximum(least, MIN_USUAL_SHARE * self._tracks)
         carrying = used >= required * np.where(self._missed > 0, RETURN_RATIO, 1.0)
         self._missed = np.where(carrying, 0, self._missed + 1)
+        self._shown[list(self._fresh)] += 1
         self._carried[carrying] = stamp
         # running means of offset and tracks, of the cameras that carry the pose
         share = min(1.0, (stamp - self._stamp) / USUAL_MEMORY_S) if np.isfinite(self._stamp) else 1.0
@@ -164,12 +199,12 @@ class CameraHealth:
         """Which cameras are missed, or that all look odd, and why; or ''. at_once: also those that only just failed."""
         late = (self._missed >= 2) & (stamp - self._carried > MAX_GAP_S)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
-        off = self.left_out | self.bumps.messages.keys()
+        off = self.left_out | self.bumps.messages.keys() | self.rivals.untimely
         doubted = {c for rival in self.rivals.doubted for c in rival.cameras | rival.carriers}
-        troubled = (
-            c for c in range(len(self._names)) if named[c] or ((c in off or self._apart[c]) and c not in doubted)
-        )
-        reasons = [*self.rivals.doubts(self._names), *(f"{self._names[c]} {self._why(c)}" for c in troubled)]
+        troubled = (c for c in range(len(self._names)) if named[c] or c in off or self._apart[c])
+        reasons = [f"{self._names[c]} {self._why(c)}" for c in troubled if c not in doubted]
+        blind = [f"{self._names[c]} shows nothing of the map" for c in sorted(self._blind & self.unseen)]
+        reasons = [*self.rivals.doubts(self._names), *reasons, *blind, *([self._hint] if blind and self._hint else [])]
         return ", ".join(reasons or ["no camera shows the surface as usual"] * self._blurred)
 
     def _why(self, camera: int) -> str:
@@ -261,6 +296,17 @@ class FrameTracks:
         continues = motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
         return (others, alone) if sound and continues else (without, fit)
 
+    def out_of_step(self, fit: PoseFit) -> frozenset[int]:
+        """The camera whose exposure in this frame set is off by more than its clock can be, if any."""
+        if fit.shared is None:
+            return frozenset()
+        count, eye = len(self.rig), np.eye(len(fit.shared.pull))
+        gain = self.shared.covariance() @ np.linalg.inv(eye + fit.shared.information @ self.shared.covariance())
+        delay = np.abs((gain @ fit.shared.pull)[:count])
+        worst = int(np.argmax(delay))
+        usual = float(np.sqrt(np.mean(np.diag(self.shared.delay))))
+        return frozenset([worst]) if delay[worst] > MAX_DELAY_SIGMAS * usual else frozenset()
+
     def rivals(
         self, fit: PoseFit, apart: Collection[int], allowed: Array, starts: Mapping[int, Array]
     ) -> tuple[RivalPose, ...]:
@@ -281,7 +327,14 @@ class FrameTracks:
             own, own_noise = self._only(key, starts.get(group[0], fit.base_from_surface))
             if (self.offsets(own)[group] <= allowed[group]).all():
                 alone.append(
-                    RivalPose(key, carriers, carried.base_from_surface, own.base_from_surface, (noise, own_noise))
+                    RivalPose(
+                        key,
+                        carriers,
+                        carried.base_from_surface,
+                        own.base_from_surface,
+                        (noise, own_noise),
+                        (own.weights > INLIER_WEIGHT) & np.isin(self.seen.camera, group),
+                    )
                 )
                 if len(group) > 1:
                     break

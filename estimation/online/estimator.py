@@ -176,7 +176,7 @@ class Estimator:
             offsets=offsets,
             allowed=allowed,
             outliers=outliers,
-            rivals=self.health.rival_poses(tracks, solution, outliers, allowed),
+            rivals=self.health.rival_poses(tracks, solution, outliers, allowed, expected),
         )
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
@@ -242,7 +242,7 @@ class Estimator:
     def may_learn(self, fit: FrameFit) -> bool:
         """Whether map, warp and clocks may learn from a fit: what blurred or bumped cameras show would bend them."""
         blurred = self.health.blurred(fit.used, fit.offsets, fit.allowed, fit.outliers)
-        return not (fit.outliers or self.health.bumps.bumped or blurred) and self.health.has_usual_tracks(fit.used)
+        return not (fit.outliers or self.health.at_odds or blurred) and self.health.has_usual_tracks(fit.used)
 
     def carrying_cameras(self, fit: FrameFit) -> Index:
         """The cameras that carry a fit, by number."""
@@ -272,7 +272,8 @@ class Estimator:
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
         points = surface.warp.points(surface.map)[seen.track]
-        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers)
+        smear = self.cameras.delays.sigma * fit.twist
+        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear)
         if not sound:
             return
         if not surface.map_held or not self.deforms:
@@ -292,7 +293,7 @@ class Estimator:
         surface.accepted += 1
         surface.detector(fit.stamp, fit.solution.base_from_surface, fit.parts.noise)
         self._update_health(fit)
-        self.health.rivals.update(self.rig, fit.stamp, fit.solution.base_from_surface, fit.rivals)
+        self.health.rivals.update(self.rig, fit.stamp, fit.solution.base_from_surface, fit.rivals, fit.outliers)
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
         quality = Measurement(
@@ -379,3 +380,4 @@ class Estimator:
         if bent:
             self.cameras, surface.map_held = self._earlier_cameras.before, True
         surface.map, surface.map_error = surface_map, MapError(surface_map)
+        self.health.bumps.unequal.forget()

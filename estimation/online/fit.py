@@ -41,6 +41,7 @@ class RivalPose:
     carried: Array  # (4, 4) base_from_surface by the carriers alone
     own: Array  # (4, 4) base_from_surface by `cameras` alone
     noise: tuple[float, float]  # px, one sigma, of what both poses do to their own pictures: carriers', own
+    inlier: Mask  # (N,) tracks of `cameras` that agree with the own pose
 
     @property
     def difference(self) -> Array:
@@ -69,6 +70,11 @@ class FrameFit:
     def measured(self) -> bool:
         """Whether the fit may enter the window."""
         return not self.reason
+
+    @property
+    def followed(self) -> Mask:
+        """(N,) tracks that agree with the pose or, where cameras contradict it, with the pose of their own."""
+        return np.logical_or.reduce([self.inlier, *(rival.inlier for rival in self.rivals)])
 
     @property
     def covariance(self) -> Array:

@@ -19,10 +19,10 @@ from estimation.scans.registration import Registration
 from estimation.scans.scan import Scan
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
-from perception.frames import FrameSet, Roi, region_polygons
+from perception.frames import FrameSet, Image, Roi, region_polygons, whole_pictures
 from perception.lens import Lenses
-from perception.mapping.features import Relocaliser
-from perception.mapping.first_map import FirstMap, build_first_map, in_frame
+from perception.mapping.features import Relocaliser, calibration_hint
+from perception.mapping.first_map import FEW_SPOTS, FirstMap, build_first_map, in_frame
 from perception.mapping.growth import (
     GROWTH_SHARE,
     MIN_NEW_LANDMARKS,
@@ -43,6 +43,8 @@ RETRY_INTERVAL_SETS = 10  # frame sets from one try to the next after those
 MAX_LANDMARKS = 600  # those out of view are kept, and cost little
 MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are measured where its image is blurred or covered
 FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, deformation is no error of the first map
+MIN_SURE_LANDMARKS = 120  # of a first map, half of those looked for: with fewer its cameras' calibration is checked
+HINT_INTERVAL_SETS = 100  # frame sets without a map from one search for a hint to the next
 CONFIRMATION_TIMEOUT_S = 2.0  # after which an unconfirmed first map is dropped, and the next images are tried
 
 
@@ -89,6 +91,11 @@ class Mapping:
         self._caveat = ""  # of every pose on this map, in words
         self._refinements = 0  # of this map
         self._seemed_bent = False  # whether the surface seemed to deform while the first map could be the cause
+        self._hint: DelayedJob[tuple[frozenset[int], str]] = DelayedJob(executor)
+        self._hint_due, self._hinted = 0, ""  # tries until the next search for a hint; the last one's words
+        self._unmapped: tuple[dict[int, Image], dict[int, Array], frozenset[int]] | None = None  # to be looked into
+        self._doubted, self._refuted = False, ""  # whether a first map is to be checked; why there is none in the end
+        self._unseen: frozenset[int] = frozenset()  # cameras whose pictures show nothing of the map
         self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor)
         self._probation: Probation | None = None
         self._offered: tuple[TrackedSet, bool] | None = None  # the last frame set, and whether the map may learn of it
@@ -120,19 +127,64 @@ class Mapping:
         if isinstance(polygons, str):
             return polygons
         self._tries += 1
+        if self._refuted and self._tries < self._hint_due:
+            return self._refuted
         if self._tries > EAGER_TRIES and self._tries % RETRY_INTERVAL_SETS:
-            return self._failure
+            return self._why_none()
         first = build_first_map(self._lenses, pyramids, polygons, self._masks.print_head)
         if isinstance(first, str):
             self._failure = first
-            return first
-        self._caveat = ""
+            if first == FEW_SPOTS and self._tries >= max(EAGER_TRIES, self._hint_due):
+                self._look_into(pyramids, polygons, frozenset(set(pyramids) & set(polygons)))
+            return self._why_none()
+        self._caveat, self._hinted, self._refuted = "", "", ""
+        self._unmapped, self._doubted = None, len(first.map) < MIN_SURE_LANDMARKS
+        if self._doubted:
+            self._look_into(pyramids, polygons, frozenset(set(pyramids) & set(polygons)))
         if self._placing is None:
             return first
         images = {c: pyramids[c][0] for c in polygons}
         self._place = self._placing.search(self._lenses, images, first, polygons)
         self._set_caveat(self._place)
         return in_frame(first, self._place.base_from_surface)
+
+    def _look_into(self, images: dict[int, Pyramid], polygons: dict[int, Array], suspects: frozenset[int]) -> None:
+        """Have these pictures searched for what is wrong with the suspects' calibration."""
+        self._hint_due = self._tries + HINT_INTERVAL_SETS
+        cameras = sorted(set(images) & set(polygons))
+        self._hint.cancel()
+        self._unmapped = {c: images[c][0] for c in cameras}, polygons, suspects
+
+    def _why_none(self) -> str:
+        return f"{self._failure}; {self._hinted}" if self._hinted else self._failure
+
+    def look_for_hint(self, images: dict[int, Pyramid]) -> bool:
+        """Once a frame set, when no pose waits: search for what is wrong with cameras that show nothing of the map.
+
+        images: of the last frame set, by camera. True where the calibration turns out to be so wrong that a map of few
+        landmarks is by chance.
+        """
+        health = self._estimator.health
+        unseen = frozenset(health.unseen & images.keys()) if self._estimator.confirmed else frozenset()
+        if unseen and unseen != self._unseen and not self._doubted:
+            assert self._estimator.pose is not None
+            view = self._matcher.in_view(sorted(unseen), self._estimator.pose.base_from_surface)
+            self._unseen = frozenset(c for c, count in view.items() if count >= MIN_NEW_LANDMARKS)
+            if self._unseen:
+                sizes = [camera.size for camera in self._lenses.rig.cameras]
+                regions = {r.camera: r.polygon for r in self._roi or whole_pictures(sizes, 0.0)}
+                self._look_into(images, regions, self._unseen)
+                self._hinted = ""
+        if self._unmapped is not None and not self._hint.busy:
+            self._hint.submit(calibration_hint, self._lenses.rig, *self._unmapped)
+            self._unmapped = None
+        found = self._hint.poll()
+        self._hinted = self._hinted if found is None else found[1]
+        health.set_unseen(self._unseen & unseen, self._hinted)
+        if found is None or not self._doubted:
+            return False
+        self._doubted, self._refuted = False, self._hinted
+        return bool(self._refuted)
 
     def align_and_fit(
         self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], start: Array

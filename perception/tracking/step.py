@@ -98,6 +98,7 @@ class TrackingStep:
         self._masks = TrackingMasks(self._lenses, tool)
         self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, executor, scan)
         self._matcher: Matcher | None = None
+        self._pictures: dict[int, Pyramid] = {}  # of the last frame set
         self._searched: dict[int, Pyramid] = {}  # images of cameras that `idle` is to search for the surface
         self._relocalised: Array | None = None  # (4, 4), where the last search saw the surface
         self._absent = 0  # frame sets since the surface was last measured
@@ -124,6 +125,7 @@ class TrackingStep:
                 bead = self._masks.lay_ink(frames.head, pose.stamp, pose.base_from_surface)
                 if bead is not None:
                     self._matcher.cover(bead)
+        self._pictures = pyramids
         self.last = self._report(observations, used)
         return pose
 
@@ -142,6 +144,8 @@ class TrackingStep:
         self._estimator.learn()
         if self._matcher is not None:
             self._mapping.update()
+        if self._mapping.look_for_hint(self._pictures):
+            self._matcher = None
         self._relocalise()
 
     def _report(self, observations: Observations, used: NDArray[np.int64]) -> StepReport:
@@ -215,7 +219,7 @@ class TrackingStep:
             pose = estimator.accept(fit, observations)
             if not fit.outliers:
                 self._mapping.offer(tracked, pose.twist)
-            matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
+            matcher.remember(pyramids, observations, fit.followed, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(fit)
             self._absent += 1
@@ -237,7 +241,8 @@ class TrackingStep:
         sigma = matcher.image_sigma(predicted, expected.covariance + np.outer(late, late))
         if sigma < COARSE_REACH_PX:
             exposed = self._estimator.as_exposed(predicted, expected.twist)
-            starts, coarse = {c: exposed[c] for c in pyramids}, sigma > FINE_REACH_PX
+            apart = self._estimator.health.rivals.starts()
+            starts, coarse = {c: apart.get(c, exposed[c]) for c in pyramids}, sigma > FINE_REACH_PX
             observations = matcher.align(stamp, pyramids, starts, coarse=coarse, most=MAX_ALIGNED_LANDMARKS)
             self._add_time("align")
             if matcher.is_complete(observations, pyramids):
@@ -253,7 +258,8 @@ class TrackingStep:
     def _lost_cameras(self, tracked: TrackedSet) -> list[int]:
         """Cameras that carried the last pose and now hardly see the surface."""
         assert self._matcher is not None
-        before = {c: self._matcher.last_count(c) for c in tracked.pyramids}
+        apart = {c for rival in tracked.fit.rivals if rival.inlier.any() for c in rival.cameras}
+        before = {c: self._matcher.last_count(c) for c in tracked.pyramids if c not in apart}
         return [c for c, n in before.items() if n >= 20 and tracked.fit.used[c] < 0.3 * n]
 
     def _second_try(self, tracked: TrackedSet, predicted: Array) -> TrackedSet:
