@@ -204,6 +204,7 @@ class CameraErrorHistory:
 
 MIN_VISIBLE_PX = 0.3  # root mean square over the anchors: more than lens and map change in a second,
 VISIBLE_SIGMAS = 5.0  # and so many of the pose's own noise there
+HANGS_RATIO = 2.0  # times what is visible that one side must move while the other does not
 RIVAL_MEMORY_S = 2.0  # looked back for what has moved; half a slow breath
 MAX_LAG_S, LAG_STEP_S = 0.5, 0.01  # by which pictures may come late, a dozen of them queued; and the step of its search
 LAG_WINDOW_S = 0.25  # of the newest poses, which a lag must explain
@@ -241,10 +242,9 @@ class RivalWatch:
     def update(
         self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose], left_out: frozenset[int]
     ) -> None:
-        """Take a frame set with the pose (4, 4) by those that carry it, those that contradict it, and those left out.
+        """Take a frame set: the pose (4, 4) by those that carry it, those that contradict it, and those left out.
 
-        A rival that is left out remains one while it is out of sight; one that agrees again does not, unless somebody
-        has been seen to hang.
+        A rival that is left out remains one out of sight.
         """
         carried = rivals[0].carried if rivals else carried
         self._looks.append((stamp, carried, {rival.cameras: rival.own for rival in rivals}))
@@ -270,8 +270,7 @@ class RivalWatch:
     @property
     def covariance(self) -> Array:
         """(6, 6) that covers the poses of all rivals that may be right."""
-        apart = [rival.difference for rival in self.doubted]
-        return sum((np.outer(d, d) for d in apart), np.zeros((6, 6)))
+        return sum((np.outer(d, d) for d in (rival.difference for rival in self.doubted)), np.zeros((6, 6)))
 
     @property
     def untimely(self) -> frozenset[int]:
@@ -302,28 +301,29 @@ class RivalWatch:
 
     def doubts(self, names: Sequence[str]) -> list[str]:
         """Why the carriers are not believed: a text for each rival. names: of all cameras."""
-        open_ = [verdict for verdict in self._verdicts.values() if not verdict.trusted]
-        newest = max((verdict.seen for verdict in open_), default=0.0)
-        return [_doubt_text(verdict, names) for verdict in open_ if verdict.seen == newest]
+        newest = max((v.seen for v in self._verdicts.values() if not v.trusted), default=0.0)
+        return [_doubt_text(v, names) for v in self._verdicts.values() if not v.trusted and v.seen == newest]
 
     def _judge(self, rig: Rig, stamp: float, verdict: _Verdict) -> None:
         """Who has moved since the carriers were last known to be right, and whether one side trails the other."""
         key, carriers = verdict.rival.cameras, verdict.rival.carriers
         looks = [look for look in self._looks if look[0] >= verdict.since and key in look[2]]
         _, a, b = _series(looks, key)
-        moved = any(_moved(self._pixels(rig, c, a), verdict.rival.noise[0]) for c in carriers)
-        rival_moved = any(_moved(self._pixels(rig, c, b), verdict.rival.noise[1]) for c in key)
-        if moved or rival_moved:  # else as it was
-            verdict.still = frozenset() if moved == rival_moved else key if moved else carriers
-            lag = self._lag(rig, verdict) if moved and rival_moved else 0.0
+        moved = max(_visible(self._pixels(rig, c, a), verdict.rival.noise[0]) for c in carriers)
+        rival_moved = max(_visible(self._pixels(rig, c, b), verdict.rival.noise[1]) for c in key)
+        hang, rival_hangs = moved < 1 and rival_moved > HANGS_RATIO, rival_moved < 1 and moved > HANGS_RATIO
+        both = min(moved, rival_moved) > 1
+        if hang or rival_hangs or both:  # else as it was
+            verdict.still = carriers if hang else key if rival_hangs else frozenset()
+            lag = self._lag(rig, verdict) if both else 0.0
             verdict.late = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
-        verdict.stood |= rival_moved and not moved
-        calm = stamp - verdict.since >= LAG_WINDOW_S and (not verdict.stood or self._steady(rig, verdict))
-        if (rival_moved and not moved) or verdict.late[0] == carriers or len(key) > len(carriers):
+        verdict.stood |= hang
+        in_step = both and stamp - verdict.since >= LAG_WINDOW_S
+        in_step = in_step and (not verdict.stood or self._steady(rig, min(key), a, b))
+        if hang or verdict.late[0] == carriers or len(key) > len(carriers):
             verdict.trusted = False
-        elif moved and (not rival_moved or (verdict.late[0] == key and not verdict.stood) or calm):
+        elif rival_hangs or in_step or (both and verdict.late[0] == key and not verdict.stood):
             verdict.trusted = True
-        if verdict.trusted and moved:
             verdict.since, verdict.stood = stamp, False
 
     def _pixels(self, rig: Rig, camera: int, poses: Array) -> Array:
@@ -337,7 +337,8 @@ class RivalWatch:
         start = max(verdict.since + 1e-9, stamps[-1] - LAG_WINDOW_S)
         camera = min(verdict.rival.cameras)
         count = next((n for n, look in enumerate(reversed(self._looks)) if look[0] < start or not look[2]), len(stamps))
-        return count, stamps, *(self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
+        first, second = (self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
+        return count, stamps, first, second
 
     def _lag(self, rig: Rig, verdict: _Verdict) -> float:
         """By how much, s, the carriers show later what the rival shows; negative: the rival is late; 0: no lag."""
@@ -355,11 +356,10 @@ class RivalWatch:
         first = best[0] <= best[1] if both else carriers < rival
         return float(lags[best[0]] if first else -lags[best[1]])
 
-    def _steady(self, rig: Rig, verdict: _Verdict) -> bool:
-        """Whether the rival's picture stands apart by the same distance while the carriers move."""
-        count, _, a, b = self._newest(rig, verdict)
-        apart, way = (a - b)[-count:], a[-count:]
-        moved = _rms(way - way.mean(0))
+    def _steady(self, rig: Rig, camera: int, a: Array, b: Array) -> bool:
+        """Whether a rival's picture by poses b (T, 4, 4) stands apart by the same while the carriers move as a."""
+        way, own = (self._pixels(rig, camera, poses).reshape(len(poses), -1) for poses in (a, b))
+        moved, apart = _rms(way - way.mean(0)), own - way
         return moved > MIN_VISIBLE_PX / 2 and _rms(apart - apart.mean(0)) < STEADY_SHARE * moved
 
 
@@ -371,10 +371,10 @@ def _series(
     return np.array([look[0] for look in looks]), np.stack([look[1] for look in looks]), own
 
 
-def _moved(pixels: Array, noise: float) -> bool:
-    """Whether anchors (T, K, 2) px have visibly left where they first were."""
+def _visible(pixels: Array, noise: float) -> float:
+    """How far anchors (T, K, 2) px have left where they first were, in parts of what counts as visible."""
     away = np.sqrt(((pixels - pixels[0]) ** 2).sum(2).mean(1))
-    return bool(away.max() > max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
+    return float(away.max() / max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
 
 
 def _rms(away: Array) -> float:

@@ -74,7 +74,7 @@ class FrameFit:
     @property
     def followed(self) -> Mask:
         """(N,) tracks that agree with the pose or, where cameras contradict it, with the pose of their own."""
-        return np.logical_or.reduce([self.inlier, *(rival.inlier for rival in self.rivals)])
+        return np.asarray(np.logical_or.reduce([self.inlier, *(rival.inlier for rival in self.rivals)]))
 
     @property
     def covariance(self) -> Array:

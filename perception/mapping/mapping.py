@@ -43,7 +43,7 @@ RETRY_INTERVAL_SETS = 10  # frame sets from one try to the next after those
 MAX_LANDMARKS = 600  # those out of view are kept, and cost little
 MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are measured where its image is blurred or covered
 FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, deformation is no error of the first map
-MIN_SURE_LANDMARKS = 120  # of a first map, half of those looked for: with fewer its cameras' calibration is checked
+MIN_SURE_VIEWS = 1.5  # cameras in which a landmark of a first map agrees, in the mean: of matches by chance it is one
 HINT_INTERVAL_SETS = 100  # frame sets without a map from one search for a hint to the next
 CONFIRMATION_TIMEOUT_S = 2.0  # after which an unconfirmed first map is dropped, and the next images are tried
 
@@ -113,6 +113,12 @@ class Mapping:
         self._matcher = Matcher(self._lenses, first.map, first.templates, self._masks)
         pose = self._estimator.begin(stamp, start, first.map, self._caveat)
         tracked = self.align_and_fit(stamp, pyramids, dict.fromkeys(pyramids, start), start)
+        self._doubted = int(tracked.fit.inlier.sum()) < MIN_SURE_VIEWS * len(first.map)
+        if self._doubted:
+            sizes = [camera.size for camera in self._lenses.rig.cameras]
+            regions = region_polygons(self._roi, frames, sizes)
+            assert not isinstance(regions, str)
+            self._look_into(pyramids, regions, frozenset(regions.keys() & pyramids.keys()))
         self._refiner.begin(first.map, stamp, start, tracked.observations)
         self._growth.cancel()
         self._probation = self._offered = None
@@ -138,9 +144,7 @@ class Mapping:
                 self._look_into(pyramids, polygons, frozenset(set(pyramids) & set(polygons)))
             return self._why_none()
         self._caveat, self._hinted, self._refuted = "", "", ""
-        self._unmapped, self._doubted = None, len(first.map) < MIN_SURE_LANDMARKS
-        if self._doubted:
-            self._look_into(pyramids, polygons, frozenset(set(pyramids) & set(polygons)))
+        self._unmapped = None
         if self._placing is None:
             return first
         images = {c: pyramids[c][0] for c in polygons}
