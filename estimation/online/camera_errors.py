@@ -9,16 +9,16 @@ What varies is learned as two variances. A delay common to all cameras cannot be
 Only the offsets are corrected. The map is made through the same lenses, so a shift that stays is in the map too, and
 correcting it would carry the pose away from the map (measured: 0.04 mm on a surface at rest that had no shift at all).
 
-Pictures that hang, or come late all of a sudden, are no such offset. They show the surface where it once was, and two
-cameras that hang agree with each other. So cameras that carry the pose are believed against others (`RivalWatch`) only
-once they have been seen to move, and not along the way that the others went before: pictures are late, never early.
+Pictures that hang, or suddenly come late, show the surface where it once was, and two cameras that hang agree with each
+other. So those that carry the pose are believed against others (`RivalWatch`) only once they have been seen to move,
+and not along the way that the others went before: pictures are late, never early.
 """
 
 from __future__ import annotations
 
 import copy
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -225,10 +225,14 @@ class _Verdict:
     still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
     late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
 
+    @property
+    def open_to_both(self) -> bool:
+        """Whether the rival may be right, and does not outnumber the carriers."""
+        return not self.trusted and len(self.rival.cameras) <= len(self.rival.carriers)
+
     def remembered(self, stamp: float) -> bool:
         """Whether a rival that is not seen at `stamp`, s, still counts."""
-        known = self.stood or bool(self.still or self.late[0])
-        return known and stamp - self.seen <= RIVAL_HOLD_S
+        return bool(self.stood or self.still or self.late[0]) and stamp - self.seen <= RIVAL_HOLD_S
 
 
 @dataclass(slots=True)
@@ -242,10 +246,7 @@ class RivalWatch:
     def update(
         self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose], left_out: frozenset[int]
     ) -> None:
-        """Take a frame set: the pose (4, 4) by those that carry it, those that contradict it, and those left out.
-
-        A rival that is left out remains one out of sight.
-        """
+        """Take a frame set: pose (4, 4), those that contradict it, and those left out, which remain rivals unseen."""
         carried = rivals[0].carried if rivals else carried
         self._looks.append((stamp, carried, {rival.cameras: rival.own for rival in rivals}))
         while self._looks[0][0] < stamp - RIVAL_MEMORY_S:
@@ -270,22 +271,20 @@ class RivalWatch:
     @property
     def covariance(self) -> Array:
         """(6, 6) that covers the poses of all rivals that may be right."""
-        return sum((np.outer(d, d) for d in (rival.difference for rival in self.doubted)), np.zeros((6, 6)))
+        apart = np.array([rival.difference for rival in self.doubted]).reshape(-1, 6)
+        return np.asarray(apart.T @ apart)
 
-    @property
-    def untimely(self) -> frozenset[int]:
-        """Rival cameras that stand still or come late while the carriers are believed: they are to be left out."""
-        wrong = (v.still | v.late[0] for v in self._verdicts.values() if v.trusted)
-        return frozenset().union(*wrong) & frozenset().union(*self._verdicts)
+    def outliers(self, bumped: Collection[int]) -> frozenset[int]:
+        """Rivals without which the pose is to be: between both it is wrong. bumped: may stay unless they hang."""
+        sides = [key - set(bumped) if v.open_to_both else v.still | v.late[0] for key, v in self._verdicts.items()]
+        return frozenset().union(*sides) & frozenset().union(*self._verdicts)
 
-    def starts(self) -> dict[int, Array]:
-        """Where each rival camera last saw the surface (4, 4), moved on as it moved from the look before."""
+    def own_poses(self, onwards: bool = False) -> dict[int, Array]:
+        """Where each rival camera last saw the surface (4, 4). onwards: moved on as it moved from the look before."""
+        last, before = (self._looks[-n][2] if self._verdicts and len(self._looks) >= n else {} for n in (1, 2))
         found: dict[int, Array] = {}
-        if not self._verdicts:
-            return found
-        before = self._looks[-2][2] if len(self._looks) > 1 else {}
-        for cameras, own in self._looks[-1][2].items():
-            moved = se3.inverse(before[cameras]) @ own if cameras in before else np.eye(4)
+        for cameras, own in last.items():
+            moved = se3.inverse(before[cameras]) @ own if onwards and cameras in before else np.eye(4)
             found.update(dict.fromkeys(cameras, own @ moved))
         return found
 
@@ -309,13 +308,14 @@ class RivalWatch:
         key, carriers = verdict.rival.cameras, verdict.rival.carriers
         looks = [look for look in self._looks if look[0] >= verdict.since and key in look[2]]
         _, a, b = _series(looks, key)
-        moved = max(_visible(self._pixels(rig, c, a), verdict.rival.noise[0]) for c in carriers)
-        rival_moved = max(_visible(self._pixels(rig, c, b), verdict.rival.noise[1]) for c in key)
-        hang, rival_hangs = moved < 1 and rival_moved > HANGS_RATIO, rival_moved < 1 and moved > HANGS_RATIO
+        noise, own_noise = verdict.rival.noise
+        moved = max(_visible(self._pixels(rig, c, a), noise) for c in carriers)
+        rival_moved, expected = (max(_visible(self._pixels(rig, c, x), own_noise) for c in key) for x in (b, a))
+        hang, rival_hangs = moved < 1 and rival_moved > HANGS_RATIO, rival_moved < 1 and expected > HANGS_RATIO
         both = min(moved, rival_moved) > 1
         if hang or rival_hangs or both:  # else as it was
             verdict.still = carriers if hang else key if rival_hangs else frozenset()
-            lag = self._lag(rig, verdict) if both else 0.0
+            lag = self._lag(rig, verdict) if min(moved, rival_moved) > HANGS_RATIO else 0.0
             verdict.late = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
         verdict.stood |= hang
         in_step = both and stamp - verdict.since >= LAG_WINDOW_S

@@ -38,6 +38,9 @@ MAX_GAP_S = 0.08  # and also two frame sets, that a camera may miss: drivers dro
 MIN_USUAL_SHARE = 0.3  # of the tracks a camera usually has: with fewer it is missed
 HIDDEN_SHARE = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
 SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them are found
+# information of one camera's last own pose about its next: 0.03 rad and 10 mm, one sigma. A small patch that is tilted
+# the other way looks nearly the same to one camera (Schweighofer and Pinz 2006).
+SINGLE_POSE_PRIOR = np.diag([1 / 0.03**2] * 3 + [1 / 10.0**2] * 3)
 MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
 MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
@@ -128,7 +131,8 @@ class CameraHealth:
 
         allowed: (C,) px. expected: by the motion until now; None where no other camera is to be left out.
         """
-        outliers = self.left_out | self.rivals.untimely
+        off = frozenset(np.flatnonzero(self._offsets > READMIT_RATIO * allowed).tolist())  # else they come back at once
+        outliers = self.left_out | (off & self.rivals.outliers(self.bumps.bumped))
         solution = tracks.fit(start, scales, outliers)
         offsets = tracks.offsets(solution)
         if expected is None:
@@ -154,8 +158,9 @@ class CameraHealth:
         """
         if expected is None:
             return ()
-        apart = outliers or frozenset(self.bumps.bumped) or self.bumps.unequal.apart or tracks.out_of_step(fit)
-        rivals = tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.starts()) if apart else ()
+        unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
+        apart = outliers or unlike or tracks.out_of_step(fit) or tracks.farthest(fit, OUTLIER_RATIO * allowed)
+        rivals = tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.own_poses()) if apart else ()
         found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
         lost = np.flatnonzero((found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0))
         lost_now = frozenset(lost.tolist()) & self._fresh - outliers
@@ -199,7 +204,7 @@ class CameraHealth:
         """Which cameras are missed, or that all look odd, and why; or ''. at_once: also those that only just failed."""
         late = (self._missed >= 2) & (stamp - self._carried > MAX_GAP_S)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
-        off = self.left_out | self.bumps.messages.keys() | self.rivals.untimely
+        off = self.left_out | self.bumps.messages.keys() | self.rivals.outliers(self.bumps.bumped)
         doubted = {c for rival in self.rivals.doubted for c in rival.cameras | rival.carriers}
         troubled = (c for c in range(len(self._names)) if named[c] or c in off or self._apart[c])
         reasons = [f"{self._names[c]} {self._why(c)}" for c in troubled if c not in doubted]
@@ -237,9 +242,12 @@ class FrameTracks:
         if not left_out:
             return solve_pose(self.rig, tracks, start, scales=scales, shared=self.shared)
         used = ~np.isin(tracks.camera, list(left_out))
-        fit = solve_pose(self.rig, tracks.only(used), start, scales=scales, shared=self.shared)
-        predicted, _, jacobians = project(self.rig, tracks.camera, fit.base_from_surface, self.points)
-        residuals, weights = predicted - tracks.pixels, np.zeros(len(self.points))
+        return self._with_rest(solve_pose(self.rig, tracks.only(used), start, scales=scales, shared=self.shared), used)
+
+    def _with_rest(self, fit: PoseFit, used: Mask) -> PoseFit:
+        """A fit to the tracks `used` (N,) with the residuals of the others, which have no weight."""
+        predicted, _, jacobians = project(self.rig, self.seen.camera, fit.base_from_surface, self.points)
+        residuals, weights = predicted - self.seen.pixels, np.zeros(len(self.points))
         residuals[used], weights[used] = fit.residuals, fit.weights
         return PoseFit(fit.base_from_surface, fit.information, residuals, weights, jacobians, fit.scale, fit.shared)
 
@@ -296,6 +304,11 @@ class FrameTracks:
         continues = motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
         return (others, alone) if sound and continues else (without, fit)
 
+    def farthest(self, fit: PoseFit, allowed: Array) -> frozenset[int]:
+        """The camera that stands farthest off, if that is farther than allowed (C,), px."""
+        off = np.nan_to_num(self.offsets(fit) / allowed)
+        return frozenset([int(np.argmax(off))]) if off.max() > 1 else frozenset()
+
     def out_of_step(self, fit: PoseFit) -> frozenset[int]:
         """The camera whose exposure in this frame set is off by more than its clock can be, if any."""
         if fit.shared is None:
@@ -342,8 +355,10 @@ class FrameTracks:
 
     def _only(self, cameras: frozenset[int], start: Array) -> tuple[PoseFit, float]:
         """The fit of these cameras' tracks alone, and its noise, px, in their pictures."""
-        fit = self.fit(start, (4.0, 1.0), set(range(len(self.rig))) - cameras)
         mine = np.isin(self.seen.camera, list(cameras))
+        tracks, prior = PointTracks.of(self.seen, self.points), SINGLE_POSE_PRIOR if len(cameras) == 1 else None
+        own = solve_pose(self.rig, tracks.only(mine), start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
+        fit = self._with_rest(own, mine)
         damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)
         jacobians = fit.jacobians[mine]
         spread = np.einsum("nki,nki->", jacobians @ np.linalg.inv(damped), jacobians) / len(jacobians)

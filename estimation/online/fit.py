@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
-from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors
-from estimation.runtime import compiled
+from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, project
+from estimation.rig import Rig
+from estimation.runtime import compiled, median
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
@@ -221,3 +222,56 @@ def pose_pulls(
                 for b in range(3):
                     by_landmark[a, landmark[i], b] += weighted * row[3 + b]
     return by_landmark, by_camera
+
+
+PICTURE_DOF = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
+MIN_CAMERA_TRACKS = 8  # of a camera, to estimate its four numbers
+OUTLIER_PX = 6.0  # px beside the median of its camera at which a track counts for nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraEquations:
+    """The normal equations of one camera's N tracks in one frame set, by its own four numbers and by the pose."""
+
+    own: Array  # (4, 4) information of the numbers
+    pull: Array  # (4,)
+    pose: Array  # (6, 6) information of the pose
+    pulled: Array  # (6,)
+    cross: Array  # (4, 6)
+    slopes: Array  # (N, 2, 4) px by the numbers
+
+    def without(self, numbers: Array) -> CameraEquations:
+        """The same with these numbers (4,) subtracted from the residuals."""
+        return replace(self, pull=self.pull - self.own @ numbers, pulled=self.pulled - numbers @ self.cross)
+
+    def moved(self, numbers: Array) -> float:
+        """Root mean square, px, by which these numbers (4,) move its tracks."""
+        return float(np.sqrt(np.mean(((self.slopes @ numbers) ** 2).sum(-1))))
+
+
+def camera_equations(
+    rig: Rig, observations: Observations, points: Array, exposed: Array, jacobians: Array
+) -> dict[int, CameraEquations]:
+    """The equations of each camera with enough tracks, by camera number."""
+    parts: dict[int, CameraEquations] = {}
+    for camera in range(len(rig)):
+        mine = np.flatnonzero(observations.camera == camera)
+        if len(mine) < MIN_CAMERA_TRACKS:
+            continue
+        pixels = observations.pixels[mine]
+        left = pixels - project(rig, observations.camera[mine], exposed[camera], points[mine])[0]
+        middle = np.array([median(left[:, 0]), median(left[:, 1])])
+        beside = ((left - middle) ** 2).sum(1) / OUTLIER_PX**2
+        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(observations.sigma[mine], 0.1)) ** 2, 2)[:, None]
+        rows, slopes = jacobians[mine].reshape(-1, 6), _picture_jacobian(rig, camera, pixels)
+        flat, gap = slopes.reshape(-1, PICTURE_DOF), left.ravel()
+        posed, own = (rows * weights).T, (flat * weights).T
+        parts[camera] = CameraEquations(own @ flat, own @ gap, posed @ rows, posed @ gap, own @ rows, slopes)
+    return parts
+
+
+def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
+    """(N, 2, 4), how pixels (N, 2) move with shift (2), roll and scale about the camera's axis."""
+    across, down = (pixels - rig.matrices[camera][:2, 2]).T
+    zero, one = np.zeros_like(across), np.ones_like(across)
+    return np.stack([np.stack([one, zero, -down, across], -1), np.stack([zero, one, across, down], -1)], 1)

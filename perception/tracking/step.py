@@ -241,7 +241,7 @@ class TrackingStep:
         sigma = matcher.image_sigma(predicted, expected.covariance + np.outer(late, late))
         if sigma < COARSE_REACH_PX:
             exposed = self._estimator.as_exposed(predicted, expected.twist)
-            apart = self._estimator.health.rivals.starts()
+            apart = self._estimator.health.rivals.own_poses(onwards=True)
             starts, coarse = {c: apart.get(c, exposed[c]) for c in pyramids}, sigma > FINE_REACH_PX
             observations = matcher.align(stamp, pyramids, starts, coarse=coarse, most=MAX_ALIGNED_LANDMARKS)
             self._add_time("align")
