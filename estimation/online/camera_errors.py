@@ -326,8 +326,7 @@ class RivalWatch:
             verdict.trusted = True
             verdict.since, verdict.stood = stamp, False
 
-    def _pixels(self, rig: Rig, camera: int, poses: Array) -> Array:
-        """Where the anchors fall in a camera at poses (T, 4, 4): (T, K, 2) px."""
+    def _pixels(self, rig: Rig, camera: int, poses: Array) -> Array:  # (T, 4, 4) -> (T, K, 2) px of the anchors
         points = self.anchors @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
         return ideal_pixels(rig.cameras[camera], points.reshape(-1, 3))[0].reshape(len(poses), -1, 2)
 

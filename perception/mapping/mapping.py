@@ -44,6 +44,7 @@ MAX_LANDMARKS = 600  # those out of view are kept, and cost little
 MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are measured where its image is blurred or covered
 FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, deformation is no error of the first map
 MIN_SURE_VIEWS = 1.5  # cameras in which a landmark of a first map agrees, in the mean: of matches by chance it is one
+CHECKED_S = 1.0  # s of a first map in which cameras that contradict each other have it checked
 HINT_INTERVAL_SETS = 100  # frame sets without a map from one search for a hint to the next
 CONFIRMATION_TIMEOUT_S = 2.0  # after which an unconfirmed first map is dropped, and the next images are tried
 
@@ -94,7 +95,8 @@ class Mapping:
         self._hint: DelayedJob[tuple[frozenset[int], str]] = DelayedJob(executor)
         self._hint_due, self._hinted = 0, ""  # tries until the next search for a hint; the last one's words
         self._unmapped: tuple[dict[int, Image], dict[int, Array], frozenset[int]] | None = None  # to be looked into
-        self._doubted, self._refuted = False, ""  # whether a first map is to be checked; why there is none in the end
+        # whether a first map has been looked into, whether that is still open, and why there is none in the end
+        self._checked, self._doubted, self._refuted = False, False, ""
         self._unseen: frozenset[int] = frozenset()  # cameras whose pictures show nothing of the map
         self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor)
         self._probation: Probation | None = None
@@ -113,12 +115,9 @@ class Mapping:
         self._matcher = Matcher(self._lenses, first.map, first.templates, self._masks)
         pose = self._estimator.begin(stamp, start, first.map, self._caveat)
         tracked = self.align_and_fit(stamp, pyramids, dict.fromkeys(pyramids, start), start)
-        self._doubted = int(tracked.fit.inlier.sum()) < MIN_SURE_VIEWS * len(first.map)
-        if self._doubted:
-            sizes = [camera.size for camera in self._lenses.rig.cameras]
-            regions = region_polygons(self._roi, frames, sizes)
-            assert not isinstance(regions, str)
-            self._look_into(pyramids, regions, frozenset(regions.keys() & pyramids.keys()))
+        self._checked = False
+        if int(tracked.fit.inlier.sum()) < MIN_SURE_VIEWS * len(first.map):
+            self._doubt(pyramids)
         self._refiner.begin(first.map, stamp, start, tracked.observations)
         self._growth.cancel()
         self._probation = self._offered = None
@@ -152,6 +151,15 @@ class Mapping:
         self._set_caveat(self._place)
         return in_frame(first, self._place.base_from_surface)
 
+    def _doubt(self, images: dict[int, Pyramid]) -> None:
+        """Have a first map checked, of these images (by camera): it may be of matches by chance."""
+        self._checked = self._doubted = True
+        self._look_into(images, self._regions(), frozenset(images))
+
+    def _regions(self) -> dict[int, Array]:
+        sizes = [camera.size for camera in self._lenses.rig.cameras]
+        return {r.camera: r.polygon for r in self._roi or whole_pictures(sizes, 0.0)}
+
     def _look_into(self, images: dict[int, Pyramid], polygons: dict[int, Array], suspects: frozenset[int]) -> None:
         """Have these pictures searched for what is wrong with the suspects' calibration."""
         self._hint_due = self._tries + HINT_INTERVAL_SETS
@@ -168,16 +176,17 @@ class Mapping:
         images: of the last frame set, by camera. True where the calibration turns out to be so wrong that a map of few
         landmarks is by chance.
         """
-        health = self._estimator.health
+        health, pose = self._estimator.health, self._estimator.pose
+        young = pose is not None and not self._checked and pose.stamp < self._mapped + CHECKED_S
+        if young and (health.at_odds or health.left_out):
+            self._doubt(images)
         unseen = frozenset(health.unseen & images.keys()) if self._estimator.confirmed else frozenset()
         if unseen and unseen != self._unseen and not self._doubted:
-            assert self._estimator.pose is not None
-            view = self._matcher.in_view(sorted(unseen), self._estimator.pose.base_from_surface)
+            assert pose is not None
+            view = self._matcher.in_view(sorted(unseen), pose.base_from_surface)
             self._unseen = frozenset(c for c, count in view.items() if count >= MIN_NEW_LANDMARKS)
             if self._unseen:
-                sizes = [camera.size for camera in self._lenses.rig.cameras]
-                regions = {r.camera: r.polygon for r in self._roi or whole_pictures(sizes, 0.0)}
-                self._look_into(images, regions, self._unseen)
+                self._look_into(images, self._regions(), self._unseen)
                 self._hinted = ""
         if self._unmapped is not None and not self._hint.busy:
             self._hint.submit(calibration_hint, self._lenses.rig, *self._unmapped)
