@@ -204,37 +204,44 @@ class _PictureLook:
         return self.pixels + self.slopes @ (known @ pulled), spread
 
 
-@dataclass(slots=True)
 class _PictureWays:
-    """How one camera's picture went, by its own pose and by that of others."""
+    """How one camera's picture went, by its own pose and by that of others: T looks."""
 
-    own: list[Array]  # (2K,) px each
-    others: list[Array]
-    variance: list[float]  # px^2 per axis, of their difference
+    def __init__(self, looks: Sequence[_PictureLook] = (), rest: Sequence[Sequence[_PictureLook]] = ()) -> None:
+        """looks: of the camera. rest: those of the others in the same frame sets."""
+        self._own = self._others = np.zeros((0, 0))  # (T, 2K) px
+        self._variance = np.zeros((0, 1))  # (T, 1) px^2 per axis, of their difference
+        for look, others in zip(looks, rest, strict=True):
+            self.add(look, others, len(looks))
 
-    def add(self, look: _PictureLook, rest: Sequence[_PictureLook]) -> None:
-        """The next look, with those of the others in the same frame set."""
+    def add(self, look: _PictureLook, rest: Sequence[_PictureLook], most: int) -> None:
+        """The next look, with those of the others in the same frame set; the last `most` are kept."""
         own, noise = look.way(look.information, look.pulled)
         information = np.stack([r.information for r in rest]).sum(0)
         others, more = look.way(information, np.stack([r.pulled for r in rest]).sum(0))
-        self.own.append(own)
-        self.others.append(others)
-        self.variance.append(noise + more + look.smear**2)
+        variance = np.array([noise + more + look.smear**2])
+        self._own, self._others = _longer(self._own, own, most), _longer(self._others, others, most)
+        self._variance = _longer(self._variance, variance, most)
 
-    def unequal(self, most: int) -> float:
-        """By how many times what is allowed the ways differ that end now and began within the last `most` looks."""
-        own, others = np.stack(self.own[-most:]), np.stack(self.others[-most:])
-        variance, worst = np.array(self.variance[-most:]), 0.0
+    def unequal(self) -> float:
+        """By how many times what is allowed the ways differ that end now."""
+        worst = 0.0
         for block in WAY_BLOCKS:
-            if len(own) < 2 * block:
+            if len(self._own) < 2 * block:
                 continue
-            mine, theirs, spread = (_block_means(rows, block) for rows in (own, others, variance[:, None]))
-            differ = _lengths((mine - theirs)[-1] - (mine - theirs)[:-block])
+            mine, theirs, spread = (_block_means(rows, block) for rows in (self._own, self._others, self._variance))
+            apart = mine - theirs
+            differ = _lengths(apart[-1] - apart[:-block])
             size = np.maximum(_lengths(mine[-1] - mine[:-block]), _lengths(theirs[-1] - theirs[:-block]))
             doubt = np.sqrt(2 * (spread[-1, 0] + spread[:-block, 0]) / block)
             allowed = np.maximum(np.maximum(MIN_UNEQUAL_PX, UNEQUAL_SIGMAS * doubt), UNEQUAL_SHARE * size)
             worst = max(worst, float((differ / allowed).max()))
         return worst
+
+
+def _longer(rows: Array, row: Array, most: int) -> Array:
+    """The last `most` of rows (T, K) and one more."""
+    return row[None] if not len(rows) else np.concatenate([rows[max(0, len(rows) + 1 - most) :], row[None]])
 
 
 class UnequalMotion:
@@ -269,8 +276,9 @@ class UnequalMotion:
             self._forget_before(stamp, now.keys())
         self._past.append(now)
         for c, look in now.items():
-            self._ways.setdefault(c, _PictureWays([], [], [])).add(look, [r for o, r in now.items() if o != c])
-        self._decide(stamp, {c: self._ways[c].unequal(len(self._past)) for c in now})
+            rest = [r for o, r in now.items() if o != c]
+            self._ways.setdefault(c, _PictureWays()).add(look, rest, len(self._past))
+        self._decide(stamp, {c: self._ways[c].unequal() for c in now})
 
     def _old(self, stamp: float) -> bool:
         return next(iter(self._past[0].values())).stamp < stamp - WAY_MEMORY_S
@@ -280,9 +288,6 @@ class UnequalMotion:
         same = self._past[-1].keys() == set(cameras)
         while self._past and (not same or self._old(stamp)):
             self._past.popleft()
-        for ways in self._ways.values():
-            for series in (ways.own, ways.others, ways.variance):
-                del series[: len(series) - len(self._past)]
 
     def _decide(self, stamp: float, unequal: dict[int, float]) -> None:
         """Which camera is apart, by how unequal each one's ways are to those of the others."""
@@ -297,13 +302,10 @@ class UnequalMotion:
 
     def _without(self, camera: int) -> float:
         """How unequal the others' ways are among themselves without a camera."""
-        rest = [c for c in self._past[-1] if c != camera]
-        worst = 0.0
+        rest, worst = [c for c in self._past[-1] if c != camera], 0.0
         for c in rest if len(rest) > 1 else ():
-            ways = _PictureWays([], [], [])
-            for look in self._past:
-                ways.add(look[c], [look[o] for o in rest if o != c])
-            worst = max(worst, ways.unequal(len(self._past)))
+            others = [[look[o] for o in rest if o != c] for look in self._past]
+            worst = max(worst, _PictureWays([look[c] for look in self._past], others).unequal())
         return worst
 
 

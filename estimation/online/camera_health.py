@@ -149,17 +149,24 @@ class CameraHealth:
         return solution, outliers, offsets
 
     def rival_poses(
-        self, tracks: FrameTracks, fit: PoseFit, outliers: frozenset[int], allowed: Array, expected: SurfacePose | None
+        self,
+        tracks: FrameTracks,
+        fit: PoseFit,
+        outliers: frozenset[int],
+        offsets: Array,
+        allowed: Array,
+        expected: SurfacePose | None,
     ) -> tuple[RivalPose, ...]:
-        """What cameras say against the fit: those left out; else those that look bumped, or move unlike the others.
+        """What cameras say against the fit: those left out; else one that moves or stands unlike the others.
 
-        allowed: (C,) px. expected: by the motion until now, which is a rival, too, where the fit contradicts it without
-        cameras that carried the pose until now; None before the map is confirmed.
+        offsets, allowed: (C,) px. expected: by the motion, a rival of a fit that contradicts it and lacks cameras.
         """
         if expected is None:
             return ()
+        off = np.nan_to_num(offsets / (OUTLIER_RATIO * allowed))
+        farthest = frozenset([int(np.argmax(off))]) if off.max() > 1 else frozenset[int]()
         unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
-        apart = outliers or unlike or tracks.out_of_step(fit) or tracks.farthest(fit, OUTLIER_RATIO * allowed)
+        apart = outliers or unlike or tracks.out_of_step(fit) or farthest
         rivals = tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.own_poses()) if apart else ()
         found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
         lost = np.flatnonzero((found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0))
@@ -167,9 +174,8 @@ class CameraHealth:
         carriers = frozenset(np.flatnonzero(found).tolist()) - lost_now
         if rivals or not lost_now or motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS:
             return rivals
-        nothing = np.zeros(len(fit.weights), bool)
-        pose = fit.base_from_surface
-        return (RivalPose(lost_now, carriers, pose, expected.base_from_surface, (0.0, 0.0), nothing),)
+        own, nothing = expected.base_from_surface, np.zeros(len(fit.weights), bool)
+        return (RivalPose(lost_now, carriers, fit.base_from_surface, own, (0.0, 0.0), nothing),)
 
     def update(
         self, stamp: float, used: Index, least: float, offsets: Array, allowed: Array, outliers: Collection[int]
@@ -303,11 +309,6 @@ class FrameTracks:
         sound = self.offsets(alone)[apart[0]] <= allowed[apart[0]]
         continues = motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
         return (others, alone) if sound and continues else (without, fit)
-
-    def farthest(self, fit: PoseFit, allowed: Array) -> frozenset[int]:
-        """The camera that stands farthest off, if that is farther than allowed (C,), px."""
-        off = np.nan_to_num(self.offsets(fit) / allowed)
-        return frozenset([int(np.argmax(off))]) if off.max() > 1 else frozenset()
 
     def out_of_step(self, fit: PoseFit) -> frozenset[int]:
         """The camera whose exposure in this frame set is off by more than its clock can be, if any."""

@@ -176,7 +176,7 @@ class Estimator:
             offsets=offsets,
             allowed=allowed,
             outliers=outliers,
-            rivals=self.health.rival_poses(tracks, solution, outliers, allowed, expected),
+            rivals=self.health.rival_poses(tracks, solution, outliers, offsets, allowed, expected),
         )
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
