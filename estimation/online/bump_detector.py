@@ -27,7 +27,7 @@ from estimation.observations import Observations
 from estimation.online.fit import PICTURE_DOF, CameraEquations, camera_equations
 from estimation.pose_solver import project
 from estimation.rig import Rig
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 
 MIN_OBSERVABLE_SHARE = 0.03  # of a number's information: where the pose leaves less of it, the number is held at zero
 LOOK_INTERVAL_S = 0.06  # every other frame set of 30 a second; all of them while a camera is bumped
@@ -111,19 +111,22 @@ class BumpDetector:
         jacobians: Array,
         outliers: frozenset[int],
         smear: Array | None = None,
+        sharp: Mask | None = None,
     ) -> None:
         """Take an accepted frame set.
 
         points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
         jacobians: (N, 2, 6) px by the pose. outliers: cameras so far off that the pose is without them; their change is
         forgotten once they are back. smear: (6,) one sigma by which the surface moves in an exposure's delay.
+        sharp: (C,) cameras that show about all they usually do: half a picture goes its own way.
         """
         if observations.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
             return
         self._forget(self._outliers - outliers)
         self._outliers = outliers
         parts = camera_equations(rig, observations, points, exposed, jacobians)
-        self.unequal.update(rig, observations.stamp, points, exposed, parts, np.zeros(6) if smear is None else smear)
+        whole = {c: part for c, part in parts.items() if sharp is None or sharp[c]}
+        self.unequal.update(rig, observations.stamp, points, exposed, whole, np.zeros(6) if smear is None else smear)
         if np.isnan(self._first):
             self._first = self._stamp = observations.stamp
         step, self._stamp = max(observations.stamp - self._stamp, 0.0), observations.stamp

@@ -208,6 +208,7 @@ HANGS_RATIO = 2.0  # times what is visible that one side must move while the oth
 RIVAL_MEMORY_S = 2.0  # looked back for what has moved; half a slow breath
 MAX_LAG_S, LAG_STEP_S = 0.5, 0.01  # by which pictures may come late, a dozen of them queued; and the step of its search
 LAG_WINDOW_S = 0.25  # of the newest poses, which a lag must explain
+CLEAR_LAG_RATIO = 3.0  # times what its own lag leaves must be left by the carriers' for a rival to be the late one
 LAG_SHARE = 0.5  # of what they stand apart: a lag that leaves less explains it
 STEADY_SHARE = 0.3  # of what the carriers moved: cameras that stand apart by a steadier distance move in step
 RIVAL_HOLD_S = 0.5  # that a verdict stays after its rival is out of sight, or passes by
@@ -230,8 +231,7 @@ class _Verdict:
         """Whether the rival may be right, and does not outnumber the carriers."""
         return not self.trusted and len(self.rival.cameras) <= len(self.rival.carriers)
 
-    def remembered(self, stamp: float) -> bool:
-        """Whether a rival that is not seen at `stamp`, s, still counts."""
+    def remembered(self, stamp: float) -> bool:  # at `stamp`, s, though the rival is not seen
         return bool(self.stood or self.still or self.late[0]) and stamp - self.seen <= RIVAL_HOLD_S
 
 
@@ -311,18 +311,19 @@ class RivalWatch:
         noise, own_noise = verdict.rival.noise
         moved = max(_visible(self._pixels(rig, c, a), noise) for c in carriers)
         rival_moved, expected = (max(_visible(self._pixels(rig, c, x), own_noise) for c in key) for x in (b, a))
-        hang, rival_hangs = moved < 1 and rival_moved > HANGS_RATIO, rival_moved < 1 and expected > HANGS_RATIO
-        both = min(moved, rival_moved) > 1
-        if hang or rival_hangs or both:  # else as it was
+        lag = self._lag(rig, verdict) if moved > HANGS_RATIO else 0.0  # at a turn one side rests while the other trails
+        hang, both = moved < 1 and rival_moved > HANGS_RATIO, min(moved, rival_moved) > 1
+        rival_hangs = rival_moved < 1 and expected > HANGS_RATIO and lag <= 0
+        lag = 0.0 if rival_hangs or (lag < 0 and rival_moved < HANGS_RATIO) else lag
+        if hang or rival_hangs or both or lag > 0:  # else as it was
             verdict.still = carriers if hang else key if rival_hangs else frozenset()
-            lag = self._lag(rig, verdict) if min(moved, rival_moved) > HANGS_RATIO else 0.0
             verdict.late = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
         verdict.stood |= hang
         in_step = both and stamp - verdict.since >= LAG_WINDOW_S
         in_step = in_step and (not verdict.stood or self._steady(rig, min(key), a, b))
-        if hang or verdict.late[0] == carriers or len(key) > len(carriers):
+        if hang or verdict.late[0] == carriers or len(key) > len(carriers) or not verdict.rival.united:
             verdict.trusted = False
-        elif rival_hangs or in_step or (both and verdict.late[0] == key and not verdict.stood):
+        elif rival_hangs or in_step:
             verdict.trusted = True
             verdict.since, verdict.stood = stamp, False
 
@@ -351,8 +352,7 @@ class RivalWatch:
         carriers, rival = behind[0][best[0]], behind[1][best[1]]
         if min(carriers, rival) > LAG_SHARE * apart:
             return 0.0
-        both = max(carriers, rival) < LAG_SHARE * apart  # a way to and fro: the shorter lag
-        first = best[0] <= best[1] if both else carriers < rival
+        first = carriers < min(LAG_SHARE * apart, CLEAR_LAG_RATIO * rival)  # a way to and fro fits both: it is open
         return float(lags[best[0]] if first else -lags[best[1]])
 
     def _steady(self, rig: Rig, camera: int, a: Array, b: Array) -> bool:
@@ -377,7 +377,7 @@ def _visible(pixels: Array, noise: float) -> float:
 
 
 def _rms(away: Array) -> float:
-    """Root mean square length, px, of (T, 2K) flat pixels."""
+    """Root mean square length, px, of flat pixels (T, 2K)."""
     return float(np.sqrt(2 * np.mean(away**2)))
 
 

@@ -14,11 +14,10 @@ from itertools import combinations
 
 import numpy as np
 
-from estimation import se3
 from estimation.observations import Observations
 from estimation.online.bump_detector import BumpDetector, spread_anchors
 from estimation.online.camera_errors import RivalWatch
-from estimation.online.fit import RivalPose
+from estimation.online.fit import RivalPose, motion_sigmas
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
@@ -41,6 +40,7 @@ SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them 
 # information of one camera's last own pose about its next: 0.03 rad and 10 mm, one sigma. A small patch that is tilted
 # the other way looks nearly the same to one camera (Schweighofer and Pinz 2006).
 SINGLE_POSE_PRIOR = np.diag([1 / 0.03**2] * 3 + [1 / 10.0**2] * 3)
+UNUSUAL_RATIO = 3.0  # times the usual offset, or the tracks' noise: beyond, cameras that carry a pose do not agree
 MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
 MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
@@ -80,12 +80,12 @@ class CameraHealth:
         return frozenset(np.flatnonzero(np.isnan(self._carried) & (self._shown >= MIN_SHOWN_PICTURES)).tolist())
 
     def set_unseen(self, cameras: frozenset[int], hint: str) -> None:
-        """Which cameras show nothing of the map, though it is in their view, and a hint at the cause, or ''."""
+        """Cameras that show nothing of the map, though it is in their view, and a hint at the cause, or ''."""
         self._blind, self._hint = cameras, hint
 
     @property
     def at_odds(self) -> bool:
-        """Whether cameras contradict each other, bumped or not, though none may be left out."""
+        """Whether cameras contradict each other, though none may be left out."""
         return bool(self.bumps.bumped or self.bumps.unequal.apart or self.rivals.doubted)
 
     def set_pictures(self, fresh: Collection[int], repeated: Collection[int]) -> None:
@@ -105,6 +105,10 @@ class CameraHealth:
         known = self._tracks > 0
         clear = (used >= MIN_USUAL_SHARE * self._tracks) & known
         return int(clear.sum()) >= min(2, int(known.sum()))
+
+    def shows_usual(self, seen: Observations) -> Mask:
+        """Which cameras (C,) show about all of their usual tracks, in step with the pose or not."""
+        return np.asarray(np.bincount(seen.camera, minlength=len(self._names)) >= SHARP_SHARE * self._tracks)
 
     def blur_offsets(self, offsets: Array, allowed: Array, outliers: Collection[int]) -> Array:
         """How far, px, each camera (C,) stands off where all stand off together; else zeros.
@@ -163,14 +167,14 @@ class CameraHealth:
         """
         if expected is None:
             return ()
-        off = np.nan_to_num(offsets / (OUTLIER_RATIO * allowed))
-        farthest = frozenset([int(np.argmax(off))]) if off.max() > 1 else frozenset[int]()
+        limit = OUTLIER_RATIO * allowed
+        farthest = frozenset([int(np.argmax(np.nan_to_num(offsets / limit)))] if (offsets > limit).any() else [])
         unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
         apart = outliers or unlike or tracks.out_of_step(fit) or farthest
-        rivals = tracks.rivals(fit, apart, OUTLIER_RATIO * allowed, self.rivals.own_poses()) if apart else ()
+        rivals = tracks.rivals(fit, apart, limit, UNUSUAL_RATIO * self._usual, self.rivals.own_poses()) if apart else ()
         found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
-        lost = np.flatnonzero((found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0))
-        lost_now = frozenset(lost.tolist()) & self._fresh - outliers
+        few = (found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0)
+        lost_now = frozenset(np.flatnonzero(few).tolist()) & self._fresh - outliers
         carriers = frozenset(np.flatnonzero(found).tolist()) - lost_now
         if rivals or not lost_now or motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS:
             return rivals
@@ -196,6 +200,7 @@ class CameraHealth:
         self._stamp = stamp
         known = carrying & np.isfinite(offsets)
         known[list(self.bumps.bumped)] = False  # a camera that hangs before a slow motion stands off ever farther
+        known &= not (outliers or self.rivals.doubted)
         self._usual[known] += share * (np.minimum(offsets, 2 * allowed)[known] - self._usual[known])
         self._tracks[carrying] += share * (used[carrying] - self._tracks[carrying])
         # which cameras stay left out
@@ -322,12 +327,12 @@ class FrameTracks:
         return frozenset([worst]) if delay[worst] > MAX_DELAY_SIGMAS * usual else frozenset()
 
     def rivals(
-        self, fit: PoseFit, apart: Collection[int], allowed: Array, starts: Mapping[int, Array]
+        self, fit: PoseFit, apart: Collection[int], allowed: Array, usual: Array, starts: Mapping[int, Array]
     ) -> tuple[RivalPose, ...]:
         """What cameras `apart` say against the others, together where they agree, else each by itself.
 
-        allowed: (C,) px by which cameras that agree may stand off. starts: (4, 4) by camera, where it last saw the
-        surface.
+        allowed, usual: (C,) px by which cameras that agree may stand off, and do. starts: (4, 4) by camera, where it
+        last saw the surface.
         """
         counts = np.bincount(self.seen.camera, minlength=len(self.rig))
         seen = frozenset(np.flatnonzero(counts >= self.min_tracks).tolist())
@@ -335,6 +340,8 @@ class FrameTracks:
         if not rivals or not carriers:
             return ()
         carried, noise = self._only(carriers, fit.base_from_surface)
+        noisy = USUAL_LENGTH_SIGMAS * median(self.seen.sigma)
+        united = bool((self.offsets(carried) <= np.maximum(usual, noisy))[sorted(carriers)].all())
         alone: list[RivalPose] = []
         for group in ([rivals] if len(rivals) > 1 else []) + [[c] for c in rivals]:
             key = frozenset(group)
@@ -348,6 +355,7 @@ class FrameTracks:
                         own.base_from_surface,
                         (noise, own_noise),
                         (own.weights > INLIER_WEIGHT) & np.isin(self.seen.camera, group),
+                        united,
                     )
                 )
                 if len(group) > 1:
@@ -389,11 +397,3 @@ class FrameTracks:
             return 0.0
         left = own_residuals(self.seen.camera, fit, inlier.astype(float))[inlier]
         return float(np.median(np.linalg.norm(left, axis=1)))
-
-
-def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
-    """By how many sigmas a pose differs from the one expected by the motion, at least one."""
-    off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
-    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # without information: one
-    spread = expected.covariance + np.linalg.inv(damped)
-    return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))

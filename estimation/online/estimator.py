@@ -272,8 +272,8 @@ class Estimator:
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
         points = surface.warp.points(surface.map)[seen.track]
-        smear = self.cameras.delays.sigma * fit.twist
-        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear)
+        smear, sharp = self.cameras.delays.sigma * fit.twist, self.health.shows_usual(seen)
+        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear, sharp)
         if not sound:
             return
         if not surface.map_held or not self.deforms:

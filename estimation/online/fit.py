@@ -9,6 +9,7 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
+from estimation.pose import SurfacePose
 from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, project
 from estimation.rig import Rig
 from estimation.runtime import compiled, median
@@ -43,6 +44,7 @@ class RivalPose:
     own: Array  # (4, 4) base_from_surface by `cameras` alone
     noise: tuple[float, float]  # px, one sigma, of what both poses do to their own pictures: carriers', own
     inlier: Mask  # (N,) tracks of `cameras` that agree with the own pose
+    united: bool = True  # whether the carriers agree among themselves as they usually do
 
     @property
     def difference(self) -> Array:
@@ -275,3 +277,11 @@ def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
     across, down = (pixels - rig.matrices[camera][:2, 2]).T
     zero, one = np.zeros_like(across), np.ones_like(across)
     return np.stack([np.stack([one, zero, -down, across], -1), np.stack([zero, one, across, down], -1)], 1)
+
+
+def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
+    """By how many sigmas a pose differs from the one expected by the motion, at least one."""
+    off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
+    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # without information: one
+    spread = expected.covariance + np.linalg.inv(damped)
+    return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
