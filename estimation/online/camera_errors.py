@@ -211,7 +211,7 @@ LAG_WINDOW_S = 0.25  # of the newest poses, which a lag must explain
 CLEAR_LAG_RATIO = 3.0  # times what its own lag leaves must be left by the carriers' for a rival to be the late one
 LAG_SHARE = 0.5  # of what they stand apart: a lag that leaves less explains it
 STEADY_SHARE = 0.3  # of what the carriers moved: cameras that stand apart by a steadier distance move in step
-RIVAL_HOLD_S = 0.5  # that a verdict stays after its rival is out of sight, or passes by
+RIVAL_HOLD_S, TRUST_MEMORY_S = 0.12, 1.0  # that doubt or trust stays after a rival is out of sight, or passes by
 
 
 @dataclass(slots=True)
@@ -222,6 +222,7 @@ class _Verdict:
     since: float  # s, when the carriers were last known to be right, or the rival was first seen
     seen: float  # s, when the rival was last seen
     trusted: bool = False  # whether the carriers are believed
+    jumped: bool = False  # whether the rival left the motion that the carriers continued: then they are not late
     stood: bool = False  # whether they have stood still while the rival moved
     still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
     late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
@@ -232,7 +233,7 @@ class _Verdict:
         return not self.trusted and len(self.rival.cameras) <= len(self.rival.carriers)
 
     def remembered(self, stamp: float) -> bool:  # at `stamp`, s, though the rival is not seen
-        return bool(self.stood or self.still or self.late[0]) and stamp - self.seen <= RIVAL_HOLD_S
+        return stamp - self.seen <= (TRUST_MEMORY_S if self.trusted else RIVAL_HOLD_S)
 
 
 @dataclass(slots=True)
@@ -254,7 +255,7 @@ class RivalWatch:
         for rival in rivals:
             verdict = self._verdicts.get(rival.cameras)
             if verdict is None or verdict.rival.carriers != rival.carriers:
-                verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp)
+                verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp, rival.jumped, rival.jumped)
             verdict.rival, verdict.seen = rival, stamp
             self._judge(rig, stamp, verdict)
         self._verdicts = {
@@ -312,6 +313,7 @@ class RivalWatch:
         moved = max(_visible(self._pixels(rig, c, a), noise) for c in carriers)
         rival_moved, expected = (max(_visible(self._pixels(rig, c, x), own_noise) for c in key) for x in (b, a))
         lag = self._lag(rig, verdict) if moved > HANGS_RATIO else 0.0  # at a turn one side rests while the other trails
+        lag = min(lag, 0.0) if verdict.jumped else lag
         hang, both = moved < 1 and rival_moved > HANGS_RATIO, min(moved, rival_moved) > 1
         rival_hangs = rival_moved < 1 and expected > HANGS_RATIO and lag <= 0
         lag = 0.0 if rival_hangs or (lag < 0 and rival_moved < HANGS_RATIO) else lag
@@ -334,9 +336,9 @@ class RivalWatch:
     def _newest(self, rig: Rig, verdict: _Verdict) -> tuple[int, Array, Array, Array]:
         """Looks that count, and stamps (T,) and anchors (T, 2K) px by carriers and by rival in the rival's picture."""
         stamps, a, b = _series(self._looks, verdict.rival.cameras)
-        start = max(verdict.since + 1e-9, stamps[-1] - LAG_WINDOW_S)
-        camera = min(verdict.rival.cameras)
-        count = next((n for n, look in enumerate(reversed(self._looks)) if look[0] < start or not look[2]), len(stamps))
+        start, camera, key = stamps[-1] - LAG_WINDOW_S, min(verdict.rival.cameras), verdict.rival.cameras
+        parted = [look[0] >= start and key in look[2] for look in reversed(self._looks)]
+        count = parted.index(False) if False in parted else len(parted)
         first, second = (self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
         return count, stamps, first, second
 
@@ -376,15 +378,13 @@ def _visible(pixels: Array, noise: float) -> float:
     return float(away.max() / max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
 
 
-def _rms(away: Array) -> float:
-    """Root mean square length, px, of flat pixels (T, 2K)."""
+def _rms(away: Array) -> float:  # length, px, of flat pixels (T, 2K)
     return float(np.sqrt(2 * np.mean(away**2)))
 
 
 def _lagged(stamps: Array, count: int, late: Array, early: Array, lags: Array) -> Array:
     """What is left (L,), px, of the newest `count` looks of one side against the other's so much earlier."""
-    at = stamps[-count:] - lags[:, None]
-    then = np.stack([np.interp(at, stamps, column) for column in early.T], -1)
+    then = np.stack([np.interp(stamps[-count:] - lags[:, None], stamps, column) for column in early.T], -1)
     return np.asarray(np.sqrt(2 * ((late[-count:] - then) ** 2).mean((1, 2))))
 
 

@@ -15,9 +15,9 @@ from itertools import combinations
 import numpy as np
 
 from estimation.observations import Observations
-from estimation.online.bump_detector import BumpDetector, spread_anchors
+from estimation.online.bump_detector import MIN_UNEQUAL_PX, BumpDetector, spread_anchors
 from estimation.online.camera_errors import RivalWatch
-from estimation.online.fit import RivalPose, motion_sigmas
+from estimation.online.fit import RivalPose, camera_numbers, motion_sigmas, picture_noise
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
@@ -37,10 +37,12 @@ MAX_GAP_S = 0.08  # and also two frame sets, that a camera may miss: drivers dro
 MIN_USUAL_SHARE = 0.3  # of the tracks a camera usually has: with fewer it is missed
 HIDDEN_SHARE = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
 SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them are found
-# information of one camera's last own pose about its next: 0.03 rad and 10 mm, one sigma. A small patch that is tilted
-# the other way looks nearly the same to one camera (Schweighofer and Pinz 2006).
+# of a camera's last own pose about its next, 0.03 rad and 10 mm: a patch has two (Schweighofer and Pinz 2006)
 SINGLE_POSE_PRIOR = np.diag([1 / 0.03**2] * 3 + [1 / 10.0**2] * 3)
 UNUSUAL_RATIO = 3.0  # times the usual offset, or the tracks' noise: beyond, cameras that carry a pose do not agree
+CLEAR_SIGMAS = (
+    2.0  # by which a camera's own pose must differ in its picture (of six degrees of freedom: 6e-4 by chance)
+)
 MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
 MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
@@ -77,7 +79,7 @@ class CameraHealth:
     @property
     def unseen(self) -> frozenset[int]:
         """Cameras that have given pictures, and have never carried the pose."""
-        return frozenset(np.flatnonzero(np.isnan(self._carried) & (self._shown >= MIN_SHOWN_PICTURES)).tolist())
+        return camera_numbers(np.isnan(self._carried) & (self._shown >= MIN_SHOWN_PICTURES))
 
     def set_unseen(self, cameras: frozenset[int], hint: str) -> None:
         """Cameras that show nothing of the map, though it is in their view, and a hint at the cause, or ''."""
@@ -135,7 +137,7 @@ class CameraHealth:
 
         allowed: (C,) px. expected: by the motion until now; None where no other camera is to be left out.
         """
-        off = frozenset(np.flatnonzero(self._offsets > READMIT_RATIO * allowed).tolist())  # else they come back at once
+        off = camera_numbers(self._offsets > READMIT_RATIO * allowed)  # else they come back at once
         outliers = self.left_out | (off & self.rivals.outliers(self.bumps.bumped))
         solution = tracks.fit(start, scales, outliers)
         offsets = tracks.offsets(solution)
@@ -168,18 +170,20 @@ class CameraHealth:
         if expected is None:
             return ()
         limit = OUTLIER_RATIO * allowed
-        farthest = frozenset([int(np.argmax(np.nan_to_num(offsets / limit)))] if (offsets > limit).any() else [])
+        farthest = frozenset([int(np.nanargmax(offsets / limit))] if (offsets > limit).any() else [])
         unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
         apart = outliers or unlike or tracks.out_of_step(fit) or farthest
-        rivals = tracks.rivals(fit, apart, limit, UNUSUAL_RATIO * self._usual, self.rivals.own_poses()) if apart else ()
+        motion, usual = motion_sigmas(fit, expected), UNUSUAL_RATIO * self._usual
+        goes_on = expected if outliers and motion <= MAX_MOTION_SIGMAS else None
+        rivals = tracks.rivals(fit, apart, limit, usual, self.rivals.own_poses(), goes_on) if apart else ()
         found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
         few = (found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0)
-        lost_now = frozenset(np.flatnonzero(few).tolist()) & self._fresh - outliers
-        carriers = frozenset(np.flatnonzero(found).tolist()) - lost_now
-        if rivals or not lost_now or motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS:
+        lost_now = camera_numbers(few) & self._fresh - outliers
+        carriers = camera_numbers(found > 0) - lost_now
+        if rivals or not lost_now or motion <= MAX_MOTION_SIGMAS:
             return rivals
-        own, nothing = expected.base_from_surface, np.zeros(len(fit.weights), bool)
-        return (RivalPose(lost_now, carriers, fit.base_from_surface, own, (0.0, 0.0), nothing),)
+        poses, nothing = (fit.base_from_surface, expected.base_from_surface), np.zeros(len(fit.weights), bool)
+        return (RivalPose(lost_now, carriers, *poses, (0.0, 0.0), nothing),)
 
     def update(
         self, stamp: float, used: Index, least: float, offsets: Array, allowed: Array, outliers: Collection[int]
@@ -188,7 +192,7 @@ class CameraHealth:
 
         used: (C,) tracks that carry the pose, zero where nothing was measured. least: tracks below which a camera says
         nothing. offsets: (C,) px of each from the pose of the others, nan where unseen. allowed: as `allowed` gives.
-        outliers: cameras that were left out of this pose.
+        outliers: left out of this pose.
         """
         required = np.maximum(least, MIN_USUAL_SHARE * self._tracks)
         carrying = used >= required * np.where(self._missed > 0, RETURN_RATIO, 1.0)
@@ -199,8 +203,8 @@ class CameraHealth:
         share = min(1.0, (stamp - self._stamp) / USUAL_MEMORY_S) if np.isfinite(self._stamp) else 1.0
         self._stamp = stamp
         known = carrying & np.isfinite(offsets)
-        known[list(self.bumps.bumped)] = False  # a camera that hangs before a slow motion stands off ever farther
         known &= not (outliers or self.rivals.doubted)
+        known[list(self.bumps.bumped)] = False  # a camera that hangs before a slow motion stands off ever farther
         self._usual[known] += share * (np.minimum(offsets, 2 * allowed)[known] - self._usual[known])
         self._tracks[carrying] += share * (used[carrying] - self._tracks[carrying])
         # which cameras stay left out
@@ -300,64 +304,63 @@ class FrameTracks:
     def along_motion(
         self, without: frozenset[int], fit: PoseFit, allowed: Array, expected: SurfacePose
     ) -> tuple[frozenset[int], PoseFit]:
-        """The cameras to be left out and the fit, once those without which the others agree are chosen.
+        """Those left out and the fit, or one camera alone that continues the motion until now which the others leave.
 
-        Where the others contradict the motion until now, and one camera that stands apart continues it, that one is
-        followed: cameras that hang, or come late together, agree with each other.
+        Cameras that hang, or come late together, agree with each other.
         """
-        present = {int(c) for c in np.unique(self.seen.camera)}
+        present = set(np.unique(self.seen.camera).tolist())
         apart = sorted(present & without)
         if motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS or len(apart) != 1:
             return without, fit
         others = frozenset(present - without) | (without - set(apart))
         alone = self.fit(expected.base_from_surface, (4.0, 1.0), others)
-        sound = self.offsets(alone)[apart[0]] <= allowed[apart[0]]
-        continues = motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
-        return (others, alone) if sound and continues else (without, fit)
+        sound = (
+            self.offsets(alone)[apart[0]] <= allowed[apart[0]] and motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
+        )
+        return (others, alone) if sound else (without, fit)
 
     def out_of_step(self, fit: PoseFit) -> frozenset[int]:
         """The camera whose exposure in this frame set is off by more than its clock can be, if any."""
         if fit.shared is None:
             return frozenset()
-        count, eye = len(self.rig), np.eye(len(fit.shared.pull))
-        gain = self.shared.covariance() @ np.linalg.inv(eye + fit.shared.information @ self.shared.covariance())
-        delay = np.abs((gain @ fit.shared.pull)[:count])
-        worst = int(np.argmax(delay))
-        usual = float(np.sqrt(np.mean(np.diag(self.shared.delay))))
-        return frozenset([worst]) if delay[worst] > MAX_DELAY_SIGMAS * usual else frozenset()
+        prior, eye = self.shared.covariance(), np.eye(len(fit.shared.pull))
+        effect = prior @ np.linalg.solve(eye + fit.shared.information @ prior, fit.shared.pull)
+        delay, usual = np.abs(effect[: len(self.rig)]), np.sqrt(np.mean(np.diag(self.shared.delay)))
+        return frozenset([int(np.argmax(delay))] if delay.max() > MAX_DELAY_SIGMAS * usual else [])
 
     def rivals(
-        self, fit: PoseFit, apart: Collection[int], allowed: Array, usual: Array, starts: Mapping[int, Array]
+        self,
+        fit: PoseFit,
+        apart: Collection[int],
+        allowed: Array,
+        usual: Array,
+        starts: Mapping[int, Array],
+        motion: SurfacePose | None,
     ) -> tuple[RivalPose, ...]:
-        """What cameras `apart` say against the others, together where they agree, else each by itself.
+        """What cameras `apart` say clearly against the others, together where they agree, else each by itself.
 
         allowed, usual: (C,) px by which cameras that agree may stand off, and do. starts: (4, 4) by camera, where it
-        last saw the surface.
+        last saw the surface. motion: the pose expected, where the fit continues the motion until now.
         """
         counts = np.bincount(self.seen.camera, minlength=len(self.rig))
-        seen = frozenset(np.flatnonzero(counts >= self.min_tracks).tolist())
+        seen = camera_numbers(counts >= self.min_tracks)
         rivals, carriers = sorted(seen & set(apart)), seen - set(apart)
         if not rivals or not carriers:
             return ()
         carried, noise = self._only(carriers, fit.base_from_surface)
+        pose, alone = carried.base_from_surface, list[RivalPose]()
         noisy = USUAL_LENGTH_SIGMAS * median(self.seen.sigma)
         united = bool((self.offsets(carried) <= np.maximum(usual, noisy))[sorted(carriers)].all())
-        alone: list[RivalPose] = []
         for group in ([rivals] if len(rivals) > 1 else []) + [[c] for c in rivals]:
-            key = frozenset(group)
-            own, own_noise = self._only(key, starts.get(group[0], fit.base_from_surface))
-            if (self.offsets(own)[group] <= allowed[group]).all():
-                alone.append(
-                    RivalPose(
-                        key,
-                        carriers,
-                        carried.base_from_surface,
-                        own.base_from_surface,
-                        (noise, own_noise),
-                        (own.weights > INLIER_WEIGHT) & np.isin(self.seen.camera, group),
-                        united,
-                    )
-                )
+            key, mine = frozenset(group), np.isin(self.seen.camera, group)
+            own, own_noise = self._only(key, starts.get(group[0], pose))
+            inlier = (own.weights > INLIER_WEIGHT) & mine
+            jumped = motion is not None and motion_sigmas(own, motion) > MAX_MOTION_SIGMAS
+            rival = RivalPose(key, carriers, pose, own.base_from_surface, (noise, own_noise), inlier, united, jumped)
+            apart_px = float(np.sqrt(2 * np.mean((own.jacobians[mine] @ rival.difference) ** 2)))
+            clear = apart_px > max(MIN_UNEQUAL_PX, CLEAR_SIGMAS * np.sqrt(2) * own_noise)
+            if clear and (self.offsets(own)[group] <= allowed[group]).all():
+                alone.append(rival)
                 if len(group) > 1:
                     break
         return tuple(alone)
@@ -368,10 +371,7 @@ class FrameTracks:
         tracks, prior = PointTracks.of(self.seen, self.points), SINGLE_POSE_PRIOR if len(cameras) == 1 else None
         own = solve_pose(self.rig, tracks.only(mine), start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
         fit = self._with_rest(own, mine)
-        damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)
-        jacobians = fit.jacobians[mine]
-        spread = np.einsum("nki,nki->", jacobians @ np.linalg.inv(damped), jacobians) / len(jacobians)
-        return fit, float(np.sqrt(spread))
+        return fit, picture_noise(fit, mine)
 
     def weak_fit_reason(self, fit: PoseFit, outliers: Collection[int], torn: bool, expected: SurfacePose) -> str:
         """What speaks against a fit that stands on little, or ''.

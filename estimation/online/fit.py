@@ -45,6 +45,7 @@ class RivalPose:
     noise: tuple[float, float]  # px, one sigma, of what both poses do to their own pictures: carriers', own
     inlier: Mask  # (N,) tracks of `cameras` that agree with the own pose
     united: bool = True  # whether the carriers agree among themselves as they usually do
+    jumped: bool = False  # whether the own pose alone contradicts the motion until now
 
     @property
     def difference(self) -> Array:
@@ -285,3 +286,15 @@ def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
     damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # without information: one
     spread = expected.covariance + np.linalg.inv(damped)
     return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
+
+
+def picture_noise(fit: PoseFit, rows: Mask) -> float:
+    """Root mean square, px, one sigma, by which a pose's noise moves the tracks `rows` (N,)."""
+    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)
+    jacobians = fit.jacobians[rows]
+    return float(np.sqrt(np.einsum("nki,nki->", jacobians @ np.linalg.inv(damped), jacobians) / len(jacobians)))
+
+
+def camera_numbers(cameras: Mask) -> frozenset[int]:
+    """The numbers of the chosen ones of cameras (C,)."""
+    return frozenset(np.flatnonzero(cameras).tolist())
