@@ -27,7 +27,7 @@ from estimation.observations import Observations
 from estimation.online.fit import PICTURE_DOF, CameraEquations, camera_equations
 from estimation.pose_solver import project
 from estimation.rig import Rig
-from estimation.se3 import Array, Mask
+from estimation.se3 import Array
 
 MIN_OBSERVABLE_SHARE = 0.03  # of a number's information: where the pose leaves less of it, the number is held at zero
 LOOK_INTERVAL_S = 0.06  # every other frame set of 30 a second; all of them while a camera is bumped
@@ -48,6 +48,8 @@ UNEQUAL_SIGMAS = 3.0  # times the noise of both ways (of six degrees of freedom:
 UNEQUAL_SHARE = 0.3  # and such a part of the longer one: what does not follow at all is sought, not what errs a little
 WAY_BLOCKS = (1, 4)  # looks that are averaged at both ends of a way
 WAY_MEMORY_S = 2.0  # over which ways are compared: half a slow breath
+WHOLE_SHARE, FEW_TRACKS = 0.8, 0.4  # of its usual tracks: a whole picture; so few that nothing usual is learned,
+TRACKS_SHARE = 0.25  # of a look's number: a first map is looked for whole, later ones in part
 MIN_UNEQUAL_LOOKS = 2  # one after the other
 EQUAL_AGAIN_S = 0.5  # that ways must be alike until the camera is like the others again
 
@@ -111,22 +113,19 @@ class BumpDetector:
         jacobians: Array,
         outliers: frozenset[int],
         smear: Array | None = None,
-        sharp: Mask | None = None,
     ) -> None:
         """Take an accepted frame set.
 
         points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
         jacobians: (N, 2, 6) px by the pose. outliers: cameras so far off that the pose is without them; their change is
         forgotten once they are back. smear: (6,) one sigma by which the surface moves in an exposure's delay.
-        sharp: (C,) cameras that show about all they usually do: half a picture goes its own way.
         """
         if observations.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
             return
         self._forget(self._outliers - outliers)
         self._outliers = outliers
         parts = camera_equations(rig, observations, points, exposed, jacobians)
-        whole = {c: part for c, part in parts.items() if sharp is None or sharp[c]}
-        self.unequal.update(rig, observations.stamp, points, exposed, whole, np.zeros(6) if smear is None else smear)
+        self.unequal.update(rig, observations.stamp, points, exposed, parts, np.zeros(6) if smear is None else smear)
         if np.isnan(self._first):
             self._first = self._stamp = observations.stamp
         step, self._stamp = max(observations.stamp - self._stamp, 0.0), observations.stamp
@@ -253,6 +252,7 @@ class UnequalMotion:
     def __init__(self) -> None:
         self.apart: frozenset[int] = frozenset()  # the camera without which the others move alike, if one does not
         self._looks, self._since = 0, np.nan  # in which ways were unequal, in a row; s, stamp of the last
+        self._tracks: dict[int, float] = {}  # usual number by camera
         self.forget()
 
     def forget(self) -> None:
@@ -264,7 +264,11 @@ class UnequalMotion:
     def update(
         self, rig: Rig, stamp: float, points: Array, exposed: Array, parts: dict[int, CameraEquations], smear: Array
     ) -> None:
-        """Take a look. points: (N, 3) mm. exposed: (C, 4, 4). smear: (6,) mm and rad, of late exposures."""
+        """Take a look. points: (N, 3) mm. exposed: (C, 4, 4). smear: (6,) mm and rad, of late exposures.
+
+        Cameras with fewer tracks than usual do not count: what covers a picture or blurs it drags the rest along.
+        """
+        parts = {c: part for c, part in parts.items() if self._shows_usual(c, len(part.slopes))}
         if len(parts) < 2:
             return
         if self._anchors is None:
@@ -282,6 +286,12 @@ class UnequalMotion:
             rest = [r for o, r in now.items() if o != c]
             self._ways.setdefault(c, _PictureWays()).add(look, rest, len(self._past))
         self._decide(stamp, {c: self._ways[c].unequal() for c in now})
+
+    def _shows_usual(self, camera: int, tracks: int) -> bool:
+        usual = self._tracks.setdefault(camera, float(tracks))
+        if tracks > FEW_TRACKS * usual:
+            self._tracks[camera] += TRACKS_SHARE * (tracks - usual)
+        return tracks >= WHOLE_SHARE * usual
 
     def _old(self, stamp: float) -> bool:
         return next(iter(self._past[0].values())).stamp < stamp - WAY_MEMORY_S

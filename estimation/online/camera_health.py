@@ -108,10 +108,6 @@ class CameraHealth:
         clear = (used >= MIN_USUAL_SHARE * self._tracks) & known
         return int(clear.sum()) >= min(2, int(known.sum()))
 
-    def shows_usual(self, seen: Observations) -> Mask:
-        """Which cameras (C,) show about all of their usual tracks, in step with the pose or not."""
-        return np.asarray(np.bincount(seen.camera, minlength=len(self._names)) >= SHARP_SHARE * self._tracks)
-
     def blur_offsets(self, offsets: Array, allowed: Array, outliers: Collection[int]) -> Array:
         """How far, px, each camera (C,) stands off where all stand off together; else zeros.
 

@@ -31,6 +31,9 @@ from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap
 
 MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
+# s, of the cameras' instants: more than of webcams at first. They then come late, or hang, now and then, and the pose
+# may be so many sigmas late or early.
+MAX_DELAY_SIGMA_S, MOST_DELAY_SIGMAS = 0.015, 3.0
 MAX_LEARNING_SMEAR_MM = 0.1  # between the cameras' instants: beyond, a late camera cannot be told from a bent surface
 MAX_MAP_SMEAR_MM = 0.5  # likewise: a map bent by more is no good for printing
 ACCELERATION_PERSISTENCE_S = 0.2  # breathing accelerates alike for so long, which adds up to more than white noise does
@@ -272,8 +275,8 @@ class Estimator:
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
         points = surface.warp.points(surface.map)[seen.track]
-        smear, sharp = self.cameras.delays.sigma * fit.twist, self.health.shows_usual(seen)
-        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear, sharp)
+        smear = self.cameras.delays.sigma * fit.twist
+        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear)
         if not sound:
             return
         if not surface.map_held or not self.deforms:
@@ -296,12 +299,14 @@ class Estimator:
         self.health.rivals.update(self.rig, fit.stamp, fit.solution.base_from_surface, fit.rivals, fit.outliers)
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
+        late = self.cameras.delays.sigma
+        unsteady = f"the cameras expose {late:.3f} s apart, now more, now less" if late > MAX_DELAY_SIGMA_S else ""
         quality = Measurement(
             cameras=tuple(self.rig.cameras[c].name for c in self.carrying_cameras(fit)),
             tracks=int(fit.used.sum()),
             sigma=position_sigma(fit.covariance + lasting),
             trouble=self.health.trouble(fit.stamp),
-            caveat=surface.local.message or surface.caveat,
+            caveat=surface.local.message or surface.caveat or unsteady,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
         )
         state = self._states.measured(fit.stamp, quality)
@@ -310,7 +315,10 @@ class Estimator:
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
         given = widened(given, surface.local.covariance) if surface.local.active else given
-        surface.reported_pose = widened(given, self.health.rivals.covariance) if self.health.rivals.doubted else given
+        if self.health.rivals.doubted or unsteady:
+            way = bool(unsteady) * MOST_DELAY_SIGMAS * late * fit.twist
+            given = widened(given, self.health.rivals.covariance + np.outer(way, way))
+        surface.reported_pose = given
         return surface.reported_pose
 
     def _update_health(self, fit: FrameFit) -> None:

@@ -196,7 +196,8 @@ class Mapping:
         health.set_unseen(self._unseen & unseen, self._hinted)
         if found is None or not self._doubted:
             return False
-        self._doubted, self._refuted = False, self._hinted
+        # without one camera the others may have made a good map
+        self._doubted, self._refuted = False, self._hinted if len(found[0]) > 1 else ""
         return bool(self._refuted)
 
     def align_and_fit(

@@ -217,7 +217,7 @@ class TrackingStep:
             self._searched = {c: pyramids[c] for c in self._lost_cameras(tracked)}
             self._absent = 0
             pose = estimator.accept(fit, observations)
-            if not fit.outliers:
+            if not fit.outliers and not fit.rivals:
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.followed, fit.solution.base_from_surface)
         else:
