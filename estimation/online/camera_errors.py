@@ -224,16 +224,16 @@ class _Verdict:
     trusted: bool = False  # whether the carriers are believed
     jumped: bool = False  # whether the rival left the motion that the carriers continued: then they are not late
     stood: bool = False  # whether they have stood still while the rival moved
+    widest: Array = field(default_factory=lambda: np.zeros(6))  # the largest difference: who is late agrees at a turn
     still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
     late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
 
     @property
-    def open_to_both(self) -> bool:
-        """Whether the rival may be right, and does not outnumber the carriers."""
+    def open_to_both(self) -> bool:  # the rival may be right, and does not outnumber the carriers
         return not self.trusted and len(self.rival.cameras) <= len(self.rival.carriers)
 
     def remembered(self, stamp: float) -> bool:  # at `stamp`, s, though the rival is not seen
-        return stamp - self.seen <= (TRUST_MEMORY_S if self.trusted else RIVAL_HOLD_S)
+        return stamp - self.seen <= (TRUST_MEMORY_S if self.trusted or self.late[0] else RIVAL_HOLD_S)
 
 
 @dataclass(slots=True)
@@ -257,6 +257,7 @@ class RivalWatch:
             if verdict is None or verdict.rival.carriers != rival.carriers:
                 verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp, rival.jumped, rival.jumped)
             verdict.rival, verdict.seen = rival, stamp
+            verdict.widest = max(verdict.widest, rival.difference, key=lambda apart: float(np.linalg.norm(apart[3:])))
             self._judge(rig, stamp, verdict)
         self._verdicts = {
             key: verdict
@@ -272,8 +273,8 @@ class RivalWatch:
     @property
     def covariance(self) -> Array:
         """(6, 6) that covers the poses of all rivals that may be right."""
-        apart = np.array([rival.difference for rival in self.doubted]).reshape(-1, 6)
-        return np.asarray(apart.T @ apart)
+        sides = [v.widest if v.late[0] else v.rival.difference for v in self._verdicts.values() if not v.trusted]
+        return np.asarray(np.reshape(sides, (-1, 6)).T @ np.reshape(sides, (-1, 6)))
 
     def outliers(self, bumped: Collection[int]) -> frozenset[int]:
         """Rivals without which the pose is to be: between both it is wrong. bumped: may stay unless they hang."""
@@ -372,8 +373,7 @@ def _series(
     return np.array([look[0] for look in looks]), np.stack([look[1] for look in looks]), own
 
 
-def _visible(pixels: Array, noise: float) -> float:
-    """How far anchors (T, K, 2) px have left where they first were, in parts of what counts as visible."""
+def _visible(pixels: Array, noise: float) -> float:  # way of anchors (T, K, 2) px, in parts of what is visible
     away = np.sqrt(((pixels - pixels[0]) ** 2).sum(2).mean(1))
     return float(away.max() / max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
 
