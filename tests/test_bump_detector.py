@@ -9,7 +9,8 @@ import pytest
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.bump_detector import BumpDetector, camera_equations, reduced_alone, reduced_together
+from estimation.online.bump_detector import BumpDetector, reduced_alone, reduced_together
+from estimation.online.fit import camera_equations
 from estimation.pose import TrackState
 from estimation.pose_solver import project
 from estimation.rig import Rig

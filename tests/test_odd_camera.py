@@ -9,8 +9,9 @@ import pytest
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.camera_health import MAX_MOTION_SIGMAS, motion_sigmas
+from estimation.online.camera_health import MAX_MOTION_SIGMAS
 from estimation.online.estimator import Estimator
+from estimation.online.fit import motion_sigmas
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import observations

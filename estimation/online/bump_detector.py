@@ -9,26 +9,28 @@ The usual values are learned of all cameras together and subtracted from the res
 cameras see the surface. A camera whose usual values are not known yet is not judged, and does not judge others. A
 number that the pose could absorb almost whole (two cameras of three, along the plane of their rays) cannot be told
 from small errors of the map, and is held at zero.
+
+A camera that hangs before a slow motion stands off by little for long, most of all where the motion is along its axis
+or along that of the one that does not hang. So the way of each picture within seconds, by a pose of the camera's own,
+is compared with the way by the pose of the others (`UnequalMotion`): lens and map err alike in so short a time.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimation.observations import Observations
+from estimation.online.fit import PICTURE_DOF, CameraEquations, camera_equations
 from estimation.pose_solver import project
 from estimation.rig import Rig
-from estimation.runtime import median
 from estimation.se3 import Array
 
-PICTURE_DOF = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
-MIN_CAMERA_TRACKS = 8  # of a camera, to estimate its four numbers
 MIN_OBSERVABLE_SHARE = 0.03  # of a number's information: where the pose leaves less of it, the number is held at zero
 LOOK_INTERVAL_S = 0.06  # every other frame set of 30 a second; all of them while a camera is bumped
-OUTLIER_PX = 6.0  # px beside the median of its camera at which a track counts for nothing
 CHANGE_MEMORY_S = 0.4  # over which the change is averaged
 USUAL_MEMORY_S = 20.0  # over which the usual values are learned
 WARMUP_S = 3.0  # of a run, and of a camera's pictures, before it is judged; half of it before it is compared
@@ -37,6 +39,19 @@ USUAL_CHANGE_RATIO = 5.0  # and at least so many times the usual change
 NEXT_CAMERA_RATIO = 1.2  # times what the next camera explains
 BUMP_LASTS_S = 0.2  # that a change must last
 BUMP_OVER_S = 0.06  # that single looks must be below half the limit until it is over
+
+
+MIN_UNEQUAL_PX = (
+    0.2  # root mean square over the anchors by which ways in a picture must differ: lens and map err by it,
+)
+UNEQUAL_SIGMAS = 3.0  # times the noise of both ways (of six degrees of freedom: one of 1e9 by chance),
+UNEQUAL_SHARE = 0.3  # and such a part of the longer one: what does not follow at all is sought, not what errs a little
+WAY_BLOCKS = (1, 4)  # looks that are averaged at both ends of a way
+WAY_MEMORY_S = 2.0  # over which ways are compared: half a slow breath
+WHOLE_SHARE, FEW_TRACKS = 0.8, 0.4  # of its usual tracks: a whole picture; so few that nothing usual is learned,
+TRACKS_SHARE = 0.25  # of a look's number: a first map is looked for whole, later ones in part
+MIN_UNEQUAL_LOOKS = 2  # one after the other
+EQUAL_AGAIN_S = 0.5  # that ways must be alike until the camera is like the others again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +97,7 @@ class BumpDetector:
         self._learned = np.zeros(count)  # s in which a camera's usual values were learned
         self._first, self._stamp, self._count = np.nan, np.nan, 0
         self._outliers: frozenset[int] = frozenset()
+        self.unequal = UnequalMotion()
 
     @property
     def messages(self) -> dict[int, str]:
@@ -96,18 +112,20 @@ class BumpDetector:
         exposed: Array,
         jacobians: Array,
         outliers: frozenset[int],
+        smear: Array | None = None,
     ) -> None:
         """Take an accepted frame set.
 
         points: (N, 3) mm, surface, of the tracks. exposed: (C, 4, 4) base_from_surface when each camera exposed.
         jacobians: (N, 2, 6) px by the pose. outliers: cameras so far off that the pose is without them; their change is
-        forgotten once they are back.
+        forgotten once they are back. smear: (6,) one sigma by which the surface moves in an exposure's delay.
         """
         if observations.stamp - self._stamp < LOOK_INTERVAL_S and not self.bumped:
             return
         self._forget(self._outliers - outliers)
         self._outliers = outliers
         parts = camera_equations(rig, observations, points, exposed, jacobians)
+        self.unequal.update(rig, observations.stamp, points, exposed, parts, np.zeros(6) if smear is None else smear)
         if np.isnan(self._first):
             self._first = self._stamp = observations.stamp
         step, self._stamp = max(observations.stamp - self._stamp, 0.0), observations.stamp
@@ -171,44 +189,156 @@ class BumpDetector:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraEquations:
-    """The normal equations of one camera's N tracks in one frame set, by its own four numbers and by the pose."""
+class _PictureLook:
+    """One camera's picture in one look: what it says of its own pose, and where K anchors stand."""
 
-    own: Array  # (4, 4) information of the numbers
-    pull: Array  # (4,)
-    pose: Array  # (6, 6) information of the pose
+    stamp: float  # s
+    pixels: Array  # (2K,) px, of the anchors by the pose of all
+    slopes: Array  # (2K, 6) px by the pose
+    information: Array  # (6, 6) of the pose by this camera alone
     pulled: Array  # (6,)
-    cross: Array  # (4, 6)
-    slopes: Array  # (N, 2, 4) px by the numbers
+    smear: float  # px, one sigma, by late exposures
 
-    def without(self, numbers: Array) -> CameraEquations:
-        """The same with these numbers (4,) subtracted from the residuals."""
-        return replace(self, pull=self.pull - self.own @ numbers, pulled=self.pulled - numbers @ self.cross)
-
-    def moved(self, numbers: Array) -> float:
-        """Root mean square, px, by which these numbers (4,) move its tracks."""
-        return float(np.sqrt(np.mean(((self.slopes @ numbers) ** 2).sum(-1))))
+    def way(self, information: Array, pulled: Array) -> tuple[Array, float]:
+        """Where the anchors stand (2K,), px, by a pose with these normal equations, and the variance of that, px^2."""
+        known = np.linalg.inv(information + (1e-9 * np.trace(information) + 1e-12) * np.eye(6))
+        spread = float(np.einsum("ki,ij,kj->", self.slopes, known, self.slopes)) / len(self.slopes)
+        return self.pixels + self.slopes @ (known @ pulled), spread
 
 
-def camera_equations(
-    rig: Rig, observations: Observations, points: Array, exposed: Array, jacobians: Array
-) -> dict[int, CameraEquations]:
-    """The equations of each camera with enough tracks, by camera number."""
-    parts: dict[int, CameraEquations] = {}
-    for camera in range(len(rig)):
-        mine = np.flatnonzero(observations.camera == camera)
-        if len(mine) < MIN_CAMERA_TRACKS:
-            continue
-        pixels = observations.pixels[mine]
-        left = pixels - project(rig, observations.camera[mine], exposed[camera], points[mine])[0]
-        middle = np.array([median(left[:, 0]), median(left[:, 1])])
-        beside = ((left - middle) ** 2).sum(1) / OUTLIER_PX**2
-        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(observations.sigma[mine], 0.1)) ** 2, 2)[:, None]
-        rows, slopes = jacobians[mine].reshape(-1, 6), _picture_jacobian(rig, camera, pixels)
-        flat, gap = slopes.reshape(-1, PICTURE_DOF), left.ravel()
-        posed, own = (rows * weights).T, (flat * weights).T
-        parts[camera] = CameraEquations(own @ flat, own @ gap, posed @ rows, posed @ gap, own @ rows, slopes)
-    return parts
+class _PictureWays:
+    """How one camera's picture went, by its own pose and by that of others: T looks."""
+
+    def __init__(self, looks: Sequence[_PictureLook] = (), rest: Sequence[Sequence[_PictureLook]] = ()) -> None:
+        """looks: of the camera. rest: those of the others in the same frame sets."""
+        self._own = self._others = np.zeros((0, 0))  # (T, 2K) px
+        self._variance = np.zeros((0, 1))  # (T, 1) px^2 per axis, of their difference
+        for look, others in zip(looks, rest, strict=True):
+            self.add(look, others, len(looks))
+
+    def add(self, look: _PictureLook, rest: Sequence[_PictureLook], most: int) -> None:
+        """The next look, with those of the others in the same frame set; the last `most` are kept."""
+        own, noise = look.way(look.information, look.pulled)
+        information = np.stack([r.information for r in rest]).sum(0)
+        others, more = look.way(information, np.stack([r.pulled for r in rest]).sum(0))
+        variance = np.array([noise + more + look.smear**2])
+        self._own, self._others = _longer(self._own, own, most), _longer(self._others, others, most)
+        self._variance = _longer(self._variance, variance, most)
+
+    def unequal(self) -> float:
+        """By how many times what is allowed the ways differ that end now."""
+        worst = 0.0
+        for block in WAY_BLOCKS:
+            if len(self._own) < 2 * block:
+                continue
+            mine, theirs, spread = (_block_means(rows, block) for rows in (self._own, self._others, self._variance))
+            apart = mine - theirs
+            differ = _lengths(apart[-1] - apart[:-block])
+            size = np.maximum(_lengths(mine[-1] - mine[:-block]), _lengths(theirs[-1] - theirs[:-block]))
+            doubt = np.sqrt(2 * (spread[-1, 0] + spread[:-block, 0]) / block)
+            allowed = np.maximum(np.maximum(MIN_UNEQUAL_PX, UNEQUAL_SIGMAS * doubt), UNEQUAL_SHARE * size)
+            worst = max(worst, float((differ / allowed).max()))
+        return worst
+
+
+def _longer(rows: Array, row: Array, most: int) -> Array:
+    """The last `most` of rows (T, K) and one more."""
+    return row[None] if not len(rows) else np.concatenate([rows[max(0, len(rows) + 1 - most) :], row[None]])
+
+
+class UnequalMotion:
+    """Remembers how each camera's picture moved lately, and which camera does not move as the others do."""
+
+    def __init__(self) -> None:
+        self.apart: frozenset[int] = frozenset()  # the camera without which the others move alike, if one does not
+        self._looks, self._since = 0, np.nan  # in which ways were unequal, in a row; s, stamp of the last
+        self._tracks: dict[int, float] = {}  # usual number by camera
+        self.forget()
+
+    def forget(self) -> None:
+        """Compare with no earlier picture, as after a change of the map."""
+        self._past: deque[dict[int, _PictureLook]] = deque()
+        self._ways: dict[int, _PictureWays] = {}
+        self._anchors: Array | None = None  # (K, 3) mm, surface frame
+
+    def update(
+        self, rig: Rig, stamp: float, points: Array, exposed: Array, parts: dict[int, CameraEquations], smear: Array
+    ) -> None:
+        """Take a look. points: (N, 3) mm. exposed: (C, 4, 4). smear: (6,) mm and rad, of late exposures.
+
+        Cameras with fewer tracks than usual do not count: what covers a picture or blurs it drags the rest along.
+        """
+        parts = {c: part for c, part in parts.items() if self._shows_usual(c, len(part.slopes))}
+        if len(parts) < 2:
+            return
+        if self._anchors is None:
+            self._anchors = spread_anchors(points)
+        now: dict[int, _PictureLook] = {}
+        for c, part in parts.items():
+            pixels, _, jacobian = project(rig, np.full(len(self._anchors), c), exposed[c], self._anchors)
+            slopes = jacobian.reshape(-1, 6)
+            late = float(np.sqrt(np.mean((slopes @ smear) ** 2)))
+            now[c] = _PictureLook(stamp, pixels.ravel(), slopes, part.pose, part.pulled, late)
+        if self._past and (now.keys() != self._past[-1].keys() or self._old(stamp)):
+            self._forget_before(stamp, now.keys())
+        self._past.append(now)
+        for c, look in now.items():
+            rest = [r for o, r in now.items() if o != c]
+            self._ways.setdefault(c, _PictureWays()).add(look, rest, len(self._past))
+        self._decide(stamp, {c: self._ways[c].unequal() for c in now})
+
+    def _shows_usual(self, camera: int, tracks: int) -> bool:
+        usual = self._tracks.setdefault(camera, float(tracks))
+        if tracks > FEW_TRACKS * usual:
+            self._tracks[camera] += TRACKS_SHARE * (tracks - usual)
+        return tracks >= WHOLE_SHARE * usual
+
+    def _old(self, stamp: float) -> bool:
+        return next(iter(self._past[0].values())).stamp < stamp - WAY_MEMORY_S
+
+    def _forget_before(self, stamp: float, cameras: Collection[int]) -> None:
+        """Drop looks that are old, and all where other cameras see the surface now."""
+        same = self._past[-1].keys() == set(cameras)
+        while self._past and (not same or self._old(stamp)):
+            self._past.popleft()
+
+    def _decide(self, stamp: float, unequal: dict[int, float]) -> None:
+        """Which camera is apart, by how unequal each one's ways are to those of the others."""
+        if max(unequal.values()) > 1:
+            self._looks, self._since = self._looks + 1, stamp
+            if self._looks >= MIN_UNEQUAL_LOOKS:
+                self.apart = frozenset([min(unequal, key=self._without)])
+        else:
+            self._looks = 0
+            if stamp - self._since > EQUAL_AGAIN_S:
+                self.apart = frozenset()
+
+    def _without(self, camera: int) -> float:
+        """How unequal the others' ways are among themselves without a camera."""
+        rest, worst = [c for c in self._past[-1] if c != camera], 0.0
+        for c in rest if len(rest) > 1 else ():
+            others = [[look[o] for o in rest if o != c] for look in self._past]
+            worst = max(worst, _PictureWays([look[c] for look in self._past], others).unequal())
+        return worst
+
+
+def _block_means(rows: Array, block: int) -> Array:
+    """Means (T - block + 1, K) of `block` rows (T, K) that follow each other."""
+    sums = np.cumsum(np.concatenate([np.zeros((1, rows.shape[1])), rows]), axis=0)
+    return np.asarray((sums[block:] - sums[:-block]) / block)
+
+
+def _lengths(ways: Array) -> Array:
+    """Root mean square (T,), px, over the anchors of ways (T, 2K)."""
+    return np.asarray(np.sqrt(2 * np.mean(ways**2, axis=1)))
+
+
+def spread_anchors(points: Array) -> Array:
+    """Of points (N, 3), the one in the middle and those that lie farthest out to four sides: (5, 3)."""
+    away = points - points.mean(0)
+    along = away @ np.linalg.svd(away, full_matrices=False)[2][:2].T
+    rows = [int(np.argmin((away**2).sum(1))), *np.argmin(along, 0).tolist(), *np.argmax(along, 0).tolist()]
+    return np.asarray(points[rows])
 
 
 def reduced_alone(parts: dict[int, CameraEquations], camera: int, others: Collection[int]) -> ReducedEquations:
@@ -236,13 +366,6 @@ def _pose_share(parts: Sequence[CameraEquations], cross: Array) -> Array:
         pose, pulled = pose + part.pose, pulled + part.pulled
     held = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
     return np.asarray(np.linalg.solve(held, np.column_stack([cross.T, pulled])))
-
-
-def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
-    """(N, 2, 4), how pixels (N, 2) move with shift (2), roll and scale about the camera's axis."""
-    across, down = (pixels - rig.matrices[camera][:2, 2]).T
-    zero, one = np.zeros_like(across), np.ones_like(across)
-    return np.stack([np.stack([one, zero, -down, across], -1), np.stack([zero, one, across, down], -1)], 1)
 
 
 def _bump_text(change: Array, part: CameraEquations, moved: float) -> str:

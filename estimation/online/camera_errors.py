@@ -8,16 +8,25 @@ One Kalman filter holds what stays, offsets and shifts together, so that a shift
 What varies is learned as two variances. A delay common to all cameras cannot be seen: the reference is their mean.
 Only the offsets are corrected. The map is made through the same lenses, so a shift that stays is in the map too, and
 correcting it would carry the pose away from the map (measured: 0.04 mm on a surface at rest that had no shift at all).
+
+Pictures that hang, or suddenly come late, show the surface where it once was, and two cameras that hang agree with each
+other. So those that carry the pose are believed against others (`RivalWatch`) only once they have been seen to move,
+and not along the way that the others went before: pictures are late, never early.
 """
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation import se3
+from estimation.online.fit import RivalPose
 from estimation.pose_solver import SharedErrors, SharedFit
+from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array, Index
 
 
@@ -191,3 +200,201 @@ class CameraErrorHistory:
     def before(self) -> CameraErrors:
         """As known INTERVAL_S ago or earlier."""
         return copy.deepcopy(self._before)
+
+
+MIN_VISIBLE_PX = 0.3  # root mean square over the anchors: more than lens and map change in a second,
+VISIBLE_SIGMAS = 5.0  # and so many of the pose's own noise there
+HANGS_RATIO = 2.0  # times what is visible that one side must move while the other does not
+RIVAL_MEMORY_S = 2.0  # looked back for what has moved; half a slow breath
+MAX_LAG_S, LAG_STEP_S = 0.5, 0.01  # by which pictures may come late, a dozen of them queued; and the step of its search
+LAG_WINDOW_S = 0.25  # of the newest poses, which a lag must explain
+CLEAR_LAG_RATIO = 3.0  # times what its own lag leaves must be left by the carriers' for a rival to be the late one
+LAG_SHARE = 0.5  # of what they stand apart: a lag that leaves less explains it
+STEADY_SHARE = 0.3  # of what the carriers moved: cameras that stand apart by a steadier distance move in step
+RIVAL_HOLD_S, TRUST_MEMORY_S = 0.12, 1.0  # that doubt or trust stays after a rival is out of sight, or passes by
+
+
+@dataclass(slots=True)
+class _Verdict:
+    """What is known of the carriers against one rival."""
+
+    rival: RivalPose  # as last seen
+    since: float  # s, when the carriers were last known to be right, or the rival was first seen
+    seen: float  # s, when the rival was last seen
+    trusted: bool = False  # whether the carriers are believed
+    jumped: bool = False  # whether the rival left the motion that the carriers continued: then they are not late
+    stood: bool = False  # whether they have stood still while the rival moved
+    widest: Array = field(default_factory=lambda: np.zeros(6))  # the largest difference: who is late agrees at a turn
+    still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
+    late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
+
+    @property
+    def open_to_both(self) -> bool:  # the rival may be right, and does not outnumber the carriers
+        return not self.trusted and len(self.rival.cameras) <= len(self.rival.carriers)
+
+    def remembered(self, stamp: float) -> bool:  # at `stamp`, s, though the rival is not seen
+        return stamp - self.seen <= (TRUST_MEMORY_S if self.trusted or self.late[0] else RIVAL_HOLD_S)
+
+
+@dataclass(slots=True)
+class RivalWatch:
+    """Remembers where carriers and rivals saw the surface lately, and which carriers may be believed."""
+
+    anchors: Array  # (K, 3) mm, surface frame: where motion is looked for
+    _looks: deque[tuple[float, Array, dict[frozenset[int], Array]]] = field(default_factory=deque)  # s, carried, own
+    _verdicts: dict[frozenset[int], _Verdict] = field(default_factory=dict)
+
+    def update(
+        self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose], left_out: frozenset[int]
+    ) -> None:
+        """Take a frame set: pose (4, 4), those that contradict it, and those left out, which remain rivals unseen."""
+        carried = rivals[0].carried if rivals else carried
+        self._looks.append((stamp, carried, {rival.cameras: rival.own for rival in rivals}))
+        while self._looks[0][0] < stamp - RIVAL_MEMORY_S:
+            self._looks.popleft()
+        for rival in rivals:
+            verdict = self._verdicts.get(rival.cameras)
+            if verdict is None or verdict.rival.carriers != rival.carriers:
+                verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp, rival.jumped, rival.jumped)
+            verdict.rival, verdict.seen = rival, stamp
+            verdict.widest = max(verdict.widest, rival.difference, key=lambda apart: float(np.linalg.norm(apart[3:])))
+            self._judge(rig, stamp, verdict)
+        self._verdicts = {
+            key: verdict
+            for key, verdict in self._verdicts.items()
+            if verdict.seen == stamp or key & left_out or verdict.remembered(stamp)
+        }
+
+    @property
+    def doubted(self) -> list[RivalPose]:
+        """Rivals against which the carriers are not believed."""
+        return [verdict.rival for verdict in self._verdicts.values() if not verdict.trusted]
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) that covers the poses of all rivals that may be right."""
+        sides = [v.widest if v.late[0] else v.rival.difference for v in self._verdicts.values() if not v.trusted]
+        return np.asarray(np.reshape(sides, (-1, 6)).T @ np.reshape(sides, (-1, 6)))
+
+    def outliers(self, bumped: Collection[int]) -> frozenset[int]:
+        """Rivals without which the pose is to be: between both it is wrong. bumped: may stay unless they hang."""
+        sides = [key - set(bumped) if v.open_to_both else v.still | v.late[0] for key, v in self._verdicts.items()]
+        return frozenset().union(*sides) & frozenset().union(*self._verdicts)
+
+    def own_poses(self, onwards: bool = False) -> dict[int, Array]:
+        """Where each rival camera last saw the surface (4, 4). onwards: moved on as it moved from the look before."""
+        last, before = (self._looks[-n][2] if self._verdicts and len(self._looks) >= n else {} for n in (1, 2))
+        found: dict[int, Array] = {}
+        for cameras, own in last.items():
+            moved = se3.inverse(before[cameras]) @ own if onwards and cameras in before else np.eye(4)
+            found.update(dict.fromkeys(cameras, own @ moved))
+        return found
+
+    def still_or_late(self, camera: int) -> str:
+        """What a rival camera that is not believed does, or ''."""
+        for cameras, verdict in self._verdicts.items():
+            if camera in cameras and verdict.trusted:
+                if camera in verdict.still:
+                    return "shows no motion while the others move"
+                if camera in verdict.late[0]:
+                    return f"shows what the others showed {verdict.late[1]:.2f} s before"
+        return ""
+
+    def doubts(self, names: Sequence[str]) -> list[str]:
+        """Why the carriers are not believed: a text for each rival. names: of all cameras."""
+        newest = max((v.seen for v in self._verdicts.values() if not v.trusted), default=0.0)
+        return [_doubt_text(v, names) for v in self._verdicts.values() if not v.trusted and v.seen == newest]
+
+    def _judge(self, rig: Rig, stamp: float, verdict: _Verdict) -> None:
+        """Who has moved since the carriers were last known to be right, and whether one side trails the other."""
+        key, carriers = verdict.rival.cameras, verdict.rival.carriers
+        looks = [look for look in self._looks if look[0] >= verdict.since and key in look[2]]
+        _, a, b = _series(looks, key)
+        noise, own_noise = verdict.rival.noise
+        moved = max(_visible(self._pixels(rig, c, a), noise) for c in carriers)
+        rival_moved, expected = (max(_visible(self._pixels(rig, c, x), own_noise) for c in key) for x in (b, a))
+        lag = self._lag(rig, verdict) if moved > HANGS_RATIO else 0.0  # at a turn one side rests while the other trails
+        lag = min(lag, 0.0) if verdict.jumped else lag
+        hang, both = moved < 1 and rival_moved > HANGS_RATIO, min(moved, rival_moved) > 1
+        rival_hangs = rival_moved < 1 and expected > HANGS_RATIO and lag <= 0
+        lag = 0.0 if rival_hangs or (lag < 0 and rival_moved < HANGS_RATIO) else lag
+        if hang or rival_hangs or both or lag > 0:  # else as it was
+            verdict.still = carriers if hang else key if rival_hangs else frozenset()
+            verdict.late = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
+        verdict.stood |= hang
+        in_step = both and stamp - verdict.since >= LAG_WINDOW_S
+        in_step = in_step and (not verdict.stood or self._steady(rig, min(key), a, b))
+        if hang or verdict.late[0] == carriers or len(key) > len(carriers) or not verdict.rival.united:
+            verdict.trusted = False
+        elif rival_hangs or in_step:
+            verdict.trusted = True
+            verdict.since, verdict.stood = stamp, False
+
+    def _pixels(self, rig: Rig, camera: int, poses: Array) -> Array:  # (T, 4, 4) -> (T, K, 2) px of the anchors
+        points = self.anchors @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+        return ideal_pixels(rig.cameras[camera], points.reshape(-1, 3))[0].reshape(len(poses), -1, 2)
+
+    def _newest(self, rig: Rig, verdict: _Verdict) -> tuple[int, Array, Array, Array]:
+        """Looks that count, and stamps (T,) and anchors (T, 2K) px by carriers and by rival in the rival's picture."""
+        stamps, a, b = _series(self._looks, verdict.rival.cameras)
+        start, camera, key = stamps[-1] - LAG_WINDOW_S, min(verdict.rival.cameras), verdict.rival.cameras
+        parted = [look[0] >= start and key in look[2] for look in reversed(self._looks)]
+        count = parted.index(False) if False in parted else len(parted)
+        first, second = (self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
+        return count, stamps, first, second
+
+    def _lag(self, rig: Rig, verdict: _Verdict) -> float:
+        """By how much, s, the carriers show later what the rival shows; negative: the rival is late; 0: no lag."""
+        count, stamps, a, b = self._newest(rig, verdict)
+        apart = _rms(a[-count:] - b[-count:])
+        lags = np.arange(LAG_STEP_S, min(MAX_LAG_S, stamps[-count] - stamps[0]) + 1e-9, LAG_STEP_S)
+        if not len(lags) or apart < MIN_VISIBLE_PX:
+            return 0.0
+        behind = [_lagged(stamps, count, x, y, lags) for x, y in ((a, b), (b, a))]
+        best = [int(np.argmin(left)) for left in behind]
+        carriers, rival = behind[0][best[0]], behind[1][best[1]]
+        if min(carriers, rival) > LAG_SHARE * apart:
+            return 0.0
+        first = carriers < min(LAG_SHARE * apart, CLEAR_LAG_RATIO * rival)  # a way to and fro fits both: it is open
+        return float(lags[best[0]] if first else -lags[best[1]])
+
+    def _steady(self, rig: Rig, camera: int, a: Array, b: Array) -> bool:
+        """Whether a rival's picture by poses b (T, 4, 4) stands apart by the same while the carriers move as a."""
+        way, own = (self._pixels(rig, camera, poses).reshape(len(poses), -1) for poses in (a, b))
+        moved, apart = _rms(way - way.mean(0)), own - way
+        return moved > MIN_VISIBLE_PX / 2 and _rms(apart - apart.mean(0)) < STEADY_SHARE * moved
+
+
+def _series(
+    looks: Sequence[tuple[float, Array, dict[frozenset[int], Array]]], key: frozenset[int]
+) -> tuple[Array, Array, Array]:
+    """Stamps (T,) and poses (T, 4, 4) by carriers and by rival; before they parted they were the same."""
+    own = np.stack([look[2].get(key, look[1]) for look in looks])
+    return np.array([look[0] for look in looks]), np.stack([look[1] for look in looks]), own
+
+
+def _visible(pixels: Array, noise: float) -> float:  # way of anchors (T, K, 2) px, in parts of what is visible
+    away = np.sqrt(((pixels - pixels[0]) ** 2).sum(2).mean(1))
+    return float(away.max() / max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
+
+
+def _rms(away: Array) -> float:  # length, px, of flat pixels (T, 2K)
+    return float(np.sqrt(2 * np.mean(away**2)))
+
+
+def _lagged(stamps: Array, count: int, late: Array, early: Array, lags: Array) -> Array:
+    """What is left (L,), px, of the newest `count` looks of one side against the other's so much earlier."""
+    then = np.stack([np.interp(stamps[-count:] - lags[:, None], stamps, column) for column in early.T], -1)
+    return np.asarray(np.sqrt(2 * ((late[-count:] - then) ** 2).mean((1, 2))))
+
+
+def _doubt_text(verdict: _Verdict, names: Sequence[str]) -> str:
+    carriers, key = verdict.rival.carriers, verdict.rival.cameras
+    first = verdict.still or verdict.late[0] or key
+    one, other = (", ".join(names[c] for c in sorted(side)) for side in (first, key if first == carriers else carriers))
+    said = f"{one} against {other}"
+    if verdict.still:
+        said = f"no motion in {one} while {other} moved"
+    elif verdict.late[0]:
+        said = f"{one} late by {verdict.late[1]:.2f} s against {other}"
+    return f"{said}: no majority can be trusted"

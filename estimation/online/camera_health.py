@@ -8,17 +8,18 @@ usually stand apart is learned, since no calibration is perfect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from estimation import se3
 from estimation.observations import Observations
-from estimation.online.bump_detector import BumpDetector
+from estimation.online.bump_detector import MIN_UNEQUAL_PX, BumpDetector, spread_anchors
+from estimation.online.camera_errors import RivalWatch
+from estimation.online.fit import RivalPose, camera_numbers, motion_sigmas, picture_noise
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
+from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index, Mask
@@ -36,6 +37,14 @@ MAX_GAP_S = 0.08  # and also two frame sets, that a camera may miss: drivers dro
 MIN_USUAL_SHARE = 0.3  # of the tracks a camera usually has: with fewer it is missed
 HIDDEN_SHARE = 0.15  # where no camera has as many, the few may be what covers the rest: no measurement
 SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them are found
+# of a camera's last own pose about its next, 0.03 rad and 10 mm: a patch has two (Schweighofer and Pinz 2006)
+SINGLE_POSE_PRIOR = np.diag([1 / 0.03**2] * 3 + [1 / 10.0**2] * 3)
+UNUSUAL_RATIO = 3.0  # times the usual offset, or the tracks' noise: beyond, cameras that carry a pose do not agree
+CLEAR_SIGMAS = (
+    2.0  # by which a camera's own pose must differ in its picture (of six degrees of freedom: 6e-4 by chance)
+)
+MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
+MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
 
 
@@ -47,11 +56,12 @@ class CameraHealth:
         self.bumps = BumpDetector(names)
         self._fresh = frozenset(range(len(self._names)))  # cameras with a new picture; all until `set_pictures`
         self._repeated: frozenset[int] = frozenset()
-        self.begin()
+        self.begin(np.zeros((1, 3)))
 
-    def begin(self) -> None:
-        """Forget everything, as for a new map."""
+    def begin(self, points: Array) -> None:
+        """Forget everything, as for a new map with landmarks (N, 3), surface frame."""
         count = len(self._names)
+        self.rivals = RivalWatch(spread_anchors(points))
         self.bumps.begin()
         self.left_out: frozenset[int] = frozenset()
         self._usual, self._tracks = np.zeros(count), np.zeros(count)  # px off, and tracks
@@ -62,6 +72,23 @@ class CameraHealth:
         self._apart = np.zeros(count, bool)
         self._blurred = False  # all cameras stand off together
         self._stamp = np.nan
+        self._shown = np.zeros(count, np.int64)  # pictures
+        self._blind: frozenset[int] = frozenset()  # cameras that show nothing of the map, though it is in their view
+        self._hint = ""  # at their calibration
+
+    @property
+    def unseen(self) -> frozenset[int]:
+        """Cameras that have given pictures, and have never carried the pose."""
+        return camera_numbers(np.isnan(self._carried) & (self._shown >= MIN_SHOWN_PICTURES))
+
+    def set_unseen(self, cameras: frozenset[int], hint: str) -> None:
+        """Cameras that show nothing of the map, though it is in their view, and a hint at the cause, or ''."""
+        self._blind, self._hint = cameras, hint
+
+    @property
+    def at_odds(self) -> bool:
+        """Whether cameras contradict each other, though none may be left out."""
+        return bool(self.bumps.bumped or self.bumps.unequal.apart or self.rivals.doubted)
 
     def set_pictures(self, fresh: Collection[int], repeated: Collection[int]) -> None:
         """Which cameras delivered a new picture for the coming frame set, and which the last one again."""
@@ -99,6 +126,61 @@ class CameraHealth:
         fewer = used.sum() < SHARP_SHARE * self._tracks.sum()
         return bool(fewer and self.blur_offsets(offsets, allowed, outliers).any())
 
+    def solve(
+        self, tracks: FrameTracks, start: Array, scales: tuple[float, ...], allowed: Array, expected: SurfacePose | None
+    ) -> tuple[PoseFit, frozenset[int], Array]:
+        """The pose of the cameras that agree with each other, those left out, and offsets (C,), px, from the pose.
+
+        allowed: (C,) px. expected: by the motion until now; None where no other camera is to be left out.
+        """
+        off = camera_numbers(self._offsets > READMIT_RATIO * allowed)  # else they come back at once
+        outliers = self.left_out | (off & self.rivals.outliers(self.bumps.bumped))
+        solution = tracks.fit(start, scales, outliers)
+        offsets = tracks.offsets(solution)
+        if expected is None:
+            return solution, outliers, offsets
+        limit = OUTLIER_RATIO * allowed
+        apart = any(offsets[c] > limit[c] for c in range(len(limit)) if c not in outliers)
+        # a camera may have moved, though the others follow it
+        if apart or motion_sigmas(solution, expected) > MAX_MOTION_SIGMAS:
+            stay, within = (1, np.inf) if apart else (2, MAX_MOTION_SIGMAS)
+            better = tracks.without_outliers(outliers, limit, expected, stay, within)
+            if better is not None:
+                outliers, solution = tracks.along_motion(*better, limit, expected) if apart else better
+                return solution, outliers, tracks.offsets(solution)
+        return solution, outliers, offsets
+
+    def rival_poses(
+        self,
+        tracks: FrameTracks,
+        fit: PoseFit,
+        outliers: frozenset[int],
+        offsets: Array,
+        allowed: Array,
+        expected: SurfacePose | None,
+    ) -> tuple[RivalPose, ...]:
+        """What cameras say against the fit: those left out; else one that moves or stands unlike the others.
+
+        offsets, allowed: (C,) px. expected: by the motion, a rival of a fit that contradicts it and lacks cameras.
+        """
+        if expected is None:
+            return ()
+        limit = OUTLIER_RATIO * allowed
+        farthest = frozenset([int(np.nanargmax(offsets / limit))] if (offsets > limit).any() else [])
+        unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
+        apart = outliers or unlike or tracks.out_of_step(fit) or farthest
+        motion, usual = motion_sigmas(fit, expected), UNUSUAL_RATIO * self._usual
+        goes_on = expected if outliers and motion <= MAX_MOTION_SIGMAS else None
+        rivals = tracks.rivals(fit, apart, limit, usual, self.rivals.own_poses(), goes_on) if apart else ()
+        found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
+        few = (found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0)
+        lost_now = camera_numbers(few) & self._fresh - outliers
+        carriers = camera_numbers(found > 0) - lost_now
+        if rivals or not lost_now or motion <= MAX_MOTION_SIGMAS:
+            return rivals
+        poses, nothing = (fit.base_from_surface, expected.base_from_surface), np.zeros(len(fit.weights), bool)
+        return (RivalPose(lost_now, carriers, *poses, (0.0, 0.0), nothing),)
+
     def update(
         self, stamp: float, used: Index, least: float, offsets: Array, allowed: Array, outliers: Collection[int]
     ) -> None:
@@ -106,16 +188,19 @@ class CameraHealth:
 
         used: (C,) tracks that carry the pose, zero where nothing was measured. least: tracks below which a camera says
         nothing. offsets: (C,) px of each from the pose of the others, nan where unseen. allowed: as `allowed` gives.
-        outliers: cameras that were left out of this pose.
+        outliers: left out of this pose.
         """
         required = np.maximum(least, MIN_USUAL_SHARE * self._tracks)
         carrying = used >= required * np.where(self._missed > 0, RETURN_RATIO, 1.0)
         self._missed = np.where(carrying, 0, self._missed + 1)
+        self._shown[list(self._fresh)] += 1
         self._carried[carrying] = stamp
         # running means of offset and tracks, of the cameras that carry the pose
         share = min(1.0, (stamp - self._stamp) / USUAL_MEMORY_S) if np.isfinite(self._stamp) else 1.0
         self._stamp = stamp
         known = carrying & np.isfinite(offsets)
+        known &= not (outliers or self.rivals.doubted)
+        known[list(self.bumps.bumped)] = False  # a camera that hangs before a slow motion stands off ever farther
         self._usual[known] += share * (np.minimum(offsets, 2 * allowed)[known] - self._usual[known])
         self._tracks[carrying] += share * (used[carrying] - self._tracks[carrying])
         # which cameras stay left out
@@ -130,9 +215,12 @@ class CameraHealth:
         """Which cameras are missed, or that all look odd, and why; or ''. at_once: also those that only just failed."""
         late = (self._missed >= 2) & (stamp - self._carried > MAX_GAP_S)
         named = (self._missed > 0) & np.isfinite(self._carried) & (late | at_once)
-        off = self.left_out | self.bumps.messages.keys()
+        off = self.left_out | self.bumps.messages.keys() | self.rivals.outliers(self.bumps.bumped)
+        doubted = {c for rival in self.rivals.doubted for c in rival.cameras | rival.carriers}
         troubled = (c for c in range(len(self._names)) if named[c] or c in off or self._apart[c])
-        reasons = [f"{self._names[c]} {self._why(c)}" for c in troubled]
+        reasons = [f"{self._names[c]} {self._why(c)}" for c in troubled if c not in doubted]
+        blind = [f"{self._names[c]} shows nothing of the map" for c in sorted(self._blind & self.unseen)]
+        reasons = [*self.rivals.doubts(self._names), *reasons, *blind, *([self._hint] if blind and self._hint else [])]
         return ", ".join(reasons or ["no camera shows the surface as usual"] * self._blurred)
 
     def _why(self, camera: int) -> str:
@@ -140,6 +228,8 @@ class CameraHealth:
             return "shows the same picture again"
         if camera not in self._fresh:
             return "delivers no picture"
+        if said := self.rivals.still_or_late(camera):
+            return said
         if camera in self.bumps.messages:
             return self.bumps.messages[camera]
         if camera in self.left_out or self._apart[camera]:
@@ -163,9 +253,12 @@ class FrameTracks:
         if not left_out:
             return solve_pose(self.rig, tracks, start, scales=scales, shared=self.shared)
         used = ~np.isin(tracks.camera, list(left_out))
-        fit = solve_pose(self.rig, tracks.only(used), start, scales=scales, shared=self.shared)
-        predicted, _, jacobians = project(self.rig, tracks.camera, fit.base_from_surface, self.points)
-        residuals, weights = predicted - tracks.pixels, np.zeros(len(self.points))
+        return self._with_rest(solve_pose(self.rig, tracks.only(used), start, scales=scales, shared=self.shared), used)
+
+    def _with_rest(self, fit: PoseFit, used: Mask) -> PoseFit:
+        """A fit to the tracks `used` (N,) with the residuals of the others, which have no weight."""
+        predicted, _, jacobians = project(self.rig, self.seen.camera, fit.base_from_surface, self.points)
+        residuals, weights = predicted - self.seen.pixels, np.zeros(len(self.points))
         residuals[used], weights[used] = fit.residuals, fit.weights
         return PoseFit(fit.base_from_surface, fit.information, residuals, weights, jacobians, fit.scale, fit.shared)
 
@@ -204,6 +297,78 @@ class FrameTracks:
                 return fits[0][1:] if sure and fits[0][0] <= within else None
         return None
 
+    def along_motion(
+        self, without: frozenset[int], fit: PoseFit, allowed: Array, expected: SurfacePose
+    ) -> tuple[frozenset[int], PoseFit]:
+        """Those left out and the fit, or one camera alone that continues the motion until now which the others leave.
+
+        Cameras that hang, or come late together, agree with each other.
+        """
+        present = set(np.unique(self.seen.camera).tolist())
+        apart = sorted(present & without)
+        if motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS or len(apart) != 1:
+            return without, fit
+        others = frozenset(present - without) | (without - set(apart))
+        alone = self.fit(expected.base_from_surface, (4.0, 1.0), others)
+        sound = (
+            self.offsets(alone)[apart[0]] <= allowed[apart[0]] and motion_sigmas(alone, expected) <= MAX_MOTION_SIGMAS
+        )
+        return (others, alone) if sound else (without, fit)
+
+    def out_of_step(self, fit: PoseFit) -> frozenset[int]:
+        """The camera whose exposure in this frame set is off by more than its clock can be, if any."""
+        if fit.shared is None:
+            return frozenset()
+        prior, eye = self.shared.covariance(), np.eye(len(fit.shared.pull))
+        effect = prior @ np.linalg.solve(eye + fit.shared.information @ prior, fit.shared.pull)
+        delay, usual = np.abs(effect[: len(self.rig)]), np.sqrt(np.mean(np.diag(self.shared.delay)))
+        return frozenset([int(np.argmax(delay))] if delay.max() > MAX_DELAY_SIGMAS * usual else [])
+
+    def rivals(
+        self,
+        fit: PoseFit,
+        apart: Collection[int],
+        allowed: Array,
+        usual: Array,
+        starts: Mapping[int, Array],
+        motion: SurfacePose | None,
+    ) -> tuple[RivalPose, ...]:
+        """What cameras `apart` say clearly against the others, together where they agree, else each by itself.
+
+        allowed, usual: (C,) px by which cameras that agree may stand off, and do. starts: (4, 4) by camera, where it
+        last saw the surface. motion: the pose expected, where the fit continues the motion until now.
+        """
+        counts = np.bincount(self.seen.camera, minlength=len(self.rig))
+        seen = camera_numbers(counts >= self.min_tracks)
+        rivals, carriers = sorted(seen & set(apart)), seen - set(apart)
+        if not rivals or not carriers:
+            return ()
+        carried, noise = self._only(carriers, fit.base_from_surface)
+        pose, alone = carried.base_from_surface, list[RivalPose]()
+        noisy = USUAL_LENGTH_SIGMAS * median(self.seen.sigma)
+        united = bool((self.offsets(carried) <= np.maximum(usual, noisy))[sorted(carriers)].all())
+        for group in ([rivals] if len(rivals) > 1 else []) + [[c] for c in rivals]:
+            key, mine = frozenset(group), np.isin(self.seen.camera, group)
+            own, own_noise = self._only(key, starts.get(group[0], pose))
+            inlier = (own.weights > INLIER_WEIGHT) & mine
+            jumped = motion is not None and motion_sigmas(own, motion) > MAX_MOTION_SIGMAS
+            rival = RivalPose(key, carriers, pose, own.base_from_surface, (noise, own_noise), inlier, united, jumped)
+            apart_px = float(np.sqrt(2 * np.mean((own.jacobians[mine] @ rival.difference) ** 2)))
+            clear = apart_px > max(MIN_UNEQUAL_PX, CLEAR_SIGMAS * np.sqrt(2) * own_noise)
+            if clear and (self.offsets(own)[group] <= allowed[group]).all():
+                alone.append(rival)
+                if len(group) > 1:
+                    break
+        return tuple(alone)
+
+    def _only(self, cameras: frozenset[int], start: Array) -> tuple[PoseFit, float]:
+        """The fit of these cameras' tracks alone, and its noise, px, in their pictures."""
+        mine = np.isin(self.seen.camera, list(cameras))
+        tracks, prior = PointTracks.of(self.seen, self.points), SINGLE_POSE_PRIOR if len(cameras) == 1 else None
+        own = solve_pose(self.rig, tracks.only(mine), start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
+        fit = self._with_rest(own, mine)
+        return fit, picture_noise(fit, mine)
+
     def weak_fit_reason(self, fit: PoseFit, outliers: Collection[int], torn: bool, expected: SurfacePose) -> str:
         """What speaks against a fit that stands on little, or ''.
 
@@ -228,11 +393,3 @@ class FrameTracks:
             return 0.0
         left = own_residuals(self.seen.camera, fit, inlier.astype(float))[inlier]
         return float(np.median(np.linalg.norm(left, axis=1)))
-
-
-def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
-    """By how many sigmas a pose differs from the one expected by the motion, at least one."""
-    off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
-    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # without information: one
-    spread = expected.covariance + np.linalg.inv(damped)
-    return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))

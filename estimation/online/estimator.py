@@ -15,7 +15,7 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
-from estimation.online.camera_health import MAX_MOTION_SIGMAS, OUTLIER_RATIO, CameraHealth, FrameTracks, motion_sigmas
+from estimation.online.camera_health import CameraHealth, FrameTracks
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.parted_texture import Elsewhere
@@ -33,13 +33,16 @@ from estimation.online.surface_state import (
 )
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
-from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
+from estimation.pose_solver import INLIER_WEIGHT, project
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap
 
 MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
+# s, of the cameras' instants: more than of webcams at first. They then come late, or hang, now and then, and the pose
+# may be so many sigmas late or early.
+MAX_DELAY_SIGMA_S, MOST_DELAY_SIGMAS = 0.015, 3.0
 MAX_LEARNING_SMEAR_MM = 0.1  # between the cameras' instants: beyond, a late camera cannot be told from a bent surface
 MAX_MAP_SMEAR_MM = 0.5  # likewise: a map bent by more is no good for printing
 ACCELERATION_PERSISTENCE_S = 0.2  # breathing accelerates alike for so long, which adds up to more than white noise does
@@ -124,7 +127,8 @@ class Estimator:
         allowed = self.health.allowed(np.full(len(self.rig), smear))
         shared = self.cameras.shared(twist)
         tracks = FrameTracks(self.rig, seen, points, shared, self._min_camera_tracks())
-        solution, outliers, offsets = self._solve(tracks, start, scales, allowed)
+        expected = self.expected(seen.stamp) if self.confirmed else None  # a bent first map sets cameras apart
+        solution, outliers, offsets = self.health.solve(tracks, start, scales, allowed, expected)
         inlier = solution.weights > INLIER_WEIGHT
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
         parts = fit_covariance(seen, solution, shared, surface.map_error, surface.warp)
@@ -148,26 +152,8 @@ class Estimator:
             offsets=offsets,
             allowed=allowed,
             outliers=outliers,
+            rivals=self.health.rival_poses(tracks, solution, outliers, offsets, allowed, expected),
         )
-
-    def _solve(
-        self, tracks: FrameTracks, start: Array, scales: tuple[float, ...], allowed: Array
-    ) -> tuple[PoseFit, frozenset[int], Array]:
-        """The pose of the cameras that agree with each other, those left out, and offsets (C,), px, from the pose."""
-        outliers = self.health.left_out
-        solution = tracks.fit(start, scales, outliers)
-        offsets = tracks.offsets(solution)
-        if not self.confirmed:  # a bent first map sets cameras apart
-            return solution, outliers, offsets
-        limit, expected = OUTLIER_RATIO * allowed, self.expected(tracks.seen.stamp)
-        apart = any(offsets[c] > limit[c] for c in range(len(self.rig)) if c not in outliers)
-        # a camera may have moved, though the others follow it
-        if apart or motion_sigmas(solution, expected) > MAX_MOTION_SIGMAS:
-            stay, within = (1, np.inf) if apart else (2, MAX_MOTION_SIGMAS)
-            better = tracks.without_outliers(outliers, limit, expected, stay, within)
-            if better is not None:
-                return better[1], better[0], tracks.offsets(better[1])
-        return solution, outliers, offsets
 
     def _twist(self, stamp: float, start: Array) -> tuple[Array, Array]:
         """Velocity (6,) at `stamp` and its variance (6,): the window's and the chord's to `start`, as each is known."""
@@ -223,14 +209,14 @@ class Estimator:
         """
         self._mapped = MappedSurface(surface_map, self.rig, self._region, caveat)
         self._smoother.reset()
-        self.health.begin()
+        self.health.begin(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
         zero = np.zeros((6, 6))
         return self._enter(stamp, base_from_surface, covariance, zero, zero, *self._states.begin(stamp))
 
     def may_learn(self, fit: FrameFit) -> bool:
         """Whether map, warp and clocks may learn from a fit: what blurred or bumped cameras show would bend them."""
-        fine = not (fit.outliers or self.health.bumps.bumped or self.looks_unusual(fit))
+        fine = not (fit.outliers or self.health.at_odds or self.looks_unusual(fit))
         return fine and self.health.has_usual_tracks(fit.used)
 
     def looks_unusual(self, fit: FrameFit) -> bool:
@@ -268,7 +254,8 @@ class Estimator:
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
         points = surface.warp.points(surface.map)[seen.track]
-        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers)
+        smear = self.cameras.delays.sigma * fit.twist
+        self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear)
         if not sound:
             return
         if not surface.map_held or not self.deforms:
@@ -301,15 +288,22 @@ class Estimator:
         surface.accepted += 1
         surface.detector(fit.stamp, fit.solution.base_from_surface, fit.parts.noise)
         self._update_health(fit)
+        self.health.rivals.update(self.rig, fit.stamp, fit.solution.base_from_surface, fit.rivals, fit.outliers)
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
         surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
+        late = self.cameras.delays.sigma
+        unsteady = f"the cameras expose {late:.3f} s apart, now more, now less" if late > MAX_DELAY_SIGMA_S else ""
         quality = Measurement(
             cameras=tuple(self.rig.cameras[c].name for c in self.carrying_cameras(fit)),
             tracks=int(fit.used.sum()),
             sigma=position_sigma(fit.covariance + lasting),
             trouble=self.health.trouble(fit.stamp),
-            caveat=alias_message(aliases) or surface.parted.message or surface.local.message or surface.caveat,
+            caveat=alias_message(aliases)
+            or surface.parted.message
+            or surface.local.message
+            or surface.caveat
+            or unsteady,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
         )
         place, parts, state = fit.solution.base_from_surface, fit.parts, self._states.measured(fit.stamp, quality)
@@ -319,6 +313,9 @@ class Estimator:
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
         if len(aliases):
             given = widened(given, alias_covariance(aliases))
+        if self.health.rivals.doubted or unsteady:
+            way = bool(unsteady) * MOST_DELAY_SIGMAS * late * fit.twist
+            given = widened(given, self.health.rivals.covariance + np.outer(way, way))
         surface.reported_pose = surface.parted.covering(given)
         return surface.reported_pose
 
@@ -390,3 +387,4 @@ class Estimator:
         if bent:
             self.cameras, surface.map_held = self._earlier_cameras.before, True
         surface.map, surface.map_error = surface_map, MapError(surface_map)
+        self.health.bumps.unequal.forget()

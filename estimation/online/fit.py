@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation import se3
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
-from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors
-from estimation.runtime import compiled
+from estimation.pose import SurfacePose
+from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, project
+from estimation.rig import Rig
+from estimation.runtime import compiled, median
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
@@ -33,6 +36,25 @@ class FitCovariance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RivalPose:
+    """Where cameras that do not carry the pose see the surface, against those that do."""
+
+    cameras: frozenset[int]  # that agree among themselves
+    carriers: frozenset[int]  # that carry the pose
+    carried: Array  # (4, 4) base_from_surface by the carriers alone
+    own: Array  # (4, 4) base_from_surface by `cameras` alone
+    noise: tuple[float, float]  # px, one sigma, of what both poses do to their own pictures: carriers', own
+    inlier: Mask  # (N,) tracks of `cameras` that agree with the own pose
+    united: bool = True  # whether the carriers agree among themselves as they usually do
+    jumped: bool = False  # whether the own pose alone contradicts the motion until now
+
+    @property
+    def difference(self) -> Array:
+        """(6,) the tangent vector from the carried pose to the own one."""
+        return se3.log(se3.inverse(self.carried) @ self.own)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameFit:
     """A fit to one frame set of C cameras, and whether it is a measurement."""
 
@@ -48,11 +70,17 @@ class FrameFit:
     allowed: Array  # (C,) px, one sigma of that
     outliers: frozenset[int] = frozenset()  # cameras that were left out
     lit: Mask | None = None  # (N,) outliers whose grain is where the pose puts it: a shadow's edge has bent the track
+    rivals: tuple[RivalPose, ...] = ()  # what cameras that are left out, or look bumped, say against it
 
     @property
     def measured(self) -> bool:
         """Whether the fit may enter the window."""
         return not self.reason
+
+    @property
+    def followed(self) -> Mask:
+        """(N,) tracks that agree with the pose or, where cameras contradict it, with the pose of their own."""
+        return np.asarray(np.logical_or.reduce([self.inlier, *(rival.inlier for rival in self.rivals)]))
 
     @property
     def covariance(self) -> Array:
@@ -292,3 +320,76 @@ def landmark_sights(
         seen[camera[i], track[i]] = True
         found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
     return found, seen
+
+
+PICTURE_DOF = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
+MIN_CAMERA_TRACKS = 8  # of a camera, to estimate its four numbers
+OUTLIER_PX = 6.0  # px beside the median of its camera at which a track counts for nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraEquations:
+    """The normal equations of one camera's N tracks in one frame set, by its own four numbers and by the pose."""
+
+    own: Array  # (4, 4) information of the numbers
+    pull: Array  # (4,)
+    pose: Array  # (6, 6) information of the pose
+    pulled: Array  # (6,)
+    cross: Array  # (4, 6)
+    slopes: Array  # (N, 2, 4) px by the numbers
+
+    def without(self, numbers: Array) -> CameraEquations:
+        """The same with these numbers (4,) subtracted from the residuals."""
+        return replace(self, pull=self.pull - self.own @ numbers, pulled=self.pulled - numbers @ self.cross)
+
+    def moved(self, numbers: Array) -> float:
+        """Root mean square, px, by which these numbers (4,) move its tracks."""
+        return float(np.sqrt(np.mean(((self.slopes @ numbers) ** 2).sum(-1))))
+
+
+def camera_equations(
+    rig: Rig, observations: Observations, points: Array, exposed: Array, jacobians: Array
+) -> dict[int, CameraEquations]:
+    """The equations of each camera with enough tracks, by camera number."""
+    parts: dict[int, CameraEquations] = {}
+    for camera in range(len(rig)):
+        mine = np.flatnonzero(observations.camera == camera)
+        if len(mine) < MIN_CAMERA_TRACKS:
+            continue
+        pixels = observations.pixels[mine]
+        left = pixels - project(rig, observations.camera[mine], exposed[camera], points[mine])[0]
+        middle = np.array([median(left[:, 0]), median(left[:, 1])])
+        beside = ((left - middle) ** 2).sum(1) / OUTLIER_PX**2
+        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(observations.sigma[mine], 0.1)) ** 2, 2)[:, None]
+        rows, slopes = jacobians[mine].reshape(-1, 6), _picture_jacobian(rig, camera, pixels)
+        flat, gap = slopes.reshape(-1, PICTURE_DOF), left.ravel()
+        posed, own = (rows * weights).T, (flat * weights).T
+        parts[camera] = CameraEquations(own @ flat, own @ gap, posed @ rows, posed @ gap, own @ rows, slopes)
+    return parts
+
+
+def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
+    """(N, 2, 4), how pixels (N, 2) move with shift (2), roll and scale about the camera's axis."""
+    across, down = (pixels - rig.matrices[camera][:2, 2]).T
+    zero, one = np.zeros_like(across), np.ones_like(across)
+    return np.stack([np.stack([one, zero, -down, across], -1), np.stack([zero, one, across, down], -1)], 1)
+
+
+def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
+    """By how many sigmas a pose differs from the one expected by the motion, at least one."""
+    off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
+    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # without information: one
+    spread = expected.covariance + np.linalg.inv(damped)
+    return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
+
+
+def picture_noise(fit: PoseFit, rows: Mask) -> float:
+    """Root mean square, px, one sigma, by which a pose's noise moves the tracks `rows` (N,)."""
+    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)
+    jacobians = fit.jacobians[rows]
+    return float(np.sqrt(np.einsum("nki,nki->", jacobians @ np.linalg.inv(damped), jacobians) / len(jacobians)))
+
+
+def camera_numbers(cameras: Mask) -> frozenset[int]:
+    """The numbers of the chosen ones of cameras (C,)."""
+    return frozenset(np.flatnonzero(cameras).tolist())

@@ -1,8 +1,11 @@
-"""Corners and SIFT features: where tracks can begin, which features of two images match, and relocalisation by them."""
+"""Corners and SIFT features: where tracks can begin, which features of two images match, relocalisation by them, and a
+hint at a camera's calibration."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -10,10 +13,10 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.pose_solver import PointTracks, project, solve_pose
-from estimation.rig import ideal_pixels
+from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.triangulation import rays
+from estimation.triangulation import epipolar_distance, rays
 from perception.frames import Image
 from perception.lens import Lenses, undistort
 from perception.mapping.patches import Pyramid
@@ -22,6 +25,7 @@ ImageMask = NDArray[np.uint8]
 Features = tuple[Array, NDArray[np.float32]]  # (N, 2) px and descriptors (N, 128)
 SIFT_OFFSET_PX = 0.25  # cv2's SIFT doubles the image and does not take the half pixel back (measured: 0.26)
 MAX_BRUTE_FORCE_DISTANCES = 12_000_000  # above which FLANN's trees are quicker
+SAME_SPOT_PX = 2.0  # px: features closer than this show one spot
 FLANN_KD_TREE = 1  # OpenCV's number for that index
 MAX_FEATURES = 5000  # strongest first: matching two images then takes 0.15 s and 100 MB
 
@@ -96,6 +100,14 @@ def match(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float = 0.8) ->
     rows = np.arange(len(a))
     good = (first < ratio**2 * second) & (back[best] == rows)
     return np.stack([rows[good], best[good]], -1).astype(np.int64)
+
+
+def matched_spots(a: Features, b: Features) -> tuple[Array, Array]:
+    """Pixels (N, 2) of each of two images, as imaged, whose features match."""
+    pairs = match(a[1], b[1], 0.85)
+    both = np.concatenate([a[0][pairs[:, 0]], b[0][pairs[:, 1]]], 1)
+    _, first = np.unique(np.round(both / SAME_SPOT_PX), axis=0, return_index=True)  # several tilts show one spot
+    return both[first, :2], both[first, 2:]
 
 
 NearestRows = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]
@@ -292,3 +304,90 @@ def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
     if not ok or inliers is None or len(inliers) < MIN_MATCHES:
         return None
     return se3.make(cv2.Rodrigues(rotation)[0], np.asarray(translation).ravel())
+
+
+HINT_FEATURES = 400  # SIFT features of a picture, before they are tilted
+MAX_HINT_DISTANCE_PX = 3.0  # px from the epipolar line: nothing but the right picture puts many matches so near
+MIN_HINT_SHARE = 0.5  # of the matches must be, where a tenth is near by chance, and at least so many:
+MIN_HINT_MATCHES = 60  # unlike pictures have up to sixty-five matches, and few of them near
+HINT_RATIO = 2.0  # times the matches that agree as the pictures are
+MIN_MATCHES_AGAINST = 100  # twice what unlike pictures have; more of them show the same spots,
+AGAINST_PX = 40.0  # and contradict the calibration so far from the epipolar line: no surface moves that far
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrangement:
+    """A guess at how pictures really belong to the rig's cameras."""
+
+    text: str
+    cameras: frozenset[int]  # those that it is about
+    mirrored: frozenset[int] = frozenset()
+    turned: frozenset[int] = frozenset()  # by half a turn
+    exchanged: tuple[int, ...] = ()  # two cameras
+
+    def camera(self, picture: int) -> int:
+        """The camera that a picture is of."""
+        return sum(self.exchanged) - picture if picture in self.exchanged else picture
+
+
+def _arrangements(names: Sequence[str], suspects: frozenset[int]) -> list[_Arrangement]:
+    """Guesses about suspects, each by itself, all of them together, and any two exchanged."""
+    found = []
+    for group in [frozenset([c]) for c in sorted(suspects)] + [suspects] * (len(suspects) > 1):
+        text = f"{names[min(group)]} looks" if len(group) == 1 else "all cameras look"
+        found.append(_Arrangement(f"{text} mirrored", group, mirrored=group))
+        found.append(_Arrangement(f"{text} upside down", group, turned=group))
+    for a, b in combinations(sorted(suspects), 2):
+        found.append(_Arrangement(f"{names[a]} and {names[b]} look exchanged", frozenset([a, b]), exchanged=(a, b)))
+    return found
+
+
+def calibration_hint(
+    rig: Rig, images: dict[int, Image], polygons: dict[int, Array], suspects: frozenset[int]
+) -> tuple[frozenset[int], str]:
+    """Which of the suspects' pictures look mirrored, turned or exchanged, and that in words; nothing without a clue.
+
+    images: by camera, as they come. polygons: by camera, (N, 2) px, where the surface is in them.
+    """
+    cameras = sorted(set(images) & set(polygons))
+    suspects = suspects & frozenset(cameras)
+    masks = {c: polygon_mask(rig.cameras[c].size, polygons[c]) for c in cameras}
+    plain = {c: sift(images[c], masks[c], HINT_FEATURES, tilted=True) for c in cameras}
+    flipped = {
+        c: sift(np.ascontiguousarray(images[c][:, ::-1]), masks[c][:, ::-1].copy(), HINT_FEATURES, tilted=True)
+        for c in cameras
+    }
+    last = {c: np.array(rig.cameras[c].size) - 1.0 for c in cameras}
+    pairs = [(a, b) for a, b in combinations(cameras, 2) if suspects & {a, b}]
+    alike = {(a, b): matched_spots(plain[a], plain[b]) for a, b in pairs}
+    unlike = {(a, b): matched_spots(plain[a], flipped[b]) for a, b in pairs}
+
+    def distances(a: int, b: int, guess: _Arrangement) -> Array:
+        same = (a in guess.mirrored) == (b in guess.mirrored)
+        at = dict(zip((a, b), (alike if same else unlike)[a, b], strict=True))
+        sides = {a: False, b: not same}  # whether the pixels are those of the flipped picture
+        for c in (a, b):
+            if sides[c] != (c in guess.mirrored):
+                at[c] = np.column_stack([last[c][0] - at[c][:, 0], at[c][:, 1]])
+            at[c] = last[c] - at[c] if c in guess.turned else at[c]
+        seen = {guess.camera(c): undistort(rig.cameras[guess.camera(c)], at[c]) for c in (a, b)}
+        first, second = guess.camera(a), guess.camera(b)
+        return np.abs(epipolar_distance(rig, first, second, seen[first], seen[second]))
+
+    def near(guess: _Arrangement) -> tuple[int, int]:
+        away = np.concatenate([distances(a, b, guess) for a, b in pairs])
+        return int((away < MAX_HINT_DISTANCE_PX).sum()), len(away)
+
+    if not pairs:
+        return frozenset(), ""
+    as_is = _Arrangement("", suspects)
+    sizes = {rig.cameras[c].size for c in cameras}
+    guesses = [g for g in _arrangements([c.name for c in rig.cameras], suspects) if not g.exchanged or len(sizes) == 1]
+    best = max(guesses, key=near)
+    agreeing, known = near(best)
+    if agreeing >= max(MIN_HINT_MATCHES, MIN_HINT_SHARE * known, HINT_RATIO * near(as_is)[0]):
+        return best.cameras, best.text
+    against = {c: np.concatenate([distances(a, b, as_is) for a, b in pairs if c in (a, b)]) for c in suspects}
+    wrong = [c for c, away in against.items() if len(away) >= MIN_MATCHES_AGAINST and np.median(away) > AGAINST_PX]
+    names = ", ".join(rig.cameras[c].name for c in wrong)
+    return frozenset(wrong), f"the matches of {names} contradict the calibration: calibrate again" if wrong else ""

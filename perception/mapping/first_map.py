@@ -23,7 +23,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
 from estimation.triangulation import epipolar_distance, rays, triangulate
 from perception.lens import Lenses, undistort
-from perception.mapping.features import Features, ImageMask, corners, match, polygon_mask, sift
+from perception.mapping.features import Features, ImageMask, corners, matched_spots, polygon_mask, sift
 from perception.mapping.masks import trackable
 from perception.mapping.patches import (
     MIN_PATCH_CONTRAST,
@@ -39,7 +39,7 @@ from perception.mapping.patches import (
 
 MAX_EPIPOLAR_OFFSET_PX = 40.0  # px: 0.3 m/s at 60 ms between exposures, f 700 px, 400 mm away
 MIN_SEEDS, MIN_LANDMARKS = 10, 20
-SAME_SPOT_PX = 2.0  # px: features closer than this show one spot
+FEW_SPOTS = f"fewer than {MIN_LANDMARKS} spots could be matched between two cameras"
 TARGET_LANDMARKS = 240  # in all: more cost time and gain nothing (the map's own error stays)
 
 
@@ -114,12 +114,10 @@ def _smooth(points: Array, neighbours: int = 8) -> NDArray[np.bool_]:
 def find_seeds(lenses: Lenses, a: int, b: int, features: dict[int, Features], rng: np.random.Generator) -> Seeds | None:
     """SIFT matches between two cameras that agree on one epipolar offset and on a surface."""
     cameras = lenses.rig.cameras
-    pairs = match(features[a][1], features[b][1], 0.85)
-    if len(pairs) < MIN_SEEDS:
+    imaged_a, imaged_b = matched_spots(features[a], features[b])
+    if len(imaged_a) < MIN_SEEDS:
         return None
-    both = np.concatenate([features[a][0][pairs[:, 0]], features[b][0][pairs[:, 1]]], 1)
-    _, first = np.unique(np.round(both / SAME_SPOT_PX), axis=0, return_index=True)  # several tilts show one spot
-    pixels_a, pixels_b = undistort(cameras[a], both[first, :2]), undistort(cameras[b], both[first, 2:])
+    pixels_a, pixels_b = undistort(cameras[a], imaged_a), undistort(cameras[b], imaged_b)
     distance = epipolar_distance(lenses.rig, a, b, pixels_a, pixels_b)
     good = consensus(pixels_b, distance, MAX_EPIPOLAR_OFFSET_PX, 2.0, rng)
     points, _, _ = _pair_points(lenses.rig, a, b, pixels_a[good], pixels_b[good])
@@ -325,7 +323,7 @@ def build_first_map(
     counts = dict.fromkeys(cameras, TARGET_LANDMARKS // len(cameras))
     parts = best_landmarks(lenses, pyramids, masks, counts, lambda a, b: find_seeds(lenses, a, b, features, rng))
     if sum(len(p.points) for p in parts) < MIN_LANDMARKS:
-        return f"fewer than {MIN_LANDMARKS} spots could be matched between two cameras"
+        return FEW_SPOTS
     points = np.concatenate([p.points for p in parts])
     centre = np.mean([rig.cameras[p.camera].base_from_camera[:3, 3] for p in parts], axis=0)
     frame = surface_frame(points, centre, rig.cameras[parts[0].camera].base_from_camera[:3, 0])

@@ -19,10 +19,10 @@ from estimation.scans.registration import Registration
 from estimation.scans.scan import Scan
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, joined_map, moved_map
-from perception.frames import FrameSet, Roi, region_polygons
+from perception.frames import FrameSet, Image, Roi, region_polygons, whole_pictures
 from perception.lens import Lenses
-from perception.mapping.features import Relocaliser
-from perception.mapping.first_map import FirstMap, build_first_map, in_frame
+from perception.mapping.features import Relocaliser, calibration_hint
+from perception.mapping.first_map import FEW_SPOTS, FirstMap, build_first_map, in_frame
 from perception.mapping.growth import (
     GROWTH_SHARE,
     MIN_NEW_LANDMARKS,
@@ -43,6 +43,9 @@ RETRY_INTERVAL_SETS = 10  # frame sets from one try to the next after those
 MAX_LANDMARKS = 600  # those out of view are kept, and cost little
 MIN_SHOWN_SHARE = 0.5  # of the landmarks in a camera's view; fewer are measured where its image is blurred or covered
 FIRST_MAP_REFINEMENTS = 6  # after these, two of them the confirmation, deformation is no error of the first map
+MIN_SURE_VIEWS = 1.5  # cameras in which a landmark of a first map agrees, in the mean: of matches by chance it is one
+CHECKED_S = 1.0  # s of a first map in which cameras that contradict each other have it checked
+HINT_INTERVAL_SETS = 100  # frame sets without a map from one search for a hint to the next
 CONFIRMATION_TIMEOUT_S = 2.0  # after which an unconfirmed first map is dropped, and the next images are tried
 
 
@@ -89,6 +92,12 @@ class Mapping:
         self._caveat = ""  # of every pose on this map, in words
         self._refinements = 0  # of this map
         self._seemed_bent = False  # whether the surface seemed to deform while the first map could be the cause
+        self._hint: DelayedJob[tuple[frozenset[int], str]] = DelayedJob(executor)
+        self._hint_due, self._hinted = 0, ""  # tries until the next search for a hint; the last one's words
+        self._unmapped: tuple[dict[int, Image], dict[int, Array], frozenset[int]] | None = None  # to be looked into
+        # whether a first map has been looked into, whether that is still open, and why there is none in the end
+        self._checked, self._doubted, self._refuted = False, False, ""
+        self._unseen: frozenset[int] = frozenset()  # cameras whose pictures show nothing of the map
         self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor)
         self._probation: Probation | None = None
         self._offered: tuple[TrackedSet, bool] | None = None  # the last frame set, and whether the map may learn of it
@@ -106,6 +115,9 @@ class Mapping:
         self._matcher = Matcher(self._lenses, first.map, first.templates, self._masks)
         pose = self._estimator.begin(stamp, start, first.map, self._caveat)
         tracked = self.align_and_fit(stamp, pyramids, dict.fromkeys(pyramids, start), start)
+        self._checked = False
+        if int(tracked.fit.inlier.sum()) < MIN_SURE_VIEWS * len(first.map):
+            self._doubt(pyramids)
         self._refiner.begin(first.map, stamp, start, tracked.observations)
         self._growth.cancel()
         self._probation = self._offered = None
@@ -120,19 +132,75 @@ class Mapping:
         if isinstance(polygons, str):
             return polygons
         self._tries += 1
+        if self._refuted and self._tries < self._hint_due:
+            return self._refuted
         if self._tries > EAGER_TRIES and self._tries % RETRY_INTERVAL_SETS:
-            return self._failure
+            return self._why_none()
         first = build_first_map(self._lenses, pyramids, polygons, self._masks.print_head)
         if isinstance(first, str):
             self._failure = first
-            return first
-        self._caveat = ""
+            if first == FEW_SPOTS and self._tries >= max(EAGER_TRIES, self._hint_due):
+                self._look_into(pyramids, polygons, frozenset(set(pyramids) & set(polygons)))
+            return self._why_none()
+        self._caveat, self._hinted, self._refuted = "", "", ""
+        self._unmapped = None
         if self._placing is None:
             return first
         images = {c: pyramids[c][0] for c in polygons}
         self._place = self._placing.search(self._lenses, images, first, polygons)
         self._set_caveat(self._place)
         return in_frame(first, self._place.base_from_surface)
+
+    def _doubt(self, images: dict[int, Pyramid]) -> None:
+        """Have a first map checked, of these images (by camera): it may be of matches by chance."""
+        self._checked = self._doubted = True
+        self._look_into(images, self._regions(), frozenset(images))
+
+    def _regions(self) -> dict[int, Array]:
+        sizes = [camera.size for camera in self._lenses.rig.cameras]
+        return {r.camera: r.polygon for r in self._roi or whole_pictures(sizes, 0.0)}
+
+    def _look_into(self, images: dict[int, Pyramid], polygons: dict[int, Array], suspects: frozenset[int]) -> None:
+        """Have these pictures searched for what is wrong with the suspects' calibration."""
+        self._hint_due = self._tries + HINT_INTERVAL_SETS
+        cameras = sorted(set(images) & set(polygons))
+        self._hint.cancel()
+        self._unmapped = {c: images[c][0] for c in cameras}, polygons, suspects
+
+    def _why_none(self) -> str:
+        return f"{self._failure}; {self._hinted}" if self._hinted else self._failure
+
+    def look_for_hint(self, images: dict[int, Pyramid], repeats: bool) -> bool:
+        """Once a frame set, when no pose waits: search for what is wrong with cameras that show nothing of the map.
+
+        images: of the last frame set, by camera. repeats: whether the surface looks like itself a period on, where
+        matches contradict any calibration. True where the calibration turns out to be so wrong that a map of few
+        landmarks is by chance.
+        """
+        health, pose = self._estimator.health, self._estimator.pose
+        young = pose is not None and not self._checked and pose.stamp < self._mapped + CHECKED_S
+        if young and (health.at_odds or health.left_out):
+            self._doubt(images)
+        unseen = frozenset(health.unseen & images.keys()) if self._estimator.confirmed else frozenset()
+        if unseen and unseen != self._unseen and not self._doubted:
+            assert pose is not None
+            view = self._matcher.in_view(sorted(unseen), pose.base_from_surface)
+            self._unseen = frozenset(c for c, count in view.items() if count >= MIN_NEW_LANDMARKS)
+            if self._unseen:
+                self._look_into(images, self._regions(), self._unseen)
+                self._hinted = ""
+        if self._unmapped is not None and not self._hint.busy:
+            self._hint.submit(calibration_hint, self._lenses.rig, *self._unmapped)
+            self._unmapped = None
+        found = self._hint.poll()
+        found = (frozenset(), "") if found is not None and repeats else found
+        self._hinted = self._hinted if found is None else found[1]
+        health.set_unseen(self._unseen & unseen, self._hinted)
+        if found is None or not self._doubted:
+            return False
+        # without one camera the others may have made a good map
+        self._doubted, self._refuted = False, self._hinted if len(found[0]) > 1 else ""
+        return bool(self._refuted)
 
     def align_and_fit(
         self, stamp: float, pyramids: dict[int, Pyramid], poses: dict[int, Array], start: Array

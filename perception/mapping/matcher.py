@@ -253,6 +253,9 @@ class Matcher:
         for c in pyramids:
             mine = good & (camera == c)
             single[c] = fit.base_from_surface
+            if mine.sum() < 8 <= (camera == c).sum():  # it contradicts the others, and is followed by itself
+                own = solve_pose(self.rig, tracks.only(camera == c), guess, scales=(8.0, 1.5), prior=CAMERA_POSE_PRIOR)
+                single[c] = own.base_from_surface
             if mine.sum() >= 8 and fit.scale > 1.2:  # else the cameras agree within the flow's own error
                 own = solve_pose(
                     self.rig,

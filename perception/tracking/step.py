@@ -112,6 +112,7 @@ class TrackingStep:
         self._matcher: Matcher | None = None
         self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
         self._unverified: TrackedSet | None = None  # by which the verification is to learn the surface
+        self._pictures: dict[int, Pyramid] = {}  # of the last frame set
         self._searched: dict[int, Pyramid] = {}  # images of cameras that `idle` is to search for the surface
         self._relocalised: Array | None = None  # (4, 4), where the last search saw the surface
         self._absent = 0  # frame sets since the surface was last measured
@@ -138,6 +139,7 @@ class TrackingStep:
                 bead = self._masks.lay_ink(frames.head, pose.stamp, pose.base_from_surface)
                 if bead is not None:
                     self._matcher.cover(bead)
+        self._pictures = pyramids
         self.last = self._report(observations, used)
         note = pose.reason or self._verification.message or self._grain.message
         return replace(pose, reason=note) if pose.state is TrackState.TRACKING else pose
@@ -161,6 +163,8 @@ class TrackingStep:
             tracked, self._unverified = self._unverified, None
             poses = self._mapping.camera_poses(tracked)
             self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
+        if self._mapping.look_for_hint(self._pictures, repeats=len(self._verification.aliases) > 0):
+            self._matcher = self._unverified = None
         self._relocalise()
 
     def _report(self, observations: Observations, used: NDArray[np.int64]) -> StepReport:
@@ -240,9 +244,9 @@ class TrackingStep:
             place = fit.solution.base_from_surface
             apart = None if away is None else matcher.align_at(stamp, pyramids, place, away.rows, away.points)
             pose = estimator.accept(fit, observations, apart, aliases)
-            if not (fit.outliers or len(aliases)):
+            if not (fit.outliers or fit.rivals or len(aliases)):
                 self._mapping.offer(tracked, pose.twist)
-            matcher.remember(pyramids, observations, fit.inlier, fit.solution.base_from_surface)
+            matcher.remember(pyramids, observations, fit.followed, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(fit)
             self._absent += 1
@@ -312,7 +316,8 @@ class TrackingStep:
         sigma = matcher.image_sigma(predicted, expected.covariance + np.outer(late, late))
         if sigma < COARSE_REACH_PX:
             exposed = self._estimator.as_exposed(predicted, expected.twist)
-            starts, coarse = {c: exposed[c] for c in pyramids}, sigma > FINE_REACH_PX
+            apart = self._estimator.health.rivals.own_poses(onwards=True)
+            starts, coarse = {c: apart.get(c, exposed[c]) for c in pyramids}, sigma > FINE_REACH_PX
             observations = matcher.align(stamp, pyramids, starts, coarse=coarse, most=MAX_ALIGNED_LANDMARKS)
             self._add_time("align")
             if matcher.is_complete(observations, pyramids):
@@ -328,7 +333,8 @@ class TrackingStep:
     def _lost_cameras(self, tracked: TrackedSet) -> list[int]:
         """Cameras that carried the last pose and now hardly see the surface."""
         assert self._matcher is not None
-        before = {c: self._matcher.last_count(c) for c in tracked.pyramids}
+        apart = {c for rival in tracked.fit.rivals if rival.inlier.any() for c in rival.cameras}
+        before = {c: self._matcher.last_count(c) for c in tracked.pyramids if c not in apart}
         return [c for c, n in before.items() if n >= 20 and tracked.fit.used[c] < 0.3 * n]
 
     def _second_try(self, tracked: TrackedSet, predicted: Array) -> TrackedSet:
