@@ -24,8 +24,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.observations import Observations
-from estimation.online.fit import PICTURE_DOF, CameraEquations, camera_equations
-from estimation.pose_solver import project
+from estimation.online.fit import (
+    PICTURE_DOF,
+    CameraEquations,
+    RivalPose,
+    camera_equations,
+    displacement_sums,
+    solve_symmetric3,
+)
+from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
 from estimation.rig import Rig
 from estimation.se3 import Array
 
@@ -39,17 +46,16 @@ USUAL_CHANGE_RATIO = 5.0  # and at least so many times the usual change
 NEXT_CAMERA_RATIO = 1.2  # times what the next camera explains
 BUMP_LASTS_S = 0.2  # that a change must last
 BUMP_OVER_S = 0.06  # that single looks must be below half the limit until it is over
-
-
-MIN_UNEQUAL_PX = (
-    0.2  # root mean square over the anchors by which ways in a picture must differ: lens and map err by it,
-)
+MIN_UNEQUAL_PX = 0.2  # by which ways of the anchors in a picture must differ: lens and map err by it,
 UNEQUAL_SIGMAS = 3.0  # times the noise of both ways (of six degrees of freedom: one of 1e9 by chance),
 UNEQUAL_SHARE = 0.3  # and such a part of the longer one: what does not follow at all is sought, not what errs a little
 WAY_BLOCKS = (1, 4)  # looks that are averaged at both ends of a way
 WAY_MEMORY_S = 2.0  # over which ways are compared: half a slow breath
 WHOLE_SHARE, FEW_TRACKS = 0.8, 0.4  # of its usual tracks: a whole picture; so few that nothing usual is learned,
 TRACKS_SHARE = 0.25  # of a look's number: a first map is looked for whole, later ones in part
+PLACE_PRIOR = 1 / 5.0**2  # mm^-2, of a landmark's displacement: no tissue deforms further
+MIN_CONTRADICTION = 0.5  # of what is expected must be shown by pictures of another instant,
+CONTRADICTION_SIGMAS = 5.0  # and so many of the tracks' noise: lens and map err alike from landmark to landmark
 MIN_UNEQUAL_LOOKS = 2  # one after the other
 EQUAL_AGAIN_S = 0.5  # that ways must be alike until the camera is like the others again
 
@@ -271,8 +277,7 @@ class UnequalMotion:
         parts = {c: part for c, part in parts.items() if self._shows_usual(c, len(part.slopes))}
         if len(parts) < 2:
             return
-        if self._anchors is None:
-            self._anchors = spread_anchors(points)
+        self._anchors = spread_anchors(points) if self._anchors is None else self._anchors
         now: dict[int, _PictureLook] = {}
         for c, part in parts.items():
             pixels, _, jacobian = project(rig, np.full(len(self._anchors), c), exposed[c], self._anchors)
@@ -331,6 +336,27 @@ def _block_means(rows: Array, block: int) -> Array:
 def _lengths(ways: Array) -> Array:
     """Root mean square (T,), px, over the anchors of ways (T, 2K)."""
     return np.asarray(np.sqrt(2 * np.mean(ways**2, axis=1)))
+
+
+def contradicts(seen: Observations, carried: PoseFit, rival: RivalPose) -> bool:
+    """Whether a rival's pictures contradict those of the carriers, and not the shape of the map.
+
+    seen: N tracks. carried: the carriers' fit. Where the surface deforms, each camera sees it at a pose of its own, but
+    what two see of a landmark fits one place. What no places explain of both poses' difference, residuals must show.
+    """
+    count, camera, track = int(seen.track.max()) + 1, seen.camera, seen.track
+    mine, theirs = rival.inlier, (carried.weights > INLIER_WEIGHT) & np.isin(camera, list(rival.carriers))
+    both = (np.bincount(track[mine], minlength=count) > 0) & (np.bincount(track[theirs], minlength=count) > 0)
+    rows = (mine | theirs) & both[track]
+    jacobian, precision = np.ascontiguousarray(carried.jacobians[rows]), seen.sigma[rows] ** -2.0
+    shown, landmark = np.ascontiguousarray(carried.residuals[rows]), np.ascontiguousarray(track[rows])
+    expected = np.ascontiguousarray(mine[rows][:, None] * -(jacobian @ rival.difference))
+    normal, by_shown = displacement_sums(count, landmark, jacobian, shown, precision)[:2]
+    _, by_expected, square, _ = displacement_sums(count, landmark, jacobian, expected, precision)
+    placed = solve_symmetric3(normal + PLACE_PRIOR * np.eye(3), by_expected)
+    known = float((square - (placed * by_expected).sum(1)).sum())  # inverse variance of the part that is shown,
+    part = float((precision[:, None] * shown * expected).sum() - (placed * by_shown).sum())
+    return bool(part > max(MIN_CONTRADICTION * known, CONTRADICTION_SIGMAS * known**0.5))
 
 
 def spread_anchors(points: Array) -> Array:

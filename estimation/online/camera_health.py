@@ -15,16 +15,9 @@ from itertools import combinations
 import numpy as np
 
 from estimation.observations import Observations
-from estimation.online.bump_detector import MIN_UNEQUAL_PX, BumpDetector, spread_anchors
+from estimation.online.bump_detector import MIN_UNEQUAL_PX, BumpDetector, contradicts, spread_anchors
 from estimation.online.camera_errors import RivalWatch
-from estimation.online.fit import (
-    RivalPose,
-    camera_numbers,
-    displacement_sums,
-    motion_sigmas,
-    picture_noise,
-    solve_symmetric3,
-)
+from estimation.online.fit import RivalPose, camera_numbers, motion_sigmas, picture_noise
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
 from estimation.rig import Rig
@@ -47,12 +40,7 @@ SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them 
 # of a camera's last own pose about its next, 0.03 rad and 10 mm: a patch has two (Schweighofer and Pinz 2006)
 SINGLE_POSE_PRIOR = np.diag([1 / 0.03**2] * 3 + [1 / 10.0**2] * 3)
 UNUSUAL_RATIO = 3.0  # times the usual offset, or the tracks' noise: beyond, cameras that carry a pose do not agree
-CLEAR_SIGMAS = (
-    2.0  # by which a camera's own pose must differ in its picture (of six degrees of freedom: 6e-4 by chance)
-)
-PLACE_PRIOR = 1 / 5.0**2  # mm^-2, of a landmark's displacement: no tissue deforms further
-MIN_CONTRADICTION = 0.5  # of what is expected must be shown by pictures of another instant,
-CONTRADICTION_SIGMAS = 5.0  # and so many of the tracks' noise: lens and map err alike from landmark to landmark
+CLEAR_SIGMAS = 2.0  # by which a camera's own pose must differ in its picture (six degrees of freedom: 6e-4 by chance)
 MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
 MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
@@ -366,33 +354,11 @@ class FrameTracks:
             apart_px = float(np.sqrt(2 * np.mean((own.jacobians[mine] @ rival.difference) ** 2)))
             clear = apart_px > max(MIN_UNEQUAL_PX, CLEAR_SIGMAS * np.sqrt(2) * own_noise)
             agrees = (self.offsets(own)[group] <= allowed[group]).all()
-            if clear and agrees and self._contradicts(carried, rival):
+            if clear and agrees and contradicts(self.seen, carried, rival):
                 alone.append(rival)
                 if len(group) > 1:
                     break
         return tuple(alone)
-
-    def _contradicts(self, carried: PoseFit, rival: RivalPose) -> bool:
-        """Whether a rival's pictures contradict those of the carriers, and not the shape of the map.
-
-        Where the surface deforms, each camera alone sees it at a pose of its own, but what two see of a landmark
-        still fits one place. So each landmark gets a place of its own; of the difference between both poses, a part is
-        left that no place explains, and the residuals must show that part.
-        """
-        count, camera, track = int(self.seen.track.max()) + 1, self.seen.camera, self.seen.track
-        mine, theirs = rival.inlier, (carried.weights > INLIER_WEIGHT) & np.isin(camera, list(rival.carriers))
-        both = (np.bincount(track[mine], minlength=count) > 0) & (np.bincount(track[theirs], minlength=count) > 0)
-        rows = (mine | theirs) & both[track]
-        jacobian, precision = np.ascontiguousarray(carried.jacobians[rows]), self.seen.sigma[rows] ** -2.0
-        shown = np.ascontiguousarray(carried.residuals[rows])
-        expected = np.ascontiguousarray(mine[rows][:, None] * -(jacobian @ rival.difference))
-        landmark = np.ascontiguousarray(track[rows])
-        normal, by_shown, _, _ = displacement_sums(count, landmark, jacobian, shown, precision)
-        _, by_expected, square, _ = displacement_sums(count, landmark, jacobian, expected, precision)
-        placed = solve_symmetric3(normal + PLACE_PRIOR * np.eye(3), by_expected)
-        known = float((square - (placed * by_expected).sum(1)).sum())  # of a part of one, its inverse variance
-        seen = float((precision[:, None] * shown * expected).sum() - (placed * by_shown).sum())
-        return seen > max(MIN_CONTRADICTION * known, CONTRADICTION_SIGMAS * np.sqrt(known))
 
     def _only(self, cameras: frozenset[int], start: Array) -> tuple[PoseFit, float]:
         """The fit of these cameras' tracks alone, and its noise, px, in their pictures."""
