@@ -23,6 +23,31 @@ NOTHING_MISSED = MissedLandmarks(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DisplacedPlaces:
+    """Places of the surface whose colours do not stand where its tracks put them."""
+
+    centres: Array  # (K, 3) mm, surface frame
+    sizes: Array  # (K,) mm, by how much
+    reach: float  # mm, one sigma about each centre
+    whole: bool  # whether most places that could tell are among them: then it is the pose that is wrong
+
+    @property
+    def message(self) -> str:
+        """For the operator, or ''."""
+        if not len(self.sizes):
+            return ""
+        return f"colours stand {self.sizes.max():.1f} mm off the texture: something moves over the tissue, or under it"
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of a pose whose 95 % radius reaches as far."""
+        return np.diag([0.0] * 3 + [float(self.sizes.max(initial=0.0)) ** 2] * 3)
+
+
+NOTHING_DISPLACED = DisplacedPlaces(np.zeros((0, 3)), np.zeros(0), 1.0, False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """The N tracks of one frame set, as parallel arrays."""
 

@@ -160,8 +160,8 @@ class LocalError:
     span: float  # mm from the nearest of them within which a place moves with it
     unsupported: float  # mm^2, at twice that distance and beyond; no support at all: everywhere
 
-    def with_bells(self, centres: Array, variance: float, reach: float) -> LocalError:
-        """The same with further bells about centres (K, 3), of one variance, mm^2, and one reach, mm."""
+    def with_bells(self, centres: Array, variance: float | Array, reach: float) -> LocalError:
+        """The same with further bells about centres (K, 3), of one variance, mm^2, or (K,), and one reach, mm."""
         every = np.ones(len(centres))
         return replace(
             self,

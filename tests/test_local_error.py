@@ -50,7 +50,7 @@ class Followed:
     def __init__(self, points: Array, rate: float, motion: Motion, seed: int = 0, region: bool = True) -> None:
         self.points, self.rate, self.motion, self.seed = points, rate, motion, seed
         count = len(points)
-        self.estimator, self.number = Estimator(RIG, region=region), 0
+        self.estimator, self.number = Estimator(RIG, region="drawn" if region else "none"), 0
         surface = SurfaceMap(points, np.tile([0.0, 0.0, 1.0], (count, 1)), 0.02**2 * np.eye(3 * count))
         self.estimator.begin(0.0, motion(0.0), surface)
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import se3
-from estimation.observations import Observations
+from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces, Observations
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
 from estimation.online.camera_health import CameraHealth, FrameTracks
 from estimation.online.deformation import WarpFilter
@@ -30,6 +30,7 @@ from estimation.online.surface_state import (
     MappedSurface,
     Measurement,
     PoseStateMachine,
+    Region,
 )
 from estimation.online.window import MeasuredPose, Smoother
 from estimation.pose import SurfacePose, TrackState, position_sigma
@@ -54,8 +55,8 @@ class Estimator:
     `begin` takes the first map. Before it only `map`, `pose`, `confirmed`, `deforms`, `sigma` and `learn` may be used.
     """
 
-    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None, region: bool = True) -> None:
-        """region: whether it is known what the surface is: all landmarks of the first map lie on it."""
+    def __init__(self, rig: Rig, settings: EstimatorSettings | None = None, region: Region = "drawn") -> None:
+        """region: who says what the surface is, on which all landmarks of the first map lie."""
         self.rig, self._region = rig, region
         self.settings, self.cameras = settings or EstimatorSettings(), CameraErrors(len(rig))
         self.health = CameraHealth([camera.name for camera in rig.cameras])
@@ -274,6 +275,7 @@ class Estimator:
         observations: Observations,
         elsewhere: Observations | None = None,
         aliases: Array = NO_SHIFTS,
+        displaced: DisplacedPlaces = NOTHING_DISPLACED,
     ) -> SurfacePose:
         """Take a measured fit into the window and give the pose.
 
@@ -281,7 +283,8 @@ class Estimator:
         """
         assert fit.measured
         surface, sigma = self._surface, np.maximum(observations.sigma, self.settings.floor_sigma)
-        sound = self.may_learn(fit) and not len(aliases)
+        sound = self.may_learn(fit) and not len(aliases) and not displaced.whole
+        surface.displaced = displaced
         surface.unlearned = fit, observations, fit.stamp - surface.pose.stamp, sound
         if sound and self._smear(fit) < MAX_LEARNING_SMEAR_MM:
             surface.warp.learn(observations, fit.solution, sigma, fit.twist, self.cameras.delays.sigma)
@@ -300,6 +303,7 @@ class Estimator:
             sigma=position_sigma(fit.covariance + lasting),
             trouble=self.health.trouble(fit.stamp),
             caveat=alias_message(aliases)
+            or displaced.message
             or surface.parted.message
             or surface.local.message
             or surface.caveat
@@ -311,8 +315,8 @@ class Estimator:
         assert self._smoother.newest is not None
         averaged = self._smoother.newest.covariance
         given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
-        if len(aliases):
-            given = widened(given, alias_covariance(aliases))
+        given = widened(given, alias_covariance(aliases)) if len(aliases) else given
+        given = widened(given, displaced.covariance) if displaced.whole else given
         if self.health.rivals.doubted or unsteady:
             way = bool(unsteady) * MOST_DELAY_SIGMAS * late * fit.twist
             given = widened(given, self.health.rivals.covariance + np.outer(way, way))
@@ -351,7 +355,7 @@ class Estimator:
             reason,
             surface.detector.motion,
             surface.warp.warp,
-            local=surface.parted.at_its_places(surface.local.error, surface.map.points),
+            local=surface.local_error,
         )
         entered = replace(entered, forecast=surface.predictor.add(entered, lasting))
         surface.pose = surface.measured = surface.reported_pose = entered

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from estimation import se3
 from estimation.forecast.predictor import Predictor
-from estimation.observations import Observations
+from estimation.observations import NOTHING_DISPLACED, Observations
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError
 from estimation.online.local_motion import LocalMotion
@@ -28,7 +29,7 @@ from estimation.online.reported_covariance import CalibrationError, ReportedCova
 from estimation.pose import MotionState, SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap
+from estimation.surface_map import LocalError, SurfaceMap
 
 AVERAGED_POSES = (2, 4, 8)  # newest poses looked at together; one alone may be a glitch
 POSES_BEFORE = 16  # before the newest ones, to which a step is compared too: lasting noise is alike in both
@@ -235,6 +236,9 @@ class StateSettings:
     coast: float = 0.5  # s without a measurement until LOST
 
 
+Region = Literal["drawn", "found", "none"]  # who says what the surface is: an operator, a network, or nobody
+
+
 @dataclass(frozen=True, slots=True)
 class EstimatorSettings:
     """When a fit counts as a measurement."""
@@ -323,11 +327,14 @@ class MappedSurface:
     reported_pose: SurfacePose  # the same with the reported covariance
     measured: SurfacePose  # the last one that was measured
 
-    def __init__(self, surface_map: SurfaceMap, rig: Rig, region: bool, caveat: str) -> None:
+    def __init__(self, surface_map: SurfaceMap, rig: Rig, region: Region, caveat: str) -> None:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
         self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
-        self.local, self.parted = LocalMotion(len(rig), region), PartedTexture(rig, len(surface_map), region)
+        self.local, self.parted = (
+            LocalMotion(len(rig), region != "none"),
+            PartedTexture(rig, len(surface_map), region == "drawn"),
+        )
         self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
         self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
@@ -335,3 +342,11 @@ class MappedSurface:
         self.unlearned: tuple[FrameFit, Observations, float, bool] | None = None
         # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
         self.accepted, self.map_held = 0, False
+        self.displaced = NOTHING_DISPLACED  # by their colours, in the last frame set that was measured
+
+    @property
+    def local_error(self) -> LocalError | None:
+        """By how much single places may be off, by displaced landmarks, groups of them, and colours."""
+        error = self.parted.at_its_places(self.local.error, self.map.points)
+        places = self.displaced
+        return error and error.with_bells(places.centres, places.sizes**2, places.reach)

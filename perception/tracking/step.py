@@ -26,6 +26,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import DuplicateFilter, FrameSet, Image, Roi, of_whole_pictures, parallel_map
 from perception.lens import Lenses, unfiltered
+from perception.mapping.colours import Colours
 from perception.mapping.features import Relocaliser, grey
 from perception.mapping.mapping import Mapping, TrackedSet
 from perception.mapping.masks import Tool, TrackingMasks
@@ -102,22 +103,28 @@ class TrackingStep:
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
         self._lenses, self._prefilter = Lenses(rig), prefilter
-        self._estimator = Estimator(
-            rig, region=not of_whole_pictures(self.roi, [camera.size for camera in rig.cameras])
-        )
+        whole = of_whole_pictures(self.roi, [camera.size for camera in rig.cameras])
+        found = any(roi.found for roi in self.roi)
+        self._estimator = Estimator(rig, region="none" if whole else "found" if found else "drawn")
         self._is_new = DuplicateFilter()
         self._search = Relocaliser(self._lenses)
         self._masks = TrackingMasks(self._lenses, tool)
         self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, executor, scan)
         self._matcher: Matcher | None = None
-        self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
+        self._forget_looks()
         self._unverified: TrackedSet | None = None  # by which the verification is to learn the surface
-        self._pictures: dict[int, Pyramid] = {}  # of the last frame set
+        self._images: dict[int, Image] = {}  # of the frame set, as they came,
+        self._pictures: dict[int, Pyramid] = {}  # and of the last one
         self._searched: dict[int, Pyramid] = {}  # images of cameras that `idle` is to search for the surface
         self._relocalised: Array | None = None  # (4, 4), where the last search saw the surface
         self._absent = 0  # frame sets since the surface was last measured
         self._spent = np.zeros(len(STAGES))
         self._lap = 0.0
+
+    def _forget_looks(self) -> None:
+        """Know nothing of how the surface looks, as before its map."""
+        self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
+        self._colours = Colours(self._lenses, self._masks)
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp` from this frame set and the ones before."""
@@ -129,6 +136,7 @@ class TrackingStep:
             return last
         self._check(frames)
         pyramids = self._pyramids(frames)
+        self._images = {f.camera: f.image for f in frames.frames if f.camera in pyramids}
         self._masks.set_print_head(frames.head, pyramids)
         self._add_time("prepare")
         if self._matcher is None:
@@ -139,6 +147,7 @@ class TrackingStep:
                 bead = self._masks.lay_ink(frames.head, pose.stamp, pose.base_from_surface)
                 if bead is not None:
                     self._matcher.cover(bead)
+                    self._colours.cover(bead)
         self._pictures = pyramids
         self.last = self._report(observations, used)
         note = pose.reason or self._verification.message or self._grain.message
@@ -163,6 +172,7 @@ class TrackingStep:
             tracked, self._unverified = self._unverified, None
             poses = self._mapping.camera_poses(tracked)
             self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
+            self._colours.begin(self._images, poses, self._estimator.map)
         if self._mapping.look_for_hint(self._pictures, repeats=len(self._verification.aliases) > 0):
             self._matcher = self._unverified = None
         self._relocalise()
@@ -199,7 +209,7 @@ class TrackingStep:
             nothing = no_observations(frames.stamp), np.zeros(len(self.rig), np.int64)
             return identity_pose(frames.stamp, started), *nothing
         self._matcher, pose, tracked = started
-        self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
+        self._forget_looks()
         return pose, tracked.observations, tracked.fit.used
 
     # -- every frame set after it
@@ -243,8 +253,10 @@ class TrackingStep:
             away = estimator.elsewhere(fit, observations)
             place = fit.solution.base_from_surface
             apart = None if away is None else matcher.align_at(stamp, pyramids, place, away.rows, away.points)
-            pose = estimator.accept(fit, observations, apart, aliases)
-            if not (fit.outliers or fit.rivals or len(aliases)):
+            there = {c: exposed[c] for c in pyramids if c not in fit.outliers}
+            displaced = self._colours(self._images, there, estimator.expected(stamp).warp)
+            pose = estimator.accept(fit, observations, apart, aliases, displaced)
+            if not (fit.outliers or fit.rivals or len(aliases) or displaced.whole):
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.followed, fit.solution.base_from_surface)
         else:

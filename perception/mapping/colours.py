@@ -1,0 +1,174 @@
+"""The colours of a surface: whether they are where the texture says that the surface is.
+
+Hairs, a film, gauze carry more texture than the tissue under them, and tracks that follow them agree with each other.
+The tissue has its colours: a wound, its rim, the edge of a cloth. Shadows and shading change all channels of a picture
+by one factor, so the ratios of channels are compared with those of the first pictures. All cameras together tell by
+which displacement of the tissue the difference is explained (Lucas and Kanade 1981, on the surface, in three
+dimensions). Uniform skin tells nothing, nor does what a print head, ink or a highlight hides; grey cameras neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import QhullError
+
+from estimation import se3
+from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces
+from estimation.se3 import Array, Mask
+from estimation.surface_map import SurfaceMap, Warp, bells
+from perception.frames import Image
+from perception.lens import Lenses
+from perception.mapping.aliases import TangentPlane
+from perception.mapping.masks import TrackingMasks, near_bead
+
+PLACE_STEP_MM = 2.0  # between the places that are looked at: a wound's rim is as wide
+CELL_MM = 1.2  # of the surface that one value averages: noise of the pixels, and chroma that cameras subsample
+BELL_MM = 7.0  # one sigma: places that move together, and as far apart
+DARK_LEVELS = 8.0  # grey levels added to each channel: ratios of darker ones are noise
+CLIPPED = 245.0  # grey level at which a channel may be clipped: a highlight
+MIN_NOISE = 0.01  # one sigma of a ratio's logarithm: the first picture's own, and light that is never quite the same
+FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
+SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference no longer grows with the displacement
+MIN_SHIFT_MM = 0.6  # that is told: what the guard allows, and three times what defocus and a turn of 20 degrees make
+MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
+MIN_EXPLAINED = 0.4  # and of all that is there beyond noise: a hand over a place looks like no displacement
+MIN_BELLS = 3  # that must tell a displacement: the edge of a hand can look like one at a place or two
+USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
+MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
+WHOLE_SHARE = 0.5  # of these places: with more of them displaced it is the pose that is wrong
+MIN_PLACES = 20  # of a camera, to compare its picture
+
+
+@dataclass(slots=True, eq=False)
+class _FirstPicture:
+    """How one camera first saw P places."""
+
+    scale: int  # pixels of the picture to one of its averages
+    ratios: Array  # (P, 2) logarithms, red and blue to green
+    slopes: Array  # (P, 2, 3) by a displacement of the surface, 1/mm, along both tangents and the normal
+    free: Mask  # (P,) places that are seen, and not clipped
+    noise: Array  # (2,) one sigma
+
+
+class Colours:
+    """Remembers the colours of one surface, and where they stand off its texture."""
+
+    def __init__(self, lenses: Lenses, masks: TrackingMasks) -> None:
+        """masks: where the print head hides the surface."""
+        self._lenses, self._masks = lenses, masks
+        self._first: dict[int, _FirstPicture] = {}
+
+    def begin(self, images: Mapping[int, Image], poses: Mapping[int, Array], surface_map: SurfaceMap) -> None:
+        """Learn a surface by pictures (by camera) in which it stands at `poses` (4, 4), each camera's own."""
+        self._first = {}
+        try:
+            plane = TangentPlane(surface_map)
+        except QhullError:  # landmarks on one line
+            return
+        self._axes = np.stack([*plane.axes, plane.normal])
+        self._points, self._centres = (_spread(plane, step) for step in (PLACE_STEP_MM, BELL_MM))
+        if not len(self._points) or not len(self._centres):
+            return
+        self._bells = bells(self._points, self._centres, BELL_MM).T
+        self._inked = np.zeros(len(self._points), bool)
+        self._sizes = np.zeros(len(self._centres))  # mm, of each bell while it is displaced, the largest since; else 0
+        for camera, image in images.items():
+            if camera in poses and image.ndim == 3:
+                self._first[camera] = self._picture(camera, image, poses[camera])
+
+    def cover(self, bead: Array) -> None:
+        """A bead (M, 3) mm, surface frame, lies on the surface: the colours there are its own from now on."""
+        if self._first:
+            self._inked |= near_bead(self._points, bead, np.full(len(self._points), CELL_MM))
+
+    def __call__(
+        self, images: Mapping[int, Image], poses: Mapping[int, Array], warp: Warp | None = None
+    ) -> DisplacedPlaces:
+        """Where colours contradict a pose: `poses` (4, 4) at each camera's exposure, of those that carry it."""
+        if not self._first:
+            return NOTHING_DISPLACED
+        count, points = len(self._centres), self._points if warp is None else warp.apply(self._points)
+        normal, pull = np.zeros((count, 9)), np.zeros((count, 3))
+        energy, known = np.zeros(count), np.zeros(count)
+        for camera, first in self._first.items():
+            if camera not in images or camera not in poses:
+                continue
+            pixels = self._pixels(camera, poses[camera], points)
+            now, free = _ratios(images[camera], first.scale, pixels)
+            free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
+            if np.count_nonzero(free) < MIN_PLACES:
+                continue
+            away = now - first.ratios
+            away -= np.median(away[free], axis=0)
+            spread = 1.4826 * np.median(np.abs(away[free]), axis=0)
+            first.noise += (spread - first.noise) / NOISE_MEMORY_SETS
+            sigma = np.maximum(first.noise, MIN_NOISE)
+            away, slopes = away / sigma, first.slopes / sigma[:, None]
+            weight = self._bells * free
+            normal += weight @ np.einsum("pai,paj->pij", slopes, slopes).reshape(-1, 9)
+            pull -= weight @ np.einsum("pai,pa->pi", slopes, away)
+            energy, known = energy + weight @ (away**2).sum(1), known + 2 * weight.sum(1)
+        if not known.any():
+            return NOTHING_DISPLACED
+        return self._judge(normal.reshape(-1, 3, 3), pull, energy, known)
+
+    def _judge(self, normal: Array, pull: Array, energy: Array, known: Array) -> DisplacedPlaces:
+        """By normal equations (K, 3, 3), (K, 3) of each bell's displacement, squared sigmas and how many are usual."""
+        shift = np.linalg.solve(normal + np.eye(3) / SHIFT_PRIOR_MM**2, pull[..., None])[..., 0]
+        size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
+        begins = (size > MIN_SHIFT_MM) & (explained > np.maximum(MIN_EVIDENCE, MIN_EXPLAINED * (energy - known)))
+        begins &= begins.sum() >= MIN_BELLS
+        lasts = (self._sizes > 0) & (energy > USUAL_RATIO * known)
+        self._sizes = np.where(begins | lasts, np.maximum(self._sizes, np.where(begins, size, 0.0)), 0.0)
+        apart = self._sizes > 0
+        if not apart.any():
+            return NOTHING_DISPLACED
+        tells = np.linalg.eigvalsh(normal)[:, 1] > MIN_TOLD_MM**-2.0
+        whole = int((apart & tells).sum()) > WHOLE_SHARE * int(tells.sum())
+        return DisplacedPlaces(self._centres[apart], self._sizes[apart], BELL_MM, whole)
+
+    def _picture(self, camera: int, image: Image, pose: Array) -> _FirstPicture:
+        pixels = self._pixels(camera, pose, self._points)
+        beside = self._pixels(camera, pose, self._points + self._axes[0])
+        scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(beside - pixels, axis=1)))))
+        ratios, free = _ratios(image, scale, pixels)
+        ends = [
+            _ratios(image, scale, self._pixels(camera, pose, self._points + side * axis))[0]
+            for axis in self._axes
+            for side in (1, -1)
+        ]
+        slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
+        free &= ~self._masks.hides(camera, pixels)
+        return _FirstPicture(scale, ratios, slopes, free, np.full(2, FIRST_NOISE))
+
+    def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
+        """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px."""
+        in_camera = se3.transform_points(self._lenses.rig.camera_from_base[camera] @ pose, points)
+        depth = np.maximum(in_camera[:, 2], 1.0)
+        imaged, _ = self._lenses.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
+        return np.asarray(imaged.T)
+
+
+def _spread(plane: TangentPlane, step: float) -> Array:
+    """Points (N, 3) mm of a surface, among its landmarks, a step, mm, apart."""
+    cells = max(1, int(np.ptp(plane.places, axis=0).max() / step))
+    flat = plane.grid(cells)[0].reshape(-1, 2)
+    return plane.lift(flat[plane.inside(flat)])[0]
+
+
+def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Mask]:
+    """Logarithms (N, 2) of red and blue to green at pixels (N, 2), and which (N,) are in view and not clipped.
+
+    Averaged over `scale` pixels.
+    """
+    height, width = image.shape[0] // scale, image.shape[1] // scale
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    across, down = ((pixels + 0.5) / scale - 0.5).astype(np.float32).T
+    in_view = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
+    levels = cv2.remap(small.astype(np.float32), across[None], down[None], cv2.INTER_LINEAR)[0]
+    blue, green, red = np.log(levels.astype(float) + DARK_LEVELS).T
+    return np.stack([red - green, blue - green], -1), in_view & (levels.max(1) < CLIPPED)

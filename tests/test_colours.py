@@ -1,0 +1,127 @@
+"""Colours tell where the tissue is, whatever lies on it; light, hands and ink do not look like a displacement."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from estimation import se3
+from estimation.observations import DisplacedPlaces
+from estimation.pose import TrackState
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
+from perception.frames import Image
+from perception.lens import Lenses
+from perception.mapping.colours import BELL_MM, MIN_SHIFT_MM, Colours
+from perception.mapping.masks import TrackingMasks
+from tests.campaigns.deceit.judge import Judge, frame_sets, tracker
+from tests.campaigns.deceit.kinds import NAMES, make_session
+from tests.campaigns.deceit.scenes import TRICK, Session
+from tests.campaigns.deceit.world import Renderer, on_tissue
+from tests.slowly import slowly
+
+SIZE, SEED = (480, 360), 11
+
+
+@cache
+def made(kind: str, variant: int = 0) -> Session:
+    return make_session(SEED, NAMES.index(kind) + len(NAMES) * variant, SIZE)
+
+
+def grid_map(session: Session, reach: float) -> SurfaceMap:
+    """Landmarks over the tissue, as a tracker would have them."""
+    side = np.arange(-reach, reach + 0.1, 5.0)
+    points = on_tissue(session.world.relief, np.stack(np.meshgrid(side, side), -1).reshape(-1, 2))
+    return SurfaceMap(points, np.tile([0.0, 0, 1], (len(points), 1)), 1e-4 * np.eye(3 * len(points)))
+
+
+class Looked:
+    """The colours of a session's tissue at its true poses, from the start on."""
+
+    def __init__(self, session: Session, reach: float = 25.0) -> None:
+        self.session, self.renderer = session, Renderer(session.world)
+        lenses = Lenses(session.world.rig)
+        self.colours = Colours(lenses, TrackingMasks(lenses))
+        images, poses = self.seen(0)
+        self.colours.begin(images, poses, grid_map(session, reach))
+
+    def seen(self, number: int) -> tuple[dict[int, Image], dict[int, Array]]:
+        frames = self.renderer.frame_set(number, float(self.session.stamps[number])).frames
+        return {f.camera: f.image for f in frames}, {
+            f.camera: self.session.world.base_from_surface(f.stamp) for f in frames
+        }
+
+    def __call__(self, number: int, shift: Array | tuple[float, ...] = (0.0, 0.0, 0.0)) -> DisplacedPlaces:
+        images, poses = self.seen(number)
+        moved = se3.make(np.eye(3), np.asarray(shift, float))
+        return self.colours(images, {c: pose @ moved for c, pose in poses.items()})
+
+
+@pytest.mark.parametrize("shift", [(1.2, 0.0, 0.0), (0.0, -1.2, 0.0), (0.8, 0.8, 0.0), (-2.0, 1.0, 0.0)])
+def test_a_pose_that_is_off_along_the_surface_is_told_by_how_much(shift: tuple[float, ...]) -> None:
+    look = Looked(made("plain"))
+    for number in range(10):
+        assert not len(look(number).sizes)
+    told = look(12, shift)
+    size = float(np.linalg.norm(shift))
+    assert told.whole and 0.5 * size < told.sizes.max() < 1.3 * size
+    assert f"{told.sizes.max():.1f} mm off the texture" in told.message
+    assert not len(look(13).sizes) and not look(13).message
+
+
+def test_what_is_told_is_remembered_until_the_colours_are_back() -> None:
+    look = Looked(made("plain"))
+    for number in range(8):
+        look(number)
+    sizes = [look(8 + k, (k * 0.5, 0.0, 0.0)).sizes.max(initial=0.0) for k in range(40)]
+    assert (np.diff(sizes) >= 0).all() and sizes[0] == 0 and sizes[-1] > 2.0
+    assert not len(look(50).sizes)
+
+
+def test_grey_cameras_tell_nothing() -> None:
+    look = Looked(made("plain"))
+    images, poses = look.seen(0)
+    look.colours.begin({c: image[..., 1].copy() for c, image in images.items()}, poses, grid_map(look.session, 25.0))
+    moved = {c: pose @ se3.make(np.eye(3), [3.0, 0, 0]) for c, pose in poses.items()}
+    assert not len(look.colours({c: image[..., 1].copy() for c, image in images.items()}, moved).sizes)
+
+
+def test_ink_has_its_own_colours() -> None:
+    look = Looked(made("plain"))
+    everywhere = look.colours._points
+    look.colours.cover(everywhere)
+    assert not len(look(8, (2.0, 0.0, 0.0)).sizes)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("shadow_drift", "wet_film", "glove", "exposure_steps"),
+        *slowly("lamp_at_rest", "flicker", "blur", "defocus", "focal_off", "camera_dark"),
+    ],
+)
+def test_light_hands_and_blur_are_no_displacement(kind: str) -> None:
+    look = Looked(made(kind))
+    numbers = range(0, len(look.session.stamps) - 1, 2)
+    assert not [n for n in numbers if look(n).sizes.max(initial=0.0) > 0]
+
+
+@pytest.mark.parametrize("variant", [0, *slowly(1, 2, 3)])
+def test_hairs_that_are_combed_aside_are_not_taken_for_the_skin(variant: int) -> None:
+    session = made("hair", variant)
+    step, judge = tracker(session), Judge(session)
+    poses, verdicts = [], []
+    for frames in frame_sets(session):
+        poses.append(step(frames))
+        verdicts.append(judge(poses[-1]))
+        step.idle()
+    assert not any(v.wrong for v in verdicts)
+    assert all(p.state is TrackState.TRACKING for p in poses[5:TRICK])
+    assert any("off the texture" in p.reason for p in poses) or max(v.error for v in verdicts[5:]) < 1.0
+
+
+def test_the_claim_of_displaced_places_reaches_as_far_as_they_are() -> None:
+    places = DisplacedPlaces(np.zeros((1, 3)), np.array([2.0]), BELL_MM, True)
+    assert np.sqrt(places.covariance[3, 3]) == 2.0 > MIN_SHIFT_MM and not places.covariance[:3].any()
