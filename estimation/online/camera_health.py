@@ -41,6 +41,7 @@ SHARP_SHARE = 0.8  # of all its usual tracks: of a blurred picture half of them 
 SINGLE_POSE_PRIOR = np.diag([1 / 0.03**2] * 3 + [1 / 10.0**2] * 3)
 UNUSUAL_RATIO = 3.0  # times the usual offset, or the tracks' noise: beyond, cameras that carry a pose do not agree
 CLEAR_SIGMAS = 2.0  # by which a camera's own pose must differ in its picture (six degrees of freedom: 6e-4 by chance)
+FAST_KEPT = 0.985  # of the fastest motion, from frame set to frame set: for two seconds
 MIN_SHOWN_PICTURES = 2  # of a camera from which nothing of the map is seen: one may be covered or blurred
 MAX_DELAY_SIGMAS = 6.0  # of the cameras' delays as they are known: beyond, a camera hangs or its pictures come late
 RETURN_RATIO = 1.5  # times what is asked of a camera that counts is asked of one that is to count again
@@ -73,6 +74,7 @@ class CameraHealth:
         self._shown = np.zeros(count, np.int64)  # pictures
         self._blind: frozenset[int] = frozenset()  # cameras that show nothing of the map, though it is in their view
         self._hint = ""  # at their calibration
+        self._fast = np.zeros(6)  # the fastest twist of late: at a turn the surface rests, cameras still stand apart
 
     @property
     def unseen(self) -> frozenset[int]:
@@ -161,15 +163,17 @@ class CameraHealth:
 
         offsets, allowed: (C,) px. expected: by the motion, a rival of a fit that contradicts it and lacks cameras.
         """
+        moves = (tracks.shared.twist, FAST_KEPT * self._fast)
+        self._fast = max(moves, key=lambda twist: float(np.mean((fit.jacobians @ twist) ** 2)))
         if expected is None:
             return ()
-        limit = OUTLIER_RATIO * allowed
+        limit, late = OUTLIER_RATIO * allowed, float(np.sqrt(np.mean(np.diag(tracks.shared.delay)))) * self._fast
         farthest = frozenset([int(np.nanargmax(offsets / limit))] if (offsets > limit).any() else [])
         unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
         apart = outliers or unlike or tracks.out_of_step(fit) or farthest
         motion, usual = motion_sigmas(fit, expected), UNUSUAL_RATIO * self._usual
         goes_on = expected if outliers and motion <= MAX_MOTION_SIGMAS else None
-        rivals = tracks.rivals(fit, apart, limit, usual, self.rivals.own_poses(), goes_on) if apart else ()
+        rivals = tracks.rivals(fit, apart, limit, usual, late, self.rivals.own_poses(), goes_on) if apart else ()
         found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
         few = (found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0)
         lost_now = camera_numbers(few) & self._fresh - outliers
@@ -262,8 +266,7 @@ class FrameTracks:
 
     def offsets(self, fit: PoseFit) -> Array:
         """Offsets (C,) px of the cameras from a pose: median residual less its noise, nan below `min_tracks` tracks."""
-        away = np.linalg.norm(fit.residuals, axis=1)
-        off = np.full(len(self.rig), np.nan)
+        away, off = np.linalg.norm(fit.residuals, axis=1), np.full(len(self.rig), np.nan)
         for c in range(len(self.rig)):
             mine = self.seen.camera == c
             if np.count_nonzero(mine) >= self.min_tracks:
@@ -328,13 +331,15 @@ class FrameTracks:
         apart: Collection[int],
         allowed: Array,
         usual: Array,
+        late: Array,
         starts: Mapping[int, Array],
         motion: SurfacePose | None,
     ) -> tuple[RivalPose, ...]:
         """What cameras `apart` say clearly against the others, together where they agree, else each by itself.
 
-        allowed, usual: (C,) px by which cameras that agree may stand off, and do. starts: (4, 4) by camera, where it
-        last saw the surface. motion: the pose expected, where the fit continues the motion until now.
+        allowed, usual: (C,) px by which cameras that agree may stand off, and do. late: (6,) motion in one sigma of a
+        camera's delay. starts: (4, 4) by camera, where it last saw the surface. motion: the pose expected, where the
+        fit continues the motion until now.
         """
         counts = np.bincount(self.seen.camera, minlength=len(self.rig))
         seen = camera_numbers(counts >= self.min_tracks)
@@ -352,7 +357,8 @@ class FrameTracks:
             jumped = motion is not None and motion_sigmas(own, motion) > MAX_MOTION_SIGMAS
             rival = RivalPose(key, carriers, pose, own.base_from_surface, (noise, own_noise), inlier, united, jumped)
             apart_px = float(np.sqrt(2 * np.mean((own.jacobians[mine] @ rival.difference) ** 2)))
-            clear = apart_px > max(MIN_UNEQUAL_PX, CLEAR_SIGMAS * np.sqrt(2) * own_noise)
+            clocks = 2 * MAX_DELAY_SIGMAS * float(np.sqrt(np.mean((fit.jacobians @ late) ** 2)))  # of both sides
+            clear = apart_px > max(MIN_UNEQUAL_PX, clocks, CLEAR_SIGMAS * np.sqrt(2) * own_noise)
             agrees = (self.offsets(own)[group] <= allowed[group]).all()
             if clear and agrees and contradicts(self.seen, carried, rival):
                 alone.append(rival)
