@@ -31,7 +31,8 @@ MIN_GROUP_SIGMA_PX = 0.2  # one sigma of a track: patches on what slips are not 
 MAX_GROUP_SCALE = 4.0  # of the residuals, in sigmas: worse ones share no motion
 GROUP_SETS = 2  # frame sets in a row in which a group must be found
 MIN_APART_MM = 0.5  # by which it must be apart to be told: what the guard allows
-MAX_PARTED_SHARE = 0.5  # of the landmarks that say what the surface is: with more of them parted, nobody knows
+MAX_PARTED_SHARE = 0.3  # of the landmarks that say what the surface is: with more of them in a group, nobody knows
+MAX_LOST_SHARE = 0.5  # likewise, with more of them lost: a hand may cover as many
 GROUP_TIMEOUT_S = 0.5  # after which a motion no longer tells where a group is
 PARTED_MEMORY_S = 10.0  # some breaths: groups that met again may part again
 COMPANY_MM = 10.0  # within which a landmark that parted has another one: alone, a group's motion fits it by chance
@@ -140,7 +141,7 @@ class PartedTexture:
         self._vanished = False
         if group is not None:
             self._take(group[0], group[1], fit, points)
-        unsure = self._unsure(self._lost)
+        unsure = self._unsure(self._lost, MAX_LOST_SHARE)
         self._torn = unsure and (self._torn or group is not None)
         if unsure and self._sets < GROUP_SETS and (self._torn or not self._core):
             self._vanished = True
@@ -187,7 +188,7 @@ class PartedTexture:
         self._members, self._size = self._members | rows, size
         side = self._side(own.mean(0) - self._middle(points), surface)
         self.message = f"texture on the {side} moves by itself, by {size:.1f} mm"
-        if not self._core or self._unsure(np.flatnonzero(self._members)):
+        if not self._core or self._unsure(np.flatnonzero(self._members), MAX_PARTED_SHARE):
             self.message = f"{self.message}; {self._hint}"
             self._hold(fit.stamp, np.outer(along, along))
 
@@ -195,10 +196,10 @@ class PartedTexture:
     def _hint(self) -> str:
         return REGION_HINT if self._core else PICTURE_HINT
 
-    def _unsure(self, rows: Index) -> bool:
-        """Whether so many landmarks (rows, (R,)) have parted that the rest need not be the surface."""
+    def _unsure(self, rows: Index, share: float) -> bool:
+        """Whether so many landmarks (rows, (R,)) have parted, of the others, that those need not be the surface."""
         count = self._core or len(self._here)
-        return int((rows < count).sum()) >= MAX_PARTED_SHARE * max(int(self._here[:count].sum()), 1)
+        return int((rows < count).sum()) >= share * max(int(self._here[:count].sum()), 1)
 
     def _hold(self, stamp: float, both: Array) -> None:
         """Take a covariance (6, 6) that holds both groups, unless the one from before says more."""
