@@ -16,6 +16,7 @@ from estimation import se3
 from estimation.observations import MissedLandmarks, Observations
 from estimation.online.estimator import Estimator
 from estimation.online.fit import FrameFit
+from estimation.online.parted_texture import MAX_PARTED_SHARE, MIN_APART_MM
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array, Mask
 from estimation.surface_map import LocalError, SurfaceMap
@@ -118,7 +119,8 @@ def test_a_bump_under_the_needle_is_claimed_before_it_is_two_frame_sets_old(
     assert claims[high == 0].max() < LIMIT_MM / 2
     two = int(np.flatnonzero(high >= 2.0 - 1e-9)[0])
     assert claims[two + 2 :].min() > LIMIT_MM, claims[two - 3 :].round(2).tolist()
-    assert rim.max() < LIMIT_MM
+    lifted = np.linalg.norm(bump.displacement(points, height), axis=1) > MIN_APART_MM
+    assert rim.max() < LIMIT_MM or lifted.mean() > MAX_PARTED_SHARE  # of so many nobody knows that they are a part
 
 
 def test_a_hand_over_a_part_is_doubted_there_and_nowhere_else_and_forgotten_when_it_is_gone() -> None:
@@ -245,14 +247,15 @@ def test_without_a_region_the_claim_covers_both_groups(slides: Motion, share: fl
 
 
 def test_what_slips_beside_the_surface_that_a_region_tells_is_told_and_left_out() -> None:
-    poses, off, _ = parted(0.2, True, slipping)
+    poses, off, _ = parted(0.15, True, slipping)
     assert off.max() < 0.2 and max(p.error_at(np.array([[40.0, 0.0, 0.0]]))[0] for p in poses) < LIMIT_MM
     assert any("texture on the left moves by itself" in p.reason for p in poses)
     assert not any("draw" in p.reason for p in poses)
 
 
-def test_a_region_that_holds_two_groups_alike_is_sure_of_neither() -> None:
-    poses, _, _ = parted(0.5, True, slipping, 1.0)
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_a_region_that_holds_two_groups_is_sure_of_neither(share: float) -> None:
+    poses, _, _ = parted(share, True, slipping, 1.0)
     last = poses[-1]
     assert not last.state.measured or last.error_at(MIDDLE)[0] > LIMIT_MM
 
