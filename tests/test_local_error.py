@@ -16,7 +16,7 @@ from estimation import se3
 from estimation.observations import MissedLandmarks, Observations
 from estimation.online.estimator import Estimator
 from estimation.online.fit import FrameFit
-from estimation.online.parted_texture import MAX_PARTED_SHARE, MIN_APART_MM
+from estimation.online.parted_texture import MAX_PARTED_SHARE, MIN_APART_MM, PartedTexture
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array, Mask
 from estimation.surface_map import LocalError, SurfaceMap
@@ -121,6 +121,35 @@ def test_a_bump_under_the_needle_is_claimed_before_it_is_two_frame_sets_old(
     assert claims[two + 2 :].min() > LIMIT_MM, claims[two - 3 :].round(2).tolist()
     lifted = np.linalg.norm(bump.displacement(points, height), axis=1) > MIN_APART_MM / 2
     assert rim.max() < LIMIT_MM or lifted.mean() > MAX_PARTED_SHARE  # of so many nobody knows that they are a part
+
+
+@pytest.mark.parametrize("rate", [13.0, 30.0])
+@pytest.mark.parametrize("seconds", [0.0, 1.0, 2.4])
+def test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence(rate: float, seconds: float) -> None:
+    """4 mm wide, one sigma: smaller than the bells under which displacements are averaged."""
+    top = DENSE[np.linalg.norm(DENSE, axis=1).argmin()]
+    shape = np.exp(-((DENSE - top) ** 2).sum(1) / (2 * 4.0**2))[:, None] * [0.0, 0.0, 1.0]
+    follow, lifts = Followed(DENSE, rate, breathing), rise(3.0, seconds)
+    high = np.array([lifts(k / rate) for k in range(1, int((BEGINS_S + seconds + 1.0) * rate))])
+    radius = np.array([follow(h * shape).radius_at(top[None], 0.95)[0] for h in high.tolist()])
+    late = np.flatnonzero(high > 1.0)[2 if seconds == 0 else 0 :]  # at once: two frame sets are allowed
+    assert (high[late] < 3 * radius[late]).all(), np.stack([high, radius])[:, late[0] - 3 :].round(2).tolist()
+    assert radius[high == 0].max() < LIMIT_MM
+
+
+def test_landmarks_that_part_together_are_told_at_their_places() -> None:
+    parted = PartedTexture(RIG, len(DENSE), True)
+    known = LocalError(np.zeros((0, 3)), *np.zeros((3, 0)), DENSE, 25.0, 100.0)
+    rows = np.linalg.norm(DENSE - DENSE[0], axis=1) < 12.0
+    parted._members, parted._size = rows, 1.5
+    told = parted.at_its_places(known, DENSE)
+    assert told is not None and (told.variance_at(DENSE[rows]) >= 0.75 * 1.5**2).all()
+    far = np.linalg.norm(DENSE[:, None] - DENSE[rows], axis=2).min(1) > 8.0
+    assert not told.variance_at(DENSE[far]).any()
+    alone = np.zeros(len(DENSE), bool)
+    alone[0] = True
+    parted._members = alone  # a motion fits one landmark by chance
+    assert parted.at_its_places(known, DENSE) is known
 
 
 def test_a_hand_over_a_part_is_doubted_there_and_nowhere_else_and_forgotten_when_it_is_gone() -> None:

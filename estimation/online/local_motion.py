@@ -44,6 +44,8 @@ ONSET_CHI2 = 36.0  # three degrees of freedom: 7e-8, and there are dozens of bel
 END_CHI2 = 16.3  # likewise, 1e-3: it is over
 MIN_DISPLACEMENT_MM = 0.2  # of a bell's mean: a fold twice as high, since it is no wider than the bell
 CLEAR_DISPLACEMENT_MM = 0.4  # likewise: no usual error is as large, so it counts whatever is usual there
+SMALL_MM, MIN_COSINE = 8.0, 0.7  # between landmarks of one small bump, two or three apart, which goes one way
+SMALL_RATIO, SMALL_REACH_MM = 2.0, 4.0  # times a landmark's displacement: the top may lie beside it; and how far
 SMEAR_SIGMAS = 3.0  # of the exposures, whose motion looks like a displacement: the pose cannot fit it everywhere
 HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it grows by until the arm has obeyed
 DISPLACEMENT_RIDGE = 1.0  # mm^-2: prior of a landmark's place, also along a line that all its cameras share
@@ -81,6 +83,7 @@ class LocalMotion:
         self._bells = self._squares = np.zeros((0, 0))  # (C, N)
         # per landmark: normal equations of its usual displacement, and in how many frame sets it was seen
         self._normal, self._right, self._looks = np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._small = np.zeros(0)  # mm, by which a landmark stands out beside its neighbours, else 0
         self._place = np.zeros((0, 3))  # mm, where it usually was after PLACED_SETS, nan before
         self._usual, self._learned = np.zeros(0), np.zeros(0)  # per bell: mean chi square per axis, and looks
         self._moving = np.zeros(0, bool)  # per bell
@@ -124,16 +127,37 @@ class LocalMotion:
         self._gate = GATE * fit.solution.scale * median(sigma) / max(along, 1e-9)
         unseen = self._support(observations, fit, self._bells, self._squares)
         self._learn(normal, right, weight, square, enough)
-        self._set_error(np.where(self._moving, HEIGHT_RATIO * np.maximum(far, MIN_DISPLACEMENT_MM), 0.0), unseen)
+        moved = np.where(self._moving, HEIGHT_RATIO * np.maximum(far, MIN_DISPLACEMENT_MM), 0.0)
+        self._look_at_small(normal, plain, weight, SMEAR_SIGMAS * smeared)
+        self._set_error(moved, unseen)
+
+    def _look_at_small(self, normal: Array, plain: Array, weight: Array, smear: float) -> None:
+        """Learn how far landmarks stand out beside the others of their bell; kept until they are seen in place again.
+
+        One alone may have strayed; another one within SMALL_MM that goes the same way, be it less far, has not.
+        """
+        shift = solve_symmetric3(normal + DISPLACEMENT_RIDGE * np.eye(3), np.ascontiguousarray(plain))
+        size, square = np.linalg.norm(shift, axis=1) - smear, (shift * plain).sum(1)
+        known = (weight > 0) & (self._looks >= MIN_LANDMARK_SETS)
+        top = np.flatnonzero(known & (square > ONSET_CHI2) & (size > CLEAR_DISPLACEMENT_MM))
+        beside = np.flatnonzero(known & (square > END_CHI2) & (size > MIN_DISPLACEMENT_MM))
+        away = np.linalg.norm(self._points[top, None] - self._points[beside], axis=2)
+        way = shift / np.maximum(np.linalg.norm(shift, axis=1), 1e-9)[:, None]
+        along = (away < SMALL_MM) & (top[:, None] != beside) & (way[top] @ way[beside].T > MIN_COSINE)
+        self._small[known & (size < MIN_DISPLACEMENT_MM)] = 0.0
+        self._small[top[along.any(1)]] = size[top[along.any(1)]] + smear
 
     def _set_error(self, moved: Array, unseen: Array) -> None:
         """Take the sigma, mm, of each bell (C,), by its displacement and as it is not seen."""
         sigma = np.maximum(moved, unseen)
-        told = np.flatnonzero(sigma)
+        told, top = np.flatnonzero(sigma), np.flatnonzero(self._small)
         variance, growth = AT_ONE_REACH * sigma[told] ** 2, AT_ONE_REACH * 2 * sigma[told] * TISSUE_SPEED
         support = self._anchors[self._near @ self._support.present > 0]
         bells_told = self._centres[told], variance, growth, self._reach[told]
         self.error = LocalError(*bells_told, support, self._span, MAX_UNSEEN_MM**2)
+        if len(top):
+            peak = (SMALL_RATIO * self._small[top]) ** 2
+            self.error = self.error.with_bells(self._points[top], peak, SMALL_REACH_MM)
 
     def _take(self, surface_map: SurfaceMap) -> None:
         """Follow a map that was refined or has grown: rows keep their meaning, and landmarks their places."""
@@ -153,7 +177,7 @@ class LocalMotion:
             self._normal = np.concatenate([self._normal, np.zeros((further, 3, 3))])
             self._right = np.concatenate([self._right, np.zeros((further, 3))])
             self._place = np.concatenate([self._place, np.full((further, 3), np.nan)])
-            self._looks = np.append(self._looks, np.zeros(further))
+            self._looks, self._small = (np.append(old, np.zeros(further)) for old in (self._looks, self._small))
             self._centres = bell_centres(points, self._centres)
             more = np.zeros(len(self._centres) - len(self._usual))
             self._usual, self._learned = np.append(self._usual, more), np.append(self._learned, more)
