@@ -35,8 +35,9 @@ FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
 SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference no longer grows with the displacement
 MIN_SHIFT_MM = 0.6  # that is told: what the guard allows, and three times what defocus and a turn of 20 degrees make
 MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
-MIN_EXPLAINED = 0.4  # and of all that is there beyond noise: a hand over a place looks like no displacement
-MIN_BELLS = 3  # that must tell a displacement: the edge of a hand can look like one at a place or two
+MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
+MIN_SEEN_SHARE = 0.5  # of a bell's places
+MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
 USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
 MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
 WHOLE_SHARE = 0.5  # of these places: with more of them displaced it is the pose that is wrong
@@ -93,7 +94,7 @@ class Colours:
             return NOTHING_DISPLACED
         count, points = len(self._centres), self._points if warp is None else warp.apply(self._points)
         normal, pull = np.zeros((count, 9)), np.zeros((count, 3))
-        energy, known = np.zeros(count), np.zeros(count)
+        energy, known, whole = np.zeros(count), np.zeros(count), np.zeros(count)
         for camera, first in self._first.items():
             if camera not in images or camera not in poses:
                 continue
@@ -112,17 +113,18 @@ class Colours:
             normal += weight @ np.einsum("pai,paj->pij", slopes, slopes).reshape(-1, 9)
             pull -= weight @ np.einsum("pai,pa->pi", slopes, away)
             energy, known = energy + weight @ (away**2).sum(1), known + 2 * weight.sum(1)
-        if not known.any():
-            return NOTHING_DISPLACED
+            whole += 2 * self._bells.sum(1)
+        known = np.where(known > MIN_SEEN_SHARE * whole, known, np.inf)  # else its edge in the picture looks displaced
         return self._judge(normal.reshape(-1, 3, 3), pull, energy, known)
 
     def _judge(self, normal: Array, pull: Array, energy: Array, known: Array) -> DisplacedPlaces:
         """By normal equations (K, 3, 3), (K, 3) of each bell's displacement, squared sigmas and how many are usual."""
         shift = np.linalg.solve(normal + np.eye(3) / SHIFT_PRIOR_MM**2, pull[..., None])[..., 0]
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
-        begins = (size > MIN_SHIFT_MM) & (explained > np.maximum(MIN_EVIDENCE, MIN_EXPLAINED * (energy - known)))
-        begins &= begins.sum() >= MIN_BELLS
-        lasts = (self._sizes > 0) & (energy > USUAL_RATIO * known)
+        begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
+        begins &= explained > MIN_EXPLAINED * (energy - known)
+        begins &= begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))
+        lasts = (self._sizes > 0) & (np.isinf(known) | (energy > USUAL_RATIO * known))
         self._sizes = np.where(begins | lasts, np.maximum(self._sizes, np.where(begins, size, 0.0)), 0.0)
         apart = self._sizes > 0
         if not apart.any():
@@ -166,7 +168,8 @@ def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Mask]:
     Averaged over `scale` pixels.
     """
     height, width = image.shape[0] // scale, image.shape[1] // scale
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    whole = image[: height * scale, : width * scale]
+    small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
     across, down = ((pixels + 0.5) / scale - 0.5).astype(np.float32).T
     in_view = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
     levels = cv2.remap(small.astype(np.float32), across[None], down[None], cv2.INTER_LINEAR)[0]

@@ -172,7 +172,8 @@ class TrackingStep:
             tracked, self._unverified = self._unverified, None
             poses = self._mapping.camera_poses(tracked)
             self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
-            self._colours.begin(self._images, poses, self._estimator.map)
+            carrying = {c: poses[c] for c in self._carrying_cameras(tracked) if c in poses}
+            self._colours.begin(self._images, carrying, self._estimator.map)
         if self._mapping.look_for_hint(self._pictures, repeats=len(self._verification.aliases) > 0):
             self._matcher = self._unverified = None
         self._relocalise()
@@ -253,7 +254,7 @@ class TrackingStep:
             away = estimator.elsewhere(fit, observations)
             place = fit.solution.base_from_surface
             apart = None if away is None else matcher.align_at(stamp, pyramids, place, away.rows, away.points)
-            there = {c: exposed[c] for c in pyramids if c not in fit.outliers}
+            there = {c: exposed[c] for c in self._carrying_cameras(tracked)}
             displaced = self._colours(self._images, there, estimator.expected(stamp).warp)
             pose = estimator.accept(fit, observations, apart, aliases, displaced)
             if not (fit.outliers or fit.rivals or len(aliases) or displaced.whole):
