@@ -360,6 +360,55 @@ MUTANTS = (
         "if not shift:",
         ("test_operator_words.py::test_a_move_that_is_not_three_figures_within_bounds_is_no_message",),
     ),
+    Mutant(
+        "the edge of a hand is a displacement",
+        "perception/mapping/colours.py",
+        "begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))",
+        "begins.sum() >= 1",
+        ("test_colours.py::test_light_hands_and_blur_are_no_displacement",),
+    ),
+    Mutant(
+        "displaced colours are forgotten while they stand apart",
+        "perception/mapping/colours.py",
+        "np.isinf(known) | (energy > USUAL_RATIO * known)",
+        "np.isinf(known)",
+        ("test_colours.py::test_what_is_told_is_remembered_until_the_colours_are_back",),
+    ),
+    Mutant(
+        "a surface that deforms looks like cameras that hang",
+        "estimation/online/bump_detector.py",
+        "return bool(part > max(",
+        "return bool(part > -max(",
+        ("test_warp.py::test_the_error_that_is_left_is_the_one_predicted",),
+    ),
+    Mutant(
+        "two cameras that hang are believed",
+        "estimation/online/camera_errors.py",
+        "if hang or verdict.late[0] == carriers or",
+        "if",
+        ("test_rival_cameras.py::test_two_that_hang_never_outvote_the_third_in_silence",),
+    ),
+    Mutant(
+        "a repeat that the pictures do not rule out is dropped",
+        "perception/mapping/verification.py",
+        "alive = evidence < (ODD",
+        "alive = evidence < -(ODD",
+        ("test_verification.py::test_where_the_marks_are_hidden_nothing_is_sure",),
+    ),
+    Mutant(
+        "a small bump is only told while it is found",
+        "estimation/online/local_motion.py",
+        "self._small[known & (size < MIN_DISPLACEMENT_MM)] = 0.0",
+        "self._small[:] = 0.0",
+        ("test_local_error.py::test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence",),
+    ),
+    Mutant(
+        "two groups in a region are no doubt",
+        "estimation/online/parted_texture.py",
+        "if not self._core or self._unsure(np.flatnonzero(self._members), MAX_PARTED_SHARE):",
+        "if not self._core:",
+        ("test_local_error.py::test_a_region_that_holds_two_groups_is_sure_of_neither",),
+    ),
 )
 
 

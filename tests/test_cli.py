@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
@@ -83,6 +84,17 @@ def test_the_exit_code_says_whether_a_runs_limits_were_met(tmp_path: Path, capsy
     assert "met     p95_mm" in capsys.readouterr().out
     assert main(["simulate", str(missed), "-o", str(tmp_path / "missed"), "--pty", "--threads", "1"]) == 1
     assert "MISSED  max_mm" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_print_goes_on_under_its_own_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Head, needle, their shadow and the ink hide landmarks and change colours: no reason to hold."""
+    demo = tomllib.loads((ROOT / "data/scenarios/demo.toml").read_text())
+    tables = {key: demo[key] for key in ("scene", "motion", "cameras", "clearance_mm", "bead_mm")}
+    (tmp_path / "path.csv").write_bytes((ROOT / "data/paths/wound_raster.csv").read_bytes())
+    limits = {"duty": 0.9, "p95_mm": 0.5}
+    file = write_scenario(tmp_path, {"arm": {"file": "arm.toml"}}, tables, seconds=8.0, limits=limits)
+    assert main(["simulate", str(file), "-o", str(tmp_path / "out")]) == 0, capsys.readouterr().out
 
 
 def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> None:

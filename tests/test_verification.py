@@ -160,8 +160,12 @@ def test_a_faint_pattern_over_skin_repeats_too() -> None:
 
 
 def test_the_operator_is_told_of_a_surface_that_repeats_and_has_no_marks() -> None:
-    assert learned(skin(1)).message == learned(marked(board(12.0))).message == ""
-    assert "repeats every 16.9 mm" in (told := learned(board(12.0)).message) and "hardly a mark" in told
+    plain, own, none = learned(skin(1)), learned(marked(board(12.0))), learned(board(12.0))
+    assert plain.message == "" and "repeats every 16.9 mm; its own marks tell" in own.message
+    assert "repeats every 16.9 mm" in none.message and "hardly a mark" in none.message
+    for verification in (own, none):
+        verification.take(1.1, poses(np.eye(4)))
+    assert not own.message and none.message
 
 
 # -- the verdict on a pose

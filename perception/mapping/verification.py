@@ -52,6 +52,7 @@ MAX_PROBE_VOTE = 0.3  # as how much better one probe's place counts at most: som
 MIN_EVIDENCE = 1.2  # votes summed: four probes that each rule an alias out
 ODD_LIKENESS = 0.95  # of the probes' usual likeness, which is steady to 0.01: below it all aliases are asked,
 ODD_EVIDENCE = 5.0  # and only so many votes rule one out: a shift alone need not fit a curved surface
+TOLD_S = 1.0  # after which it is no news that a surface repeats
 MAX_RIVALS = 3  # aliases that are fitted anew, 6 ms each
 BETTER_LIKENESS = 0.02  # in parts of the usual, by which a rival must look more like the surface,
 WORSE_LIKENESS = 0.1  # and by which less, to be ruled out
@@ -79,13 +80,14 @@ class Verification:
         self._probes: list[_Probes] = []
         self._centre = np.zeros(3)
         self._marked = False  # whether the surface has marks of its own that rule out the nearest aliases
+        self._begun = float("nan")  # s, when the surface was learned
         self._stamp, self._place = float("nan"), np.zeros(3)  # s, mm: of the last sure pose, and its centre there
 
     def begin(
         self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array], surface_map: SurfaceMap
     ) -> None:
         """Learn a surface by pictures (by camera) in which it stands at `poses` (4, 4), each camera's own."""
-        self._probes, self.aliases = [], NO_ALIASES
+        self._probes, self.aliases, self._begun = [], NO_ALIASES, stamp
         try:
             plane = TangentPlane(surface_map)
         except QhullError:  # landmarks on one line: no surface whose repeats could be looked for
@@ -104,10 +106,12 @@ class Verification:
 
     @property
     def message(self) -> str:
-        """For the operator, where a surface repeats and has no marks of its own that tell them apart; or ''."""
-        if self._marked or not len(self.aliases):
+        """For the operator: that a surface repeats, at first where its own marks tell where it is, else always; or ''."""
+        if not len(self.aliases) or (self._marked and self._stamp - self._begun > TOLD_S):
             return ""
         every = f"the surface repeats every {np.linalg.norm(self.aliases.shifts[0]):.1f} mm"
+        if self._marked:
+            return f"{every}; its own marks tell where it is"
         return f"{every} and has hardly a mark of its own: a jump by that cannot be seen; put a sticker on it"
 
     def __call__(self, stamp: float, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array]) -> Verdict:
