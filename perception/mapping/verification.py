@@ -106,7 +106,7 @@ class Verification:
 
     @property
     def message(self) -> str:
-        """For the operator: that a surface repeats, at first where its own marks tell where it is, else always; or ''."""
+        """For the operator: that a surface repeats; where its own marks tell where it is, at first only; or ''."""
         if not len(self.aliases) or (self._marked and self._stamp - self._begun > TOLD_S):
             return ""
         every = f"the surface repeats every {np.linalg.norm(self.aliases.shifts[0]):.1f} mm"
