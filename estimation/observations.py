@@ -29,7 +29,7 @@ class DisplacedPlaces:
     centres: Array  # (K, 3) mm, surface frame
     sizes: Array  # (K,) mm, by how much
     reach: float  # mm, one sigma about each centre
-    whole: bool  # whether most places that could tell are among them: then it is the pose that is wrong
+    whole: bool  # whether so many of the places that could tell are among them that the pose may be wrong
 
     @property
     def message(self) -> str:

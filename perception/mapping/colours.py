@@ -18,6 +18,7 @@ from scipy.spatial import QhullError
 
 from estimation import se3
 from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces
+from estimation.runtime import median
 from estimation.se3 import Array, Mask
 from estimation.surface_map import SurfaceMap, Warp, bells
 from perception.frames import Image
@@ -40,7 +41,7 @@ MIN_SEEN_SHARE = 0.5  # of a bell's places
 MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
 USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
 MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
-WHOLE_SHARE = 0.5  # of these places: with more of them displaced it is the pose that is wrong
+WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
 MIN_PLACES = 20  # of a camera, to compare its picture
 
 
@@ -49,8 +50,9 @@ class _FirstPicture:
     """How one camera first saw P places."""
 
     scale: int  # pixels of the picture to one of its averages
-    ratios: Array  # (P, 2) logarithms, red and blue to green
-    slopes: Array  # (P, 2, 3) by a displacement of the surface, 1/mm, along both tangents and the normal
+    ratios: Array  # (2, P) logarithms, red and blue to green
+    slopes: Array  # (2, P, 3) by a displacement of the surface, 1/mm, along both tangents and the normal
+    squares: Array  # (2, P, 9) outer products of the slopes
     free: Mask  # (P,) places that are seen, and not clipped
     noise: Array  # (2,) one sigma
 
@@ -92,9 +94,8 @@ class Colours:
         """Where colours contradict a pose: `poses` (4, 4) at each camera's exposure, of those that carry it."""
         if not self._first:
             return NOTHING_DISPLACED
-        count, points = len(self._centres), self._points if warp is None else warp.apply(self._points)
-        normal, pull = np.zeros((count, 9)), np.zeros((count, 3))
-        energy, known, whole = np.zeros(count), np.zeros(count), np.zeros(count)
+        points = self._points if warp is None else warp.apply(self._points)
+        sums, cameras = np.zeros((len(points), 14)), 0  # normal equations, energy and number, of all cameras
         for camera, first in self._first.items():
             if camera not in images or camera not in poses:
                 continue
@@ -103,19 +104,20 @@ class Colours:
             free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
             if np.count_nonzero(free) < MIN_PLACES:
                 continue
-            away = now - first.ratios
-            away -= np.median(away[free], axis=0)
-            spread = 1.4826 * np.median(np.abs(away[free]), axis=0)
-            first.noise += (spread - first.noise) / NOISE_MEMORY_SETS
-            sigma = np.maximum(first.noise, MIN_NOISE)
-            away, slopes = away / sigma, first.slopes / sigma[:, None]
-            weight = self._bells * free
-            normal += weight @ np.einsum("pai,paj->pij", slopes, slopes).reshape(-1, 9)
-            pull -= weight @ np.einsum("pai,pa->pi", slopes, away)
-            energy, known = energy + weight @ (away**2).sum(1), known + 2 * weight.sum(1)
-            whole += 2 * self._bells.sum(1)
-        known = np.where(known > MIN_SEEN_SHARE * whole, known, np.inf)  # else its edge in the picture looks displaced
-        return self._judge(normal.reshape(-1, 3, 3), pull, energy, known)
+            cameras += 1
+            for k in range(2):
+                away = now[k] - first.ratios[k]
+                away -= median(away[free])
+                first.noise[k] += (1.4826 * median(np.abs(away[free])) - first.noise[k]) / NOISE_MEMORY_SETS
+                precision = free / max(first.noise[k], MIN_NOISE) ** 2
+                sums[:, :9] += precision[:, None] * first.squares[k]
+                sums[:, 9:12] -= (precision * away)[:, None] * first.slopes[k]
+                sums[:, 12] += precision * away * away
+                sums[:, 13] += free
+        summed = self._bells @ sums
+        whole = 2 * cameras * self._bells.sum(1)
+        known = np.where(summed[:, 13] > MIN_SEEN_SHARE * whole, summed[:, 13], np.inf)  # else its edge looks displaced
+        return self._judge(summed[:, :9].reshape(-1, 3, 3), summed[:, 9:12], summed[:, 12], known)
 
     def _judge(self, normal: Array, pull: Array, energy: Array, known: Array) -> DisplacedPlaces:
         """By normal equations (K, 3, 3), (K, 3) of each bell's displacement, squared sigmas and how many are usual."""
@@ -144,8 +146,9 @@ class Colours:
             for side in (1, -1)
         ]
         slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
+        squares = (slopes[..., :, None] * slopes[..., None, :]).reshape(2, -1, 9)
         free &= ~self._masks.hides(camera, pixels)
-        return _FirstPicture(scale, ratios, slopes, free, np.full(2, FIRST_NOISE))
+        return _FirstPicture(scale, ratios, slopes, squares, free, np.full(2, FIRST_NOISE))
 
     def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
         """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px."""
@@ -163,15 +166,17 @@ def _spread(plane: TangentPlane, step: float) -> Array:
 
 
 def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Mask]:
-    """Logarithms (N, 2) of red and blue to green at pixels (N, 2), and which (N,) are in view and not clipped.
+    """Logarithms (2, N) of red and blue to green at pixels (N, 2), and which (N,) are in view and not clipped.
 
     Averaged over `scale` pixels.
     """
-    height, width = image.shape[0] // scale, image.shape[1] // scale
-    whole = image[: height * scale, : width * scale]
-    small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
-    across, down = ((pixels + 0.5) / scale - 0.5).astype(np.float32).T
+    size = np.array(image.shape[1::-1]) // scale
+    low = np.clip(pixels.min(0) // scale - 2, 0, size - 1).astype(int)
+    width, height = np.clip(pixels.max(0) // scale + 3, low + 1, size).astype(int) - low
+    part = image[low[1] * scale : (low[1] + height) * scale, low[0] * scale : (low[0] + width) * scale]
+    small = cv2.resize(part, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+    across, down = ((pixels + 0.5) / scale - 0.5 - low).astype(np.float32).T
     in_view = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
     levels = cv2.remap(small.astype(np.float32), across[None], down[None], cv2.INTER_LINEAR)[0]
     blue, green, red = np.log(levels.astype(float) + DARK_LEVELS).T
-    return np.stack([red - green, blue - green], -1), in_view & (levels.max(1) < CLIPPED)
+    return np.stack([red - green, blue - green]), in_view & (levels.max(1) < CLIPPED)
