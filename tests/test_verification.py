@@ -142,7 +142,7 @@ def test_the_correlation_is_that_of_what_is_seen_in_both(seed: int) -> None:
 
 @pytest.mark.parametrize("square", [8.0, 12.0, 20.0])
 def test_a_board_repeats_by_its_squares(square: float) -> None:
-    shifts = aliases(board(square)).shifts[:8]
+    shifts = aliases(board(square)).motions[:8, :3, 3]
     assert np.linalg.norm(shifts[:4], axis=1) == pytest.approx(np.full(4, np.sqrt(2) * square), abs=0.35)
     off = np.abs(shifts[:, :2] / square - np.round(shifts[:, :2] / square)) * square
     assert off.max() < 0.5  # mm: each is a whole number of squares
@@ -154,9 +154,31 @@ def test_skin_repeats_nowhere(seed: int, strength: float) -> None:
     assert not len(aliases(skin(seed, strength)))
 
 
+@pytest.mark.parametrize("square", [8.0, 12.0])
+def test_a_board_looks_like_itself_turned_by_quarters(square: float) -> None:
+    """Each motion puts every square on one of its own colour."""
+    found, texture = aliases(board(square)), lambda at: np.floor(at / square).sum(1) % 2
+    turned = found.motions[np.abs(found.motions[:, 0, 0] - 1) > 0.5]
+    quarters = np.round(np.degrees(np.arctan2(turned[:, 1, 0], turned[:, 0, 0])) / 90) % 4
+    assert set(quarters) == {1, 2, 3} and np.abs(turned[:, 2, :2]).max() < 1e-9
+    places = (np.stack(np.meshgrid(np.arange(-4, 4), np.arange(-4, 4)), -1).reshape(-1, 2) + 0.5) * square
+    for motion in turned:
+        assert (texture(places) == texture((places @ motion[:2, :2].T) + motion[:2, 3])).all()
+
+
+def test_a_board_that_was_turned_while_it_was_hidden_is_doubted() -> None:
+    looks = pictures(board(12.0), np.eye(4), 1)
+
+    def turned(gap: float) -> int:
+        alive = learned(board(12.0))(gap, looks, poses(np.eye(4))).alive
+        return int((np.abs(alive[:, 0, 0] - 1) > 0.5).sum())
+
+    assert turned(0.5) >= 3 and not turned(FRAME_S)
+
+
 def test_a_faint_pattern_over_skin_repeats_too() -> None:
     found = aliases(skin(4, 0.8) + 0.3 * (board(10.0) - 130.0))
-    assert np.linalg.norm(found.shifts, axis=1).min() == pytest.approx(np.sqrt(200.0), abs=0.4)
+    assert found.sizes.min() == pytest.approx(np.sqrt(200.0), abs=0.4)
 
 
 def test_the_operator_is_told_of_a_surface_that_repeats_and_has_no_marks() -> None:
@@ -175,7 +197,7 @@ def test_the_operator_is_told_of_a_surface_that_repeats_and_has_no_marks() -> No
 def test_marks_of_its_own_tell_a_board_that_jumped(x: float, y: float) -> None:
     texture = marked(board(12.0))
     verdict = learned(texture)(FRAME_S, pictures(texture, shifted(x, y), 1), poses(np.eye(4)))
-    assert verdict.rivals and verdict.alive[0] == pytest.approx([x, y, 0.0], abs=0.5)
+    assert verdict.rivals and verdict.alive[0, :3, 3] == pytest.approx([x, y, 0.0], abs=0.5)
     right = learned(texture)(FRAME_S, pictures(texture, shifted(x, y), 1), poses(shifted(x, y)))
     assert right.likeness > verdict.likeness + 0.02 and not len(right.alive)
 
@@ -185,8 +207,8 @@ def test_where_the_marks_are_hidden_nothing_is_sure() -> None:
     looks = pictures(board(12.0), np.eye(4), 1)  # as if each mark were covered by its surroundings
     reach = 12.0 * np.sqrt(2) / MAX_TISSUE_SPEED
     assert not len(learned(board(12.0))(0.9 * reach, looks, poses(np.eye(4))).alive)  # too far for the tissue
-    alive = learned(board(12.0))(1.1 * reach, looks, poses(np.eye(4))).alive
-    assert np.linalg.norm(alive, axis=1).min() == pytest.approx(12.0 * np.sqrt(2), abs=0.4)
+    sizes = learned(board(12.0))(1.1 * reach, looks, poses(np.eye(4))).sizes
+    assert sizes.min() == pytest.approx(12.0 * np.sqrt(2), abs=0.4)
     assert not len(verification(0.001, pictures(texture, np.eye(4), 2), poses(np.eye(4))).alive)
 
 

@@ -20,7 +20,7 @@ from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
 from estimation.online.parted_texture import Elsewhere
 from estimation.online.reported_covariance import (
-    NO_SHIFTS,
+    NO_ALIASES,
     alias_covariance,
     alias_message,
     widened,
@@ -274,12 +274,12 @@ class Estimator:
         fit: FrameFit,
         observations: Observations,
         elsewhere: Observations | None = None,
-        aliases: Array = NO_SHIFTS,
+        aliases: Array = NO_ALIASES,
         displaced: DisplacedPlaces = NOTHING_DISPLACED,
     ) -> SurfacePose:
         """Take a measured fit into the window and give the pose.
 
-        elsewhere: what was found of `elsewhere`. aliases: (K, 3) mm, shifts of the pose that may be as right.
+        elsewhere: what was found of `elsewhere`. aliases: (K,) mm, how far away the surface may as well be.
         """
         assert fit.measured
         surface, sigma = self._surface, np.maximum(observations.sigma, self.settings.floor_sigma)

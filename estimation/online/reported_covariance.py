@@ -271,17 +271,16 @@ def widened(pose: SurfacePose, more: Array) -> SurfacePose:
     return replace(pose, covariance=pose.covariance + more, forecast=ahead)
 
 
-NO_SHIFTS = np.zeros((0, 3))
+NO_ALIASES = np.zeros(0)
 
 
-def alias_message(shifts: Array) -> str:
-    """For the operator, where the pose may as well be shifted (K, 3) mm; or ''."""
-    if not len(shifts):
+def alias_message(sizes: Array) -> str:
+    """For the operator, where the surface may as well be (K,) mm away; or ''."""
+    if not len(sizes):
         return ""
-    nearest = float(np.linalg.norm(shifts, axis=1).min())
-    return f"ambiguous: the surface repeats every {nearest:.1f} mm, and nothing tells where on it this is"
+    return f"ambiguous: the surface repeats every {sizes.min():.1f} mm, and nothing tells where on it this is"
 
 
-def alias_covariance(shifts: Array) -> Array:
-    """(6, 6): a pose that may as well be shifted (K, 3) mm; its 95 % radius reaches the farthest."""
-    return np.diag([0.0] * 3 + [float((shifts**2).sum(1).max()) / 4] * 3)
+def alias_covariance(sizes: Array) -> Array:
+    """(6, 6): of a surface that may as well be (K,) mm away; its 95 % radius reaches the farthest."""
+    return np.diag([0.0] * 3 + [float(sizes.max()) ** 2 / 4] * 3)

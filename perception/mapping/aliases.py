@@ -1,8 +1,8 @@
-"""The aliases of a surface: the shifts along its tangent plane under which its own picture looks like itself.
+"""The aliases of a surface: the motions along its tangent plane under which its own picture looks like itself.
 
 Where a surface repeats (a mesh, a board, a row of sutures), its tracks agree on every pose that is off by a period.
 The picture is the surface seen squarely, free of shading; its masked correlation with itself (Padfield 2012) has a top
-at every alias.
+at every alias. One that repeats may also look like itself turned, by quarters: meshes and boards are square.
 """
 
 from __future__ import annotations
@@ -31,20 +31,21 @@ MIN_REPEAT = 0.25
 MIN_ALIAS_MM = 1.5  # nearer to itself the surface only looks smooth
 RIVAL_SHARE = 0.5  # of the strongest alias' correlation: what is weaker is a mark that stands somewhere twice
 MAX_ALIASES = 80  # the nearest: a mesh of 4 mm up to 20 mm
+MAX_TURNED = 4  # by each quarter of a turn, the likeliest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aliases:
-    """The shifts under which a surface looks like itself."""
+    """The motions under which a surface looks like itself."""
 
-    shifts: Array  # (K, 3) mm, surface frame, along the tangent plane, nearest first
-    likeness: Array  # (K,) correlation with itself there
+    motions: Array  # (K, 4, 4) mm, of the surface in its own frame, nearest first
+    sizes: Array  # (K,) mm, root mean square, by which its landmarks move
 
     def __len__(self) -> int:
-        return len(self.shifts)
+        return len(self.motions)
 
 
-NO_ALIASES = Aliases(np.zeros((0, 3)), np.zeros(0))
+NO_ALIASES = Aliases(np.zeros((0, 4, 4)), np.zeros(0))
 
 
 class TangentPlane:
@@ -101,6 +102,7 @@ class SurfaceGrid:
         places, self.step = plane.grid(GRID_SIDE)
         flat = places.reshape(-1, 2)
         self.axes, self.points = plane.axes, plane.lift(flat)[0]  # (2, 3); (V U, 3) mm
+        self.normal, self.first = plane.normal, plane.origin + flat[0] @ plane.axes  # (3,); (3,) mm, of the first cell
         self.inside = plane.inside(flat).reshape(places.shape[:2])  # among the landmarks
 
 
@@ -127,25 +129,27 @@ def surface_picture(
     return np.where(seen, away / (spread + 1.0), 0.0), seen
 
 
-def self_correlation(picture: Array, seen: Mask) -> tuple[Array, Array]:
+def self_correlation(picture: Array, seen: Mask, quarters: int = 0) -> tuple[Array, Array]:
     """Correlation of a picture (V, U) with itself at every shift, and how much of it overlaps there, 0 to 1.
 
-    Both (2V - 1, 2U - 1); no shift is in the middle.
+    Both (2V - 1, 2U - 1); no shift is in the middle. quarters: of a turn before it is shifted; the picture is square.
 
     Only what is seen (V, U) counts (Padfield 2012, Eq. 14-19); 0 where too little of it overlaps.
     """
     rows, columns = picture.shape
     shape = (next_fast_len(2 * rows - 1), next_fast_len(2 * columns - 1))
-    mask, first, square = (rfft2(part, shape) for part in (seen.astype(float), picture, picture**2))
+    turned, visible = np.rot90(picture, quarters), np.rot90(seen, quarters).astype(float)
+    mask, first, square = (rfft2(part, shape) for part in (visible, turned, turned**2))
+    own_mask, own, own_square = (rfft2(part, shape) for part in (seen.astype(float), picture, picture**2))
 
     def both(a: Array, b: Array) -> Array:
         whole = np.roll(irfft2(a * np.conj(b), shape), (rows - 1, columns - 1), (0, 1))
         return np.asarray(whole[: 2 * rows - 1, : 2 * columns - 1])
 
-    overlap = np.maximum(both(mask, mask), 0.5)
-    sum_a, sum_b = both(first, mask), both(mask, first)
-    product = both(first, first) - sum_a * sum_b / overlap
-    spread_a, spread_b = both(square, mask) - sum_a**2 / overlap, both(mask, square) - sum_b**2 / overlap
+    overlap = np.maximum(both(mask, own_mask), 0.5)
+    sum_a, sum_b = both(first, own_mask), both(mask, own)
+    product = both(first, own) - sum_a * sum_b / overlap
+    spread_a, spread_b = both(square, own_mask) - sum_a**2 / overlap, both(mask, own_square) - sum_b**2 / overlap
     spread = np.sqrt(np.maximum(spread_a * spread_b, 1e-12))
     share = overlap / max(float(seen.sum()), 1.0)
     sound = (spread > 1e-3 * float((picture**2).sum())) & (share > MIN_OVERLAP)
@@ -153,18 +157,39 @@ def self_correlation(picture: Array, seen: Mask) -> tuple[Array, Array]:
 
 
 def find_aliases(picture: Array, seen: Mask, grid: SurfaceGrid) -> Aliases:
-    """The shifts under which a surface's picture (V, U) looks like itself; seen: (V, U)."""
-    likeness, overlap = self_correlation(picture, seen)
-    middle = np.array(likeness.shape) // 2
-    side = 2 * int(MIN_ALIAS_MM / grid.step / 2) + 1
+    """The motions under which a surface's picture (V, U) looks like itself; seen: (V, U)."""
+    shift, score = _tops(*self_correlation(picture, seen), grid.step)
+    away = np.linalg.norm(shift, axis=1)
+    rival = (away > MIN_ALIAS_MM) & (score > RIVAL_SHARE * score[away > MIN_ALIAS_MM].max(initial=0.0))
+    if not rival.any():
+        return NO_ALIASES
+    order = np.flatnonzero(rival)[np.argsort(away[rival], kind="stable")][:MAX_ALIASES]
+    motions = [se3.make(np.eye(3), along) for along in shift[order] @ grid.axes]
+    # turned about the middle of a square that holds the picture
+    side = max(picture.shape)
+    border = [(0, side - n) for n in picture.shape]
+    square, visible = np.pad(picture, border), np.pad(seen, border)
+    middle = grid.first + grid.step * (side - 1) / 2 * grid.axes.sum(0)
+    for quarters in (1, 2, 3):
+        shift, likeness = _tops(*self_correlation(square, visible, quarters), grid.step)
+        best = np.argsort(-likeness, kind="stable")[:MAX_TURNED]
+        turn = se3.exp_rotation(quarters * np.pi / 2 * grid.normal)
+        about = se3.make(np.eye(3), middle) @ se3.make(turn, np.zeros(3))
+        for along in shift[best[likeness[best] > RIVAL_SHARE * score[rival].max()]] @ grid.axes:
+            motions.append(about @ se3.make(np.eye(3), along - middle))
+    points = grid.points[grid.inside.ravel()]
+    sizes = np.array([np.sqrt(((se3.transform_points(m, points) - points) ** 2).sum(1).mean()) for m in motions])
+    nearest = np.argsort(sizes, kind="stable")
+    return Aliases(np.stack(motions)[nearest], sizes[nearest])
+
+
+def _tops(likeness: Array, overlap: Array, step: float) -> tuple[Array, Array]:
+    """Shifts (K, 2) mm at which a correlation (V, U) has a top that chance does not explain, and its value (K,)."""
+    middle, side = np.array(likeness.shape) // 2, 2 * int(MIN_ALIAS_MM / step / 2) + 1
     top = (maximum_filter(likeness, max(3, side)) == likeness) & (likeness * np.sqrt(overlap) > MIN_REPEAT)
     top[[0, -1], :], top[:, [0, -1]] = False, False
     v, u = np.nonzero(top)
-    shift = grid.step * (np.stack([v, u], -1) - middle + _vertex(likeness, v, u))[:, ::-1]
-    away, score = np.linalg.norm(shift, axis=1), likeness[top]
-    rival = (away > MIN_ALIAS_MM) & (score > RIVAL_SHARE * score[away > MIN_ALIAS_MM].max(initial=0.0))
-    order = np.flatnonzero(rival)[np.argsort(away[rival], kind="stable")][:MAX_ALIASES]
-    return Aliases(shift[order] @ grid.axes, score[order])
+    return step * (np.stack([v, u], -1) - middle + _vertex(likeness, v, u))[:, ::-1], likeness[top]
 
 
 def _vertex(likeness: Array, v: Index, u: Index) -> Array:

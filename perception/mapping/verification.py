@@ -62,12 +62,13 @@ WORSE_LIKENESS = 0.1  # and by which less, to be ruled out
 class Verdict:
     """What the pictures say of a pose."""
 
-    alive: Array  # (K, 3) mm, shifts of the pose, surface frame, that they do not contradict, the likeliest first
+    alive: Array  # (K, 4, 4) mm, motions of the surface in its frame that they do not contradict, the likeliest first
+    sizes: Array  # (K,) mm, of these
     rivals: int  # of these, to be fitted anew: on a curved surface tracks agree near an alias, not at it
     likeness: float  # of the surface with its first pictures, in parts of the usual
 
 
-SURE = Verdict(np.zeros((0, 3)), 0, 1.0)
+SURE = Verdict(NO_ALIASES.motions, NO_ALIASES.sizes, 0, 1.0)
 
 
 class Verification:
@@ -100,7 +101,7 @@ class Verification:
             return
         for c in pyramids:
             self._probes.append(_Probes(self._lenses, c, pyramids[c], poses[c], plane, self.aliases))
-        evidence, _ = self._evidence(pyramids, poses, self._probes, self.aliases.shifts[:NEAR_ALIASES])
+        evidence, _ = self._evidence(pyramids, poses, self._probes, self.aliases.motions[:NEAR_ALIASES])
         self._marked = bool(evidence.min() >= 2 * MIN_EVIDENCE)
         self.take(stamp, poses)
 
@@ -109,7 +110,7 @@ class Verification:
         """For the operator: that a surface repeats; where its own marks tell where it is, at first only; or ''."""
         if not len(self.aliases) or (self._marked and self._stamp - self._begun > TOLD_S):
             return ""
-        every = f"the surface repeats every {np.linalg.norm(self.aliases.shifts[0]):.1f} mm"
+        every = f"the surface repeats every {self.aliases.sizes[0]:.1f} mm"
         if self._marked:
             return f"{every}; its own marks tell where it is"
         return f"{every} and has hardly a mark of its own: a jump by that cannot be seen; put a sticker on it"
@@ -120,19 +121,22 @@ class Verification:
         if not probes:
             return SURE
         reach = MAX_TISSUE_SPEED * (stamp - self._stamp)
-        within = int(np.count_nonzero(np.linalg.norm(self.aliases.shifts, axis=1) < reach))
-        shifts = self.aliases.shifts[: NEAR_ALIASES if reach < NEAR_MM else max(NEAR_ALIASES, within)]
-        evidence, likeness = self._evidence(pyramids, poses, probes, shifts)
+        within = int(np.count_nonzero(self.aliases.sizes < reach))
+        some = slice(NEAR_ALIASES if reach < NEAR_MM else max(NEAR_ALIASES, within))
+        evidence, likeness = self._evidence(pyramids, poses, probes, self.aliases.motions[some])
         odd = likeness < ODD_LIKENESS
         if odd or evidence.min() < MIN_EVIDENCE:
-            shifts = self.aliases.shifts
-            evidence, likeness = self._evidence(pyramids, poses, probes, shifts)
+            some = slice(None)
+            evidence, likeness = self._evidence(pyramids, poses, probes, self.aliases.motions)
+        motions, sizes = self.aliases.motions[some], self.aliases.sizes[some]
         alive = evidence < (ODD_EVIDENCE if odd else MIN_EVIDENCE)
         if evidence.min() >= -MIN_EVIDENCE:
-            there = se3.transform_points(next(iter(poses.values())), self._centre + shifts)
-            alive &= (np.linalg.norm(there - self._place, axis=1) < reach) | odd
-        left = shifts[alive][np.argsort(evidence[alive], kind="stable")]
-        return Verdict(left, MAX_RIVALS if odd or evidence.min() < -MIN_EVIDENCE else 0, likeness)
+            moved = motions[:, :3, :3] @ self._centre + motions[:, :3, 3]
+            there = se3.transform_points(next(iter(poses.values())), moved)
+            turned = sizes - np.linalg.norm(moved - self._centre, axis=1)  # what a turn moves beside the middle
+            alive &= (np.linalg.norm(there - self._place, axis=1) + turned < reach) | odd
+        left = np.flatnonzero(alive)[np.argsort(evidence[alive], kind="stable")]
+        return Verdict(motions[left], sizes[left], MAX_RIVALS if odd or evidence.min() < -MIN_EVIDENCE else 0, likeness)
 
     def take(self, stamp: float, poses: Mapping[int, Array]) -> None:
         """The poses looked at last, of `stamp`, are right."""
@@ -142,10 +146,10 @@ class Verification:
             probes.learn()
 
     def _evidence(
-        self, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array], probes: Sequence[_Probes], shifts: Array
+        self, pyramids: Mapping[int, Pyramid], poses: Mapping[int, Array], probes: Sequence[_Probes], motions: Array
     ) -> tuple[Array, float]:
-        """Votes (K,) for the poses against the same shifted (K, 3); and the probes' likeness, in parts of the usual."""
-        scores = parallel_map(lambda p: p.compare(pyramids[p.camera], poses[p.camera], shifts, self._masks), probes)
+        """Votes (K,) for the poses against them moved (K, 4, 4); and the probes' likeness, in parts of the usual."""
+        scores = parallel_map(lambda p: p.compare(pyramids[p.camera], poses[p.camera], motions, self._masks), probes)
         here = np.concatenate([usual for _, usual in scores], axis=1)
         votes = np.concatenate([vote for vote, _ in scores], axis=1).sum(1)
         return votes, float(here[0].sum() / max(here[1].sum(), 1e-9))
@@ -165,7 +169,7 @@ class _Probes:
         good = where.visible & (templates.contrast > MIN_PATCH_CONTRAST)
         self._points, self._normals, self._templates = points[good], normals[good], templates.take(good)
         # those that tell aliases best, spread over the surface
-        here, there = self._likeness(images, pose, aliases.shifts[:NEAR_ALIASES], None)
+        here, there = self._likeness(images, pose, aliases.motions[:NEAR_ALIASES], None)
         power = np.maximum(_votes(here, there), 0.0)
         best = _spread_choice(np.where(np.isfinite(power), power, 0.0).sum(0), self._points)
         self._points, self._normals = self._points[best], self._normals[best]
@@ -173,9 +177,9 @@ class _Probes:
         self._usual = np.ones(len(best))
         self._newest = np.full(len(best), np.nan)
 
-    def compare(self, images: Pyramid, pose: Array, shifts: Array, masks: TrackingMasks) -> tuple[Array, Array]:
-        """Each probe's vote (K, P) for a pose (4, 4) against it shifted (K, 3); likeness and its usual value (2, P)."""
-        here, there = self._likeness(images, pose, shifts, masks)
+    def compare(self, images: Pyramid, pose: Array, motions: Array, masks: TrackingMasks) -> tuple[Array, Array]:
+        """Each probe's vote (K, P) for a pose (4, 4) against it moved (K, 4, 4); likeness and its usual one (2, P)."""
+        here, there = self._likeness(images, pose, motions, masks)
         self._newest = here
         vote = _votes(here, there)
         counts = np.isfinite(vote) & (np.fmax(here, there) > MIN_LIKENESS)
@@ -188,14 +192,17 @@ class _Probes:
         self._usual[known] += (self._newest - self._usual)[known] / USUAL_MEMORY_SETS
 
     def _likeness(
-        self, images: Pyramid, pose: Array, shifts: Array, masks: TrackingMasks | None
+        self, images: Pyramid, pose: Array, motions: Array, masks: TrackingMasks | None
     ) -> tuple[Array, Array]:
-        """Correlation (P,) of the probes at a pose (4, 4), and (K, P) at it shifted (K, 3); nan where out of view."""
-        every = np.concatenate([np.zeros((1, 3)), shifts])
-        points = (self._points + every[:, None]).reshape(-1, 3)
+        """Correlation (P,) of the probes at a pose (4, 4), and (K, P) at it moved (K, 4, 4); nan where out of view."""
+        every = np.concatenate([np.eye(4)[None], motions])
         rows = np.tile(np.arange(len(self._points)), len(every))
+        turns = np.repeat(every[:, :3, :3], len(self._points), axis=0)
         templates = self._templates.take(rows)
-        where = project_squares(self._lenses, self.camera, pose, points, self._normals[rows], templates.axes)
+        points = (every[:, None, :3, :3] @ self._points[..., None])[..., 0] + every[:, None, :3, 3]
+        normals = (turns @ self._normals[rows, :, None])[..., 0]
+        at = points.reshape(-1, 3), normals, turns @ templates.axes
+        where = project_squares(self._lenses, self.camera, pose, *at)
         score = coarse_score(templates, images, where, where.centre)
         free = where.visible if masks is None else where.visible & ~masks.hides(self.camera, where.centre)
         likeness = np.where(free, score, np.nan).reshape(len(every), -1)

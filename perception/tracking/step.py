@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations
 from estimation.online.estimator import Estimator
@@ -231,7 +230,7 @@ class TrackingStep:
             self._add_time("search")
 
         # the map's confirmation, or its rebuilding on a fast surface; or else the pose's verification
-        fit, aliases = tracked.fit, np.zeros((0, 3))
+        fit, aliases = tracked.fit, SURE.sizes
         if not estimator.confirmed:
             if len(self._carrying_cameras(tracked)) < 2:
                 if self._mapping.expired(stamp):
@@ -268,26 +267,25 @@ class TrackingStep:
         return pose, observations, fit.used
 
     def _verified(self, tracked: TrackedSet) -> tuple[TrackedSet, Array]:
-        """The frame set at the alias that its pictures prefer, and the shifts (K, 3) mm that they leave open.
+        """The frame set at the alias that its pictures prefer, and how far (K,) mm away those are that they leave open.
 
         It is no measurement where the surface's grain contradicts its tracks.
         """
         poses, verdict = self._look(tracked)
-        given, first, alive = tracked, poses, list(verdict.alive)
-        for rival in verdict.alive[: verdict.rivals]:
-            shift = se3.make(np.eye(3), rival)
-            starts, pose = {c: pose @ shift for c, pose in first.items()}, given.fit.solution.base_from_surface
-            again = self._mapping.align_and_fit(given.fit.stamp, given.pyramids, starts, pose @ shift)
+        given, first, ruled_out = tracked, poses, list[int]()
+        for number, moved in enumerate(verdict.alive[: verdict.rivals]):
+            starts, pose = {c: pose @ moved for c, pose in first.items()}, given.fit.solution.base_from_surface
+            again = self._mapping.align_and_fit(given.fit.stamp, given.pyramids, starts, pose @ moved)
             if not again.fit.measured:
                 continue
             there, second = self._look(again)
             if second.likeness > verdict.likeness + BETTER_LIKENESS:
-                tracked, poses, verdict, alive = again, there, second, list(second.alive)
+                tracked, poses, verdict = again, there, second
             elif second.likeness < verdict.likeness - WORSE_LIKENESS and tracked is given:
-                alive = [other for other in alive if other is not rival]
+                ruled_out.append(number)
+        aliases = np.delete(verdict.sizes, ruled_out) if tracked is given else verdict.sizes
         if tracked is not given:
             self._estimator.forget_motion()
-        aliases = np.array(alive).reshape(-1, 3)
         light = self._follows_light(tracked)
         if light:
             return replace(tracked, fit=replace(tracked.fit, reason=light)), aliases
