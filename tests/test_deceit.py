@@ -168,20 +168,10 @@ def named(index: int) -> str:
     return f"{index}-{NAMES[index % len(NAMES)]}"
 
 
-def never_silently_wrong(index: int, size: tuple[int, int]) -> None:
-    session = make_session(SEED, index, size)
+@pytest.mark.parametrize("index", [i for i in TENTH if i not in STILL_WRONG], ids=named)
+def test_a_tenth_of_the_sessions_that_would_fool_the_tracker(index: int) -> None:
+    session = make_session(SEED, index, SMALL)
     verdict = run(session)
     assert not verdict.wrong or not verdict.decidable, f"{session.what}: {verdict.states}"
     if session.honest:
         assert verdict.followed > 0.5, verdict.states
-
-
-@pytest.mark.parametrize("index", [i for i in TENTH if i not in STILL_WRONG], ids=named)
-def test_a_tenth_of_the_sessions_that_would_fool_the_tracker(index: int) -> None:
-    never_silently_wrong(index, SMALL)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("index", range(COUNT), ids=named)
-def test_all_sessions_that_would_fool_the_tracker(index: int) -> None:
-    never_silently_wrong(index, (480, 360))
