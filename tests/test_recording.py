@@ -116,13 +116,13 @@ def test_roi_truth_and_surface_travel(tmp_path: Path) -> None:
     polygon = np.array([[-1.5, 2.0], [30.0, 1 / 3], [12.0, 40.0]])
     with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
         recorder.surface(scan)
-        recorder.write(Roi(1, -0.1, polygon))
+        recorder.write(Roi(1, -0.1, polygon, found=True))
         write_frames(recorder, 5)
         recorder.truth(trajectory(5, True))
     session = open_session(tmp_path / "x.mcap")
     assert session.surface is not None and session.surface.suffix == ".stl"
     assert session.surface.read_bytes() == scan.read_bytes()
-    assert session.roi[0].camera == 1 and session.roi[0].polygon.tobytes() == polygon.tobytes()
+    assert session.roi[0].camera == 1 and session.roi[0].polygon.tobytes() == polygon.tobytes() and session.roi[0].found
     assert session.truth is not None and session.truth.exact
     assert session.truth.stamps.tolist() == stamps(5)
     assert np.abs(session.truth.base_from_surface - trajectory(5, True).base_from_surface).max() < 1e-13

@@ -70,12 +70,14 @@ def rig_from_message(where: object, message: Message) -> Rig:
 
 def message_from_roi(roi: Roi) -> Message:
     """A polygon as a message."""
-    return {"stamp": roi.stamp, "camera": int(roi.camera), "polygon": roi.polygon.ravel().tolist()}
+    polygon = roi.polygon.ravel().tolist()
+    return {"stamp": roi.stamp, "camera": int(roi.camera), "polygon": polygon, "found": roi.found}
 
 
 def roi_from_message(message: Message) -> Roi:
     """A polygon from its message."""
-    return Roi(message["camera"], message["stamp"], np.array(message["polygon"], float).reshape(-1, 2))
+    polygon = np.array(message["polygon"], float).reshape(-1, 2)
+    return Roi(message["camera"], message["stamp"], polygon, message.get("found", False))
 
 
 def message_from_truth(row: Array, exact: bool) -> Message:

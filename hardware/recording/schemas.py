@@ -130,6 +130,7 @@ TOPICS: dict[str, Schema] = {
         stamp=STAMP,
         camera=COUNT,
         polygon=_array(NUMBER, None, "x y of each corner"),
+        found=_described(FLAG, "by a network; else an operator drew it"),
     ),
     "/frames": _message(
         "stillbed.Frame",
