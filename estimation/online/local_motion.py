@@ -45,6 +45,7 @@ END_CHI2 = 16.3  # likewise, 1e-3: it is over
 MIN_DISPLACEMENT_MM = 0.2  # of a bell's mean: a fold twice as high, since it is no wider than the bell
 CLEAR_DISPLACEMENT_MM = 0.4  # likewise: no usual error is as large, so it counts whatever is usual there
 SMALL_MM, MIN_COSINE = 8.0, 0.7  # between landmarks of one small bump, two or three apart, which goes one way
+MAX_SMALL_MM = 5.0  # beyond, two cameras have strayed alike along a line of sight
 SMALL_RATIO, SMALL_REACH_MM = 2.0, 4.0  # times a landmark's displacement: the top may lie beside it; and how far
 SMEAR_SIGMAS = 3.0  # of the exposures, whose motion looks like a displacement: the pose cannot fit it everywhere
 HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it grows by until the arm has obeyed
@@ -83,7 +84,8 @@ class LocalMotion:
         self._bells = self._squares = np.zeros((0, 0))  # (C, N)
         # per landmark: normal equations of its usual displacement, and in how many frame sets it was seen
         self._normal, self._right, self._looks = np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
-        self._small = np.zeros(0)  # mm, by which a landmark stands out beside its neighbours, else 0
+        self._small = np.zeros(0)  # mm, by which a landmark stands out beside its neighbours, else 0;
+        self._stood = np.zeros(0, bool)  # whether it seemed to in the last frame set
         self._place = np.zeros((0, 3))  # mm, where it usually was after PLACED_SETS, nan before
         self._usual, self._learned = np.zeros(0), np.zeros(0)  # per bell: mean chi square per axis, and looks
         self._moving = np.zeros(0, bool)  # per bell
@@ -138,14 +140,17 @@ class LocalMotion:
         """
         shift = solve_symmetric3(normal + DISPLACEMENT_RIDGE * np.eye(3), np.ascontiguousarray(plain))
         size, square = np.linalg.norm(shift, axis=1) - smear, (shift * plain).sum(1)
-        known = (weight > 0) & (self._looks >= MIN_LANDMARK_SETS)
+        known = (weight > 0) & (self._looks >= MIN_LANDMARK_SETS) & (size < MAX_SMALL_MM)
         top = np.flatnonzero(known & (square > ONSET_CHI2) & (size > CLEAR_DISPLACEMENT_MM))
         beside = np.flatnonzero(known & (square > END_CHI2) & (size > MIN_DISPLACEMENT_MM))
         away = np.linalg.norm(self._points[top, None] - self._points[beside], axis=2)
         way = shift / np.maximum(np.linalg.norm(shift, axis=1), 1e-9)[:, None]
         along = (away < SMALL_MM) & (top[:, None] != beside) & (way[top] @ way[beside].T > MIN_COSINE)
         self._small[known & (size < MIN_DISPLACEMENT_MM)] = 0.0
-        self._small[top[along.any(1)]] = size[top[along.any(1)]] + smear
+        stands = np.zeros(len(size), bool)
+        stands[top[along.any(1)]] = True
+        again = stands & self._stood
+        self._small[again], self._stood = (size + smear)[again], stands
 
     def _set_error(self, moved: Array, unseen: Array) -> None:
         """Take the sigma, mm, of each bell (C,), by its displacement and as it is not seen."""
@@ -178,6 +183,7 @@ class LocalMotion:
             self._right = np.concatenate([self._right, np.zeros((further, 3))])
             self._place = np.concatenate([self._place, np.full((further, 3), np.nan)])
             self._looks, self._small = (np.append(old, np.zeros(further)) for old in (self._looks, self._small))
+            self._stood = np.append(self._stood, np.zeros(further, bool))
             self._centres = bell_centres(points, self._centres)
             more = np.zeros(len(self._centres) - len(self._usual))
             self._usual, self._learned = np.append(self._usual, more), np.append(self._learned, more)
