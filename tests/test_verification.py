@@ -173,7 +173,7 @@ def test_a_board_that_was_turned_while_it_was_hidden_is_doubted() -> None:
         alive = learned(board(12.0))(gap, looks, poses(np.eye(4))).alive
         return int((np.abs(alive[:, 0, 0] - 1) > 0.5).sum())
 
-    assert turned(0.5) >= 3 and not turned(FRAME_S)
+    assert turned(2.0) > turned(1.0) >= 2 and not turned(0.5)
 
 
 def test_a_faint_pattern_over_skin_repeats_too() -> None:

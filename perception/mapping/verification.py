@@ -46,6 +46,7 @@ USUAL_PROBES = 20  # of each camera: those that tell aliases best,
 PROBE_SPACING_MM = 10.0  # so far apart, as long as there are any: one hand or nozzle is not to hide them all
 USUAL_MEMORY_SETS = 30.0  # frame sets over which a probe's likeness is learned
 MAX_TISSUE_SPEED = 300.0  # mm/s: a cough moves skin at 175, a hand waves a board as fast as this
+MAX_TISSUE_TURN = 2.0  # rad/s: a board in a hand turns by a quarter in 0.8 s
 MIN_LIKENESS = 0.5  # correlation of a probe with its first picture: with less it is covered, or elsewhere
 MIN_PROBE_VOTE = 0.06  # correlation that is lost where a shift is off by a quarter of a pixel: it counts for nothing
 MAX_PROBE_VOTE = 0.3  # as how much better one probe's place counts at most: some are covered, some repeat by chance
@@ -133,8 +134,9 @@ class Verification:
         if evidence.min() >= -MIN_EVIDENCE:
             moved = motions[:, :3, :3] @ self._centre + motions[:, :3, 3]
             there = se3.transform_points(next(iter(poses.values())), moved)
-            turned = sizes - np.linalg.norm(moved - self._centre, axis=1)  # what a turn moves beside the middle
-            alive &= (np.linalg.norm(there - self._place, axis=1) + turned < reach) | odd
+            alive &= (np.linalg.norm(there - self._place, axis=1) < reach) | odd
+        turns = np.arccos(np.clip((np.trace(motions, axis1=1, axis2=2) - 2) / 2, -1.0, 1.0))  # of 4 x 4
+        alive &= (turns < 1e-6) | (turns < MAX_TISSUE_TURN * (stamp - self._stamp))
         left = np.flatnonzero(alive)[np.argsort(evidence[alive], kind="stable")]
         return Verdict(motions[left], sizes[left], MAX_RIVALS if odd or evidence.min() < -MIN_EVIDENCE else 0, likeness)
 
