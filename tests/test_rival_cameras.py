@@ -153,6 +153,16 @@ def test_a_bumped_camera_is_told_from_two_that_hang_by_the_motion_until_then() -
     assert np.median(radius(np.stack([p.covariance[3:, 3:] for p in after]), 0.95)) < 0.5
 
 
+def test_all_cameras_that_lose_most_of_the_surface_at_a_jump_are_no_rivals_of_nobody() -> None:
+    estimator = begun(breathing)
+    for number in range(1, 60):
+        step(estimator, look(breathing, number / 30, 1))
+    for number in range(60, 75):
+        few = look(lambda t: breathing(t) @ se3.make(np.eye(3), [20.0, 0, 0]), number / 30, 1)
+        pose = step(estimator, few.only(few.track % 5 == 0))
+        assert not (pose.state is TrackState.TRACKING and error(pose, breathing) < 1.0)
+
+
 # -- the watch itself
 
 

@@ -178,7 +178,7 @@ class CameraHealth:
         few = (found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0)
         lost_now = camera_numbers(few) & self._fresh - outliers
         carriers = camera_numbers(found > 0) - lost_now
-        if rivals or not lost_now or motion <= MAX_MOTION_SIGMAS:
+        if rivals or not lost_now or not carriers or motion <= MAX_MOTION_SIGMAS:
             return rivals
         poses, nothing = (fit.base_from_surface, expected.base_from_surface), np.zeros(len(fit.weights), bool)
         return (RivalPose(lost_now, carriers, *poses, (0.0, 0.0), nothing),)
