@@ -106,7 +106,7 @@ class PartedTexture:
             self._looks = np.append(self._looks, np.zeros(more, np.int64))
             self._members = np.append(self._members, np.zeros(more, bool))
         here = np.bincount(observations.track[fit.inlier], minlength=count)
-        away = np.bincount(observations.track[~fit.inlier], minlength=count)
+        away = np.bincount(observations.track[self._off(fit)], minlength=count)
         away += np.bincount(observations.missed.track, minlength=count)
         agrees = self._here = here >= MIN_VIEWS
         self._agreed[agrees], self._members = pose, self._members & ~agrees
@@ -129,7 +129,7 @@ class PartedTexture:
         """Take the accepted fit that `sought` was asked with, and what was found elsewhere. points: (N, 3) mm."""
         if len(self._lost) < MIN_GROUP_LANDMARKS and not self.message:
             return
-        beside = ~fit.inlier & np.isin(observations.track, self._lost)
+        beside = self._off(fit) & np.isin(observations.track, self._lost)
         parts = [observations.only(beside)] + ([] if elsewhere is None else [elsewhere])
         names = ("camera", "track", "pixels", "sigma")
         camera, track, pixels, sigma = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
@@ -153,6 +153,11 @@ class PartedTexture:
             self._apart = None
         if not self._members.any() and self._apart is None and not self._vanished:
             self.message = ""
+
+    @staticmethod
+    def _off(fit: FrameFit) -> Mask:
+        """Tracks (N,) that are off the pose, and not by a shadow's edge."""
+        return ~fit.inlier if fit.lit is None else ~fit.inlier & ~fit.lit
 
     def _expected(self, stamp: float) -> Array | None:
         if self._found is None:

@@ -39,6 +39,7 @@ MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
 MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
 MIN_SEEN_SHARE = 0.5  # of a bell's places
 MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
+MIN_COSINE = 0.7  # of the angle between one displacement and all
 USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
 MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
 WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
@@ -125,6 +126,8 @@ class Colours:
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
         begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
         begins &= explained > MIN_EXPLAINED * (energy - known)
+        way = (explained * begins) @ shift  # what moves goes one way; highlights go theirs
+        begins &= shift @ way > MIN_COSINE * size * np.linalg.norm(way)
         begins &= begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))
         lasts = (self._sizes > 0) & (np.isinf(known) | (energy > USUAL_RATIO * known))
         self._sizes = np.where(begins | lasts, np.maximum(self._sizes, np.where(begins, size, 0.0)), 0.0)
