@@ -26,6 +26,8 @@ A stop by software is no safety function, nor is anything else on this page: it 
 hang, and nobody has assessed it. An arm near a patient needs an emergency stop in hardware that takes its power away,
 within reach of somebody who watches. This is research software, not a medical device.
 
+What can fool the tracker, how often it does, and what no three cameras can tell: [deceptions.md](deceptions.md).
+
 Made from `data/hazards.toml` by `make hazards`, which runs the tests named here. `make check` fails where one of them
 is not there, may be skipped, or failed when it last ran on the machine, or where this page is not what that file says.
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from estimation.pose import SurfacePose
+from estimation.pose import SurfacePose, TrackState
 from hardware.cli.main import main
 from hardware.files.pose_file import PoseWriter, read_poses
 from hardware.offline.track import follow
@@ -95,6 +95,9 @@ def test_a_print_goes_on_under_its_own_head(tmp_path: Path, capsys: pytest.Captu
     limits = {"duty": 0.9, "p95_mm": 0.5}
     file = write_scenario(tmp_path, {"arm": {"file": "arm.toml"}}, tables, seconds=8.0, limits=limits)
     assert main(["simulate", str(file), "-o", str(tmp_path / "out")]) == 0, capsys.readouterr().out
+    states = read_poses(tmp_path / "out" / "tracking" / "poses.csv").states
+    tracking = [state is TrackState.TRACKING for state in states]
+    assert np.mean(tracking[tracking.index(True) :]) > 0.98
 
 
 def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> None:
