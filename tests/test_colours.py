@@ -88,6 +88,13 @@ def test_grey_cameras_tell_nothing() -> None:
     assert not len(look.colours({c: image[..., 1].copy() for c, image in images.items()}, moved).sizes)
 
 
+@pytest.mark.parametrize("away", [-900.0, 900.0, 1e5])
+def test_a_surface_out_of_view_or_behind_a_camera_tells_nothing(away: float) -> None:
+    look = Looked(made("plain"))
+    for axis in np.eye(3):
+        assert not len(look(3, away * axis).sizes)
+
+
 def test_ink_has_its_own_colours() -> None:
     look = Looked(made("plain"))
     everywhere = look.colours._points

@@ -44,6 +44,7 @@ USUAL_RATIO = 1.5  # times the noise, below which colours are again what they we
 MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
 WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
 MIN_PLACES = 20  # of a camera, to compare its picture
+UNSEEN_PX = -1e6
 
 
 @dataclass(slots=True, eq=False)
@@ -154,11 +155,11 @@ class Colours:
         return _FirstPicture(scale, ratios, slopes, squares, free, np.full(2, FIRST_NOISE))
 
     def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
-        """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px."""
+        """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px, far off for those unseen."""
         in_camera = se3.transform_points(self._lenses.rig.camera_from_base[camera] @ pose, points)
         depth = np.maximum(in_camera[:, 2], 1.0)
-        imaged, _ = self._lenses.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
-        return np.asarray(imaged.T)
+        imaged, seen = self._lenses.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
+        return np.asarray(np.where(seen, imaged, UNSEEN_PX).T)
 
 
 def _spread(plane: TangentPlane, step: float) -> Array:
