@@ -40,7 +40,7 @@ class DisplacedPlaces:
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of a pose whose 95 % radius reaches as far."""
+        """(6, 6) of a pose that may be off by the largest of them, one sigma, along every direction."""
         return np.diag([0.0] * 3 + [float(self.sizes.max(initial=0.0)) ** 2] * 3)
 
 

@@ -57,7 +57,7 @@ class Roi:
     camera: int  # number in the rig
     stamp: float  # s
     polygon: Array  # (N, 2) px, may reach beyond the image
-    found: bool = False  # by a network, which may have taken another thing for the wound; else an operator drew it
+    found: bool = False  # by a network, which may take another thing for the wound; else by an operator or its mark
 
 
 ROI_LEAD = 0.1  # s before the stamp of a region from which it counts: cameras that run freely are less out of step

@@ -93,6 +93,9 @@ def test_a_surface_out_of_view_or_behind_a_camera_tells_nothing(away: float) -> 
     look = Looked(made("plain"))
     for axis in np.eye(3):
         assert not len(look(3, away * axis).sizes)
+    camera, rig = 0, look.session.world.rig
+    behind = se3.inverse(rig.camera_from_base[camera]) @ se3.make(np.eye(3), [0.0, 0.0, -abs(away)])
+    assert (look.colours._pixels(camera, behind, look.colours._points) < 0).all()  # the lens model says: the middle
 
 
 def test_ink_has_its_own_colours() -> None:

@@ -331,10 +331,8 @@ class MappedSurface:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
         self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
-        self.local, self.parted = (
-            LocalMotion(len(rig), region != "none"),
-            PartedTexture(rig, len(surface_map), region == "drawn"),
-        )
+        self.local = LocalMotion(len(rig), region != "none")
+        self.parted = PartedTexture(rig, len(surface_map), region == "drawn")
         self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
         self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed

@@ -34,7 +34,7 @@ CLIPPED = 245.0  # grey level at which a channel may be clipped: a highlight
 MIN_NOISE = 0.01  # one sigma of a ratio's logarithm: the first picture's own, and light that is never quite the same
 FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
 SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference no longer grows with the displacement
-MIN_SHIFT_MM = 0.6  # that is told: what the guard allows, and three times what defocus and a turn of 20 degrees make
+MIN_SHIFT_MM = 0.6  # that is told: a bit more than the guard allows
 MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
 MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
 MIN_SEEN_SHARE = 0.5  # of a bell's places
@@ -44,7 +44,7 @@ USUAL_RATIO = 1.5  # times the noise, below which colours are again what they we
 MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
 WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
 MIN_PLACES = 20  # of a camera, to compare its picture
-UNSEEN_PX = -1e6
+UNSEEN_PX = -1e6  # where a place is said to be that a camera cannot see: out of every picture
 
 
 @dataclass(slots=True, eq=False)

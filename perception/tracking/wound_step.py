@@ -159,12 +159,13 @@ class RegionSearch:
     def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> Sequence[Roi]:
         """Round each camera's wound, the whole picture of a camera that sees none; or round the patch where it is."""
         if self._patch:
-            return [Roi(c, stamp, hull_of(sight.mask), True) for c, sight in sights.items() if sight.box is not None]
+            return [Roi(c, stamp, hull_of(sight.mask)) for c, sight in sights.items() if sight.box is not None]
         rois = []
         for camera, sight in sights.items():
             size = self._rig.cameras[camera].size
             side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
-            rois.append(Roi(camera, stamp, polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side)), True))
+            shape = polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))
+            rois.append(Roi(camera, stamp, shape, found=True))
         return rois
 
 
