@@ -361,11 +361,11 @@ MUTANTS = (
         ("test_operator_words.py::test_a_move_that_is_not_three_figures_within_bounds_is_no_message",),
     ),
     Mutant(
-        "the edge of a hand is a displacement",
+        "the colours of ink are the tissue's",
         "perception/mapping/colours.py",
-        "begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))",
-        "begins.sum() >= 1",
-        ("test_colours.py::test_light_hands_and_blur_are_no_displacement",),
+        "first.free & ~self._inked &",
+        "first.free &",
+        ("test_colours.py::test_ink_has_its_own_colours",),
     ),
     Mutant(
         "displaced colours are forgotten while they stand apart",
@@ -384,8 +384,8 @@ MUTANTS = (
     Mutant(
         "two cameras that hang are believed",
         "estimation/online/camera_errors.py",
-        "if hang or verdict.late[0] == carriers or",
-        "if",
+        "elif rival_hangs or in_step:",
+        "else:",
         ("test_rival_cameras.py::test_two_that_hang_never_outvote_the_third_in_silence",),
     ),
     Mutant(
