@@ -1,4 +1,5 @@
-"""Labelled pictures, groups and samples to learn from; segmentation by shape; tracking by the wound's place."""
+"""Labelled pictures, groups and folds, and how networks are judged; segmentation by shape; tracking by the wound's
+place."""
 
 from __future__ import annotations
 
@@ -21,19 +22,22 @@ from perception.tracking.wound_step import MAX_EMPTY_LOOKS, RegionSearch, Region
 from perception.training.dataset import (
     PIECE_SIDES_PX,
     WOUND_MARGIN_PX,
-    Augmentation,
     Labelled,
-    cover_sample,
-    draw_sample,
+    fold_numbers,
     healthy_pieces,
-    hold_out_groups,
     picture_groups,
     read_dataset,
-    relight,
-    sample_pyramid,
 )
-from perception.training.metrics import dice_before_and_after_cover, half_covered, scores, silent_share
-from perception.wound.network import shipped_model
+from perception.training.metrics import (
+    Unseen,
+    calibration_error,
+    dice_before_and_after_cover,
+    half_covered,
+    judge,
+    scores,
+    silent_share,
+)
+from perception.wound.network import Looks, shipped_model
 from perception.wound.segmentation import SHEET_CELL_PX, SHEET_COLUMNS, JudgedPicture, Segmentation, contact_sheet, dice
 from perception.wound.shape_matching import (
     COLOUR_TERMS,
@@ -115,56 +119,13 @@ def test_copies_mirror_images_and_shifted_views_are_one_group_and_strangers_are_
 
 
 @settings(max_examples=40)
-@given(st.lists(st.integers(0, 12), min_size=1, max_size=60), st.integers(0, 40), st.integers(0, 99))
-def test_a_split_never_parts_a_group_and_holds_out_enough(numbers: list[int], wanted: int, seed: int) -> None:
+@given(st.lists(st.integers(0, 12), min_size=1, max_size=60), st.integers(2, 6), st.integers(0, 99))
+def test_folds_never_part_a_group_and_are_as_full_as_groups_allow(numbers: list[int], folds: int, seed: int) -> None:
     group = np.array(numbers)
-    held = hold_out_groups(group, wanted, np.random.default_rng(seed))
-    assert held.sum() >= min(wanted, len(group))
-    assert not set(group[held]) & set(group[~held])
-
-
-@settings(max_examples=15)
-@given(st.integers(0, 10**6), st.booleans())
-def test_a_sample_has_its_size_and_its_wound_stays_on_the_wound(seed: int, wounded: bool) -> None:
-    source = sample_pyramid(labelled(seed, wounded))
-    how = Augmentation(cover=0.0)
-    rng = np.random.default_rng(seed)
-    seen, wound = draw_sample(source, source, how, rng)
-    assert seen.shape == (192, 192, 3) and wound.shape == (192, 192)
-    if not wounded:
-        assert not wound.any()
-    inside = cv2.erode((wound == 255).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    outside = cv2.dilate((wound > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
-    if inside.sum() > 50 and outside.sum() > 50:
-        redness = seen[..., 0].astype(float) - seen[..., 1]
-        if redness.std() > 8:  # else the sample lost its colour
-            assert np.median(redness[inside]) > np.median(redness[outside])
-
-
-def test_samples_are_the_same_for_the_same_seed() -> None:
-    source = sample_pyramid(labelled(5))
-    first, second = (draw_sample(source, source, Augmentation(), np.random.default_rng(9)) for _ in range(2))
-    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
-
-
-def test_what_is_covered_is_no_wound_and_the_rest_is_left_alone() -> None:
-    each = labelled(3, size=(192, 192))
-    mask = each.wound.astype(np.uint8) * np.uint8(255)
-    changed = 0
-    for seed in range(20):
-        seen, wound = cover_sample(each.picture, mask, each.picture, np.random.default_rng(seed))
-        assert not (wound > mask).any()
-        gone = (mask > 0) & (wound == 0)
-        changed += gone.any()
-        if gone.sum() > 100:
-            assert np.abs(seen[gone].astype(float) - each.picture[gone]).mean() > 3
-    assert changed > 8
-
-
-def test_light_changes_colours_and_not_places() -> None:
-    each = labelled(4)
-    means = [relight(each.picture, np.random.default_rng(seed)).mean() for seed in range(12)]
-    assert np.std(means) > 5
+    fold = fold_numbers(group, folds, np.random.default_rng(seed))
+    assert all(len(set(fold[group == each])) == 1 for each in group)
+    filled = np.bincount(fold, minlength=folds)
+    assert len(filled) == folds and filled.max() - filled.min() <= np.bincount(group).max()
 
 
 def test_healthy_pieces_keep_away_from_the_wound() -> None:
@@ -183,6 +144,64 @@ def test_half_covered_hides_half_of_the_wound(seed: int) -> None:
     each = labelled(seed)
     _, cover = half_covered(each, np.random.default_rng(seed))
     assert (each.wound & cover).sum() / each.wound.sum() == pytest.approx(0.5, abs=0.12)
+
+
+def unseen(seed: int, sureness: float, pieces: int = 40) -> Unseen:
+    """Pictures of a disc, found at logits near `sureness`, and of nothing, of which some is faintly taken for one."""
+    rng = np.random.default_rng(seed)
+    logits, wounds, piece = [], [], []
+    for number in range(60 + pieces):
+        wound = disc((48, 64), (int(rng.integers(16, 48)), 24), int(rng.integers(6, 12)))
+        seen = np.where(wound, rng.normal(sureness, 1), -6.0) + rng.normal(0, 0.3, wound.shape)
+        kind = number % 12 if number < 60 else 11
+        if kind == 11:  # nothing there, and now and then something faint is taken for it
+            wound = np.zeros_like(wound)
+            faint = disc((48, 64), (32, 24), 5) if rng.random() < 0.2 else wound
+            seen = np.where(faint, 1.0, -6.0)
+        logits.append(seen.astype(np.float16))
+        wounds.append(wound)
+        piece.append(number >= 60)
+    return Unseen(logits, wounds, np.arange(60 + pieces) % 3, np.array(piece))
+
+
+def test_judged_by_folds_faint_masks_of_nothing_are_kept_silent_about_and_wounds_are_not() -> None:
+    settings, judged = judge(unseen(1, 5.0), Looks(), np.random.default_rng(0))
+    assert 0 < settings.trust < 1 and settings.slope > 0 and judged.silent == 1
+    assert len(judged.dice) == 60 and judged.dice.mean() > 0.95
+    assert judged.confidence[judged.right].min() > judged.confidence[~judged.right].max()
+    assert calibration_error(judged.confidence, judged.right) < 0.1
+
+
+def test_a_fold_is_judged_by_settings_that_never_saw_it() -> None:
+    """Wounds of one fold are as faint as what other folds have taught to keep silent about."""
+    seen = unseen(2, 5.0)
+    parts = zip(seen.logits, seen.wounds, seen.fold, strict=True)
+    faint = [np.where(wound, 1.0, -6.0).astype(np.float16) if fold == 0 else each for each, wound, fold in parts]
+    _, judged = judge(Unseen(faint, seen.wounds, seen.fold, seen.piece), Looks(), np.random.default_rng(0))
+    wounded = np.array([wound.any() for wound in seen.wounds])[~seen.piece]
+    assert judged.dice[wounded & (seen.fold[~seen.piece] == 0)].max() == 0
+    assert judged.dice[seen.fold[~seen.piece] != 0].mean() > 0.6
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=20)
+def test_the_calibration_error_is_nothing_for_the_honest_and_the_gap_for_the_boastful(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said = rng.uniform(0, 1, 20_000)
+    assert calibration_error(said, rng.random(len(said)) < said) < 0.03
+    boast = np.full(len(said), 0.95)
+    assert calibration_error(boast, rng.random(len(said)) < 0.6) == pytest.approx(0.35, abs=0.02)
+
+
+def test_pixels_that_boast_are_brought_to_how_often_they_are_right() -> None:
+    rng = np.random.default_rng(3)
+    honest = unseen(4, 3.0)
+    noisy = [
+        np.where(rng.random(w.shape) < 0.15, -each, each) for each, w in zip(honest.logits, honest.wounds, strict=True)
+    ]
+    settings, judged = judge(Unseen(noisy, honest.wounds, honest.fold, honest.piece), Looks(), rng)
+    assert settings.pixel_slope < 0.8
+    assert calibration_error(judged.pixel, judged.pixel_wound) < 0.05
 
 
 def test_a_segmenter_that_knows_the_truth_scores_one_and_one_that_sees_wounds_everywhere_nothing() -> None:

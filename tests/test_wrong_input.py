@@ -80,7 +80,7 @@ segment blank.png -o OUT --model gone.onnx
 train empty -o OUT.txt --network shape
 train empty -o gone/x.toml --network shape
 train empty -o typo.toml --network shape
-train empty -o OUT.toml --network shape --hold-out 0
+train empty -o OUT.toml --network shape --folds 1  # --folds
 train empty -o OUT.toml --network shape
 plan -o OUT.csv
 plan junk.stl -o OUT.csv

@@ -42,7 +42,7 @@ from perception.frames import Frame, FrameSet
 from perception.tracking.step import TrackingStep
 from perception.training.dataset import Labelled, healthy_pieces, read_dataset
 from perception.training.metrics import bgr, dice_before_and_after_cover, scores, silent_share
-from perception.wound.network import SHIPPED_MODEL, THESIS_MODEL, WoundNetwork, shipped_model
+from perception.wound.network import THESIS_MODEL, WoundNetwork, shipped_model
 from perception.wound.segmentation import JudgedPicture, NetworkSegmenter, contact_sheet, dice
 from perception.wound.shape_matching import ShapeSegmenter, largest_outline, read_shape_model, thesis_mask
 
@@ -170,18 +170,26 @@ PUBLISHED_DICE = "thesis U-Net 0.765; FUSeg winner 0.844 public, 0.888 hidden; t
 
 def run_segmentation(options: argparse.Namespace) -> list[Figure]:
     """All figures; those of real pictures only where a data set is named."""
-    network = WoundNetwork(shipped_model() if options.model is None else options.model)
-    segmenter, pictures = NetworkSegmenter(network, network.settings), list[Labelled]()
+    model: Path = shipped_model() if options.model is None else options.model
+    network = WoundNetwork(model)
+    segmenter, given = NetworkSegmenter(network, network.settings), list[Labelled]()
     if options.dataset is not None:
         with Progress(f"read {options.dataset.name}", "pictures", WallClock().now) as progress:
-            pictures = judged_by(read_dataset(options.dataset, progress), options.dataset)
+            given = read_dataset(options.dataset, progress)
+    pictures = new_to(given, model)
+    if len(pictures) < len(given):
+        learned = f"{len(given) - len(pictures)} of {len(given)} pictures were learned from and judge nothing"
+        print(
+            f"note: {learned}: {model.with_suffix('.md').name} says what the folds reach", file=sys.stderr, flush=True
+        )
     wounds, healthy = ([_rendered(number, kind) for number in range(options.rendered)] for kind in (True, False))
     rng = np.random.default_rng(options.seed)
     if options.sheet is not None:
         images = [(bgr(each.picture), each.wound) for each in pictures or wounds]
         judged = [JudgedPicture(image, segmenter(image), wound) for image, wound in images]
         options.sheet.write_bytes(encode(contact_sheet(judged), SHEET_QUALITY)[1])
-    figures = [*_dice(segmenter, pictures), *_others(pictures, rng)]
+    shapes = shipped_model("shape", ".toml")
+    figures = [*_dice(segmenter, pictures), *_others(pictures, new_to(given, shapes), shapes, rng)]
     pieces = healthy_pieces(pictures, rng, HEALTHY_PIECES)
     real, rendered = silent_share(segmenter, pieces), silent_share(segmenter, [each.picture for each in healthy])
     silent, note = at_least(0.95), f"{len(wounds)} pictures"
@@ -201,13 +209,11 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
     return [figure for figure in figures if not math.isnan(figure.value)]
 
 
-def judged_by(pictures: list[Labelled], folder: Path) -> list[Labelled]:
-    """The pictures the network was not trained on: of its own data set those held out, of any other all."""
-    names = set(shipped_model(f"{SHIPPED_MODEL}_held_out", ".txt").read_text(encoding="utf-8").split())
-    held_out = [each for each in pictures if each.name in names]
-    if held_out and len(held_out) < len(names):
-        raise InputError(folder, "pictures held out", len(held_out), f"all {len(names)}, or another data set")
-    return held_out or pictures
+def new_to(pictures: list[Labelled], model: Path) -> list[Labelled]:
+    """The pictures that a model has not learned from, by the list of names that may lie beside it."""
+    names = model.with_name(f"{model.stem}_trained.txt")
+    learned = set(names.read_text(encoding="utf-8").split()) if names.is_file() else set()
+    return [each for each in pictures if each.name not in learned]
 
 
 def _dice(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Figure]:
@@ -218,13 +224,15 @@ def _dice(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Fig
     empty = np.array([not labelled.wound.any() for labelled in pictures])
     note = f"{len(each)} pictures, {empty.sum()} without a wound, {(each < 0.1).sum()} below 0.1"
     return [
-        Figure("Dice of each picture, mean", float(each.mean()), "", at_least(0.86), PUBLISHED_DICE, note),
+        Figure("Dice of each picture, mean", float(each.mean()), "", at_least(0.87), PUBLISHED_DICE, note),
         Figure("Dice of each picture, median", float(np.median(each))),
         Figure("Dice where there is a wound, mean", _mean(each[~empty])),
     ]
 
 
-def _others(pictures: Sequence[Labelled], rng: np.random.Generator) -> list[Figure]:
+def _others(
+    pictures: Sequence[Labelled], new_to_shapes: Sequence[Labelled], shapes: Path, rng: np.random.Generator
+) -> list[Figure]:
     """The thesis's U-Net where it comes along, and shape matching."""
     figures = []
     try:
@@ -235,8 +243,8 @@ def _others(pictures: Sequence[Labelled], rng: np.random.Generator) -> list[Figu
         with Progress("reference", "pictures", WallClock().now) as progress:
             mean = _mean(scores(NetworkSegmenter(network, network.settings), pictures, progress))
         figures = [Figure("Dice of each picture, mean, thesis's U-Net", mean, "", None, "0.765 in the thesis")]
-    model = read_shape_model(shipped_model("shape", ".toml"))
-    wounded = [each for each in pictures if each.wound.any()]
+    model = read_shape_model(shapes)
+    wounded = [each for each in new_to_shapes if each.wound.any()]
     areas = np.array([each.wound.sum() for each in wounded]) * np.exp(rng.normal(0, AREA_SIGMA, len(wounded)))
     of_scan, usual, thesis = list[float](), list[float](), list[float]()
     for labelled, area in zip(wounded, areas.tolist(), strict=True):
@@ -287,6 +295,6 @@ def _time(network: WoundNetwork, pictures: Sequence[Labelled]) -> list[Figure]:
     reference = "thesis 9 ms on an RTX 3080 Ti"
     return [
         Figure("network, a picture: median", percentile(counted, 50), "ms", None, reference, note),
-        Figure("network, a picture: p99", percentile(counted, 99), "ms", at_most(20.0), "", note),
-        Figure("parameters, at most", network.size / 1e6, "million", at_most(3.0), "", "a byte each in the file"),
+        Figure("network, a picture: p99", percentile(counted, 99), "ms", at_most(25.0), "", note),
+        Figure("parameters, at most", network.size / 1e6, "million", at_most(6.0), "", "a byte each in the file"),
     ]

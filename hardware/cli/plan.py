@@ -231,18 +231,28 @@ def add_train(commands: Commands) -> None:
         _run_train,
         "train the wound network on labelled pictures",
         "Train the wound network. Each DATASET holds images/ and labels/, a mask of the same name and\n"
-        "size for each picture. Pictures are grouped by what they show, a part is held out and judged at the end.\n"
-        "Writes X.onnx, X.toml (hash and settings), X.md (model card) and X_curves.png; X.ckpt lets a run\n"
-        "that was broken off go on. Needs the extra [train]: pip install 'stillbed[train]'.",
+        "size for each picture. The pictures of the first are grouped by what they show and parted into folds;\n"
+        "for each fold a network is trained that never sees it, which judges the recipe and sets the thresholds;\n"
+        "the network that is written learns from all.\n"
+        "Writes X.onnx, X.toml (hash and settings), X.md (model card), X_curves.png, X_reliability.png and\n"
+        "X_trained.txt (the pictures learned from); X_PART.ckpt lets a run that was broken off go on.\n"
+        "Six networks take hours of a processor, or minutes of a large GPU.\n"
+        "Needs the extra [train]: pip install 'stillbed[train]'.",
         "stillbed train data/fuseg data/medetec -o wound.onnx",
+        "stillbed train data/fuseg data/medetec -o wound.onnx --part 0 & ... --part all & wait; then without --part",
     ).add_argument
-    add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is held out in part")
+    add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is what the recipe is judged by")
     add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="file to write")
     networks = "thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml"
     add("--network", choices=("wound", "thesis", "shape"), default="wound", help=networks)
-    add("--rounds", type=int, metavar="N", help="of 250 steps (thesis: 100); more take longer")
-    add("--rendered", type=int, default=120, metavar="N", help="rendered pictures to add")
-    add("--hold-out", type=int, default=160, metavar="N", help="pictures to judge by, in groups")
+    add("--rounds", type=int, metavar="N", help="of 200 steps (thesis: 100); more take longer")
+    add("--rendered", type=int, default=140, metavar="N", help="rendered pictures to add")
+    add("--folds", type=int, default=5, metavar="N", help="that the first data set is parted into")
+    only = "train only the network without fold 0, 1, ... or the one of all, and stop: processes can share the work"
+    add("--part", metavar="PART", help=only)
+    add("--device", choices=("cpu", "cuda"), help="by default cuda where torch sees a GPU; results differ between them")
+    add("--licence", metavar="TEXT", help="under which the network may be used, written into X.toml")
+    add("--source", metavar="TEXT", help="of its pictures, written into X.toml")
     add("--threads", type=int, default=1, metavar="N", help="of torch")
     add("--seed", type=int, default=1, metavar="N", help="of the weights and of all that is drawn")
     add("--force", action="store_true", help="overwrite X.onnx and begin anew")

