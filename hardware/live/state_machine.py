@@ -37,6 +37,7 @@ HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
 ARMING_TIMEOUT = 5.0  # s until a stopped arm is at rest and can be armed
 RESEND_AFTER = 0.3  # s between orders to an arm that was not ready for the last one
 SEARCH_TIMEOUT = 180.0  # s in which an unattended run must pass its checks and find the surface
+OUTLINED_TEXT = "inside the outline that the operator corrected"
 ARM_BACK_TEXT = "the arm is back: resume, or go home first"
 ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
 
@@ -181,7 +182,7 @@ class RunStateMachine:
         elif wish in (Wish.AGAIN, Wish.OUTLINE):
             self.placed_path = self.placement = None
             self.looks, self.moves, self.outline = self.looks + 1, 0, request.outline
-            self._enter(RunStage.CHECK, "the outline was corrected" if self.outline else "", now)
+            self._enter(RunStage.CHECK, "", now)
         elif wish is Wish.START:
             return self._home(RunStage.APPROACH, now)
         elif wish is Wish.PAUSE:
@@ -255,7 +256,7 @@ class RunStateMachine:
     def _await_checks(self, now: float) -> Orders:
         waits = [c for c in self.checks if c.name != "reach" and c.verdict in (CheckVerdict.FAIL, CheckVerdict.BUSY)]
         if not waits:
-            self._enter(RunStage.FIND, "", now)
+            self._enter(RunStage.FIND, OUTLINED_TEXT if self.outline else "", now)
             return []
         fails = [check for check in waits if check.verdict is CheckVerdict.FAIL]
         self._failing = min(self._failing, now) if fails else inf

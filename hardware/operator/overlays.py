@@ -28,8 +28,9 @@ from hardware.operator.shared_state import (
 )
 from perception.frames import FrameSet, OutlinedPicture, Roi
 from perception.lens import undistort
+from perception.mapping.features import polygon_mask
 from perception.tracking.wound_step import WoundSight
-from perception.wound.segmentation import WoundMask, hull_of, outline_of
+from perception.wound.segmentation import WoundMask, dice, hull_of, largest_part, outline_of
 
 MAX_LINES = 2500  # of all: 3 cameras draw them five times a second
 DRAWN_TRIANGLES = 6000  # of which depth lines are made: 1 mm apart on a scan of 55 mm
@@ -38,6 +39,7 @@ MIN_DEPTH_MM = 0.8  # of anything around which lines are drawn
 DEPTH_NEIGHBOURS = 3  # landmarks whose depth a corner of an outline is taken to have
 OUTLINE_TOLERANCES = (0.004, 0.006, 0.01, 0.015, 0.025, 0.04)  # of its length, by which a wound's outline is simplified
 MAX_OUTLINE_CORNERS = 24  # of a wound's outline as it is shown: more are no easier to put right by hand
+MIN_OUTLINE_DICE = 0.9  # of the polygon and what was found: below, it would be drawn anew
 SHEET_WIDTH, SHEET_QUALITY = 1280, 85  # px and JPEG of pictures on which an outline is corrected
 OPERATOR = "operator"  # who says so, in a recording
 FIT_ROUNDS = 12  # of the smooth surface; by then what lies deep has lost its weight
@@ -143,14 +145,20 @@ class SurfaceOutline:
 
 
 def wound_corners(mask: WoundMask) -> Corners:
-    """A polygon of few corners, px, round the largest part of a mask (H, W), without crossing edges; () if empty."""
+    """A polygon of few corners, px, round the largest part of a mask (H, W), without crossing edges.
+
+    The convex hull where no such polygon covers that part well; () of an empty mask.
+    """
     if not mask.any():
         return ()
+    part, (height, width) = largest_part(mask), mask.shape
     for tolerance in OUTLINE_TOLERANCES:
-        corners = outline_of(mask, tolerance)
-        if 3 <= len(corners) <= MAX_OUTLINE_CORNERS and crossing_edges(corners) is None:
+        corners = outline_of(part, tolerance)
+        if not 3 <= len(corners) <= MAX_OUTLINE_CORNERS or crossing_edges(corners) is not None:
+            continue
+        if dice(polygon_mask((width, height), corners) > 0, part) > MIN_OUTLINE_DICE:
             return _corners(corners)
-    hull = hull_of(mask)
+    hull = hull_of(part)
     return _corners(hull) if 3 <= len(hull) <= MAX_CORNERS else ()
 
 

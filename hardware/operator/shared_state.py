@@ -29,6 +29,7 @@ REQUEST_SLOTS = 16  # requests that wait; the run takes them every few ms and a 
 OTHER_REQUEST_SLOTS = 8  # of them for what does not lead towards rest: a flood of such requests leaves room for a pause
 PICTURES_CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
 MAX_PATH_POINTS, MAX_TRIANGLES = 4000, 1500  # what a browser without a graphics card draws ten times a second
+OUTLINE_CAPACITY = 1 << 15  # bytes: four times a window's longest message
 SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras at their own size
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
@@ -256,7 +257,7 @@ class OperatorLink:
     scan: SharedLatest[ScanDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
     requests: RequestLine = field(default_factory=RequestLine)
     regions: SharedLatest[DrawnRegion] = field(default_factory=SharedLatest)  # from the page
-    outlines: SharedLatest[CorrectedOutline] = field(default_factory=SharedLatest)  # from the page
+    outlines: SharedLatest[CorrectedOutline] = field(default_factory=lambda: SharedLatest(OUTLINE_CAPACITY))
 
     def ask(self, wish: Wish, turn: int, move: MoveRequest | None = None, outline: Polygons = ()) -> int | None:
         """As `RequestLine.ask`; outline: of Wish.OUTLINE."""
