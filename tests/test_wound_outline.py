@@ -254,6 +254,14 @@ def test_before_the_surface_is_measured_an_outline_stays_where_it_was_drawn() ->
             assert np.array_equal(roi.polygon, np.array(wanted))
 
 
+def test_an_outline_that_a_camera_would_not_see_any_more_stays_where_it_was_drawn() -> None:
+    shown, away = OutlineSheet(sheet.rig(), sheet_frames(), {}), sheet.pose_at(0.0)
+    away[0, 3] += 2000.0  # mm
+    shown.place(GROUND, sheet.pose_at(0.0))
+    for roi, (_, wanted) in zip(shown.rois(drawn_at(0.0), away), drawn_at(0.0), strict=True):
+        assert np.array_equal(roi.polygon, np.array(wanted))
+
+
 def test_what_is_recorded_are_the_very_pictures_and_corners_of_cameras_that_have_both() -> None:
     frames, polygons = sheet_frames(2), drawn_at(0.0)
     pictures = OutlineSheet(sheet.rig(), frames, {}).recorded(polygons[1:], 77.0)

@@ -7,15 +7,18 @@ wound and over every bump, so that a scan that lies wrong is seen to.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.rig import Rig, ideal_pixels, pixels_from_points
 from estimation.scans.scan import Scan, open_edges
 from estimation.se3 import Array, transform_points
+from hardware.files.folder_tables import check_polygon
 from hardware.files.images import small_jpeg
 from hardware.files.region_table import MAX_CORNERS, Corners, crossing_edges
 from hardware.operator.shared_state import (
@@ -200,15 +203,23 @@ class OutlineSheet:
     def rois(self, polygons: Polygons, base_from_surface: Array | None) -> tuple[Roi, ...]:
         """An operator's outline as a region from now on, carried to where the surface is now as any region is.
 
-        base_from_surface: (4, 4) mm; None where that is not known: the region is where it was drawn.
+        base_from_surface: (4, 4) mm; None where that is not known. The region is then where it was drawn, as it is in a
+        camera that would not see it any more.
         """
         drawn = tuple(Roi(number, -np.inf, corners) for number, corners in self._by_number(polygons).items())
         if self._placed is None or base_from_surface is None:
             return drawn
         outline = SurfaceOutline(self._rig)
         outline.place(drawn, *self._placed)
-        carried = [outline.in_pixels(roi.camera, base_from_surface) or (roi.polygon,) for roi in drawn]
-        return tuple(replace(roi, polygon=polygon) for roi, (polygon,) in zip(drawn, carried, strict=True))
+        return tuple(self._seen(roi, outline.in_pixels(roi.camera, base_from_surface)) for roi in drawn)
+
+    def _seen(self, drawn: Roi, carried: tuple[Array, ...]) -> Roi:
+        """The region as it was carried along, where that is one in the camera's picture; else as it was drawn."""
+        for polygon in carried:
+            with suppress(InputError):
+                check_polygon("the page", "outline", polygon, self._rig.cameras[drawn.camera].size)
+                return replace(drawn, polygon=polygon)
+        return drawn
 
     def _by_number(self, polygons: Polygons) -> dict[int, Array]:
         """Corners (N, 2) px by the camera's number in the rig."""
