@@ -60,6 +60,18 @@ class Roi:
     found: bool = False  # by a network, which may take another thing for the wound; else by an operator or its mark
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class OutlinedPicture:
+    """One camera's picture, and where the wound is in it as somebody says."""
+
+    camera: int  # number in the rig
+    stamp: float  # s, when it was said
+    taken: float  # s, stamp of the picture
+    image: Image  # (H, W) grey or (H, W, 3) BGR
+    polygon: Array  # (N, 2) px, round the wound
+    by: str  # who says so: "operator"
+
+
 ROI_LEAD = 0.1  # s before the stamp of a region from which it counts: cameras that run freely are less out of step
 ROI_SLACK = 1e-3  # s by which the set that a region counts from is safely later than that
 

@@ -326,6 +326,27 @@ MUTANTS = (
         ("test_arm_calibration.py::test_moves_that_cannot_tell_are_named",),
     ),
     Mutant(
+        "an outline stays on the picture while the surface moves on",
+        "hardware/operator/overlays.py",
+        "outline.in_pixels(roi.camera, base_from_surface)",
+        "outline.in_pixels(roi.camera, self._placed[1])",
+        ("test_wound_outline.py::test_an_outline_goes_to_where_the_surface_is_when_it_is_taken",),
+    ),
+    Mutant(
+        "the first outline of a picture counts",
+        "hardware/recording/session_reader.py",
+        "newest[key].stamp <= record.stamp",
+        "newest[key].stamp > record.stamp",
+        ("test_wound_outline.py::test_each_picture_counts_once_with_the_last_outline_in_order_of_camera_and_stamp",),
+    ),
+    Mutant(
+        "an outline that another one has replaced is followed",
+        "hardware/operator/shared_state.py",
+        "own = newest is not None and newest.number == request.number",
+        "own = newest is not None",
+        ("test_operator_words.py::test_an_outline_goes_with_its_own_request_and_with_no_other",),
+    ),
+    Mutant(
         "a guess is confirmed as it lies",
         "hardware/live/state_machine.py",
         "return placement.certain or (placement.usable and self.moves > 0)",

@@ -20,7 +20,7 @@ from hardware.operator.broadcast import RegionMessage, parse_message
 from hardware.operator.server import drawn_region
 from hardware.operator.settings import WindowLimits
 from hardware.operator.shared_state import CameraPicture, PagePictures, scene_from
-from hardware.operator.view import DRAW_QUESTION, RunStage
+from hardware.operator.view import DRAW_QUESTION, RunStage, Wish
 from tests.browser import Browser, Page
 from tests.operator_page import Served, full_view, served
 from tests.printed_sheet import SIZE, rig
@@ -113,7 +113,44 @@ def test_a_region_without_turn_and_tag_makes_no_sense(text: str) -> None:
 def test_the_longest_region_fits_into_a_message() -> None:
     corners = [[round(1919.9 - k / 10, 1), round(1079.9 - k / 10, 1)] for k in range(MAX_CORNERS)]
     region = {f"camera{k}": corners for k in range(6)}
-    assert len(json.dumps({"region": region, "turn": 2**53 - 1, "tag": 2**53 - 1}, separators=(",", ":"))) <= 8192
+    counts = {"turn": 2**53 - 1, "tag": 2**53 - 1}
+    for message in ({"region": region, **counts}, {"ask": "outline", "outline": region, **counts}):
+        assert len(json.dumps(message, separators=(",", ":"))) <= WindowLimits().message
+
+
+async def outline_answer(socket: Socket, outline: object, turn: int = 1) -> dict[str, Any]:
+    """What is said to a corrected outline."""
+    await socket.socket.send_str(json.dumps({"ask": "outline", "turn": turn, "tag": 6, "outline": outline}))
+    return await socket.next("asked")
+
+
+def test_an_outline_reaches_the_run_where_it_is_offered_and_is_checked_as_a_region_is() -> None:
+    async def correcting(page: Served) -> None:
+        async with window(page.address) as socket:
+            await socket.next()
+            assert "has changed" in (await outline_answer(socket, BOTH, turn=0))["words"]
+            assert "2 cameras" in (await outline_answer(socket, {"camera0": SQUARE}))["words"]
+            assert (
+                "in the picture"
+                in (await outline_answer(socket, {**BOTH, "camera1": [[0, 0], [9999, 0], [0, 99]]}))["words"]
+            )
+            assert page.link.take() == []
+            assert (await outline_answer(socket, BOTH)) == {
+                "kind": "asked", "tag": 6, "wish": "outline", "number": 1, "words": "",
+            }  # fmt: skip
+            (request,) = page.link.take()
+            assert request.wish is Wish.OUTLINE and request.turn == 1
+            assert dict(request.outline) == {k: tuple(map(tuple, v)) for k, v in BOTH.items()}
+            page.put(full_view(3.0, 2, RunStage.CONFIRM, offers=(Wish.END,)))
+            while (await socket.next())["view"]["turn"] < 2:
+                pass
+            assert "cannot be done" in (await outline_answer(socket, BOTH, turn=2))["words"]
+            assert page.link.take() == []
+
+    with served() as page:
+        page.link.scene.put(scene_from(rig()))
+        page.put(full_view(2.0, 1, RunStage.CONFIRM, offers=(Wish.OUTLINE, Wish.END)))
+        asyncio.run(correcting(page))
 
 
 def pictures() -> PagePictures:

@@ -17,8 +17,17 @@ from hardware.live.state_machine import PrintTask, RunStateMachine
 from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
 from hardware.motion.material import MaterialStatus
-from hardware.operator.shared_state import OperatorRequest
-from hardware.operator.view import MAX_MOVE_DEG, MAX_MOVE_MM, STAGE_OFFERS, CheckVerdict, MoveRequest, RunStage, Wish
+from hardware.operator.shared_state import OperatorRequest, Polygons
+from hardware.operator.view import (
+    MAX_MOVE_DEG,
+    MAX_MOVE_MM,
+    STAGE_OFFERS,
+    CheckVerdict,
+    MoveRequest,
+    RequestAnswer,
+    RunStage,
+    Wish,
+)
 from planning.command import Hold
 from planning.path import PrintPhase, PrintProgress
 from planning.placement import PathPlacement, PlacedBy, path_middle
@@ -43,7 +52,7 @@ class Staged:
         self.seen, self.pose = RunReports(recorder=RecorderReport(0, 0.0, "")), SURFACE
         self.ended, self.asked, self.answers = "", 0, 0
         self.placement: PathPlacement | None = CERTAIN
-        self.points, self.looks = GROUND, 0
+        self.points, self.looks, self.outlined = GROUND, 0, False
         self.orders: list[object] = []
         self.led: list[object] = []  # orders on the way to where it prints, begun paths by a word
 
@@ -57,7 +66,7 @@ class Staged:
         pose = replace(self.pose, stamp=self.now)
         self.seen.tracking = TrackingReport(
             self.now, ("a", "b"), (0, 1), pose, self.placement, 0.0, 5, ended=self.ended, used=(50, 50),
-            surface=self.points, looks=self.looks,
+            surface=self.points, looks=self.looks, outlined=self.outlined,
         )  # fmt: skip
         nan = float("nan")
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
@@ -479,6 +488,78 @@ def test_again_looks_anew_and_takes_no_place_of_the_look_before() -> None:
     run.stays(RunStage.FIND, 5)
     run.looks = 1
     assert run.look() is RunStage.CONFIRM and run.conductor.placement is CERTAIN
+
+
+OUTLINE = (("a", ((1.0, 2.0), (30.0, 2.0), (9.0, 40.0))), ("b", ((5.0, 5.0), (60.0, 5.0), (9.0, 70.0))))
+
+
+def outlined(run: Staged, outline: Polygons = OUTLINE, turn: int | None = None) -> RequestAnswer:
+    """What is answered to a corrected outline."""
+    turn = run.conductor.turn if turn is None else turn
+    run.orders += run.conductor(run.now, run.seen, [OperatorRequest(77, Wish.OUTLINE, turn, None, outline)])
+    assert run.conductor.answer is not None
+    return run.conductor.answer
+
+
+def to_outlining() -> Staged:
+    """A run that asks whether the path lies right, and whose page has pictures to correct the outline on."""
+    run = to_confirm(CERTAIN)
+    run.outlined = True
+    run.look()
+    return run
+
+
+def test_a_corrected_outline_looks_anew_inside_it_and_takes_no_place_of_the_look_before() -> None:
+    run = to_outlining()
+    run.look(MoveRequest(1.0, 0.0, 0.0))
+    assert outlined(run).followed
+    machine = run.conductor
+    assert (machine.looks, machine.outline, machine.moves) == (1, OUTLINE, 0) and machine.placed_path is None
+    run.stays(RunStage.FIND, 5)
+    assert "outline" in machine.reason and not run.orders
+    run.looks = 1
+    assert run.look() is RunStage.CONFIRM and machine.outline == OUTLINE
+    run.look(Wish.AGAIN)
+    assert (machine.looks, machine.outline) == (2, ())
+    assert run.look() is RunStage.FIND and machine.reason == ""
+
+
+def test_where_nothing_is_found_inside_an_outline_a_look_without_it_is_offered_and_else_not() -> None:
+    run = to_outlining()
+    run.look(Wish.AGAIN)
+    assert run.look() is RunStage.FIND and Wish.AGAIN not in run.conductor.offers
+    run.looks = 1
+    run.look()
+    assert outlined(run).followed
+    assert run.look() is RunStage.FIND and Wish.AGAIN in run.conductor.offers
+    run.look(Wish.AGAIN)
+    assert (run.conductor.looks, run.conductor.outline) == (3, ())
+
+
+@pytest.mark.parametrize("stage", [stage for stage in RunStage if stage is not RunStage.CONFIRM])
+def test_an_outline_is_taken_while_the_path_is_to_be_confirmed_and_at_no_other_stage(stage: RunStage) -> None:
+    run = to_outlining()
+    run.conductor.stage = stage
+    assert Wish.OUTLINE not in run.conductor.offers
+    assert not outlined(run).followed and run.conductor.looks == 0
+
+
+def test_an_outline_is_taken_on_pictures_of_this_look_alone_and_of_the_turn_that_was_shown() -> None:
+    run = to_confirm(CERTAIN)
+    assert not outlined(run).followed  # nothing to draw on
+    run.outlined = True
+    run.look()
+    assert "look again" in outlined(run, turn=run.conductor.turn - 1).words
+    assert "send it again" in outlined(run, ()).words  # another one has taken its place
+    run.look(Wish.AGAIN)
+    run.look()
+    run.stays(RunStage.FIND, 3)
+    run.looks = 1
+    run.outlined = False
+    assert run.look() is RunStage.CONFIRM and Wish.OUTLINE not in run.conductor.offers
+    run.outlined = True
+    run.look()
+    assert outlined(run).followed and run.conductor.looks == 2
 
 
 def test_a_path_that_was_moved_out_of_reach_is_not_confirmed_until_it_is_moved_back() -> None:

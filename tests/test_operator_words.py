@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.rig import Camera, Rig
+from hardware.files.region_table import MAX_CORNERS
 from hardware.operator import shared_state as limits
 from hardware.operator.broadcast import (
     MAX_BROWSER_INTEGER,
@@ -47,7 +48,10 @@ from tests.operator_page import full_view
 COUNTS = st.integers(0, MAX_BROWSER_INTEGER)
 
 
-@given(st.sampled_from([wish for wish in Wish if wish is not Wish.MOVE]), COUNTS, COUNTS)
+BARE = [wish for wish in Wish if wish not in (Wish.MOVE, Wish.OUTLINE)]  # wishes that carry nothing
+
+
+@given(st.sampled_from(BARE), COUNTS, COUNTS)
 def test_what_the_page_says_is_understood(wish: Wish, turn: int, tag: int) -> None:
     assert parse_message(json.dumps({"ask": wish.value, "turn": turn, "tag": tag})) == RequestMessage(wish, turn, tag)
     assert parse_message(json.dumps({"shown": turn})) == ShownMessage(turn)
@@ -68,10 +72,53 @@ def test_a_move_is_understood_and_comes_through_the_line_to_the_last_digit(
     assert line.take() == [OperatorRequest(1, Wish.MOVE, turn, move)]
 
 
-@pytest.mark.parametrize("wish", [wish for wish in Wish if wish is not Wish.MOVE])
-def test_no_other_wish_carries_a_move(wish: Wish) -> None:
-    for move in ([1, 2, 3], None):
-        assert parse_message(json.dumps({"ask": wish.value, "turn": 1, "tag": 1, "move": move})) is None
+@pytest.mark.parametrize("wish", BARE)
+def test_no_other_wish_carries_a_move_or_an_outline(wish: Wish) -> None:
+    for more in ({"move": [1, 2, 3]}, {"move": None}, {"outline": {}}, {"outline": None}):
+        assert parse_message(json.dumps({"ask": wish.value, "turn": 1, "tag": 1, **more})) is None
+
+
+def test_a_move_carries_no_outline_and_an_outline_no_move() -> None:
+    asked = {"turn": 1, "tag": 1, "move": [1, 2, 3], "outline": {}}
+    assert parse_message(json.dumps({"ask": "move", **asked})) is None
+    assert parse_message(json.dumps({"ask": "outline", **asked})) is None
+
+
+@pytest.mark.parametrize("outline", [None, [], "camera0", 3, True, [["camera0", [1, 2]]]])
+def test_an_outline_that_is_no_table_is_no_message(outline: object) -> None:
+    assert parse_message(json.dumps({"ask": "outline", "turn": 1, "tag": 1, "outline": outline})) is None
+    assert parse_message(json.dumps({"ask": "outline", "turn": 1, "tag": 1})) is None
+
+
+CORNERS = st.lists(st.tuples(st.floats(0, 4000), st.floats(0, 4000)), min_size=3, max_size=MAX_CORNERS).map(tuple)
+
+
+@given(st.dictionaries(st.text(min_size=1, max_size=8), CORNERS, min_size=1, max_size=6), COUNTS, COUNTS)
+def test_an_outline_comes_through_with_its_request_to_the_last_digit(
+    outline: dict[str, tuple[tuple[float, float], ...]], turn: int, tag: int
+) -> None:
+    said = parse_message(json.dumps({"ask": "outline", "turn": turn, "tag": tag, "outline": outline}))
+    assert isinstance(said, RequestMessage) and said.outline is not None
+    assert {name: tuple(map(tuple, corners)) for name, corners in said.outline.items()} == outline
+    LINK.take()
+    number = LINK.ask(Wish.OUTLINE, turn, None, tuple(outline.items()))
+    assert LINK.take() == [OperatorRequest(number, Wish.OUTLINE, turn, None, tuple(outline.items()))]
+
+
+LINK = OperatorLink()
+
+
+def test_an_outline_goes_with_its_own_request_and_with_no_other() -> None:
+    link, first, second = OperatorLink(), (("a", ((1.0, 2.0),)),), (("b", ((3.0, 4.0),)),)
+    one = link.ask(Wish.OUTLINE, 1, None, first)
+    move = link.ask(Wish.MOVE, 1, MoveRequest(1, 0, 0))
+    two = link.ask(Wish.OUTLINE, 1, None, second)
+    assert [(each.number, each.outline) for each in link.take()] == [(one, ()), (move, ()), (two, second)]
+    for _ in range(REQUEST_SLOTS):
+        link.ask(Wish.HOME, 1)
+    assert link.ask(Wish.OUTLINE, 1, None, first) is None  # no room, and its outline is nobody's
+    link.take()
+    assert link.ask(Wish.MOVE, 1, MoveRequest(2, 0, 0)) and link.take()[0].outline == ()
 
 
 @pytest.mark.parametrize(
@@ -96,7 +143,8 @@ ANYTHING = st.recursive(
 NEARLY = st.fixed_dictionaries(
     {},
     optional={
-        name: ANYTHING | COUNTS | st.sampled_from(list(Wish)) for name in ("ask", "turn", "tag", "shown", "move", "x")
+        name: ANYTHING | COUNTS | st.sampled_from(list(Wish))
+        for name in ("ask", "turn", "tag", "shown", "move", "outline", "x")
     },
 )
 
@@ -106,7 +154,9 @@ def test_anything_else_is_no_message_and_no_error(said: str) -> None:
     message = parse_message(said)
     if isinstance(message, RequestMessage):
         move = {} if message.move is None else {"move": list(astuple(message.move))}
-        assert json.loads(said) == {"ask": message.wish.value, "turn": message.turn, "tag": message.tag} | move
+        told, outline = json.loads(said), message.outline
+        assert json.dumps(told.pop("outline", None)) == json.dumps(outline)  # as texts: NaN is like itself
+        assert told == {"ask": message.wish.value, "turn": message.turn, "tag": message.tag} | move
     elif message is not None:
         assert json.loads(said) == {"shown": message.bundle}
 

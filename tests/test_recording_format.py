@@ -25,7 +25,7 @@ from hardware.recording.messages import message_from_rig
 from hardware.recording.recorder import LOG_EPOCH, MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.schemas import CALIBRATION, TOPICS
 from hardware.recording.session_reader import open_session
-from perception.frames import Image, Roi
+from perception.frames import Image, OutlinedPicture, Roi
 from planning.command import Hold, Move
 from tests.recorded import LOST, pose, whole_recording, write_frames
 from tests.session_files import NAMES, image, rig, stamps, trajectory
@@ -98,6 +98,7 @@ def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
         recorder.write(Move(0.0, np.zeros(6), 1.0, 0, False))
         recorder.write(Hold(0.0, 0.1, "why"))
         recorder.write(Roi(0, 0.0, np.eye(3)[:, :2]))
+        recorder.write(OutlinedPicture(0, 0.0, -1.0, image(0, 0), 9 * np.eye(3)[:, :2], "operator"))
         recorder.sent(0.0, b"1")
         recorder.received(0.0, b"2")
         recorder.event(0.0, "words")
@@ -114,7 +115,7 @@ def test_every_message_fits_its_published_schema(tmp_path: Path) -> None:
             jsonschema.validate(json.loads(message.data), parsed, cls=jsonschema.Draft202012Validator)
             seen.add(schema.name)
     assert {"foxglove.CameraCalibration", "foxglove.FrameTransform", "foxglove.Log"} <= seen
-    assert len(seen) == 13
+    assert len(seen) == 14
 
 
 def plain(schema: dict[str, object]) -> bool:

@@ -19,7 +19,7 @@ from hardware.arm.device import ArmState, LinkCode
 from hardware.arm.link import Arm
 from hardware.arm.profile import LinkSettings
 from hardware.files.path_file import read_path
-from hardware.live.state_machine import silence_text
+from hardware.live.checklist import silence_text
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock

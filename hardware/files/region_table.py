@@ -118,7 +118,7 @@ def corners_from(where: object, key: str, value: object) -> Corners:
     x, y = (points - points[0]).T
     if abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 < MIN_AREA:
         raise InputError(where, key, points.tolist(), f"a polygon of {MIN_AREA:g} px^2 or more")
-    if crossing := _crossing(points):
+    if crossing := crossing_edges(points):
         allowed = "edges that meet in their corners alone"
         raise InputError(where, key, f"the edges from corners {crossing[0]} and {crossing[1]} on meet", allowed)
     return tuple((float(px), float(py)) for px, py in points)
@@ -146,7 +146,7 @@ def check_region(where: object, region: RegionSettings, rig: Rig) -> None:
         raise InputError(where, "region", f"corners in {region.polygons[0][0]!r} alone", allowed)
 
 
-def _crossing(points: Array) -> tuple[int, int] | None:
+def crossing_edges(points: Array) -> tuple[int, int] | None:
     """Two edges of a polygon (N, 2) that meet elsewhere than in the corner they share, by their first corners' numbers.
 
     Edges that fold back onto the one before, or that have no length, count as meeting it.

@@ -23,6 +23,20 @@ from planning.placement import NoSurfaceError, PathPlacement, PlacedBy, SurfaceM
 MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
 PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN
 
+SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s
+
+
+def silence_text(name: str, last: float, interval: float, now: float) -> str:
+    """The operator's message that a process is silent at `now`, s, long before it counts as hung; "" if it is not.
+
+    last: s, of its last report. interval: s from report to report; NaN while unknown. Nothing is done about silence:
+    the arm rests anyhow, as its queue is empty or the pose too old.
+    """
+    silent = now - last
+    if silent > SILENT_INTERVALS * interval + SILENCE_SLACK:
+        return f"the {name} process has said nothing for {silent:.2f} s"
+    return ""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPath:

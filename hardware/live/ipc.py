@@ -28,6 +28,7 @@ from hardware.live.recorder_process import RecorderSender, record
 from hardware.live.records import (
     LiveMotionReport,
     MotionChannels,
+    OutlineOrder,
     PoseHandover,
     RecorderReport,
     TrackingChannels,
@@ -183,6 +184,7 @@ class RunChannels:
     trouble: SharedLatest[str]  # why the arm cannot be used at all
     start: c_double  # s, when printing began; NaN before
     looks: c_uint64  # how often the surface is to be looked for anew
+    outline: SharedLatest[OutlineOrder]  # put before `looks` is set
 
     def end(self) -> None:
         """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
@@ -218,14 +220,14 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:
             processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
-        looks = RawValue(c_uint64, 0)
-        ends_of_tracking = to_recorder[1][1], looks, lifeline[0]
+        looks, outline = RawValue(c_uint64, 0), SharedLatest[OutlineOrder]()
+        ends_of_tracking = to_recorder[1][1], looks, outline, lifeline[0]
         track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, *ends_of_tracking)
         processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
         sender = RecorderSender(to_recorder[2][1])
-        own_ends = orders[1], lifeline[1], arm_lifeline[1], sender
+        own_ends = orders[1], lifeline[1], arm_lifeline[1], sender, link, trouble
         stack.pop_all()
-    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, link, trouble, start, looks)
+    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, start, looks, outline)
 
 
 def _start_arm(processes: ProcessGroup, prepared: Prepared, device: File, lifeline: Connection) -> None:

@@ -41,7 +41,7 @@ from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
 from hardware.process.clock import ProcessorClock, WallClock
 from hardware.process.system import SharedLatest, set_up_process
-from perception.frames import Roi
+from perception.frames import OutlinedPicture, Roi
 
 if TYPE_CHECKING:
     from hardware.recording.recorder import Recorder
@@ -278,7 +278,7 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.attach(entry.name, entry.text.encode())
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
-    elif isinstance(entry, Roi | DispenserRecord):
+    elif isinstance(entry, Roi | OutlinedPicture | DispenserRecord):
         recorder.write(entry)
 
 

@@ -22,10 +22,10 @@ from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
 from hardware.motion.loop import RecordedTick, Tick
 from hardware.motion.material import DispenserRecord, MaterialStatus
-from hardware.operator.shared_state import OperatorLink, RequestLine
+from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
 from hardware.process.system import SharedLatest
 from hardware.process.ticks import Histogram
-from perception.frames import Frame, PrintHead, Roi
+from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
 from planning.material import Outlets
 from planning.path import Path, PrintProgress
 from planning.placement import PathPlacement
@@ -77,6 +77,7 @@ class TrackingReport:
     draws: bool = False  # whether somebody has to draw the region first
     looks: int = 0  # how often the surface was looked for anew
     since: float = nan  # s, stamp of the first frame set since then
+    outlined: bool = False  # whether the page was given pictures to correct the wound's outline on
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,7 +201,7 @@ class UsedEntry:
 
 
 # the rig comes first: nothing is written before the cameras are known
-Record = Roi | RecordedTick | DispenserRecord
+Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | EventEntry | LatencyEntry
 
 
@@ -225,6 +226,14 @@ class StageHistograms:
         return [LatencyEntry(stamp, name, h.width, h.counts.copy(), h.most) for name, h in self._stages.items()]
 
 
+@dataclass(frozen=True, slots=True)
+class OutlineOrder:
+    """Inside which outline of the wound the surface is to be looked for anew."""
+
+    looks: int  # of which look
+    polygons: Polygons  # none: the region is found as at first
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingChannels:
     """What joins the tracking process to the others."""
@@ -237,6 +246,7 @@ class TrackingChannels:
     link: OperatorLink
     recorder: Connection
     looks: c_uint64  # how often the surface is to be looked for anew
+    outline: SharedLatest[OutlineOrder]  # put before `looks` is set
     lifeline: Connection  # its end says that the run is gone
 
 

@@ -34,7 +34,7 @@ from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
-from hardware.live.records import BeginPrint, EventEntry, RunReports, UsedEntry
+from hardware.live.records import BeginPrint, EventEntry, OutlineOrder, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text
 from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
@@ -117,7 +117,7 @@ class LiveRun:
         ready = wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)
         if wake in ready:
             wake.recv(64)
-        requests = self._requests_by_key(ready) + self._channels.link.requests.take()
+        requests = self._requests_by_key(ready) + self._channels.link.take()
         reports, channels, now = self._reports, self._channels, self._clock.now()
         reports.tracking, reports.motion = channels.tracking.get(), channels.motion.get()
         reports.recorder = channels.recorder.get()
@@ -126,7 +126,9 @@ class LiveRun:
         for text in self._injector.update(now):
             self._log(f"on purpose: {text}", WARNING)
         self._send(self._check_failures(progress_writer, now) + machine(now, reports, requests))
-        channels.looks.value = machine.looks
+        if channels.looks.value != machine.looks:
+            channels.outline.put(OutlineOrder(machine.looks, machine.outline))
+            channels.looks.value = machine.looks
         arm = None if machine.placed_path is None else machine.placed_path.profile.arm
         self._statistics.update(now, machine.stage, reports, arm)
         self._view_builder.update(reports, self._profile)

@@ -12,10 +12,10 @@ from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile, measured_lag
-from hardware.live.checklist import PlacedPath, moved_placement, place_path, raised_path, run_checks
+from hardware.live.checklist import PlacedPath, moved_placement, place_path, raised_path, run_checks, silence_text
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
 from hardware.motion.loop import Order
-from hardware.operator.shared_state import OperatorRequest
+from hardware.operator.shared_state import OperatorRequest, Polygons
 from hardware.operator.view import (
     ACTIVE_STAGES,
     STAGE_OFFERS,
@@ -33,27 +33,15 @@ from planning.material import Outlets
 from planning.path import Path, PrintPhase, fingerprint
 from planning.placement import PathPlacement
 
-SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s
 HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
 ARMING_TIMEOUT = 5.0  # s until a stopped arm is at rest and can be armed
 RESEND_AFTER = 0.3  # s between orders to an arm that was not ready for the last one
 SEARCH_TIMEOUT = 180.0  # s in which an unattended run must pass its checks and find the surface
+OUTLINED_TEXT = "inside the outline that the operator corrected"
 ARM_BACK_TEXT = "the arm is back: resume, or go home first"
 ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
 
 Orders = list[Order | PauseOrder | BeginPrint]
-
-
-def silence_text(name: str, last: float, interval: float, now: float) -> str:
-    """The operator's message that a process is silent at `now`, s, long before it counts as hung; "" if it is not.
-
-    last: s, of its last report. interval: s from report to report; NaN while unknown. Nothing is done about silence:
-    the arm rests anyhow, as its queue is empty or the pose too old.
-    """
-    silent = now - last
-    if silent > SILENT_INTERVALS * interval + SILENCE_SLACK:
-        return f"the {name} process has said nothing for {silent:.2f} s"
-    return ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +80,7 @@ class RunStateMachine:
     placement: PathPlacement | None = None  # of that path: by what, and what it is worth
     moves: int = 0  # how often the operator has moved it
     looks: int = 0  # how often the surface is to be looked for anew
+    outline: Polygons = ()  # the wound as the operator corrected its outline, inside which that is done; or none
     answer: RequestAnswer | None = None  # to the last request
     checks: tuple[Check, ...] = ()
     _since: float = nan  # s, when the stage was entered
@@ -104,16 +93,20 @@ class RunStateMachine:
     _homed: bool = False  # whether the arm was armed since it was ordered home
     _armed: bool = False  # whether it was armed since that was ordered
     _after_homing: RunStage = RunStage.APPROACH
+    _outlined: bool = False  # whether the page has pictures of this look, on which the outline can be corrected
     _wanted: str = ""  # material that the operator was asked for in this pause
 
     @property
     def offers(self) -> tuple[Wish, ...]:
-        """The wishes that would be followed now."""
+        """The wishes that would be followed now; where nothing is found inside an outline, a look without it is one."""
         offers = STAGE_OFFERS.get(self.stage, ())
+        if self.stage is RunStage.FIND and self.outline:
+            return (Wish.AGAIN, *offers)
         if self.stage is not RunStage.CONFIRM or self.placement is None:
             return offers
         held = [Wish.CONFIRM] if not self.confirmable else []
         held += [Wish.MOVE] if not self.placement.usable else []
+        held += [Wish.OUTLINE] if not self._outlined else []
         return tuple(wish for wish in offers if wish not in held)
 
     @property
@@ -141,8 +134,10 @@ class RunStateMachine:
         if isnan(self._since):
             self._since = now
         orders: Orders = []
+        tracking = reports.tracking
+        self._outlined = tracking is not None and tracking.outlined and tracking.looks == self.looks
         for request in requests:
-            orders += self._answer(request, reports.tracking, now)
+            orders += self._answer(request, tracking, now)
         task = self.task
         self.checks = run_checks(reports, task.path, task.start, self.placed_path, task.stands_home, now)
         if not self.ended:
@@ -169,10 +164,13 @@ class RunStateMachine:
         why = refusal(request.wish, request.turn, self.offers, self.turn)
         if not why and request.wish is Wish.MOVE:
             why = self._move(request.move, tracking, now)
+        if not why and request.wish is Wish.OUTLINE and not request.outline:
+            why = "another outline came at the same time: send it again"
         self.answer = RequestAnswer(request.number, request.wish, not why, why)
-        return [] if why else self._follow(request.wish, now)
+        return [] if why else self._follow(request, now)
 
-    def _follow(self, wish: Wish, now: float) -> Orders:
+    def _follow(self, request: OperatorRequest, now: float) -> Orders:
+        wish = request.wish
         if wish is Wish.STOP:
             if self.stage in ACTIVE_STAGES:
                 self._enter(RunStage.STOPPED, "by the operator", now)
@@ -181,9 +179,9 @@ class RunStateMachine:
             return self.end("ended by the operator", now, RunStage.ENDED)
         if wish is Wish.CONFIRM:
             self._enter(RunStage.READY, "", now)
-        elif wish is Wish.AGAIN:
+        elif wish in (Wish.AGAIN, Wish.OUTLINE):
             self.placed_path = self.placement = None
-            self.looks, self.moves = self.looks + 1, 0
+            self.looks, self.moves, self.outline = self.looks + 1, 0, request.outline
             self._enter(RunStage.CHECK, "", now)
         elif wish is Wish.START:
             return self._home(RunStage.APPROACH, now)
@@ -258,7 +256,7 @@ class RunStateMachine:
     def _await_checks(self, now: float) -> Orders:
         waits = [c for c in self.checks if c.name != "reach" and c.verdict in (CheckVerdict.FAIL, CheckVerdict.BUSY)]
         if not waits:
-            self._enter(RunStage.FIND, "", now)
+            self._enter(RunStage.FIND, OUTLINED_TEXT if self.outline else "", now)
             return []
         fails = [check for check in waits if check.verdict is CheckVerdict.FAIL]
         self._failing = min(self._failing, now) if fails else inf

@@ -38,7 +38,7 @@ from hardware.live.records import (
 )
 from hardware.motion.loop import CommandedPose
 from hardware.offline.track import FrameSetStep, region_search, tracker
-from hardware.operator.overlays import SurfaceOutline, scan_drawing
+from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock
 from hardware.process.system import (
@@ -51,7 +51,7 @@ from hardware.process.system import (
 )
 from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
-from perception.frames import FrameSet, PrintHead, region_since
+from perception.frames import FrameSet, PrintHead, Roi, region_since
 from perception.tracking.step import STAGES, TrackingStep
 from perception.tracking.wound_step import RegionTrackingStep
 from planning.placement import (
@@ -181,19 +181,25 @@ class _TrackingLoop:
             channels.link.scan.put(scan_drawing(read_mesh(self._surface).scan))
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
-        self._rois, self._region_recorded, self._drawn = rois, bool(rois), region.drawn and not rois
+        self._rois, self._drawn = rois, region.drawn and not rois
+        self._sheet: OutlineSheet | None = None  # of this look, where a network looked
         self._steps = stack.enter_context(ExitStack())
         self._look(0)
 
     def _look(self, looks: int) -> None:
-        """Look for the surface, with a tracker that knows nothing of it yet; a run that resumes shows it its map."""
+        """Look for the surface, with a tracker that knows nothing of it yet; a run that resumes shows it its map.
+
+        What an operator says is the wound is the region, and no skin beside it: of that the operator has said nothing.
+        """
+        outlined = self._outlined(looks)
         self._steps.close()
         self._outline = SurfaceOutline(self._rig)
         placed, placement, settings = None, self._prepared.placement, self._prepared.settings
         # the stamps of earlier pictures are to end a second ago: the clock may have begun anew since
         shift = 0.0 if placement is None else self._clock.now() - placement.until - SETTLING_TIME - 1.0
         since = [-np.inf if self._earlier is None else roi.stamp + shift for roi in self._rois]
-        timed = tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, since, strict=True))
+        timed = outlined or tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, since, strict=True))
+        self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
         find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
         given = self._surface, self._clock.now, self._prepared.task.profile.tool
         self._step = self._steps.enter_context(tracker(self._rig, timed, *given, model=settings.model, find=find))
@@ -202,7 +208,33 @@ class _TrackingLoop:
             words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
             lies = new_from_old @ placement.surface_from_path
             placed = PathPlacement(lies, PlacedBy.EARLIER, words, placement.certain, True)
-        self.report = replace(self.report, placement=placed, registered=np.nan, surface=None, looks=looks, since=np.nan)
+        report = replace(self.report, placement=placed, registered=np.nan, surface=None, looks=looks, since=np.nan)
+        self.report = replace(report, outlined=False)
+
+    def _outlined(self, looks: int) -> tuple[Roi, ...]:
+        """The outline corrected before this look, if any, where the wound is now; recorded with its pictures."""
+        order, pose, sheet, self._sheet = self._channels.outline.get(), self.report.pose, self._sheet, None
+        if order is None or order.looks != looks or not order.polygons or sheet is None:
+            return ()
+        for picture in sheet.recorded(order.polygons, self._clock.now()):
+            self._sender.put(picture)
+        known = pose is not None and pose.state.measured
+        return sheet.rois(order.polygons, pose.base_from_surface if known and pose is not None else None)
+
+    def _offer_outline(self, frames: FrameSet, pose: SurfacePose) -> None:
+        """Give the page, once a look, pictures on which the outline of the wound can be corrected, and it so far."""
+        step, settings = self._step, self._prepared.settings
+        if self._sheet is None and settings.page and not settings.unattended:
+            sight = step.sight if isinstance(step, RegionTrackingStep) else None
+            if sight is not None:
+                self._sheet = sheet_from_sight(self._rig, sight)
+            elif self._by_outline:
+                self._sheet = sheet_from_rois(self._rig, frames, step.roi)
+            if self._sheet is not None:
+                with suppress(InputError):  # larger than their place: nothing is corrected then
+                    self._channels.link.sheet.put(self._sheet.pictures())
+        if self._sheet is not None and pose.state.measured and (surface_map := step.map) is not None:
+            self._sheet.place(surface_map.points, pose.base_from_surface)
 
     def __call__(self) -> None:
         settle_memory()
@@ -223,6 +255,7 @@ class _TrackingLoop:
         sent = self._clock.now()
         self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
         self._count_times(arrived, pose, start, sent)
+        self._offer_outline(frames, pose)
         self._register(pose, arrived)
         self._report(arrived, pose)
         self._show(frames, pose)
@@ -296,6 +329,7 @@ class _TrackingLoop:
             truth=None if self._truth is None else _true_pose(self._truth, arrived.source),
             surface=self._landmarks(pose),
             draws=self._drawn and not self._step.roi,
+            outlined=self._sheet is not None,
         )
         self._channels.reports.put(self.report)
 

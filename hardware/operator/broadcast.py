@@ -84,9 +84,13 @@ def scene_text(scene: PageScene) -> str:
     )
 
 
-def pictures_bytes(pictures: PagePictures) -> bytes:
-    """Length of the head (4 bytes, little-endian), the head as JSON, each camera's JPEGs: the whole, the near one."""
+def pictures_bytes(pictures: PagePictures, kind: str = "live") -> bytes:
+    """Length of the head (4 bytes, little-endian), the head as JSON, each camera's JPEGs: the whole, the near one.
+
+    kind: "live", or "sheet" of the pictures on which the wound's outline is corrected.
+    """
     head = text(
+        kind=kind,
         stamp=pictures.stamp,
         base_from_surface=pictures.base_from_surface,
         pictures=[
@@ -114,11 +118,12 @@ class Broadcast:
         self._link = link
         self._scene: PageScene | None = None
         self._pictures: PagePictures | None = None
+        self._sheet: PagePictures | None = None
         self._since = nan
         self._timeline: deque[tuple[float, float, float, float, bool]] = deque(maxlen=TIMELINE_ROWS)
         self.view: OperatorView | WavingView | RecordingView | None = None
         self.gone, self.refused = False, 0
-        self.view_text, self.scene_text, self.pictures_bytes = "null", "", b""
+        self.view_text, self.scene_text, self.pictures_bytes, self.sheet_bytes = "null", "", b"", b""
         self.news = asyncio.Event()  # set, and replaced, when there is something new
 
     def update(self, now: float, watched: bool) -> None:
@@ -130,6 +135,8 @@ class Broadcast:
             self._add_to_timeline(view.stamp, view.motion if isinstance(view, OperatorView) else None)
         if (scene := self._link.scene.get()) is not self._scene and scene is not None:
             self._scene, self.scene_text, new = scene, scene_text(scene), True
+        if watched and (sheet := self._link.sheet.get()) is not self._sheet and sheet is not None:
+            self._sheet, self.sheet_bytes, new = sheet, pictures_bytes(sheet, "sheet"), True
         if watched and (pictures := self._link.pictures.get()) is not self._pictures and pictures is not None:
             self._pictures, self.pictures_bytes, new = pictures, pictures_bytes(pictures), True
         if new:
@@ -170,6 +177,7 @@ class RequestMessage:
     turn: int  # of the view it was asked under
     tag: int  # the window's own number for it
     move: MoveRequest | None = None  # of Wish.MOVE, and of no other
+    outline: dict[str, Any] | None = None  # of Wish.OUTLINE alone: corners by camera's name, not checked yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,13 +212,16 @@ def parse_message(text: str) -> RequestMessage | RegionMessage | ShownMessage | 
     wish = message.get("ask")
     if not isinstance(wish, str) or wish not in Wish.__members__.values():
         return None
-    moves = wish == Wish.MOVE
-    if message.keys() != {"ask", "turn", "tag", *(["move"] if moves else [])}:
+    more = wish if wish in (Wish.MOVE, Wish.OUTLINE) else None  # what it carries has its name
+    if message.keys() != {"ask", "turn", "tag", *([] if more is None else [more])}:
         return None
     if not (_is_count(message["turn"]) and _is_count(message["tag"])):
         return None
-    move = _parse_move(message["move"]) if moves else None
-    return None if moves and move is None else RequestMessage(Wish(wish), message["turn"], message["tag"], move)
+    move = _parse_move(message["move"]) if more == Wish.MOVE else None
+    outline = message["outline"] if more == Wish.OUTLINE else None
+    if (more == Wish.MOVE and move is None) or (more == Wish.OUTLINE and not isinstance(outline, dict)):
+        return None
+    return RequestMessage(Wish(wish), message["turn"], message["tag"], move, outline)
 
 
 def _parse_move(shift: object) -> MoveRequest | None:

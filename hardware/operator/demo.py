@@ -5,6 +5,7 @@ To learn the page by. Nothing moves, whatever is pressed: three painted cameras 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import nan, radians
 
@@ -15,10 +16,19 @@ from estimation.pose import TrackState
 from estimation.rig import Camera, Rig, ideal_pixels
 from estimation.scans.scan import scan_from_triangles
 from estimation.se3 import Array
-from hardware.operator.overlays import scan_drawing
+from hardware.files.images import small_jpeg
+from hardware.operator.overlays import SHEET_QUALITY, SHEET_WIDTH, scan_drawing
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import OperatorLink, OperatorRequest, PageScene, ScanDrawing, scene_from
+from hardware.operator.shared_state import (
+    CameraPicture,
+    OperatorLink,
+    OperatorRequest,
+    PagePictures,
+    PageScene,
+    ScanDrawing,
+    scene_from,
+)
 from hardware.operator.view import (
     ACTIVE_STAGES,
     STAGE_OFFERS,
@@ -171,6 +181,7 @@ DEMO_PLACEMENT = PathPlacement(
 NEXT_STAGES = {
     Wish.CONFIRM: RunStage.READY,
     Wish.MOVE: RunStage.CONFIRM,
+    Wish.OUTLINE: RunStage.FIND,
     Wish.AGAIN: RunStage.FIND,
     Wish.START: RunStage.APPROACH,
     Wish.PAUSE: RunStage.PAUSED,
@@ -199,6 +210,7 @@ class DemoRun:
         self._points = np.column_stack([x, y, surface_height(x, y)])
         self.placement, self._moved = DEMO_PLACEMENT, False
         self._answer: RequestAnswer | None = None
+        self.outline: dict[str, Array] = {}  # (N, 2) px by camera, as the operator corrected it
 
     def _enter(self, stage: RunStage, now: float) -> None:
         self.stage, self._since, self._turn = stage, now, self._turn + 1
@@ -209,6 +221,8 @@ class DemoRun:
         if not why and request.wish is Wish.MOVE and request.move is not None:
             why = self._move(request.move)
         self._answer = RequestAnswer(request.number, request.wish, not why, why)
+        if not why and request.wish is Wish.OUTLINE:
+            self.outline = {name: np.array(corners) for name, corners in request.outline}
         if not why:
             self._enter(NEXT_STAGES[request.wish], now)
 
@@ -285,6 +299,19 @@ class DemoRun:
         return ProgressView(self._fraction, total, share, (1 - share) * total / DEMO_SPEED, 0.87, layer, 2)
 
 
+def demo_sheet(now: float, shots: Sequence[CameraShot], outline: Mapping[str, Array]) -> PagePictures:
+    """The pictures on which the wound's outline is corrected, as a network found it, a little wrong, or as it was
+    corrected."""
+    pictures = []
+    for shot in shots:
+        found = np.asarray(shot.outline[0])[::4]
+        pull = 1 + 0.12 * np.sin(np.linspace(0, 2 * np.pi, len(found)))[:, None]
+        middle = found.mean(axis=0)
+        corners = outline.get(shot.camera, np.round(middle + 0.9 * pull * (found - middle), 1))
+        pictures.append(CameraPicture(shot.camera, small_jpeg(shot.image, SHEET_WIDTH, SHEET_QUALITY), (corners,)))
+    return PagePictures(now, tuple(pictures))
+
+
 def _held(now: float) -> bool:
     return now % 12 > 9.5
 
@@ -320,17 +347,20 @@ def _checks(age: float) -> tuple[Check, ...]:
 def run(link: OperatorLink, page: OperatorPage, clock: Clock) -> None:
     """Go on until interrupted."""
     made_up, painter = DemoRun(260.0, clock.now()), Painter(demo_rig(), np.random.default_rng(1))
-    thumbnailer = Thumbnailer(link.pictures, link.requests)
+    thumbnailer, looked = Thumbnailer(link.pictures, link.requests), made_up.stage
     scan, shown = demo_scan(), made_up.placement
     link.scene.put(demo_scene(shown.surface_from_path, scan))
     while True:
         now = clock.now()
         page.tend(now)
-        for request in link.requests.take():
+        for request in link.take():
             made_up.follow(request, now)
         if made_up.placement is not shown:
             shown = made_up.placement
             link.scene.put(demo_scene(shown.surface_from_path, scan))
+        if made_up.stage is RunStage.FIND and looked is not RunStage.FIND:
+            link.sheet.put(demo_sheet(now, painter.shots(surface_at(now)), made_up.outline))
+        looked = made_up.stage
         link.views.put(made_up.step(now))
         if link.requests.windows:
             pose = surface_at(now)

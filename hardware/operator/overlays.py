@@ -1,4 +1,4 @@
-"""What the operator's page draws over the pictures: the outline of the region, and the scan's lines and coarse mesh.
+"""What the operator's page draws over the pictures: outlines of region and wound, the scan's lines and coarse mesh.
 
 A scan's lines are its rim and those along which it lies equally deep under the smooth surface around: they run round a
 wound and over every bump, so that a scan that lies wrong is seen to.
@@ -6,24 +6,45 @@ wound and over every bump, so that a scan that lies wrong is seen to.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.rig import Rig, ideal_pixels, pixels_from_points
 from estimation.scans.scan import Scan, open_edges
 from estimation.se3 import Array, transform_points
-from hardware.operator.shared_state import MAX_TRIANGLES, ScanDrawing, coarser_mesh
-from perception.frames import Roi
+from hardware.files.folder_tables import check_polygon
+from hardware.files.images import small_jpeg
+from hardware.files.region_table import MAX_CORNERS, Corners, crossing_edges
+from hardware.operator.shared_state import (
+    MAX_TRIANGLES,
+    CameraPicture,
+    PagePictures,
+    Polygons,
+    ScanDrawing,
+    coarser_mesh,
+)
+from perception.frames import FrameSet, OutlinedPicture, Roi
 from perception.lens import undistort
+from perception.mapping.features import polygon_mask
+from perception.tracking.wound_step import WoundSight
+from perception.wound.segmentation import WoundMask, dice, hull_of, largest_part, outline_of
 
 MAX_LINES = 2500  # of all: 3 cameras draw them five times a second
 DRAWN_TRIANGLES = 6000  # of which depth lines are made: 1 mm apart on a scan of 55 mm
 DEPTH_LINES = 4  # between the deepest and the smooth surface around
 MIN_DEPTH_MM = 0.8  # of anything around which lines are drawn
 DEPTH_NEIGHBOURS = 3  # landmarks whose depth a corner of an outline is taken to have
+OUTLINE_TOLERANCES = (0.004, 0.006, 0.01, 0.015, 0.025, 0.04)  # of its length, by which a wound's outline is simplified
+MAX_OUTLINE_CORNERS = 24  # of a wound's outline as it is shown: more are no easier to put right by hand
+MIN_OUTLINE_DICE = 0.9  # of the polygon and what was found: below, it would be drawn anew
+SHEET_WIDTH, SHEET_QUALITY = 1280, 85  # px and JPEG of pictures on which an outline is corrected
+OPERATOR = "operator"  # who says so, in a recording
 FIT_ROUNDS = 12  # of the smooth surface; by then what lies deep has lost its weight
 
 
@@ -124,3 +145,93 @@ class SurfaceOutline:
         points_base = se3.transform_points(base_from_surface, self._corners[camera])
         pixels, depth = pixels_from_points(self._rig.cameras[camera], points_base)
         return (pixels,) if (depth > 0).all() else ()
+
+
+def wound_corners(mask: WoundMask) -> Corners:
+    """A polygon of few corners, px, round the largest part of a mask (H, W), without crossing edges.
+
+    The convex hull where no such polygon covers that part well; () of an empty mask.
+    """
+    if not mask.any():
+        return ()
+    part, (height, width) = largest_part(mask), mask.shape
+    for tolerance in OUTLINE_TOLERANCES:
+        corners = outline_of(part, tolerance)
+        if not 3 <= len(corners) <= MAX_OUTLINE_CORNERS or crossing_edges(corners) is not None:
+            continue
+        if dice(polygon_mask((width, height), corners) > 0, part) > MIN_OUTLINE_DICE:
+            return _corners(corners)
+    hull = hull_of(part)
+    return _corners(hull) if 3 <= len(hull) <= MAX_CORNERS else ()
+
+
+def _corners(points: Array) -> Corners:
+    return tuple((float(x), float(y)) for x, y in points)
+
+
+class OutlineSheet:
+    """The pictures of one instant, and the wound's outline in them, which an operator may correct there."""
+
+    def __init__(self, rig: Rig, frames: FrameSet, polygons: Mapping[int, Corners]) -> None:
+        """polygons: the outline by camera, px; none of a camera that sees no wound."""
+        self._rig, self._frames, self._polygons = rig, frames, polygons
+        self._placed: tuple[Array, Array] | None = None
+
+    def pictures(self) -> PagePictures:
+        """For the page: each picture whole, with its outline."""
+        pictures = []
+        for frame in self._frames.frames:
+            camera, corners = self._rig.cameras[frame.camera], self._polygons.get(frame.camera, ())
+            outline = (np.clip(corners, 0, np.array(camera.size) - 1.0),) if corners else ()
+            jpeg = small_jpeg(frame.image, SHEET_WIDTH, SHEET_QUALITY)
+            pictures.append(CameraPicture(camera.name, jpeg, outline))
+        return PagePictures(self._frames.stamp, tuple(pictures))
+
+    def place(self, points_surface: Array, base_from_surface: Array) -> None:
+        """Take where the surface, mapped by landmarks (V, 3) mm, was in these pictures; the first place counts."""
+        self._placed = self._placed or (points_surface, base_from_surface)
+
+    def recorded(self, polygons: Polygons, stamp: float) -> list[OutlinedPicture]:
+        """What is recorded of an outline that an operator says at `stamp`, s: a picture of each camera that has one."""
+        said, frames = self._by_number(polygons), {frame.camera: frame for frame in self._frames.frames}
+        return [
+            OutlinedPicture(number, stamp, frames[number].stamp, frames[number].image, corners, OPERATOR)
+            for number, corners in said.items()
+            if number in frames
+        ]
+
+    def rois(self, polygons: Polygons, base_from_surface: Array | None) -> tuple[Roi, ...]:
+        """An operator's outline as a region from now on, carried to where the surface is now as any region is.
+
+        base_from_surface: (4, 4) mm; None where that is not known. The region is then where it was drawn, as it is in a
+        camera that would not see it any more.
+        """
+        drawn = tuple(Roi(number, -np.inf, corners) for number, corners in self._by_number(polygons).items())
+        if self._placed is None or base_from_surface is None:
+            return drawn
+        outline = SurfaceOutline(self._rig)
+        outline.place(drawn, *self._placed)
+        return tuple(self._seen(roi, outline.in_pixels(roi.camera, base_from_surface)) for roi in drawn)
+
+    def _seen(self, drawn: Roi, carried: tuple[Array, ...]) -> Roi:
+        """The region as it was carried along, where that is one in the camera's picture; else as it was drawn."""
+        for polygon in carried:
+            with suppress(InputError):
+                check_polygon("the page", "outline", polygon, self._rig.cameras[drawn.camera].size)
+                return replace(drawn, polygon=polygon)
+        return drawn
+
+    def _by_number(self, polygons: Polygons) -> dict[int, Array]:
+        """Corners (N, 2) px by the camera's number in the rig."""
+        names = [camera.name for camera in self._rig.cameras]
+        return {names.index(name): np.array(corners, float) for name, corners in polygons}
+
+
+def sheet_from_sight(rig: Rig, sight: WoundSight) -> OutlineSheet:
+    """The pictures in which a network looked for the wound, with the outline that it found."""
+    return OutlineSheet(rig, sight.frames, {camera: wound_corners(mask) for camera, mask in sight.masks.items()})
+
+
+def sheet_from_rois(rig: Rig, frames: FrameSet, rois: Sequence[Roi]) -> OutlineSheet:
+    """The first pictures that were followed inside an operator's outline, with that outline."""
+    return OutlineSheet(rig, frames, {roi.camera: _corners(np.round(roi.polygon, 1)) for roi in rois})

@@ -30,7 +30,7 @@ from hardware.operator.broadcast import (
     text,
 )
 from hardware.operator.settings import AccessControl, OperatorSettings, WindowLimits, response_headers
-from hardware.operator.shared_state import DrawnRegion, OperatorLink
+from hardware.operator.shared_state import DrawnRegion, OperatorLink, Polygons
 from hardware.operator.view import CALMING_WISHES, Wish, refusal
 from hardware.process.clock import WallClock
 
@@ -86,8 +86,13 @@ class WindowSession:
                 await self._close(b"too many messages, or none that make sense")
 
     def _ask(self, ask: RequestMessage) -> None:
-        number, words = None, self._refusal(ask)
-        if not words and (number := self._link.requests.ask(ask.wish, ask.turn, ask.move)) is None:
+        number, words, outline = None, self._refusal(ask), Polygons()
+        if not words and ask.outline is not None:
+            try:
+                outline = drawn_region(ask.outline, self._newest.cameras).polygons
+            except InputError as error:
+                words = f"{error.what} = {error.got}, allowed {error.allowed}"
+        if not words and (number := self._link.ask(ask.wish, ask.turn, ask.move, outline)) is None:
             words = "the run has not yet taken what was asked before"
         self._replies.append(text(kind="asked", tag=ask.tag, wish=ask.wish, number=number, words=words))
         self._newest.wake()
@@ -133,7 +138,7 @@ class WindowSession:
             await self._close(b"nothing was shown for too long")
 
     async def _send_all(self) -> None:
-        newest, scene, pictures = self._newest, "", b""
+        newest, scene, pictures, sheet = self._newest, "", b"", b""
         await self._put(newest.timeline_text())
         while True:
             news = newest.news
@@ -141,6 +146,9 @@ class WindowSession:
             if newest.scene_text is not scene:
                 scene = newest.scene_text
                 await self._put(scene)
+            if newest.sheet_bytes is not sheet:
+                sheet = newest.sheet_bytes
+                await self._put(sheet)
             if newest.pictures_bytes is not pictures:
                 pictures = newest.pictures_bytes
                 await self._put(pictures)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from ctypes import c_uint64
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.sharedctypes import RawArray
 from typing import Any
 from zlib import crc32
@@ -29,11 +29,15 @@ REQUEST_SLOTS = 16  # requests that wait; the run takes them every few ms and a 
 OTHER_REQUEST_SLOTS = 8  # of them for what does not lead towards rest: a flood of such requests leaves room for a pause
 PICTURES_CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
 MAX_PATH_POINTS, MAX_TRIANGLES = 4000, 1500  # what a browser without a graphics card draws ten times a second
+OUTLINE_CAPACITY = 1 << 15  # bytes: four times a window's longest message
+SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras at their own size
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
 _RECORD = struct.Struct("=QQBdddI")  # the same, and its check sum
 _LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS = range(5)  # last number given, last stop, records written and taken, windows
 _WISHES = tuple(Wish)
+
+Polygons = tuple[tuple[str, Corners], ...]  # px, by camera's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,7 @@ class OperatorRequest:
     wish: Wish
     turn: int  # of the view that the operator saw when asking
     move: MoveRequest | None = None  # of Wish.MOVE, and of no other
+    outline: Polygons = ()  # of Wish.OUTLINE alone; none where it was lost as another one came
 
 
 class RequestLine:
@@ -59,7 +64,7 @@ class RequestLine:
 
         move: of Wish.MOVE.
         """
-        number = int(self._counts[_LAST]) + 1
+        number = self.next_number
         if wish is Wish.STOP:
             self._counts[_LAST] = number
             self._counts[_STOP] = number
@@ -82,6 +87,11 @@ class RequestLine:
             self._stops_seen = stop
             return [OperatorRequest(stop, Wish.STOP, 0)]
         return waiting
+
+    @property
+    def next_number(self) -> int:
+        """The number that the next request will have."""
+        return int(self._counts[_LAST]) + 1
 
     @property
     def last_stop(self) -> int:
@@ -145,7 +155,15 @@ class PagePictures:
 class DrawnRegion:
     """Where the surface is, as somebody drew it over the pictures; checked by the page against the scene's cameras."""
 
-    polygons: tuple[tuple[str, Corners], ...]  # px, by camera's name
+    polygons: Polygons
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedOutline:
+    """The wound's outline as an operator corrected it; checked by the page as a region is."""
+
+    number: int  # of the request that it belongs to
+    polygons: Polygons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,12 +246,30 @@ class ScanDrawing:
 class OperatorLink:
     """All that joins a run and its page, handed to each process that takes part when it is started.
 
-    Of `views`, `pictures` and `scene` each has one process that puts; the page gets. It puts `regions`.
+    Of `views`, `pictures`, `sheet` and `scene` each has one process that puts; the page gets. It puts `regions` and
+    `outlines`. `sheet`: the pictures in which the wound was looked for, each whole and with the outline found there.
     """
 
     views: SharedLatest[OperatorView | WavingView | RecordingView] = field(default_factory=SharedLatest)
     pictures: SharedLatest[PagePictures] = field(default_factory=lambda: SharedLatest(PICTURES_CAPACITY))
+    sheet: SharedLatest[PagePictures] = field(default_factory=lambda: SharedLatest(SHEET_CAPACITY))
     scene: SharedLatest[PageScene] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))
     scan: SharedLatest[ScanDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
     requests: RequestLine = field(default_factory=RequestLine)
     regions: SharedLatest[DrawnRegion] = field(default_factory=SharedLatest)  # from the page
+    outlines: SharedLatest[CorrectedOutline] = field(default_factory=lambda: SharedLatest(OUTLINE_CAPACITY))
+
+    def ask(self, wish: Wish, turn: int, move: MoveRequest | None = None, outline: Polygons = ()) -> int | None:
+        """As `RequestLine.ask`; outline: of Wish.OUTLINE."""
+        if wish is Wish.OUTLINE:
+            self.outlines.put(CorrectedOutline(self.requests.next_number, outline))
+        return self.requests.ask(wish, turn, move)
+
+    def take(self) -> list[OperatorRequest]:
+        """As `RequestLine.take`, each outline with its request."""
+        return [self._with_outline(each) if each.wish is Wish.OUTLINE else each for each in self.requests.take()]
+
+    def _with_outline(self, request: OperatorRequest) -> OperatorRequest:
+        newest = self.outlines.get()
+        own = newest is not None and newest.number == request.number
+        return replace(request, outline=newest.polygons) if newest is not None and own else request

@@ -37,6 +37,7 @@ class Wish(StrEnum):
 
     CONFIRM = "confirm"  # what is shown over the pictures is right
     MOVE = "move"  # move the path along the surface to where it belongs
+    OUTLINE = "outline"  # the wound lies inside the outline as it was corrected: follow the surface there
     AGAIN = "again"  # do this stage anew: check, or look for the wound
     START = "start"  # let the arm move: approach, then print
     PAUSE = "pause"  # hold above the surface, ready to go on
@@ -51,7 +52,7 @@ ACTIVE_STAGES = (RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING, RunStage.PA
 STAGE_OFFERS = {
     RunStage.CHECK: (Wish.END,),
     RunStage.FIND: (Wish.END,),
-    RunStage.CONFIRM: (Wish.CONFIRM, Wish.MOVE, Wish.AGAIN, Wish.END),
+    RunStage.CONFIRM: (Wish.CONFIRM, Wish.MOVE, Wish.OUTLINE, Wish.AGAIN, Wish.END),
     RunStage.READY: (Wish.START, Wish.AGAIN, Wish.END),
     RunStage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
     RunStage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),

@@ -17,11 +17,12 @@ from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.surface_map import LocalError, Warp
+from hardware.files.images import decode, encode
 from hardware.files.rig_file import rig_from_table, table_from_rig
 from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
 from hardware.recording.schemas import camera_frame
-from perception.frames import Roi
+from perception.frames import OutlinedPicture, Roi
 from planning.command import Hold, Move
 
 Message = dict[str, Any]
@@ -78,6 +79,28 @@ def roi_from_message(message: Message) -> Roi:
     """A polygon from its message."""
     polygon = np.array(message["polygon"], float).reshape(-1, 2)
     return Roi(message["camera"], message["stamp"], polygon, message.get("found", False))
+
+
+def message_from_outlined(outlined: OutlinedPicture) -> Message:
+    """A wound's outline with its picture, exact, as a message."""
+    kind, data = encode(outlined.image)
+    return {
+        "stamp": outlined.stamp,
+        "camera": int(outlined.camera),
+        "taken": outlined.taken,
+        "polygon": outlined.polygon.ravel().tolist(),
+        "by": outlined.by,
+        "format": kind,
+        "data": base64.b64encode(data).decode("ascii"),
+    }
+
+
+def outlined_from_message(where: object, message: Message) -> OutlinedPicture:
+    """A wound's outline with its picture from its message; InputError (where) for a picture that is none."""
+    image = decode(bytes_from_message(message), where, "/wound_outline: data")
+    polygon = np.array(message["polygon"], float).reshape(-1, 2)
+    stamps = float(message["stamp"]), float(message["taken"])
+    return OutlinedPicture(int(message["camera"]), *stamps, image, polygon, str(message["by"]))
 
 
 def message_from_truth(row: Array, exact: bool) -> Message:

@@ -29,7 +29,7 @@ from hardware.recording.mcap_file import ChunkMessages, walk
 from hardware.recording.mcap_writer import McapWriter
 from hardware.recording.messages import SURFACE_FRAME, Message
 from hardware.recording.schemas import CALIBRATION, INFO, TOPICS, Schema, calibration_topic, camera_frame, image_topic
-from perception.frames import Frame, Roi
+from perception.frames import Frame, OutlinedPicture, Roi
 from planning.command import Command, Hold, Move
 
 MAX_CHUNK_SECONDS = 0.5  # s of stamps that a killed run may lose: half of the second that is promised
@@ -42,6 +42,7 @@ MAX_LOG_TIME = 2**63 - 1  # ns
 RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic and encoder of each kind of record
     Observations: ("/observations", messages.message_from_observations),
     Roi: ("/roi", messages.message_from_roi),
+    OutlinedPicture: ("/wound_outline", messages.message_from_outlined),
     RecordedTick: ("/tick", messages.message_from_tick),
     DispenserRecord: ("/dispenser", messages.message_from_dispenser),
     Move: ("/move", messages.message_from_move),
@@ -106,7 +107,8 @@ class Recorder:
                 raise
 
     def write(
-        self, record: Frame | Observations | SurfacePose | Command | Roi | RecordedTick | DispenserRecord
+        self,
+        record: Frame | Observations | SurfacePose | Command | Roi | OutlinedPicture | RecordedTick | DispenserRecord,
     ) -> None:
         """Write a record to its channel at its own stamp."""
         if isinstance(record, Frame):

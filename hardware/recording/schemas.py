@@ -132,6 +132,17 @@ TOPICS: dict[str, Schema] = {
         polygon=_array(NUMBER, None, "x y of each corner"),
         found=_described(FLAG, "by a network; else an operator drew it"),
     ),
+    "/wound_outline": _message(
+        "stillbed.WoundOutline",
+        "Where the wound is in one picture as somebody says; the last one of a picture counts",
+        stamp=_described(NUMBER, "s, when it was said, exact"),
+        camera=COUNT,
+        taken=_described(NUMBER, "s, of the picture, exact"),
+        polygon=_array(NUMBER, None, "x y of each corner, px"),
+        by=_described(TEXT, "who says so: operator"),
+        format=_described(TEXT, "of the picture: png"),
+        data=_described(BASE64, "the picture, exact"),
+    ),
     "/frames": _message(
         "stillbed.Frame",
         "When an image was taken; the image is the message of the same sequence number on its camera's channel",

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -43,10 +43,13 @@ from hardware.recording.mcap_file import (
 )
 from hardware.recording.messages import Message
 from hardware.recording.schemas import image_topic
-from perception.frames import Image, PrintHead, Roi
+from perception.frames import Image, OutlinedPicture, PrintHead, Roi
 from planning.command import Command
 from planning.material import Outlets
 from planning.path import Path as PrintPath
+
+if TYPE_CHECKING:
+    from perception.training.dataset import Labelled
 
 CACHED_CHUNKS = 4  # frames of one instant lie in neighbouring chunks
 SURFACE_NAMES = tuple(f"surface{suffix}" for suffix in SURFACE_SUFFIXES)  # exact names: one with a folder in it is none
@@ -190,7 +193,14 @@ def _checked_rois(path: Path, contents: RecordingContents, rig: Rig) -> tuple[Ro
             got = f"camera {roi.camera} at {roi.stamp} s"
             raise InputError(path, f"/roi[{i}]", got, f"a camera of /rig, 0..{len(rig) - 1}, and a finite stamp")
         check_polygon(path, f"/roi[{i}]", roi.polygon, rig.cameras[roi.camera].size)
-    return tuple(contents.rois.values())
+    return _last_look(tuple(contents.rois.values()))
+
+
+def _last_look(rois: tuple[Roi, ...]) -> tuple[Roi, ...]:
+    """The regions that count: a run that looks for the surface anew records all of its region again, at one stamp."""
+    last = tuple(roi for roi in rois if roi.stamp == max(each.stamp for each in rois))
+    again = len({roi.camera for roi in rois}) < len(rois)
+    return last if again and len(last) > 1 else rois
 
 
 def _truth(path: Path, contents: RecordingContents) -> Trajectory | None:
@@ -300,6 +310,49 @@ def read_channels(path: str | Path, decoders: Mapping[str, Callable[[Message], T
         for stored in part.messages if isinstance(part, ChunkMessages) else ():
             if stored.topic in decoders:
                 yield _decoded(path, stored, decoders[stored.topic])
+
+
+OUTLINE_TOPIC = "/wound_outline"
+OUTLINE_ALLOWED = "a recording of a live run in which an operator corrected the wound's outline"
+
+
+def corrected_pictures(recording: Path) -> list[Labelled]:
+    """The pictures on which operators corrected the wound's outline, each once with the last outline drawn on it.
+
+    In order of camera and stamp. A picture is what the operator saw, to the last bit; a mask is True inside the outline
+    and on it. name: "FILE/CAMERA_STAMP". InputError: no such file, no corrected picture in it, one that is not of its
+    camera's size, an outline that is no polygon in its picture.
+    """
+    from perception.mapping.features import polygon_mask  # loads what no run needs that only reads poses
+    from perception.training.dataset import Labelled
+    from perception.wound.segmentation import rgb
+
+    where, newest = Path(recording), dict[tuple[int, float], OutlinedPicture]()
+    decoders: dict[str, Callable[[Message], Rig | OutlinedPicture]] = {
+        "/rig": partial(messages.rig_from_message, f"{where} /rig"),
+        OUTLINE_TOPIC: partial(messages.outlined_from_message, where),
+    }
+    rig: Rig | None = None
+    for record in read_channels(where, decoders):
+        if isinstance(record, Rig):
+            rig = record
+        elif not np.isfinite(both := [record.stamp, record.taken]).all():
+            raise InputError(where, f"{OUTLINE_TOPIC}: stamp", both, "finite numbers of seconds")
+        elif (key := (record.camera, record.taken)) not in newest or newest[key].stamp <= record.stamp:
+            newest[key] = record
+    if rig is None or not newest:
+        raise InputError(where, OUTLINE_TOPIC, recording_damage(where) or "no message", OUTLINE_ALLOWED)
+    made = []
+    for camera, taken in sorted(newest):
+        outlined = newest[camera, taken]
+        if not 0 <= camera < len(rig):
+            raise InputError(where, f"{OUTLINE_TOPIC}: camera", camera, f"a camera of /rig, 0..{len(rig) - 1}")
+        name, size = rig.cameras[camera].name, rig.cameras[camera].size
+        check_size(outlined.image, size, where, f"{OUTLINE_TOPIC}: image of camera {name!r}")
+        check_polygon(where, f"{OUTLINE_TOPIC}: polygon of camera {name!r}", outlined.polygon, size)
+        wound = polygon_mask(size, outlined.polygon) > 0
+        made.append(Labelled(f"{where.name}/{name}_{taken:.6f}", rgb(outlined.image), wound))
+    return made
 
 
 PATH_ATTACHMENT, ARM_ATTACHMENT, DISPENSER_ATTACHMENT = "path.csv", "arm.toml", "dispenser.toml"

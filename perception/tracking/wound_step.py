@@ -98,15 +98,15 @@ class AsyncSegmentation:
         self._segmenter = segmenter
         self._filters = [WoundFilter(camera.size) for camera in rig.cameras]
         self._job: DelayedJob[dict[int, Segmentation]] = DelayedJob(executor, delay)
-        self._stamp = float("nan")
+        self.looked: FrameSet | None = None  # the pictures that the last job was given
 
     def __call__(self, frames: FrameSet) -> tuple[float, dict[int, WoundEstimate]] | None:
         """Once a frame set: what is due, as the stamp of the pictures and what each camera sees; None: nothing is."""
         looks, due = self._job.poll(), None
-        if looks is not None:
-            due = self._stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
+        if looks is not None and self.looked is not None:
+            due = self.looked.stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
         if not self._job.busy and frames.frames:
-            self._stamp = frames.stamp
+            self.looked = frames
             self._job.submit(segment_all, self._segmenter, {f.camera: f.image for f in frames.frames})
         return due
 
@@ -122,11 +122,23 @@ SKIN_MARGIN_SHARE = 0.6  # of the wound's box on every side: the skin beside it 
 WHOLE_PICTURES = "no region and no wound: whole pictures are tracked as one surface; better draw a region"
 WOUND_SOUGHT, PATCH_SOUGHT = "the wound is being looked for", "the coloured frame is being looked for"
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WoundSight:
+    """The pictures by which the region was found, and the wound that was seen in them."""
+
+    frames: FrameSet
+    masks: Mapping[int, WoundMask]  # (H, W) by camera; none of a camera that saw no wound
+
+
 FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, known from this frame set on, or why it is not
 
 
 class RegionSearch:
-    """Looks for the region by a segmenter, once a frame set, until it is found."""
+    """Looks for the region by a segmenter, once a frame set, until it is found.
+
+    sight: what it was found by; None until then, and of a frame or patch.
+    """
 
     def __init__(self, rig: Rig, segmenter: Segmenter, executor: Executor | None = None, patch: bool = False) -> None:
         """executor: one thread, as `AsyncSegmentation` takes it.
@@ -137,19 +149,24 @@ class RegionSearch:
         self._rig, self._patch = rig, patch
         self._segmentation = AsyncSegmentation(rig, segmenter, executor)
         self._looks = 0
+        self.sight: WoundSight | None = None
 
     def __call__(self, frames: FrameSet) -> Sequence[Roi] | str:
         """The region in each camera; two cameras or more see it."""
+        looked = self._segmentation.looked  # what the next result is of
         due = self._segmentation(frames)
         if due is None:
             return self._sought
         self._looks += 1
         stamp, sights = due
         seen = sum(sight.box is not None for sight in sights.values())
-        if seen == len(self._rig) or (seen >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS)):
-            return self._rois(stamp, sights)
-        if self._patch or self._looks < MAX_EMPTY_LOOKS:
+        enough = seen == len(self._rig) or (seen >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS))
+        if not enough and (self._patch or self._looks < MAX_EMPTY_LOOKS):
             return self._sought
+        if looked is not None and not self._patch:
+            self.sight = WoundSight(looked, {c: sight.mask for c, sight in sights.items() if sight.box is not None})
+        if enough:
+            return self._rois(stamp, sights)
         return whole_pictures([camera.size for camera in self._rig.cameras], stamp)
 
     @property
@@ -208,6 +225,11 @@ class RegionTrackingStep:
     def roi(self) -> tuple[Roi, ...]:
         """Where the surface was at the start, none before that is known."""
         return () if self._step is None else self._step.roi
+
+    @property
+    def sight(self) -> WoundSight | None:
+        """What the network saw when it found the region; None before, and where none was asked."""
+        return self._find.sight if isinstance(self._find, RegionSearch) else None
 
     def idle(self) -> None:
         """Work that no pose waits for."""

@@ -118,6 +118,18 @@ def hull_of(mask: WoundMask) -> Array:
     return np.asarray(even.reshape(-1, 2), float)
 
 
+def outline_of(mask: WoundMask, tolerance: float) -> Array:
+    """(N, 2) px corners of the outline of a mask's (H, W) largest part, holes filled, to `tolerance` of its length.
+
+    It runs through the middles of the outermost pixels. None, (0, 2), of an empty mask.
+    """
+    contours, _ = cv2.findContours(largest_part(mask).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return np.zeros((0, 2))
+    even = cv2.approxPolyDP(contours[0], tolerance * cv2.arcLength(contours[0], True), True)
+    return np.asarray(even.reshape(-1, 2), float)
+
+
 def segmentation_from_logits(logits: NDArray[np.float32], settings: Settings) -> Segmentation:
     """The wound by (H, W) logits.
 

@@ -12,7 +12,7 @@ const PATIENCE = 1500; // ms until a request without an answer is spoken of
 const SHOWN = 6000; // ms
 
 export class Buttons {
-  // ask: given wish, turn and, of a move, how far, asks; returns a tag or null
+  // ask: given wish, turn and what a move or an outline carries, asks; returns a tag or null
   constructor(ask) {
     this.ask = ask;
     this.view = null;
@@ -66,8 +66,8 @@ export class Buttons {
     this.sure.hidden = true;
     this.asking = null;
   }
-  send(wish, turn, move) {
-    const tag = this.ask(wish, turn, move);
+  send(wish, turn, more) {
+    const tag = this.ask(wish, turn, more);
     if (tag === null) {
       this.say(`${upper(wish)} was not sent: no connection.`, true);
       return null;

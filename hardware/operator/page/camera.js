@@ -2,10 +2,10 @@
 import { drawPath, Lens, product } from "./lens.js";
 
 const OLD = 1500; // ms: they come five times a second
-const NO_HAND = { drag: null, press: () => false, click: () => false, preview: () => null, draw() {} }; // nothing is moved
+const NO_HAND = { drag: null, press: () => false, click: () => false, preview: () => null, still: () => null, draw() {} }; // nothing is moved
 
 export class CameraPane {
-  // hand: takes presses, pulls and clicks in css px of the picture; see Placing
+  // hand: takes presses, pulls and clicks in css px of the picture; see Placing and Outlining
   constructor(name, chosen, hand = NO_HAND) {
     this.name = name;
     this.root = document.createElement("figure");
@@ -22,21 +22,22 @@ export class CameraPane {
       const box = this.canvas.getBoundingClientRect();
       return [event.clientX - box.left, event.clientY - box.top];
     };
+    this.hand = hand;
     let dragged = false;
+    const drags = (event) => this.hand.drag && this.hand.drag.camera === this && this.hand.drag.id === event.pointerId;
     this.canvas.addEventListener("pointerdown", (event) => {
       dragged = false;
-      if (event.button === 0 && hand.press(this, place(event), event)) this.canvas.setPointerCapture(event.pointerId);
+      if (event.button === 0 && this.hand.press(this, place(event), event)) this.canvas.setPointerCapture(event.pointerId);
     });
     this.canvas.addEventListener("pointermove", (event) => {
-      if (hand.drag && hand.drag.camera === this && hand.drag.id === event.pointerId) hand.pull(place(event));
+      if (drags(event)) this.hand.pull(place(event));
     });
     for (const kind of ["pointerup", "pointercancel"]) this.canvas.addEventListener(kind, (event) => {
-      if (hand.drag && hand.drag.camera === this && hand.drag.id === event.pointerId) dragged = hand.release();
+      if (drags(event)) dragged = this.hand.release();
     });
     this.root.addEventListener("click", (event) => {
-      if (!dragged && !hand.click(this, place(event)) && !this.clicked(event)) chosen(name);
+      if (!dragged && !this.hand.click(this, place(event)) && !this.clicked(event)) chosen(name);
     });
-    this.hand = hand;
     this.fitted = null; // how a pixel of the camera lies on the canvas
     this.corners = []; // of the region, [x, y] px
     this.drawing = this.place = null; // takes a corner while a region is drawn; where the picture lies on the canvas
@@ -63,10 +64,13 @@ export class CameraPane {
     for (const each of [this.image, this.close]) if (each) each.close();
     [this.image, this.close, this.found, this.since] = [image, close, found, performance.now()];
   }
-  // whether a click was a corner of the region: in a picture that is not small beside another
+  // whether it is small beside another, so that a click makes it large
+  get small() {
+    return document.body.dataset.large === "yes" && !this.root.classList.contains("chosen");
+  }
+  // whether a click was a corner of the region
   clicked(event) {
-    const small = document.body.dataset.large === "yes" && !this.root.classList.contains("chosen");
-    if (!this.drawing || !this.place || small) return false;
+    if (!this.drawing || !this.place || this.small) return false;
     const { x0, y0, scale, size, ratio } = this.place, box = this.canvas.getBoundingClientRect();
     const pixel = [(event.clientX - box.left) * ratio - x0, (event.clientY - box.top) * ratio - y0];
     this.drawing(pixel.map((p, k) => Math.round(10 * Math.min(Math.max(p / scale - 0.5, 0), size[k] - 1)) / 10));
@@ -74,9 +78,9 @@ export class CameraPane {
   }
   // a picture that stands still must not be taken for a live one
   tick() {
-    const age = this.image ? performance.now() - this.since : 0, old = age > OLD;
+    const age = this.image ? performance.now() - this.since : 0, old = age > OLD && !this.standing;
     this.root.classList.toggle("still", old);
-    this.title.textContent = old ? `${this.name}, ${(age / 1000).toFixed(0)} s old` : this.name;
+    this.title.textContent = this.standing ? `${this.name}, still picture` : old ? `${this.name}, ${(age / 1000).toFixed(0)} s old` : this.name;
   }
   fares(view) {
     this.root.dataset.verdict = view ? view.verdict : "";
@@ -99,18 +103,27 @@ export class CameraPane {
     g.clearRect(0, 0, w, h);
     const size = this.lens ? this.lens.camera.size : this.image ? [this.image.width, this.image.height] : null;
     if (!size) return;
-    const crop = near && !this.drawing && this.close && this.found.crop, [left, top, across, down] = crop || [0, 0, ...size];
+    const still = this.hand.still(this, near); // a picture that stands while something is put right on it
+    this.standing = Boolean(still);
+    const crop = still ? still.crop : near && !this.drawing && this.close && this.found.crop, [left, top, across, down] = crop || [0, 0, ...size];
     const scale = Math.min(w / across, h / down), x0 = (w - scale * across) / 2, y0 = (h - scale * down) / 2;
     this.place = { x0, y0, scale, size, ratio };
     this.fitted = { scale, x0, y0, left, top, across, down, ratio };
-    this.canvas.dataset.drawn = !this.image ? "" : scene && pose && this.lens ? "path" : "picture";
-    if (this.image) g.drawImage(crop ? this.close : this.image, x0, y0, scale * across, scale * down);
+    this.canvas.dataset.drawn = still ? "outline" : !this.image ? "" : scene && pose && this.lens ? "path" : "picture";
+    const fine = still && still.image.width / size[0];
+    if (still) g.drawImage(still.image, fine * left, fine * top, fine * across, fine * down, x0, y0, scale * across, scale * down);
+    else if (this.image) g.drawImage(crop ? this.close : this.image, x0, y0, scale * across, scale * down);
     if (!this.lens) return;
     g.save();
     g.beginPath();
     g.rect(x0, y0, scale * across, scale * down);
     g.clip();
     const on = (p) => p && [x0 + scale * (p[0] - left + 0.5), y0 + scale * (p[1] - top + 0.5)];
+    if (still) {
+      this.hand.draw(g, this, on, ratio);
+      g.restore();
+      return;
+    }
     this.found && this.overlay(g, on, ratio);
     this.region(g, on, ratio);
     if (scene && pose) {

@@ -2,7 +2,8 @@
 import { Buttons } from "./buttons.js";
 import { Course } from "./course.js";
 import { Drawing } from "./draw.js";
-import { Panes } from "./panes.js";
+import { Outlining } from "./outline.js";
+import { Panes, unpacked } from "./panes.js";
 import { Placing } from "./placing.js";
 import { SceneView } from "./scene.js";
 import { Line } from "./socket.js";
@@ -13,8 +14,9 @@ const EVENTS = 2; // of the last ones that there is room for
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
 const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null, near: true };
-const placing = new Placing(by("placing"), (move, turn) => buttons.send("move", turn, move), (words, bad) => buttons.say(words, bad), refresh);
+const placing = new Placing(by("placing"), (move, turn) => buttons.send("move", turn, { move }), (words, bad) => buttons.say(words, bad), refresh);
 const panes = new Panes(by("pictures"), choose, placing);
+const outlining = new Outlining(by("outlining"), by("outline"), panes, (outline, turn) => buttons.send("outline", turn, { outline }), (words, bad) => buttons.say(words, bad), show);
 const course = new Course(document.querySelector("#course canvas"));
 const space = new SceneView(by("scene"));
 
@@ -51,7 +53,9 @@ function scene(message) {
 }
 
 async function pictures(data) {
-  const head = await panes.show(data);
+  const came = await unpacked(data);
+  if (came.head.kind === "sheet") return outlining.take(came);
+  const head = panes.put(came);
   by("closer").hidden = !head.pictures.some((each) => each.crop);
   state.poses = head.base_from_surface;
   refresh();
@@ -78,8 +82,12 @@ function show() {
   alarm(news, age);
   if (seen) stage(seen);
   sees();
+  outlining.show(seen, news === "live");
+  placing.aside = outlining.on;
   placing.show(seen, news === "live");
-  buttons.held = placing.busy;
+  panes.hand = outlining.on ? outlining : placing;
+  for (const each of panes.values()) each.hand = panes.hand;
+  buttons.held = placing.busy || outlining.on;
   buttons.show(seen, news === "live");
   drawing.show(seen, news === "live");
   if (seen) {
@@ -112,7 +120,7 @@ function stage(seen) {
   by("chip").textContent = holds ? "Holding" : about.word;
   document.body.dataset.tone = holds ? "hold" : about.tone;
   const same = seen.question.toLowerCase() === about.word.toLowerCase(); // it stands beside it already
-  by("question").textContent = (!same && seen.question) || (holds ? "Holding until it is safe to print." : about.say);
+  by("question").textContent = outlining.on ? "Where is the wound's edge?" : (!same && seen.question) || (holds ? "Holding until it is safe to print." : about.say);
   by("reason").textContent = upper((holds && seen.motion.reason) || (seen.placement && seen.placement.verdict === seen.reason ? "" : seen.reason));
   by("notes").replaceChildren(...seen.notes.map((note) => {
     const made = text("span", note.split(/[:;]/)[0]); // the rest is told to whoever points at it
@@ -239,7 +247,7 @@ for (const button of by("closer").querySelectorAll("button")) button.addEventLis
 space.changed = refresh;
 window.addEventListener("resize", refresh);
 const line = new Line(hear);
-const buttons = new Buttons((wish, turn, move) => line.ask(wish, turn, move));
+const buttons = new Buttons((wish, turn, more) => line.ask(wish, turn, more));
 const drawing = new Drawing(by("draw"), panes, line, (words, bad) => buttons.say(words, bad));
 setInterval(() => {
   for (const each of panes.values()) each.tick();

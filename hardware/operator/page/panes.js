@@ -27,7 +27,9 @@ export class Panes extends Map {
     return this.get(name);
   }
   async show(data) {
-    const { head, images } = await unpacked(data);
+    return this.put(await unpacked(data));
+  }
+  put({ head, images }) {
     head.pictures.forEach((each, k) => images[k][0] && this.of(each.camera).show(...images[k], each));
     return head;
   }

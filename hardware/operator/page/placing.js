@@ -22,7 +22,7 @@ export class Placing {
   constructor(root, ask, say, changed) {
     Object.assign(this, { root, ask, say, changed });
     this.view = this.sent = this.points = this.drag = null;
-    this.live = false;
+    this.live = this.aside = false; // aside: something else is put right in the pictures
     this.rest = nothing();
     this.step = 1;
     this.last = -Infinity;
@@ -49,7 +49,7 @@ export class Placing {
   }
   // whether the path can be moved now
   get open() {
-    return Boolean(this.live && this.view && this.view.stage === "confirm" && this.view.offers.includes("move") && this.frame);
+    return Boolean(this.live && !this.aside && this.view && this.view.stage === "confirm" && this.view.offers.includes("move") && this.frame);
   }
   // surface_from_tangent, null where the surface is not mapped
   get frame() {
@@ -70,7 +70,7 @@ export class Placing {
     const answer = view && view.answer;
     if (this.sent && answer && answer.number === this.sent.number && !answer.followed) this.forget();
     const placement = view && view.stage === "confirm" ? view.placement : null;
-    this.root.hidden = !placement;
+    this.root.hidden = !placement || this.aside;
     if (!this.open) {
       if (this.drag || this.points) this.points = this.drag = null;
       if (!placement) this.forget();
@@ -183,6 +183,10 @@ export class Placing {
 
   // -- in the pictures
 
+  // no picture stands while the path is moved
+  still() {
+    return null;
+  }
   // where a pixel of a camera meets the surface, in the path's frame on it; relief: whether to follow the mapped points
   meet(camera, [px, py], relief) {
     const { pose, scene } = this.at;

@@ -37,10 +37,10 @@ export class Line {
     this.socket.send(JSON.stringify({ region, turn, tag: ++this.tag }));
     return this.tag;
   }
-  // ask for a wish under the turn that was shown, a move with how far; its tag, or null where nobody can be asked
-  ask(wish, turn, move) {
+  // ask for a wish under the turn that was shown; more: { move } or { outline }; its tag, or null where nobody can be asked
+  ask(wish, turn, more) {
     const tag = ++this.tag;
-    if (this.connected) this.socket.send(JSON.stringify(move ? { ask: wish, turn, tag, move } : { ask: wish, turn, tag }));
+    if (this.connected) this.socket.send(JSON.stringify({ ask: wish, turn, tag, ...more }));
     if (wish === "stop" && (!this.connected || performance.now() - this.heard > SILENCE)) {
       fetch("stop", { method: "POST" }).catch(() => {});
     } else if (!this.connected) return null;

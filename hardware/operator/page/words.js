@@ -31,7 +31,7 @@ export const ACTIVITIES = {
   homing: { word: "Going home", tone: "good" },
 };
 export const WISHES = {
-  confirm: "Yes, it lies right", move: "Move", start: "Start", resume: "Resume", pause: "Pause", again: "Again", home: "Home",
+  confirm: "Yes, it lies right", move: "Move", outline: "Use this outline", start: "Start", resume: "Resume", pause: "Pause", again: "Again", home: "Home",
   end: "Finish", stop: "Stop",
 };
 export const AGAIN = { check: "Check again", find: "Look again", confirm: "No, look again" };
