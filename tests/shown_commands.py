@@ -116,7 +116,10 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
     "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 2", LONG),
     "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),
-    "stillbed bench segmentation DATASET": ("stillbed bench segmentation dataset --rendered 1", "has a small one"),
+    "stillbed bench segmentation DATASET": (
+        "stillbed bench segmentation dataset --rendered 1 --areas 1",
+        "has a small one",
+    ),
     "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand "
     "breathing_calm breathing_deep turns steps_300um camera_lost --rendered 6": (
         "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",

@@ -245,11 +245,16 @@ def test_the_bench_judges_by_what_was_held_out_of_the_networks_own_data_and_by_a
 def test_the_bench_runs_without_data_and_says_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
     parser = argparse.ArgumentParser()
     SUBJECTS["segmentation"].add_options(parser)
-    figures = {figure.what: figure for figure in run_segmentation(parser.parse_args(["--rendered", "2"]))}
+    figures = {
+        figure.what: figure for figure in run_segmentation(parser.parse_args(["--rendered", "2", "--areas", "1"]))
+    }
     assert "segmentation" in SUBJECTS
     assert "Dice of each picture, mean" not in figures and "no DATASET is named" in capsys.readouterr().err
     assert figures["Dice on rendered wounds, mean"].value > 0.7
     assert figures["network, a picture: median"].value > 0
+    for kind in ("network", "true outlines"):
+        assert figures[f"area by three cameras, {kind}: inside the 95 % interval"].value == 1
+    assert abs(figures["area by three cameras, true outlines: error, mean"].value) < 3
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="labelled pictures of wounds are not beside the project")

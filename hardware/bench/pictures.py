@@ -2,7 +2,7 @@
 
 `views`: rendered skin that deforms, grazing views with glare, edges. Everything is measured after the constant
 transform at the first TRACKING pose; nothing is fitted over the run.
-`segmentation`: Dice on held-out pictures, silence where there is no wound, a half covered wound, time.
+`segmentation`: Dice on held-out pictures, silence where there is no wound, a half covered wound, time; areas in mm^2.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.bench.figures import Figure, at_least, at_most, percentile, rms
+from hardware.bench.figures import Figure, at_least, at_most, percentile, rms, with_progress
 from hardware.bench.mapping import wound_points
 from hardware.files.images import encode
 from hardware.process.checks import Table
@@ -33,17 +33,27 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.scene.appearance import Sensor, unlit_texture
 from hardware.simulator.scene.fields import smooth_noise
-from hardware.simulator.scene.ground_truth_views import wound_view
+from hardware.simulator.scene.ground_truth_views import wound_set, wound_view
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import shape_from_function
 from hardware.simulator.truth import Truth
 from perception.frames import Frame, FrameSet
 from perception.tracking.step import TrackingStep
+from perception.tracking.wound_area import wound_area
 from perception.training.dataset import Labelled, healthy_pieces, read_dataset
 from perception.training.metrics import bgr, dice_before_and_after_cover, scores, silent_share
 from perception.wound.network import SHIPPED_MODEL, THESIS_MODEL, WoundNetwork, shipped_model
-from perception.wound.segmentation import JudgedPicture, NetworkSegmenter, contact_sheet, dice
+from perception.wound.segmentation import (
+    JudgedPicture,
+    NetworkSegmenter,
+    Segmentation,
+    WoundBand,
+    contact_sheet,
+    dice,
+    filled,
+    seeded_parts,
+)
 from perception.wound.shape_matching import ShapeSegmenter, largest_outline, read_shape_model, thesis_mask
 
 VIEW_RATE, VIEW_EXPOSURE = 30.0, 0.005  # frame sets a second; s
@@ -194,6 +204,8 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
         Figure("Dice on rendered wounds, mean", mean, "", None, "", note),
         Figure(covered, before - after, "", at_most(0.05), "thesis by eye", f"from {before:.3f} to {after:.3f}"),
         *_time(network, pictures or wounds),
+        *spread_figures(segmenter, pictures),
+        *area_figures(segmenter, options.areas),
     ]
     if pictures:
         return figures
@@ -290,3 +302,64 @@ def _time(network: WoundNetwork, pictures: Sequence[Labelled]) -> list[Figure]:
         Figure("network, a picture: p99", percentile(counted, 99), "ms", at_most(20.0), "", note),
         Figure("parameters, at most", network.size / 1e6, "million", at_most(3.0), "", "a byte each in the file"),
     ]
+
+
+def spread_figures(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Figure]:
+    """How many labels' areas lie inside a picture's interval, and which spread would hold 95 % of them.
+
+    The latter is a quantile of normalised residuals (split conformal prediction: Angelopoulos and Bates 2021, 2.3).
+    Only outlines that touch the label count: what is found elsewhere is no error of an outline.
+    """
+    residuals = []  # of the logarithm of the label's area, in half bands
+    for each in pictures:
+        band = segmenter.band(bgr(each.picture))
+        label = filled(seeded_parts(each.wound, band.outline, 0.0)) if band.outline.any() else each.wound
+        if band.outline.any() and (label & band.outline).any():
+            with np.errstate(divide="ignore"):
+                outline, inner, outer, true = np.log([m.sum() for m in (band.outline, band.inner, band.outer, label)])
+            off, half = (true - outline, outer - outline) if true > outline else (outline - true, outline - inner)
+            residuals.append(off / half if half > 0 else (math.inf if off > 0 else 0.0))
+    if not residuals:
+        return []
+    off, spread = np.array(residuals), segmenter.settings.spread
+    halves = [float((off[i::2] <= _conformal(off[1 - i :: 2])).mean()) for i in (0, 1)]
+    note = f"{len(off)} pictures; by the spread of the other half {halves[0]:.3f} and {halves[1]:.3f}"
+    inside = float((off <= spread).mean())
+    return [
+        Figure("label's area inside the interval of one picture", inside, "", at_least(0.93), "", note),
+        Figure("spread that holds 95 % of the labels", _conformal(off), "half bands", None, "", f"used: {spread:g}"),
+    ]
+
+
+def _conformal(residuals: Array) -> float:
+    """The quantile of residuals (N,) below which a further one lies in 95 of 100 cases."""
+    return float(np.quantile(residuals, min(1.0, 0.95 * (1 + 1 / len(residuals))), method="higher"))
+
+
+def area_figures(segmenter: NetworkSegmenter, count: int) -> list[Figure]:
+    """Areas by three cameras of `count` rendered wounds beside the true ones: by the network, and by true outlines."""
+    judged: dict[str, list[tuple[float, float, bool]]] = {"network": [], "true outlines": []}
+    refused = dict.fromkeys(judged, 0)
+    for seed in with_progress("areas", "wounds", range(count), count):
+        taken = wound_set(seed)
+        images = dict(enumerate(taken.images))
+        exact = {c: WoundBand(Segmentation(m, 1.0, 0.5), m, m, m) for c, m in enumerate(taken.wounds)}
+        for kind, bands in (("network", {c: segmenter.band(i) for c, i in images.items()}), ("true outlines", exact)):
+            area = wound_area(taken.rig, images, bands, segmenter.settings.spread)
+            if isinstance(area, str):
+                refused[kind] += 1
+            else:
+                error, half = math.log(area.area / taken.area), math.log(area.high / max(area.low, 1e-9)) / 2
+                judged[kind].append((error, half, area.low <= taken.area <= area.high))
+    figures = []
+    for kind, rows in judged.items():
+        if rows:
+            error, half, inside = np.array(rows).T
+            what, note = f"area by three cameras, {kind}", f"{len(rows)} rendered wounds, {refused[kind]} not measured"
+            figures += [
+                Figure(f"{what}: inside the 95 % interval", float(inside.mean()), "", at_least(0.93), "", note),
+                Figure(f"{what}: error, median of the absolute", 100 * float(np.median(np.abs(error))), "%"),
+                Figure(f"{what}: error, mean", 100 * float(error.mean()), "%"),
+                Figure(f"{what}: half the interval, median", 100 * float(np.median(half)), "%, of the logarithm"),
+            ]
+    return figures

@@ -214,10 +214,11 @@ _SUBJECTS = (
         _option("--arm", type=Path, metavar="ARM.toml", help="instead of the default arm"),
         _number("--seed", 0, None, "of the streams; runs with other seeds may go side by side"),
     ),
-    _subject("segmentation", "pictures", "finding the wound: Dice, silence, a half covered one, time")(
+    _subject("segmentation", "pictures", "finding the wound: Dice, silence, a half covered one, time, area")(
         _option("dataset", type=Path, nargs="?", metavar="DATASET", help="folder with images/ and labels/"),
         _option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
         _number("--rendered", 60, "N", "rendered pictures of each kind"),
+        _number("--areas", 40, "N", "rendered wounds before three cameras, for areas in mm^2; default 40"),
         _option("--sheet", type=Path, metavar="X.jpg", help="also draw best, median and worst, 8 of each"),
         _number("--seed", 1, "N", "of pieces, covers and sizes drawn"),
     ),

@@ -101,6 +101,7 @@ class Settings:
     trust: float = 0.5  # confidence below which there is no wound
     slope: float = 1.0  # of the logistic that turns the mean logit of the mask's pixels into a confidence
     offset: float = 0.0  # of the same
+    spread: float = 2.0  # half a 95 % interval of the area, in half bands of probability (`WoundBand`): so labels ask
 
 
 @dataclass(frozen=True, slots=True)
