@@ -96,6 +96,11 @@ _SUBJECTS = (
         _number("--runs", 50, "N", "arms on drawn tips; default 50"),
         _number("--seed", 0, None, "of the first arm; default 0"),
     ),
+    _subject("beside", "live", "the wound network beside the tracker: its share of a core, what it costs a pose")(
+        _number("--seconds", 10.0, "S", "of the made recording; default 10"),
+        _option("--scene", choices=MADE, default=MADE[-1], metavar="NAME", help="; ".join(MADE)),
+        _option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
+    ),
     _subject("bumps", "detection", "cameras knocked and lenses turned by little: found, named, false alarms")(
         _number("--count", 9, "N", "of each knock; default 9"),
         _number("--minutes", 10.0, "M", "of calm; default 10"),
