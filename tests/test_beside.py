@@ -66,4 +66,5 @@ def test_the_network_beside_the_tracker_changes_no_pose() -> None:
     figures = {figure.what: figure for figure in subject.run(parser.parse_args(["--seconds", "1.5", "--scene", scene]))}
     assert figures[f"{scene}: poses lost with the network alone"].value == 0
     assert figures[f"{scene}: poses that differ in a bit"].value == 0
-    assert 0 < figures[f"{scene}: network's share of a core"].value <= 100
+    share, pace = figures[f"{scene}: network's share of a core"].value, figures[f"{scene}: pace"].value
+    assert 0 < share <= 110 and 0 < pace < 100.001  # what is left of the last pictures ends after a block

@@ -365,8 +365,8 @@ def run_beside(options: argparse.Namespace) -> list[Figure]:
         steps, beside = (without, along), AsyncSegmentation(recording.rig, timed, thread)
         for block in range(0, len(packed), BLOCK_SETS):
             for turn in (0, 1) if block % (2 * BLOCK_SETS) else (1, 0):
-                start = clock.now()
-                for number, each in enumerate(packed[block : block + BLOCK_SETS]):
+                start, sets = clock.now(), packed[block : block + BLOCK_SETS]
+                for number, each in enumerate(sets):
                     frames = unpacked_set(each)
                     clock.wait_until(start + number / FRAME_RATE)
                     begun = clock.now()
@@ -377,10 +377,14 @@ def run_beside(options: argparse.Namespace) -> list[Figure]:
                         beside(frames)
                         spent[2].append(clock.now() - ended)
                     steps[turn].idle()
-                thread.submit(int).result()  # the network has ended before the other's turn
+                clock.wait_until(start + len(sets) / FRAME_RATE)
                 wall += turn * (clock.now() - start)
-    share = Figure(
-        f"{options.scene}: network's share of a core", 100 * sum(looks) / wall, "%", None, "",
-        f"one thread; {len(looks)} pictures in {wall:.1f} s; the machine's load was {os.getloadavg()[0]:.1f}",
-    )  # fmt: skip
-    return [share, *beside_figures(options.scene, *poses, np.array(spent))]
+                thread.submit(int).result()  # the network has ended before the other's turn
+    pace = len(packed) / FRAME_RATE / wall  # of live cameras; below 1 the machine had no time for them
+    share, note = f"{options.scene}: network's share of a core", f"{len(looks)} pictures in {wall:.1f} s, one thread"
+    figures = [
+        Figure(share, 100 * sum(looks) / wall, "%", None, "", f"{note}; the load was {os.getloadavg()[0]:.1f}"),
+        Figure(f"{options.scene}: pace", 100 * pace, "%", at_least(95), "", "of 30 frame sets a second"),
+        Figure(f"{options.scene}: network, a picture", 1000 * float(np.median(looks)), "ms", None, "", "processor"),
+    ]
+    return [*figures, *beside_figures(options.scene, *poses, np.array(spent))]
