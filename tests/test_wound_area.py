@@ -32,6 +32,7 @@ from perception.tracking.wound_area import (
     SkinSurface,
     WoundArea,
     area_on_surface,
+    pixel_patches,
     quadric,
     wound_area,
 )
@@ -243,6 +244,13 @@ def test_outlines_of_different_places_or_beyond_the_surface_are_no_wound() -> No
     assert area_on_surface(RIG, FLAT, {**circles((12.0, 12.0)), 1: exact(aside)}, 1.0) == ELSEWHERE
     behind = replace(FLAT, base_from_skin=BASE_FROM_REST @ se3.make(np.eye(3), [0.0, 0.0, 3000.0]))
     assert area_on_surface(RIG, behind, circles((12.0, 12.0)), 1.0) == OFF_SURFACE
+    # a camera that the surface is turned away from, where a part of its outline lies: the others measure
+    sharp = replace(FLAT, coefficients=np.array([0, 0, 0, 0, 0, -0.03]))
+    beyond = np.zeros_like(aside)
+    beyond[300:420, 200:1000] = True
+    assert not np.isfinite(pixel_patches(RIG.cameras[2], sharp, (200, 300, 1000, 420))[0]).all()
+    area = on_surface({**circles((9.0, 9.0), sharp), 2: exact(beyond)}, sharp)
+    assert area.cameras == (0, 1)
 
 
 def test_an_outline_has_no_holes_and_is_the_largest_part() -> None:

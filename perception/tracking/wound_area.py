@@ -109,17 +109,20 @@ def wound_area(rig: Rig, images: Mapping[int, Image], bands: Mapping[int, WoundB
 
 
 def area_on_surface(rig: Rig, skin: SkinSurface, bands: Mapping[int, WoundBand], spread: float) -> WoundArea | str:
-    """As `wound_area`, of two whole outlines or more, laid on a surface."""
-    rows, centres = [], []  # mm^2 of outline, inner and outer of each camera; (2,) mm
+    """As `wound_area`, of two whole outlines or more, laid on a surface; one that runs beyond it does not count."""
+    used, rows, centres = [], [], []  # cameras; mm^2 of outline, inner and outer; (3,) mm
     for c, band in bands.items():
         box = box_of(band.outer)
         assert box is not None
         patches, middles = pixel_patches(rig.cameras[c], skin, box)
         outline, inner, outer = (m[box[1] : box[3], box[0] : box[2]] for m in (band.outline, band.inner, band.outer))
         if not np.isfinite(patches[outer]).all():
-            return OFF_SURFACE
+            continue
+        used.append(c)
         rows.append([patches[mask].sum() for mask in (outline, inner, outer)])
         centres.append(np.average(middles[outline], axis=0, weights=patches[outline]))
+    if len(used) < 2:
+        return OFF_SURFACE
     areas, aside = np.array(rows), np.array(centres) - np.mean(centres, axis=0)
     with np.errstate(divide="ignore"):
         log, low, high = np.log(areas).T
@@ -129,13 +132,12 @@ def area_on_surface(rig: Rig, skin: SkinSurface, bands: Mapping[int, WoundBand],
     down, up = spread * float((log - low).mean()), spread * float((high - log).mean())
     count = len(log)
     apart = float(stdtrit(count - 1, 0.975) * log.std(ddof=1) / np.sqrt(count))
-    first = next(iter(bands))
-    fitted = surface_sigma(skin, rig.cameras[first], bands[first].outline)
+    fitted = surface_sigma(skin, rig.cameras[used[0]], bands[used[0]].outline)
     geometry = NORMAL_95 * float(np.hypot(fitted, 2 * RIG_SCALE_SIGMA))
     lower, upper = (np.sqrt(half**2 + apart**2 + geometry**2) for half in (down, up))
     low_area, high_area = float(np.exp(mean - lower)), float(np.exp(mean + upper))
     area = float(np.exp(mean))
-    return WoundArea(area, low_area, high_area, tuple(bands), areas[:, 0], (down, up), apart, geometry)
+    return WoundArea(area, low_area, high_area, tuple(used), areas[:, 0], (down, up), apart, geometry)
 
 
 def pixel_patches(camera: Camera, skin: SkinSurface, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
