@@ -79,6 +79,8 @@ OUTAGES = "stillbed bench outages --count 1 --processes 1"
 INSTALLS = "makes an environment and runs what else is tested; that the target can be made is looked at"
 INSTEAD = {  # (what is run in its place, why)
     "stillbed bench arm-calibration": ("stillbed bench arm-calibration --rendered 0 --runs 1", LONG),
+    "stillbed bench beside": ("stillbed bench beside --seconds 1", LONG),
+    "stillbed bench beside --seconds 6": ("stillbed bench beside --seconds 1", LONG),
     "stillbed bench bumps": ("stillbed bench bumps --count 1 --minutes 0.1", LONG),
     "stillbed bench calibration": ("stillbed bench calibration --instants 12 --runs 1", LONG),
     "stillbed bench cameras": ("stillbed bench cameras --minutes 0.05", LONG),
@@ -116,7 +118,10 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
     "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 2", LONG),
     "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),
-    "stillbed bench segmentation DATASET": ("stillbed bench segmentation dataset --rendered 1", "has a small one"),
+    "stillbed bench segmentation DATASET": (
+        "stillbed bench segmentation dataset --rendered 1 --areas 1",
+        "has a small one",
+    ),
     "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand "
     "breathing_calm breathing_deep turns steps_300um camera_lost --rendered 6": (
         "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",

@@ -18,8 +18,7 @@ from hardware.arm.protocol import G1, G4, Pause, Reply, ReplyKind, encode
 from hardware.motion.loop import Order
 from hardware.process.faults import Fault, FaultKind, FaultPart, WorkRates
 from hardware.simulator.arm.ports import PortFaults
-from hardware.simulator.arm.serial_line import FaultyLine
-from hardware.simulator.arm.settings import ArmSettings, ReplyMode
+from hardware.simulator.arm.settings import ArmSettings, FaultyLine, ReplyMode
 from tests.linked import Linked, linked
 from tests.test_motion_loop import Looping
 from tests.virtual_arm import HOME, IDEAL, arm_fault, axes_at, motion, move, virtual_arm

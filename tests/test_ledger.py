@@ -16,7 +16,7 @@ from estimation.se3 import Array
 from estimation.synthetic.movements import ComposedMotion
 from estimation.synthetic.world import BASE_FROM_REST
 from hardware.arm.profile import ArmProfile, placed
-from hardware.simulator.arm.serial_line import SerialWire
+from hardware.simulator.arm.settings import SerialWire
 from hardware.simulator.camera_pipeline import ARRIVAL_EVENT, EXPOSURE_EVENT, POSE_EVENT, TICK_EVENT, EventQueue
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold, Move

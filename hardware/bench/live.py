@@ -1,6 +1,7 @@
-"""Subject `live`: whole runs in real time with pre-rendered cameras, the virtual arm, and all processes.
+"""Subjects `live` and `beside`: whole runs in real time; the wound network beside the tracker and without it.
 
-Rendering takes ten times as long as the pictures last, so they are rendered once and shown by a process of their own.
+A run has pre-rendered cameras, the virtual arm, and all processes. Rendering takes ten times as long as the pictures
+last, so they are rendered once and shown by a process of their own.
 Kills: random processes of a run end at random instants. Is the arm at rest? Does the next run go on where it was?
 """
 
@@ -13,15 +14,19 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from estimation.errors import InputError
+from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.bench.figures import Figure, append_rows, at_least, at_most, with_progress
+from hardware.bench.recordings import FRAME_RATE, beside_figures, made_recording, packed_sets, unpacked_set
 from hardware.bench.whole import LiveSession
 from hardware.files.dispenser_file import read_dispensers
 from hardware.files.path_file import read_path, write_path
@@ -30,13 +35,18 @@ from hardware.live.prerender import prerender
 from hardware.live.recorded_run import NozzleErrors, nozzle_errors, printed_range
 from hardware.live.records import EXPOSURE_TO_WIRE_STAGE, FRAMES_TO_WIRE_STAGE, LATE_TICK_STAGE
 from hardware.live.settings import LiveSettings, available_cores, settings_text
+from hardware.offline.track import tracker
 from hardware.process.checks import read_toml
-from hardware.process.clock import WallClock
+from hardware.process.clock import CpuClock, WallClock
 from hardware.process.progress import cache_folder
 from hardware.process.ticks import measure_evenness
 from hardware.recording.session_reader import open_session
 from hardware.simulator.dispenser import VirtualDispenserSettings
 from hardware.simulator.nozzle_error import MaterialFigures
+from perception.frames import Image
+from perception.tracking.wound_step import AsyncSegmentation
+from perception.wound.network import WoundNetwork, shipped_model
+from perception.wound.segmentation import NetworkSegmenter, Segmentation
 from planning.path import Path as Toolpath
 from planning.path import way_lengths
 
@@ -328,3 +338,53 @@ def _arguments(scenario: Path, record: Path, path: Path) -> list[str]:
 
 def _of(span: dict[str, Any], key: str) -> float:
     return float(span[key]) if span.get(key) is not None else math.nan
+
+
+BLOCK_SETS = 15  # half a second, tracked with the network and without it in turn, at the pace of live cameras
+
+
+def run_beside(options: argparse.Namespace) -> list[Figure]:
+    """Two trackers of the same pictures take turns, one with the network: its share of a core, what a pose costs."""
+    clock, cpu = WallClock(), CpuClock()
+    looks, wall = list[float](), 0.0  # s of processor for each picture segmented; s of the blocks in which they were
+    recording = made_recording(options.scene, options.seconds)
+    packed = packed_sets(recording)
+    network = WoundNetwork(shipped_model() if options.model is None else options.model, 1)
+    segmenter = NetworkSegmenter(network, network.settings)
+    poses = list[SurfacePose](), list[SurfacePose]()  # without the network, with it
+    spent = list[float](), list[float](), list[float]()  # s to a pose likewise; s after it to hand pictures over
+
+    def timed(image: Image) -> Segmentation:
+        start = cpu.now()
+        found = segmenter(image)
+        looks.append(cpu.now() - start)
+        return found
+
+    track = partial(tracker, recording.rig, recording.roi, recording.surface)
+    with track() as without, track() as along, ThreadPoolExecutor(1) as thread:
+        steps, beside = (without, along), AsyncSegmentation(recording.rig, timed, thread)
+        for block in range(0, len(packed), BLOCK_SETS):
+            for turn in (0, 1) if block % (2 * BLOCK_SETS) else (1, 0):
+                start, sets = clock.now(), packed[block : block + BLOCK_SETS]
+                for number, each in enumerate(sets):
+                    frames = unpacked_set(each)
+                    clock.wait_until(start + number / FRAME_RATE)
+                    begun = clock.now()
+                    poses[turn].append(steps[turn](frames))
+                    ended = clock.now()
+                    spent[turn].append(ended - begun)
+                    if turn:
+                        beside(frames)
+                        spent[2].append(clock.now() - ended)
+                    steps[turn].idle()
+                clock.wait_until(start + len(sets) / FRAME_RATE)
+                wall += turn * (clock.now() - start)
+                thread.submit(int).result()  # the network has ended before the other's turn
+    pace = len(packed) / FRAME_RATE / wall  # of live cameras; below 1 the machine had no time for them
+    share, note = f"{options.scene}: network's share of a core", f"{len(looks)} pictures in {wall:.1f} s, one thread"
+    figures = [
+        Figure(share, 100 * sum(looks) / wall, "%", None, "", f"{note}; the load was {os.getloadavg()[0]:.1f}"),
+        Figure(f"{options.scene}: pace", 100 * pace, "%", at_least(95), "", "of 30 frame sets a second"),
+        Figure(f"{options.scene}: network, a picture", 1000 * float(np.median(looks)), "ms", None, "", "processor"),
+    ]
+    return [*figures, *beside_figures(options.scene, *poses, np.array(spent))]

@@ -2,7 +2,7 @@
 
 `views`: rendered skin that deforms, grazing views with glare, edges. Everything is measured after the constant
 transform at the first TRACKING pose; nothing is fitted over the run.
-`segmentation`: Dice on held-out pictures, silence where there is no wound, a half covered wound, time.
+`segmentation`: Dice on held-out pictures, silence where there is no wound, a half covered wound, time; areas in mm^2.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Rig
+from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.bench.figures import Figure, at_least, at_most, percentile, rms
+from hardware.bench.figures import Figure, at_least, at_most, percentile, rms, with_progress
 from hardware.bench.mapping import wound_points
 from hardware.files.images import encode
 from hardware.process.checks import Table
@@ -33,17 +33,32 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.scene.appearance import Sensor, unlit_texture
 from hardware.simulator.scene.fields import smooth_noise
-from hardware.simulator.scene.ground_truth_views import wound_view
+from hardware.simulator.scene.ground_truth_views import wound_set, wound_view
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import shape_from_function
 from hardware.simulator.truth import Truth
 from perception.frames import Frame, FrameSet
 from perception.tracking.step import TrackingStep
+from perception.tracking.wound_area import RIG_SCALE_SIGMA, wound_area
 from perception.training.dataset import Labelled, healthy_pieces, read_dataset
-from perception.training.metrics import bgr, dice_before_and_after_cover, scores, silent_share
+from perception.training.metrics import (
+    area_residual,
+    bgr,
+    conformal_spread,
+    dice_before_and_after_cover,
+    scores,
+    silent_share,
+)
 from perception.wound.network import THESIS_MODEL, WoundNetwork, shipped_model
-from perception.wound.segmentation import JudgedPicture, NetworkSegmenter, contact_sheet, dice
+from perception.wound.segmentation import (
+    JudgedPicture,
+    NetworkSegmenter,
+    Segmentation,
+    WoundBand,
+    contact_sheet,
+    dice,
+)
 from perception.wound.shape_matching import ShapeSegmenter, largest_outline, read_shape_model, thesis_mask
 
 VIEW_RATE, VIEW_EXPOSURE = 30.0, 0.005  # frame sets a second; s
@@ -202,10 +217,11 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
         Figure("Dice on rendered wounds, mean", mean, "", None, "", note),
         Figure(covered, before - after, "", at_most(0.05), "thesis by eye", f"from {before:.3f} to {after:.3f}"),
         *_time(network, pictures or wounds),
+        *spread_figures(segmenter, pictures),
+        *area_figures(segmenter, options.areas),
     ]
-    if pictures:
-        return figures
-    print(NO_DATA, file=sys.stderr, flush=True)
+    if options.dataset is None:
+        print(NO_DATA, file=sys.stderr, flush=True)
     return [figure for figure in figures if not math.isnan(figure.value)]
 
 
@@ -298,3 +314,66 @@ def _time(network: WoundNetwork, pictures: Sequence[Labelled]) -> list[Figure]:
         Figure("network, a picture: p99", percentile(counted, 99), "ms", at_most(25.0), "", note),
         Figure("parameters, at most", network.size / 1e6, "million", at_most(6.0), "", "a byte each in the file"),
     ]
+
+
+def spread_figures(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Figure]:
+    """How many labels' areas lie inside a picture's interval, and which spread would hold 95 % of them."""
+    found = [area_residual(segmenter.band(bgr(each.picture)), each.wound) for each in pictures]
+    residuals = [each for each in found if each is not None]
+    if not residuals:
+        return []
+    off, spread = np.array(residuals), segmenter.settings.spread
+    halves = [float((off[i::2] <= conformal_spread(off[1 - i :: 2])).mean()) for i in (0, 1)]
+    note = f"{len(off)} pictures; by the spread of the other half {halves[0]:.3f} and {halves[1]:.3f}"
+    inside, used = float((off <= spread).mean()), f"used: {spread:g}; by 1 inside: {float((off <= 1).mean()):.3f}"
+    return [
+        Figure("label's area inside the interval of one picture", inside, "", at_least(0.93), "", note),
+        Figure("spread that holds 95 % of the labels", conformal_spread(off), "half bands", None, "", used),
+    ]
+
+
+RIG_PLACE_SIGMA, RIG_TURN_SIGMA = 0.05, math.radians(0.02)  # mm and rad of a camera: the targets of its calibration
+
+
+def miscalibrated(rig: Rig, rng: np.random.Generator) -> Rig:
+    """A rig as it is known: each camera a little aside, and all lengths by as much too long as a ruler is."""
+    scale, cameras = math.exp(rng.normal(0, RIG_SCALE_SIGMA)), list[Camera]()
+    for camera in rig.cameras:
+        off = se3.make(se3.exp_rotation(rng.normal(0, RIG_TURN_SIGMA, 3)), rng.normal(0, RIG_PLACE_SIGMA, 3))
+        pose = camera.base_from_camera @ off
+        pose[:3, 3] *= scale
+        cameras.append(replace(camera, base_from_camera=pose))
+    return Rig(tuple(cameras))
+
+
+def area_figures(segmenter: NetworkSegmenter, count: int) -> list[Figure]:
+    """Areas by three cameras of `count` rendered wounds beside the true ones: by the network, and by true outlines.
+
+    The rig is off by what calibration leaves.
+    """
+    judged: dict[str, list[tuple[float, float, bool]]] = {"network": [], "true outlines": []}
+    refused = dict.fromkeys(judged, 0)
+    for seed in with_progress("areas", "wounds", range(count), count):
+        taken = wound_set(seed)
+        rig = miscalibrated(taken.rig, np.random.default_rng([seed, 47]))
+        images = dict(enumerate(taken.images))
+        exact = {c: WoundBand(Segmentation(m, 1.0, 0.5), m, m, m) for c, m in enumerate(taken.wounds)}
+        for kind, bands in (("network", {c: segmenter.band(i) for c, i in images.items()}), ("true outlines", exact)):
+            area = wound_area(rig, images, bands, segmenter.settings.spread)
+            if isinstance(area, str):
+                refused[kind] += 1
+            else:
+                error, half = math.log(area.area / taken.area), math.log(area.high / max(area.low, 1e-9)) / 2
+                judged[kind].append((error, half, area.low <= taken.area <= area.high))
+    figures = []
+    for kind, rows in judged.items():
+        if rows:
+            error, half, inside = np.array(rows).T
+            what, note = f"area by three cameras, {kind}", f"{len(rows)} rendered wounds, {refused[kind]} not measured"
+            figures += [
+                Figure(f"{what}: inside the 95 % interval", float(inside.mean()), "", at_least(0.93), "", note),
+                Figure(f"{what}: error, median of the absolute", 100 * float(np.median(np.abs(error))), "%"),
+                Figure(f"{what}: error, mean", 100 * float(error.mean()), "%"),
+                Figure(f"{what}: half the interval, median", 100 * float(np.median(half)), "%, of the logarithm"),
+            ]
+    return figures

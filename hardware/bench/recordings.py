@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from estimation.pose import TrackState, Trajectory
+from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow_steps
@@ -199,16 +199,12 @@ def _time_steps(recording: Recording) -> tuple[Array, Array]:
     """Wall time (N, 1 + len(STAGES)) s, in all and by stage, and processor time (N,), s, of each tracked frame set."""
     now, processor = WallClock().now, ProcessorClock().now
     rows, costs, initialised = [], [], 0
-    # all are rendered before the first is tracked
-    packed = [
-        (frames.stamp, [(f.camera, f.stamp, encode(f.image, JPEG_QUALITY)[1]) for f in frames.frames])
-        for frames in recording.frame_sets()
-    ]
+    packed = packed_sets(recording)
     with tracker(recording.rig, recording.roi, recording.surface, now) as step:
-        for stamp, pictures in packed:
-            frames = tuple(Frame(c, t, decode(data, "bench", "picture")) for c, t, data in pictures)
+        for each in packed:
+            frames = unpacked_set(each)
             start, cost = now(), processor()
-            pose = step(FrameSet(stamp, frames))
+            pose = step(frames)
             cost, spent = processor() - cost, now() - start
             step.idle()
             initialised += pose.state is not TrackState.INITIALISING
@@ -216,6 +212,23 @@ def _time_steps(recording: Recording) -> tuple[Array, Array]:
                 rows.append([spent, *step.last.seconds])
                 costs.append(cost)
     return np.array(rows).reshape(-1, 1 + len(STAGES)), np.array(costs)
+
+
+PackedSet = tuple[float, list[tuple[int, float, bytes]]]  # stamp, s; of each picture camera, stamp, s, and JPEG
+
+
+def packed_sets(recording: Recording) -> list[PackedSet]:
+    """A recording's pictures, small enough to wait in memory: all are rendered before the first is tracked."""
+    return [
+        (frames.stamp, [(f.camera, f.stamp, encode(f.image, JPEG_QUALITY)[1]) for f in frames.frames])
+        for frames in recording.frame_sets()
+    ]
+
+
+def unpacked_set(packed: PackedSet) -> FrameSet:
+    """The frame set, decoded anew."""
+    stamp, pictures = packed
+    return FrameSet(stamp, tuple(Frame(c, t, decode(data, "bench", "picture")) for c, t, data in pictures))
 
 
 def latency_figures(name: str, wall: Array, processor: Array) -> list[Figure]:
@@ -237,6 +250,42 @@ def latency_figures(name: str, wall: Array, processor: Array) -> list[Figure]:
         figure("estimation alone", stages["pose"], "99 %", 99, ESTIMATION_TARGET),
         Figure(f"{name}: frame sets that asked for flow", 100 * flow, "%"),
     ]
+
+
+def beside_figures(
+    name: str, without: Sequence[SurfacePose], along: Sequence[SurfacePose], spent: Array
+) -> list[Figure]:
+    """What the network beside the tracker costs the N poses of the same pictures.
+
+    without, along: N poses each. spent: (3, N) s, to each of them, and after the latter to hand the pictures over.
+    """
+    tracked = np.cumsum([pose.state is not TrackState.INITIALISING for pose in without]) > WARM_UP_STEPS
+    if not tracked.any():
+        return [Figure(f"{name}: pose after", math.nan, "ms", note="no surface was followed for long enough")]
+    both, figures = list(zip(without, along, strict=True)), list[Figure]()
+    lost = sum(a.state.measured and not b.state.measured for a, b in both)
+    other = sum(pose_bytes(a) != pose_bytes(b) for a, b in both)
+    for word, share in (("median", 50), ("99 %", 99)):
+        alone, beside, handed = (milliseconds(seconds[tracked], share) for seconds in spent)
+        figures += [
+            Figure(f"{name}: pose after, without the network, {word}", alone, "ms", None, "", f"{tracked.sum()} each"),
+            Figure(f"{name}: pose after, with it, {word}", beside, "ms"),
+            Figure(f"{name}: with / without, {word}", beside / alone, "times"),
+            Figure(f"{name}: pictures handed over, after the pose, {word}", handed, "ms"),
+        ]
+    late = [int((seconds[tracked] > 1 / FRAME_RATE).sum()) for seconds in spent[:2]]
+    return [
+        *figures,
+        Figure(f"{name}: poses later than the next pictures", late[1], "", None, "", f"without the network {late[0]}"),
+        Figure(f"{name}: poses lost with the network alone", lost, "", at_most(0), "", f"of {len(both)}"),
+        Figure(f"{name}: poses that differ in a bit", other, "", at_most(0), "", f"of {len(both)}"),
+    ]
+
+
+def pose_bytes(pose: SurfacePose) -> tuple[object, ...]:
+    """All of a pose, to the last bit."""
+    numbers = [np.ravel(values) for values in (pose.stamp, pose.base_from_surface, pose.covariance, pose.twist)]
+    return pose.state, pose.reason, np.concatenate(numbers).tobytes()
 
 
 ANGLES_DEG = (0.0, 36.0, 84.0, -36.0, 60.0, -60.0)  # the thesis's three cameras, and three more on the same arc

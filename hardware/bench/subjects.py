@@ -96,6 +96,11 @@ _SUBJECTS = (
         _number("--runs", 50, "N", "arms on drawn tips; default 50"),
         _number("--seed", 0, None, "of the first arm; default 0"),
     ),
+    _subject("beside", "live", "the wound network beside the tracker: its share of a core, what it costs a pose")(
+        _number("--seconds", 10.0, "S", "of the made recording; default 10"),
+        _option("--scene", choices=MADE, default=MADE[-1], metavar="NAME", help="; ".join(MADE)),
+        _option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
+    ),
     _subject("bumps", "detection", "cameras knocked and lenses turned by little: found, named, false alarms")(
         _number("--count", 9, "N", "of each knock; default 9"),
         _number("--minutes", 10.0, "M", "of calm; default 10"),
@@ -214,10 +219,11 @@ _SUBJECTS = (
         _option("--arm", type=Path, metavar="ARM.toml", help="instead of the default arm"),
         _number("--seed", 0, None, "of the streams; runs with other seeds may go side by side"),
     ),
-    _subject("segmentation", "pictures", "finding the wound: Dice, silence, a half covered one, time")(
+    _subject("segmentation", "pictures", "finding the wound: Dice, silence, a half covered one, time, area")(
         _option("dataset", type=Path, nargs="?", metavar="DATASET", help="folder with images/ and labels/"),
         _option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
         _number("--rendered", 60, "N", "rendered pictures of each kind"),
+        _number("--areas", 40, "N", "rendered wounds before three cameras, for areas in mm^2; default 40"),
         _option("--sheet", type=Path, metavar="X.jpg", help="also draw best, median and worst, 8 of each"),
         _number("--seed", 1, "N", "of pieces, covers and sizes drawn"),
     ),

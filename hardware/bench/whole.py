@@ -149,7 +149,7 @@ BENCH_PARTS = (
     BenchPart("steps", ("--steps", "500", "--hours", "0.2"), None),
     BenchPart("latency", ("--seconds", "4")),
     BenchPart("thesis", ("--seconds", "2")),
-    BenchPart("segmentation", ("--rendered", "30"), ("--rendered", "2")),
+    BenchPart("segmentation", ("--rendered", "30", "--areas", "20"), ("--rendered", "2", "--areas", "1")),
     BenchPart("plan", (), None),
     BenchPart("fill", ("--count", "60"), ("--count", "3")),
     BenchPart("planner", ("--updates", "20000"), ("--updates", "2000")),

@@ -190,14 +190,17 @@ def add_segment(commands: Commands) -> None:
     add = commands.add(
         "segment",
         _run_segment,
-        "find the wound in pictures, a video or a recording",
-        "Find the wound in pictures, folders of pictures, videos or recordings. Writes a PNG mask (0 or 255) of each\n"
+        "find the wound in pictures, a video or a session",
+        "Find the wound in pictures, folders of pictures, videos or sessions. Writes a PNG mask (0 or 255) of each\n"
         "picture's own size and name, and wounds.csv: confidence, area, centroid, box and time of each. A picture\n"
-        "without a wound gets an empty mask. Ctrl-C keeps what is done.",
+        "without a wound gets an empty mask. Of a session, where two calibrated cameras or more show the whole wound,\n"
+        "it prints the area in mm^2 with a 95 % interval, and areas.csv has it at nine instants. Ctrl-C keeps what\n"
+        "is done.",
         "stillbed segment photos/ -o masks --overlay",
+        "stillbed segment try.mcap -o masks",
         "stillbed segment ward.mp4 -o masks --method shape",
     ).add_argument
-    add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, video, or .mcap recording")
+    add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, video, or SESSION")
     add("-o", "--out", type=Path, required=True, metavar="MASKS", help="folder, new or empty")
     methods = "unet: a trained network; shape: outlines like the scan's"
     add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=methods)
@@ -205,7 +208,7 @@ def add_segment(commands: Commands) -> None:
     add("--version", action=_NetworkVersion, nargs=0, help="print the network's name, licence and source, and exit")
     add("--scan", type=Path, metavar="SCAN", help="with --method shape: of the wound, z upwards")
     add("--overlay", action="store_true", help="also write the pictures with the outlines drawn in")
-    add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for areas in mm^2")
+    add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for areas in wounds.csv")
     add("--threads", type=int, default=2, metavar="N", help="of the network; results do not vary")
     add("--force", action="store_true", help="write into a folder that is not empty")
 

@@ -34,7 +34,7 @@ from hardware.process.clock import Clock, SimClock
 from hardware.process.faults import FaultPart, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.serial_line import SerialWire
+from hardware.simulator.arm.settings import SerialWire
 from hardware.simulator.camera_pipeline import (
     ARRIVAL_EVENT,
     TICK_EVENT,

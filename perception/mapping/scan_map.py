@@ -183,13 +183,15 @@ LATTICE_MARGIN_MM = 3.0  # mm that the lattice reaches beyond the landmarks
 NODE_WIDTHS = (2.0, 2.0, 1.0, 1.0)  # widths of a node, in its finest size
 CORRECTION_SIGMA_NODES = 1.2  # over which corrections are averaged: neighbours share their matches anyway
 MAX_JUMP_MM = 0.5  # mm: a correction this far from its neighbours' is a wrong match
-POINT_SPACING_NODES = 6  # nodes from one point given out to the next: half a matched patch, so they share little
+POINT_STEP_NODES = 6  # nodes from one point given out to the next: half a matched patch, so they share little
 
 
-def relief_points(lenses: Lenses, images: dict[int, Image], first: FirstMap, polygons: dict[int, Array]) -> Array:
+def relief_points(
+    lenses: Lenses, images: dict[int, Image], first: FirstMap, polygons: dict[int, Array], step: int = POINT_STEP_NODES
+) -> Array:
     """Points (N, 3) mm, base frame, spread over the surface inside the middle camera's polygon; none without matches.
 
-    images: grey, by camera. polygons: (N, 2) px as imaged, by camera.
+    images: grey, by camera. polygons: (N, 2) px as imaged, by camera. step: nodes from a point to the next.
     """
     cameras, centre = sorted(images), first.base_from_surface[:3, 3]
     reference = middle_camera(lenses, [c for c in cameras if c in polygons] or cameras, centre)
@@ -199,8 +201,7 @@ def relief_points(lenses: Lenses, images: dict[int, Image], first: FirstMap, pol
     heights, relief, sure = _initial_heights(points, low, high), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
     for width in NODE_WIDTHS:
         flat = _lattice(low, high, width * finest)
-        size = flat.shape[1], flat.shape[0]
-        resized = np.asarray(cv2.resize(heights, size, interpolation=cv2.INTER_CUBIC), np.float32)
+        resized = np.asarray(cv2.resize(heights, flat.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
         nodes = np.dstack([flat, resized.astype(float)])
         match = match_near(lenses, images, _transformed(first.base_from_surface, nodes), reference)
         if match is None:
@@ -209,8 +210,7 @@ def relief_points(lenses: Lenses, images: dict[int, Image], first: FirstMap, pol
         inner = _transformed(se3.inverse(first.base_from_surface), relief)
         heights = _corrected(nodes, inner, sure, width * finest)
     sure &= _inside(lenses, reference, relief, polygons)
-    every = slice(None, None, POINT_SPACING_NODES)
-    return np.asarray(relief[every, every][sure[every, every]])
+    return np.asarray(relief[::step, ::step][sure[::step, ::step]])
 
 
 def _lattice(low: Array, high: Array, step: float) -> Array:

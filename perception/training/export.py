@@ -181,6 +181,8 @@ By networks of the same recipe, each trained without one fold and judged on it; 
 | silent on {figures.pieces} pieces of healthy skin, real | {100 * judged.silent:.1f} % |
 | silent on healthy skin, rendered | {100 * figures.rendered:.1f} % |
 | Dice on the open half: before it was half covered, after | {figures.before:.3f}, {figures.after:.3f} |
+| half a 95 % interval of the area, in half bands of probability: what 95 % of the labels ask for |\
+ {settings.spread:.2f} |
 | expected calibration error of "there is this wound" | {calibration_error(judged.confidence, judged.right):.3f} |
 | the same of pixels that may be a wound's (2 % or more) | {calibration_error(judged.pixel, judged.pixel_wound):.3f} |
 

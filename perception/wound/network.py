@@ -103,6 +103,7 @@ class Settings:
     offset: float = 0.0  # of the same
     pixel_slope: float = 1.0  # of the logistic that turns a pixel's logit into how often such a pixel is a wound's
     pixel_offset: float = 0.0  # of the same
+    spread: float = 2.0  # half a 95 % interval of the area, in half bands of probability (`WoundBand`): so labels ask
 
 
 @dataclass(frozen=True, slots=True)

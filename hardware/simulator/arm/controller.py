@@ -25,8 +25,7 @@ from estimation.se3 import Array
 from hardware.arm import protocol
 from hardware.arm.protocol import G1, G4, G54, ControllerReset, Dialect, Instruction, Mode
 from hardware.process.faults import Fault, FaultPart, WorkRates, WorkStretches, faults_striking
-from hardware.simulator.arm.serial_line import FaultyLine, Telemetry
-from hardware.simulator.arm.settings import ArmSettings
+from hardware.simulator.arm.settings import ArmSettings, FaultyLine, Telemetry
 from planning.command import MIN_TRAVEL
 
 AXIS_COUNT = 6

@@ -1,7 +1,7 @@
 """Two ways to a virtual arm: a port in virtual time with faults of its own, and a pseudo-terminal in real time.
 
 The port's own faults are those of an adapter: it takes a part of a write or nothing for a while, it is gone for a
-while, and stray bytes get in between. Faults of the arm itself are in serial_line.py.
+while, and stray bytes get in between. Faults of the arm itself are in settings.py.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ from hardware.process.checks import error_text
 from hardware.process.clock import Clock, WallClock
 from hardware.process.faults import Fault
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.serial_line import SerialWire
-from hardware.simulator.arm.settings import ArmSettings
+from hardware.simulator.arm.settings import ArmSettings, SerialWire
 
 Interval = tuple[float, float]  # from, until, s
 

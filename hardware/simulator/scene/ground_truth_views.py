@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.rig import Camera, pixels_from_points
+from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.simulator.scene.appearance import Appearance, Sensor
@@ -21,12 +21,13 @@ from hardware.simulator.scene.fields import Field
 from hardware.simulator.scene.rays import rays_at
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState
-from hardware.simulator.scene.shape import BODIES, Wound, body
+from hardware.simulator.scene.shape import BODIES, Shape, Wound, body
 from perception.boards.board import Board, ink_cells
 from perception.frames import Image
 
 VIEW_TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own
 MASK_SAMPLES = 4  # samples a pixel and axis of the true mask
+FINER_OUTLINES = 3  # of pictures by which areas are judged: at 4 and 0.25 mm the outline is off by 1 % of a small wound
 IMAGE_SIZES = ((1280, 720), (640, 480), (768, 576))  # px
 
 
@@ -41,39 +42,90 @@ class WoundView:
     area: float  # mm^2 of the wound on the surface
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class WoundSet:
+    """Pictures of one wound by the cameras of a rig at one instant, with their ground truth."""
+
+    images: tuple[Image, ...]  # (H, W, 3) BGR, by camera
+    wounds: tuple[NDArray[np.bool_], ...]  # (H, W), by camera
+    rig: Rig
+    base_from_surface: Array  # (4, 4) mm
+    area: float  # mm^2 inside the wound's edge of the skin as it would go on over the wound
+
+
 def wound_view(seed: int, wounded: bool = True) -> WoundView:
     """The picture of a seed: body, wound, tone, wetness, drape, lamps and camera are drawn from it."""
     rng = np.random.default_rng([seed, 41])
-    wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
-    shape = body(rng.choice(list(BODIES)), wound, seed)
-    scene = Scene(shape, _random_appearance(rng), seed=seed)
+    scene, _ = _random_scene(rng, seed, wounded)
     size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
     focal = size[0] * rng.uniform(0.7, 1.1)
     camera = arc_rig((rng.uniform(0, 75),), rng.uniform(220, 480), focal, size).cameras[0]
+    image, pose = _random_pictures(rng, scene, Rig((camera,)))
+    inside, area = scene.shape.inside, 0.0
+    if inside is not None:
+        area = float((inside > 0).sum()) * scene.shape.step**2
+    return WoundView(image[0], _true_mask(scene.shape, camera, pose), camera, pose, area)
+
+
+def wound_set(seed: int) -> WoundSet:
+    """The pictures of a seed by the thesis's three cameras: drawn as in `wound_view`, and how far away they stand."""
+    rng = np.random.default_rng([seed, 43])
+    scene, bare = _random_scene(rng, seed, True)
+    size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
+    rig = arc_rig(distance=rng.uniform(260, 480), focal=size[0] * rng.uniform(0.7, 1.1), size=size)
+    images, pose = _random_pictures(rng, scene, rig)
+    inside, step = scene.shape.inside, scene.shape.step
+    assert inside is not None
+    along, across = np.gradient(bare.heights, step)
+    area = float(np.sqrt(1 + along**2 + across**2)[inside > 0].sum()) * step**2
+    wounds = tuple(_true_mask(scene.shape, camera, pose, FINER_OUTLINES) for camera in rig.cameras)
+    return WoundSet(tuple(images), wounds, rig, pose, area)
+
+
+def _random_scene(rng: np.random.Generator, seed: int, wounded: bool) -> tuple[Scene, Shape]:
+    """A scene, and the shape of its skin as it would be without the wound."""
+    wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
+    kind = rng.choice(list(BODIES))
+    return Scene(body(kind, wound, seed), _random_appearance(rng), seed=seed), body(kind, None, seed)
+
+
+def _random_pictures(rng: np.random.Generator, scene: Scene, rig: Rig) -> tuple[list[Image], Array]:
+    """A picture (H, W, 3) BGR of each camera, and base_from_surface (4, 4)."""
     pose = BASE_FROM_REST @ se3.make(se3.exp_rotation(rng.normal(0, [0.15, 0.15, 1.5])), rng.normal(0, [12, 12, 6]))
     instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
     sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
-    image = render(scene, [camera], [instant], sensor, [rng], threads=1)[0]
-    outlines, area = [], 0.0
+    draws = [rng] if len(rig) == 1 else rng.spawn(len(rig))
+    return render(scene, rig.cameras, [instant] * len(rig), sensor, draws, threads=1), pose
+
+
+def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: int = 1) -> NDArray[np.bool_]:
+    """(H, W) what a camera sees of the wound; all False without one.
+
+    finer: times that the outline is drawn finer; by 1 it runs through the outermost nodes, half a node too far in.
+    """
+    outlines = []
     if shape.inside is not None:
-        wound_nodes = shape.inside > 0
-        area = float(wound_nodes.sum()) * shape.step**2
-        contours, _ = cv2.findContours(wound_nodes.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        middle = (np.array(wound_nodes.shape[::-1]) - 1) / 2
-        for nodes in contours:
-            points = shape.points((nodes.reshape(-1, 2) - middle) * shape.step)
-            outlines.append(pixels_from_points(camera, se3.transform_points(pose, points))[0])
-    return WoundView(image, mask_from_outlines(outlines, camera.size), camera, pose, area)
+        inside = cv2.resize(shape.inside, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
+        contours, _ = cv2.findContours((inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
+        for each in contours:
+            nodes = (each.reshape(-1, 2) + 0.5) / finer - 0.5
+            points = shape.points((nodes - middle) * shape.step)
+            outlines.append(pixels_from_points(camera, se3.transform_points(base_from_surface, points))[0])
+    return mask_from_outlines(outlines, camera.size, finer * MASK_SAMPLES)
 
 
-def mask_from_outlines(outlines: Sequence[Array], size: tuple[int, int]) -> NDArray[np.bool_]:
+def mask_from_outlines(
+    outlines: Sequence[Array], size: tuple[int, int], samples: int = MASK_SAMPLES
+) -> NDArray[np.bool_]:
     """(H, W) pixels that lie for the most part inside closed outlines (N, 2) px, in an image of `size` (W, H).
 
-    Drawn finer and shrunk: OpenCV fills the outline's own pixels too, which would add half a pixel all round.
+    Drawn finer, by `samples` a pixel and axis, and shrunk: OpenCV fills the outline's own pixels too, which would add
+    half a pixel all round.
     """
-    fine = np.zeros((size[1] * MASK_SAMPLES, size[0] * MASK_SAMPLES), np.uint8)
+    fine = np.zeros((size[1] * samples, size[0] * samples), np.uint8)
     for outline in outlines:
-        cv2.fillPoly(fine, [np.round((outline + 0.5) * MASK_SAMPLES - 0.5).astype(np.int32)], 255)
+        cv2.fillPoly(fine, [np.round((outline + 0.5) * samples - 0.5).astype(np.int32)], 255)
     return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA) > 127)
 
 
