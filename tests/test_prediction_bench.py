@@ -42,7 +42,7 @@ from hardware.cli.main import main, subject_parser
 from hardware.files.folder_tables import write_tum
 from hardware.live.prerender import cached
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
-from perception.package_data import shipped_file
+from perception import shipped_file
 from tests.slowly import slowly
 from tests.synthetic import write_session
 from tests.virtual_arm import HOME

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import perception as shipped
 from estimation.errors import InputError
 from hardware.bench.subjects import SUBJECTS
-from perception import package_data as shipped
-from perception.package_data import named_path, shipped_file
+from perception import named_path, shipped_file
 from tests.audit import NOBODY, NONE, SOME, main, told
 from tests.hazard_table import DOCUMENT, document, failed, hazards, missing
 

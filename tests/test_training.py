@@ -40,7 +40,7 @@ from tests.test_training_data import labelled, write
 RECIPE = Recipe(Augmentation(side=64, long_side=96.0))
 SCHEDULE = Schedule(rounds=2, steps=3, batch=4, seed=7)
 PICTURES = [labelled(seed) for seed in range(4)]
-CPU = torch.device("cpu")
+CPU = "cpu"
 SOURCE = Pictures(PICTURES, np.ones(4), CPU)
 
 

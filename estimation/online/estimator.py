@@ -43,7 +43,7 @@ from estimation.surface_map import SurfaceMap
 MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
 # s, of the cameras' instants: more than of webcams at first. They then come late, or hang, now and then, and the pose
 # may be so many sigmas late or early.
-MAX_DELAY_SIGMA_S, MOST_DELAY_SIGMAS = 0.015, 3.0
+MAX_DELAY_SIGMA_S, MOST_DELAY_SIGMAS = 0.02, 3.0
 MAX_LEARNING_SMEAR_MM = 0.1  # between the cameras' instants: beyond, a late camera cannot be told from a bent surface
 MAX_MAP_SMEAR_MM = 0.5  # likewise: a map bent by more is no good for printing
 ACCELERATION_PERSISTENCE_S = 0.2  # breathing accelerates alike for so long, which adds up to more than white noise does

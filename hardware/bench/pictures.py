@@ -228,7 +228,7 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
 def new_to(pictures: list[Labelled], model: Path) -> list[Labelled]:
     """The pictures that a model has not learned from, by the list of names that may lie beside it."""
     names = model.with_name(f"{model.stem}_trained.txt")
-    learned = set(names.read_text(encoding="utf-8").split()) if names.is_file() else set()
+    learned = set(names.read_text(encoding="utf-8").splitlines()) if names.is_file() else set()
     return [each for each in pictures if each.name not in learned]
 
 

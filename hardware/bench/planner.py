@@ -32,7 +32,7 @@ from hardware.report.report import HALF_CHART_WIDTH
 from hardware.simulator.deposit import planned_line
 from hardware.simulator.nozzle_error import EndsOfBeads, MaterialFigures, material_figures, nozzle_errors
 from hardware.simulator.nozzle_report import ends_chart
-from perception.package_data import shipped_file
+from perception import shipped_file
 from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle
 from planning.motion.guard import Guard

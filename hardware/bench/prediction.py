@@ -39,8 +39,8 @@ from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock
 from hardware.report.page import Plot, document, legend, line_key, section
 from hardware.simulator.scenario import read_scenario
+from perception import shipped_file
 from perception.frames import FrameSet
-from perception.package_data import shipped_file
 
 LONGEST_LAGS = (0.5, 1.0, 2.0, 4.0)  # s
 FORGETTING_FACTORS = (0.995, 0.9995)  # a sample

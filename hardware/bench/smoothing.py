@@ -48,8 +48,8 @@ from hardware.process.progress import cache_folder, no_progress
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import best_constant, spread
+from perception import shipped_file
 from perception.frames import Frame
-from perception.package_data import shipped_file
 
 SESSION_SETTINGS = 5.0, 30.0, 60  # s, Hz, landmarks
 MIN_SPEED_UP = 1.8

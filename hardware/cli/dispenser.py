@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from estimation.errors import InputError
 from hardware.cli.parser import FAILED, Commands, arm_profile, not_negative, positive, progress_bar, wrong_option
 from hardware.process.clock import Clock, WallClock
-from perception.package_data import named_path
+from perception import named_path
 
 if TYPE_CHECKING:
     from hardware.calibration.dispenser_record import LineOptions

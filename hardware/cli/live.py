@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from estimation.errors import InputError
 from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, arm_profile, positive, wrong_option
 from hardware.process.clock import WallClock
-from perception.package_data import named_path
+from perception import named_path
 
 if TYPE_CHECKING:
     from hardware.arm.profile import ArmProfile

@@ -25,7 +25,7 @@ from hardware.cli.sessions import add_compare, add_export, add_import, add_repla
 from hardware.process.clock import WallClock
 from hardware.process.progress import left_files_text, prepare_out, write_error_text
 from hardware.process.system import fill_standard_streams
-from perception.package_data import named_path
+from perception import named_path
 
 if TYPE_CHECKING:
     from hardware.operator.view import CheckVerdict

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from estimation.errors import StillbedError
 from hardware.cli.parser import FAILED, MODEL_HELP, Commands, damage_code, not_negative, wrong_option
-from perception.package_data import named_path
+from perception import named_path
 
 if TYPE_CHECKING:
     from perception.wound.segmentation import Segmenter
@@ -242,10 +242,13 @@ def add_train(commands: Commands) -> None:
         "Six networks take hours of a processor, or minutes of a large GPU.\n"
         "Needs the extra [train]: pip install 'stillbed[train]'.",
         "stillbed train data/fuseg data/medetec -o wound.onnx",
+        "stillbed train data/fuseg -o ward.onnx --add monday.mcap tuesday.mcap",
         "stillbed train data/fuseg data/medetec -o wound.onnx --part 0 & ... --part all & wait; then without --part",
     ).add_argument
     add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is what the recipe is judged by")
     add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="file to write")
+    own = "recordings of live runs: pictures whose outline an operator corrected join the first data set"
+    add("--add", type=Path, nargs="+", default=[], metavar="RECORDING", help=own)
     networks = "thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml"
     add("--network", choices=("wound", "thesis", "shape"), default="wound", help=networks)
     add("--rounds", type=int, metavar="N", help="of 200 steps (thesis: 100); more take longer")

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from estimation.errors import InputError, StillbedError
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
+from hardware.recording.session_reader import corrected_pictures
 from perception.training.dataset import Labelled, fold_numbers, healthy_pieces, picture_groups, read_dataset
 from perception.wound.network import TERMS_KEYS
 
 if TYPE_CHECKING:
-    from torch import nn
-
     from perception.training.loop import Recipe, Schedule, Trained
     from perception.training.metrics import Unseen
     from perception.wound.network import WoundNetwork
@@ -63,7 +62,7 @@ class TrainingPictures:
 
     def weights(self, kept: int) -> NDArray[np.float64]:
         """(kept + M,) how often each picture is drawn, `kept` of the first data set and all others."""
-        return np.r_[np.ones(kept), np.full(len(self.others), OTHER_SET_WEIGHT)]
+        return np.concatenate([np.ones(kept), np.full(len(self.others), OTHER_SET_WEIGHT)])
 
 
 def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
@@ -78,7 +77,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     recipe, schedule = loop.Recipe(), loop.Schedule()
     if options.network == "thesis":
         recipe, schedule = loop.THESIS_RECIPE, loop.THESIS_SCHEDULE
-    own = {"seed": options.seed, "threads": options.threads, "device": _device(options)}
+    own = {"seed": options.seed, "threads": options.threads, "device": loop.torch_device(options.device)}
     schedule = replace(schedule, rounds=options.rounds or schedule.rounds, **own)
     parts = [str(fold) for fold in range(options.folds)] + [ALL] if options.part is None else [options.part]
     trained = {part: _trained(options, part, pictures, recipe, schedule) for part in parts}
@@ -88,22 +87,19 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
     schedule = replace(schedule, device=trained[ALL].device)
     terms = {key: text for key in TERMS_KEYS if (text := getattr(options, key)) is not None}
-    networks = {part: each.network for part, each in trained.items()}
-    return _finish(out, networks, pictures, recipe, schedule, render_view, terms)
+    return _finish(out, trained, pictures, recipe, schedule, render_view, terms)
 
 
 def _trained(
     options: argparse.Namespace, part: str, pictures: TrainingPictures, recipe: Recipe, schedule: Schedule
 ) -> Trained:
     """The network of one part, from its checkpoint as far as that goes."""
-    import torch
-
     from perception.training import loop
     from perception.training.samples import Pictures
 
     network = loop.build_network(options.network, schedule.seed)
     trained = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
-    source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), torch.device(schedule.device))
+    source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), schedule.device)
     what = "train on all" if part == ALL else f"train without fold {part}"
     with _progress(what, "steps") as progress:
         return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe)
@@ -111,7 +107,7 @@ def _trained(
 
 def _finish(
     out: Path,
-    networks: dict[str, nn.Module],
+    trained: dict[str, Trained],
     pictures: TrainingPictures,
     recipe: Recipe,
     schedule: Schedule,
@@ -130,18 +126,19 @@ def _finish(
     rendered = [_rendered_view(render_view, number, wounded=False) for number in range(RENDERED_HEALTHY)]
     with tempfile.TemporaryDirectory() as folder:
         rounded = []
-        for part, network in networks.items():
+        for part, each in trained.items():
             if part != ALL:
-                export.export(network, Path(folder) / f"{part}.onnx", Settings(looks=recipe.looks, trust=0.0))
+                export.export(each.network, Path(folder) / f"{part}.onnx", Settings(looks=recipe.looks, trust=0.0))
                 rounded.append(WoundNetwork(Path(folder) / f"{part}.onnx"))
         with _progress("judge", "pictures") as progress:
             unseen = _unseen(rounded, pictures, healthy, recipe, progress)
-        settings, judged = metrics.judge(unseen, recipe.looks, rng)
+        with _progress("choose", "settings") as progress:
+            settings, judged = metrics.judge(unseen, recipe.looks, rng, progress)
         segmenters = [NetworkSegmenter(network, settings) for network in rounded]
         before, after = _covered(segmenters, pictures, rng)
         silent = [metrics.silent_share(each, [view.picture for view in rendered]) for each in segmenters]
-    export.export(networks[ALL], out, settings, terms)
-    alike = export.agreement(networks[ALL], out, pictures.judged[:COMPARED], recipe.looks)
+    export.export(trained[ALL].network, out, settings, terms)
+    alike = export.agreement(trained[ALL].network, out, pictures.judged[:COMPARED], recipe.looks)
     out.with_name(f"{out.stem}_trained.txt").write_text("".join(f"{each.name}\n" for each in pictures.judged), "utf-8")
     export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), judged)
     figures = export.Figures(
@@ -158,7 +155,7 @@ def _finish(
         " near-duplicates (small colour copies, mirrored and turned; SIFT), never at random",
         f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
     )
-    origin = export.NetworkOrigin(out.stem, loop.parameter_count(networks[ALL]), data, str(schedule), alike)
+    origin = export.NetworkOrigin(out.stem, loop.parameter_count(trained[ALL].network), data, str(schedule), alike)
     export.write_card(out.with_suffix(".md"), origin, figures, settings, hash_of(out))
     dice = judged.dice
     return (
@@ -237,7 +234,7 @@ def _pictures(options: argparse.Namespace, render_view: RenderView) -> TrainingP
     for folder in options.datasets:
         with _progress(f"read {folder.name}", "pictures") as progress:
             data_sets.append(read_dataset(folder, progress))
-    judged = data_sets[0]
+    judged = [*data_sets[0], *(each for recording in options.add for each in corrected_pictures(recording))]
     group = picture_groups(judged)
     count = len(np.unique(group))
     if count < options.folds:
@@ -259,14 +256,6 @@ def _rendered_view(render_view: RenderView, seed: int, wounded: bool) -> Labelle
 
 def _checkpoint(out: Path, part: str) -> Path:
     return out.with_name(f"{out.stem}_{part}.ckpt")
-
-
-def _device(options: argparse.Namespace) -> str:
-    import torch
-
-    if options.device == "cuda" and not torch.cuda.is_available():
-        raise InputError("command line", "--device", "cuda", "cpu: torch sees no GPU here")
-    return options.device or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -30,6 +30,7 @@ PLACE_STEP_MM = 2.0  # between the places that are looked at: a wound's rim is a
 CELL_MM = 1.2  # of the surface that one value averages: noise of the pixels, and chroma that cameras subsample
 BELL_MM = 7.0  # one sigma: places that move together, and as far apart
 DARK_LEVELS = 8.0  # grey levels added to each channel: ratios of darker ones are noise
+LIGHT_SIGMA = 0.5  # of the logarithm of a place's brightness, by which those levels change a ratio: shadows, shading
 CLIPPED = 245.0  # grey level at which a channel may be clipped: a highlight
 MIN_NOISE = 0.01  # one sigma of a ratio's logarithm: the first picture's own, and light that is never quite the same
 FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
@@ -38,12 +39,14 @@ MIN_SHIFT_MM = 0.6  # that is told: a bit more than the guard allows
 MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
 MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
 MIN_SEEN_SHARE = 0.5  # of a bell's places
+MIN_SECOND_SHARE = 0.1  # of what a displacement explains, that is the share of a second camera
 MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
 MIN_COSINE = 0.7  # of the angle between one displacement and all
 USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
 MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
 WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
 MIN_PLACES = 20  # of a camera, to compare its picture
+AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
 UNSEEN_PX = -1e6  # where a place is said to be that a camera cannot see: out of every picture
 
 
@@ -97,36 +100,43 @@ class Colours:
         if not self._first:
             return NOTHING_DISPLACED
         points = self._points if warp is None else warp.apply(self._points)
-        sums, cameras = np.zeros((len(points), 14)), 0  # normal equations, energy and number, of all cameras
+        sums = np.zeros((len(points), 14))  # normal equations, energy and number, of all cameras
+        pulls = list[Array]()  # (K, 3) of each
         for camera, first in self._first.items():
             if camera not in images or camera not in poses:
                 continue
             pixels = self._pixels(camera, poses[camera], points)
-            now, free = _ratios(images[camera], first.scale, pixels)
+            now, dark, free = _ratios(images[camera], first.scale, pixels)
             free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
             if np.count_nonzero(free) < MIN_PLACES:
                 continue
-            cameras += 1
+            before = sums[:, 9:12].copy()
             for k in range(2):
                 away = now[k] - first.ratios[k]
                 away -= median(away[free])
                 first.noise[k] += (1.4826 * median(np.abs(away[free])) - first.noise[k]) / NOISE_MEMORY_SETS
-                precision = free / max(first.noise[k], MIN_NOISE) ** 2
+                precision = free / (max(first.noise[k], MIN_NOISE) ** 2 + (LIGHT_SIGMA * dark[k]) ** 2)
                 sums[:, :9] += precision[:, None] * first.squares[k]
                 sums[:, 9:12] -= (precision * away)[:, None] * first.slopes[k]
                 sums[:, 12] += precision * away * away
                 sums[:, 13] += free
+            pulls.append(self._bells @ (sums[:, 9:12] - before))
+        if not pulls:
+            return NOTHING_DISPLACED
         summed = self._bells @ sums
-        whole = 2 * cameras * self._bells.sum(1)
+        whole = 2 * len(pulls) * self._bells.sum(1)
         known = np.where(summed[:, 13] > MIN_SEEN_SHARE * whole, summed[:, 13], np.inf)  # else its edge looks displaced
-        return self._judge(summed[:, :9].reshape(-1, 3, 3), summed[:, 9:12], summed[:, 12], known)
+        return self._judge(summed[:, :9].reshape(-1, 3, 3), np.stack(pulls), summed[:, 12], known)
 
-    def _judge(self, normal: Array, pull: Array, energy: Array, known: Array) -> DisplacedPlaces:
-        """By normal equations (K, 3, 3), (K, 3) of each bell's displacement, squared sigmas and how many are usual."""
+    def _judge(self, normal: Array, pulls: Array, energy: Array, known: Array) -> DisplacedPlaces:
+        """By normal equations (K, 3, 3), (C, K, 3) of each camera and bell, squared sigmas and how many are usual."""
+        pull = pulls.sum(0)
         shift = np.linalg.solve(normal + np.eye(3) / SHIFT_PRIOR_MM**2, pull[..., None])[..., 0]
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
         begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
         begins &= explained > MIN_EXPLAINED * (energy - known)
+        if len(pulls) > 1:  # else it may be what one camera sees there: a print head that its first picture showed
+            begins &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
         way = (explained * begins) @ shift  # what moves goes one way; highlights go theirs
         begins &= shift @ way > MIN_COSINE * size * np.linalg.norm(way)
         begins &= begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))
@@ -143,7 +153,7 @@ class Colours:
         pixels = self._pixels(camera, pose, self._points)
         beside = self._pixels(camera, pose, self._points + self._axes[0])
         scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(beside - pixels, axis=1)))))
-        ratios, free = _ratios(image, scale, pixels)
+        ratios, _, free = _ratios(image, scale, pixels)
         ends = [
             _ratios(image, scale, self._pixels(camera, pose, self._points + side * axis))[0]
             for axis in self._axes
@@ -151,7 +161,8 @@ class Colours:
         ]
         slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
         squares = (slopes[..., :, None] * slopes[..., None, :]).reshape(2, -1, 9)
-        free &= ~self._masks.hides(camera, pixels)
+        for around in 2 * scale * AROUND:  # what an average or a slope reaches must be the surface's as well
+            free &= ~self._masks.hides(camera, pixels + around)
         return _FirstPicture(scale, ratios, slopes, squares, free, np.full(2, FIRST_NOISE))
 
     def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
@@ -169,11 +180,9 @@ def _spread(plane: TangentPlane, step: float) -> Array:
     return plane.lift(flat[plane.inside(flat)])[0]
 
 
-def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Mask]:
-    """Logarithms (2, N) of red and blue to green at pixels (N, 2), and which (N,) are in view and not clipped.
-
-    Averaged over `scale` pixels.
-    """
+def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array, Mask]:
+    """Logarithms (2, N) of red and blue to green at pixels (N, 2), averaged over `scale` of them; how fast each changes
+    (2, N) with the logarithm of the brightness, where a channel is dark; and which (N,) are in view and not clipped."""
     size = np.array(image.shape[1::-1]) // scale
     low = np.clip(pixels.min(0) // scale - 2, 0, size - 1).astype(int)
     width, height = np.clip(pixels.max(0) // scale + 3, low + 1, size).astype(int) - low
@@ -182,5 +191,6 @@ def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Mask]:
     across, down = ((pixels + 0.5) / scale - 0.5 - low).astype(np.float32).T
     in_view = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
     levels = cv2.remap(small.astype(np.float32), across[None], down[None], cv2.INTER_LINEAR)[0]
-    blue, green, red = np.log(levels.astype(float) + DARK_LEVELS).T
-    return np.stack([red - green, blue - green]), in_view & (levels.max(1) < CLIPPED)
+    blue, green, red = (levels.astype(float) + DARK_LEVELS).T
+    ratios = np.log(np.stack([red, blue]) / green)
+    return ratios, DARK_LEVELS * (1 / green - 1 / np.stack([red, blue])), in_view & (levels.max(1) < CLIPPED)

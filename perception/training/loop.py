@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from estimation.errors import InputError
 from perception.training.samples import Augmentation, Pictures, draw_samples
 from perception.wound.network import Looks
 
@@ -67,6 +68,14 @@ class Schedule:
             f"Trained for {self.rounds * self.steps} steps of {self.batch} samples on {self.device}, AdamW, half a"
             f" cosine from {self.rate:g}, weights averaged, seed {self.seed}."
         )
+
+
+def torch_device(wanted: str | None) -> str:
+    """The device by its name, or the GPU where torch sees one; InputError where one is wanted and there is none."""
+    seen = torch.cuda.is_available()
+    if wanted == "cuda" and not seen:
+        raise InputError("command line", "--device", "cuda", "cpu: torch sees no GPU here")
+    return wanted or ("cuda" if seen else "cpu")
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,11 +173,11 @@ def as_function(network: nn.Module) -> Callable[[NDArray[np.float32]], NDArray[n
     return run
 
 
-@torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, keeps: float, step: int) -> None:
     """One step of an exponential average that forgets its first, untrained weights sooner than `keeps` would."""
     pairs = [pair for pair in zip(_state(averaged), _state(network), strict=True) if pair[0].is_floating_point()]
-    torch._foreach_lerp_(*(list(each) for each in zip(*pairs, strict=True)), max(1 - keeps, 9 / (10 + step)))
+    with torch.no_grad():
+        torch._foreach_lerp_(*(list(each) for each in zip(*pairs, strict=True)), max(1 - keeps, 9 / (10 + step)))
 
 
 def _state(network: nn.Module) -> list[Tensor]:

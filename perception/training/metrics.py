@@ -129,12 +129,15 @@ class _Drawn:
     level: Array  # (N,) mean logit inside; nan where nothing is drawn
 
 
-def judge(unseen: Unseen, looks: Looks, rng: np.random.Generator) -> tuple[Settings, Judged]:
-    """The settings chosen on all folds, and each fold judged by those chosen on all others."""
-    drawn = [
-        _draw(unseen, Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0))
-        for edge, smallest in product(EDGE_CHOICES, SMALLEST_CHOICES)
-    ]
+def judge(
+    unseen: Unseen, looks: Looks, rng: np.random.Generator, seen: Callable[[int, int], None] = lambda done, of: None
+) -> tuple[Settings, Judged]:
+    """The settings chosen on all folds, and each fold judged by those chosen on all others; `seen(done, of)` counts the
+    settings that were tried."""
+    choices, drawn = list(product(EDGE_CHOICES, SMALLEST_CHOICES)), list[_Drawn]()
+    for edge, smallest in choices:
+        drawn.append(_draw(unseen, Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0)))
+        seen(len(drawn), len(choices))
     reached, confidence = np.zeros(len(unseen.fold)), np.full(len(unseen.fold), np.nan)
     hit, quiet = np.zeros(len(unseen.fold), bool), np.zeros(len(unseen.fold), bool)
     empty = np.array([not wound.any() for wound in unseen.wounds])

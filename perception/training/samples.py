@@ -39,7 +39,7 @@ class Augmentation:
 class Pictures:
     """Labelled pictures in three sizes, on the device that samples are made on; the wound is their fourth channel."""
 
-    def __init__(self, labelled: Sequence[Labelled], weights: NDArray[np.float64], device: torch.device) -> None:
+    def __init__(self, labelled: Sequence[Labelled], weights: NDArray[np.float64], device: str) -> None:
         """weights: (N,) how often each is drawn relative to the others."""
         planes = [_reduced(each) for each in labelled]
         self.sizes = np.array([each.shape[:2] for each in planes])  # (N, 2) height, width in px

@@ -21,7 +21,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from perception.package_data import shipped_file
+from perception import shipped_file
 
 Network = Callable[[NDArray[np.float32]], NDArray[np.float32]]  # (1, 3, H, W) RGB in 0..1 -> (1, 1, H, W) logits
 

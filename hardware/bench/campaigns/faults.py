@@ -29,7 +29,7 @@ from hardware.process.clock import ProcessorClock
 from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, fault_from_text
 from hardware.report.page import Plot, document, figures_table, section
 from hardware.simulator.deposit import NozzleLog
-from perception.package_data import shipped_file
+from perception import shipped_file
 
 RowFlags = NDArray[np.bool_]
 

@@ -17,7 +17,7 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.bench.figures import Figure, at_most, columns
-from perception.package_data import shipped_file
+from perception import shipped_file
 from planning.command import Command, Hold, Move
 from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_joints
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
