@@ -389,6 +389,20 @@ MUTANTS = (
         ("test_colours.py::test_ink_has_its_own_colours",),
     ),
     Mutant(
+        "what one camera alone sees displaced counts",
+        "perception/mapping/colours.py",
+        "[-2] > MIN_SECOND_SHARE",
+        "[-1] > MIN_SECOND_SHARE",
+        ("test_colours.py::test_a_displacement_is_what_a_second_camera_sees_as_well",),
+    ),
+    Mutant(
+        "shadows over dark tissue move its colours",
+        "perception/mapping/colours.py",
+        "(LIGHT_SIGMA * dark[k]) ** 2",
+        "0 * dark[k]",
+        ("test_colours.py::test_a_shadow_over_dark_tissue_is_no_displacement",),
+    ),
+    Mutant(
         "displaced colours are forgotten while they stand apart",
         "perception/mapping/colours.py",
         "np.isinf(known) | (energy > USUAL_RATIO * known)",

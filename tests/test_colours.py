@@ -71,6 +71,38 @@ def test_a_pose_that_is_off_along_the_surface_is_told_by_how_much(shift: tuple[f
     assert not len(look(13).sizes) and not look(13).message
 
 
+@pytest.mark.parametrize(("shares", "told"), [((1.0, 0.0, 0.0), 0), ((0.6, 0.4, 0.0), 4), ((1.0,), 4)])
+def test_a_displacement_is_what_a_second_camera_sees_as_well(shares: tuple[float, ...], told: int) -> None:
+    """A print head that stood in one camera's first picture looks like one; where there is one camera, it must do."""
+    colours = Looked(made("plain")).colours
+    colours._centres, colours._sizes = np.zeros((4, 3)), np.zeros(4)
+    shift = np.tile([1.5, 0.5, 0.0], (4, 1))
+    normal = np.tile(1e3 * np.eye(3), (4, 1, 1))
+    pulls = np.stack([share * 1e3 * shift for share in shares])
+    explained = 1e3 * (shift**2).sum(1)
+    found = colours._judge(normal, pulls, 1.1 * explained + 50, np.full(4, 50.0))
+    assert len(found.sizes) == told
+
+
+def test_a_shadow_over_dark_tissue_is_no_displacement() -> None:
+    """What is added to dark channels makes their ratios depend on the light; the more they do, the less they tell."""
+    look = Looked(made("plain"))
+    images, poses = look.seen(0)
+
+    def darkened(image: Image, light: Array | float = 1.0) -> Image:
+        return (image * (0.35 * light)).astype(np.uint8)
+
+    look.colours.begin({c: darkened(image) for c, image in images.items()}, poses, grid_map(look.session, 25.0))
+    for number in range(1, 12):
+        images, poses = look.seen(number)
+        shaded = {}
+        for c, image in images.items():
+            edge = look.colours._pixels(c, poses[c], np.array([[4.0, 0.0, 0.0]]))[0, 0]
+            light = np.where((np.arange(image.shape[1]) > edge) & (number > 6), 0.4, 1.0)
+            shaded[c] = darkened(image, light[None, :, None])
+        assert not len(look.colours(shaded, poses).sizes)
+
+
 def test_what_is_told_is_remembered_until_the_colours_are_back() -> None:
     look = Looked(made("plain"))
     for number in range(8):

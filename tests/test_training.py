@@ -36,6 +36,7 @@ from perception.training.loop import (
 from perception.training.samples import Augmentation, Pictures, draw_samples
 from perception.wound.network import Looks, Settings, WoundNetwork
 from tests.test_training_data import labelled, write
+from tests.test_wound_outline import outlined, recorded
 
 RECIPE = Recipe(Augmentation(side=64, long_side=96.0))
 SCHEDULE = Schedule(rounds=2, steps=3, batch=4, seed=7)
@@ -191,9 +192,13 @@ def test_the_command_trains_parts_by_themselves_and_puts_them_together(tmp_path:
         assert (tmp_path / "own_1.ckpt").is_file() and not out.exists()
         made = (tmp_path / "own_1.ckpt").read_bytes()
         assert main([*words, "--licence", "mine"]) == 0
+        ward = tmp_path / "ward.onnx"
+        run = recorded(tmp_path / "run.mcap", outlined(0))
+        assert main([*words[:3], str(ward), *words[4:], "--add", str(run)]) == 0
     assert (tmp_path / "own_1.ckpt").read_bytes() == made
     assert WoundNetwork(out).terms.licence == "mine"
     assert (tmp_path / "own_trained.txt").read_text().split() == [f"clinic/{number}.jpg" for number in range(9)]
+    assert (tmp_path / "ward_trained.txt").read_text().splitlines()[-1] == "run.mcap/left_0.000000"
     card = out.with_suffix(".md").read_text()
     assert "9 pictures in 2 folds" in card and "on cpu" in card
     for picture in ("own_curves.png", "own_reliability.png"):
