@@ -403,6 +403,13 @@ MUTANTS = (
         ("test_colours.py::test_a_shadow_over_dark_tissue_is_no_displacement",),
     ),
     Mutant(
+        "one place alone is displaced by its colours",
+        "perception/mapping/colours.py",
+        "MIN_BELLS, MIN_BELL_SHARE = 3,",
+        "MIN_BELLS, MIN_BELL_SHARE = 1,",
+        ("test_colours.py::test_a_displacement_is_what_several_places_see",),
+    ),
+    Mutant(
         "displaced colours are forgotten while they stand apart",
         "perception/mapping/colours.py",
         "np.isinf(known) | (energy > USUAL_RATIO * known)",

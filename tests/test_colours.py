@@ -84,6 +84,22 @@ def test_a_displacement_is_what_a_second_camera_sees_as_well(shares: tuple[float
     assert len(found.sizes) == told
 
 
+@pytest.mark.parametrize(("displaced", "told"), [(2, 0), (3, 3)])
+def test_a_displacement_is_what_several_places_see(displaced: int, told: int) -> None:
+    """The edge of a hand can look like one here or there."""
+    colours = Looked(made("plain")).colours
+    colours._centres, colours._sizes = np.zeros((8, 3)), np.zeros(8)
+    shift = np.where(np.arange(8)[:, None] < displaced, [1.5, 0.5, 0.0], 0.0)
+    pull = 1e3 * shift
+    found = colours._judge(
+        np.tile(1e3 * np.eye(3), (8, 1, 1)),
+        np.stack([pull, pull]) / 2,
+        1.1 * (shift * pull).sum(1) + 50,
+        np.full(8, 50.0),
+    )
+    assert len(found.sizes) == told
+
+
 def test_a_shadow_over_dark_tissue_is_no_displacement() -> None:
     """What is added to dark channels makes their ratios depend on the light; the more they do, the less they tell."""
     look = Looked(made("plain"))
