@@ -180,7 +180,9 @@ def test_both_networks_keep_the_size_and_ours_is_below_six_million() -> None:
     assert parameter_count(build_network("wound", 1)) < 3.2e6 < parameter_count(ThesisUNet())
 
 
-def test_the_command_trains_parts_by_themselves_and_puts_them_together(tmp_path: Path) -> None:
+def test_the_command_trains_parts_by_themselves_and_puts_them_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for number in range(9):
         each = labelled(number)
         write(tmp_path / "clinic", f"{number}", each.picture[..., ::-1], each.wound.astype(np.uint8) * 255)
@@ -195,6 +197,11 @@ def test_the_command_trains_parts_by_themselves_and_puts_them_together(tmp_path:
         ward = tmp_path / "ward.onnx"
         run = recorded(tmp_path / "run.mcap", outlined(0))
         assert main([*words[:3], str(ward), *words[4:], "--add", str(run)]) == 0
+        out.unlink()
+        assert main([*words, "--add", str(run)]) == 2  # the checkpoints that lie there are of fewer pictures
+        told = capsys.readouterr().err
+        assert "own_0.ckpt" in told and "of other pictures or options" in told and "--force" in told
+        assert main([*words, "--licence", "mine"]) == 0
     assert (tmp_path / "own_1.ckpt").read_bytes() == made
     assert WoundNetwork(out).terms.licence == "mine"
     assert (tmp_path / "own_trained.txt").read_text().split() == [f"clinic/{number}.jpg" for number in range(9)]

@@ -7,6 +7,7 @@ learns from all pictures.
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -100,9 +101,18 @@ def _trained(
     network = loop.build_network(options.network, schedule.seed)
     trained = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
     source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), schedule.device)
+    of = _fingerprint(options.network, [*trained, *pictures.others], schedule, recipe)
     what = "train on all" if part == ALL else f"train without fold {part}"
     with _progress(what, "steps") as progress:
-        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe)
+        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe, of)
+
+
+def _fingerprint(network: str, pictures: Sequence[Labelled], schedule: Schedule, recipe: Recipe) -> str:
+    """What a checkpoint is of: pictures with their labels, and all options but those that only say where it is made."""
+    made = hashlib.sha256(repr((network, replace(schedule, device="", threads=0), recipe.augmentation)).encode())
+    for each in pictures:
+        made.update(each.name.encode() + each.picture.tobytes() + each.wound.tobytes())
+    return made.hexdigest()
 
 
 def _finish(

@@ -112,8 +112,9 @@ def train(
     checkpoint: Path,
     report: Callable[[int, int], None],
     recipe: Recipe,
+    of: str = "",
 ) -> Trained:
-    """Continues from `checkpoint` where there is one.
+    """Continues from `checkpoint` where there is one; InputError where that is of another training than `of` says.
 
     source: on the schedule's device. `report(done, of)` counts steps. Every round draws from its own generator, so that
     a run that was broken off and continued is the run that was not.
@@ -128,7 +129,7 @@ def train(
     ]
     used = [each for each in groups if each["params"]]
     optimiser = torch.optim.AdamW(used, schedule.rate, weight_decay=schedule.decay)
-    loss, device = _continued(checkpoint, network, averaged, optimiser, schedule.device)
+    loss, device = _continued(checkpoint, of, (network, averaged, optimiser), schedule.device)
     for number in range(len(loss), schedule.rounds):
         rng = np.random.default_rng([schedule.seed, number])
         torch.manual_seed(int(rng.integers(2**62)))  # of what is dropped
@@ -145,7 +146,7 @@ def train(
         parts: dict[str, Any] = {"averaged": averaged}
         if number + 1 < schedule.rounds:  # all that going on needs
             parts |= {"network": network, "optimiser": optimiser}
-        state = {name: part.state_dict() for name, part in parts.items()} | {"loss": loss, "device": device}
+        state = {name: part.state_dict() for name, part in parts.items()} | {"loss": loss, "device": device, "of": of}
         torch.save(state, checkpoint.with_suffix(".new"))
         checkpoint.with_suffix(".new").replace(checkpoint)
     return Trained(averaged.to("cpu"), loss, device)
@@ -185,12 +186,16 @@ def _state(network: nn.Module) -> list[Tensor]:
 
 
 def _continued(
-    checkpoint: Path, network: nn.Module, averaged: nn.Module, optimiser: torch.optim.Optimizer, device: str
+    checkpoint: Path, of: str, parts: tuple[nn.Module, nn.Module, torch.optim.Optimizer], device: str
 ) -> tuple[list[float], str]:
-    """The losses so far, and on what they were reached."""
+    """The losses so far, and on what they were reached. parts: the network, its average and the optimiser."""
     if not checkpoint.exists():
         return [], device
+    network, averaged, optimiser = parts
     state = torch.load(checkpoint, weights_only=True, map_location=next(network.parameters()).device)
+    if state["of"] != of:
+        allowed = "one of the same pictures and options, or --force to begin anew"
+        raise InputError(checkpoint, "training", "of other pictures or options", allowed)
     averaged.load_state_dict(state["averaged"])
     if "network" in state:  # the last round was not reached
         network.load_state_dict(state["network"])
