@@ -323,8 +323,10 @@ def spread_figures(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) ->
     if not residuals:
         return []
     off, spread = np.array(residuals), segmenter.settings.spread
-    halves = [float((off[i::2] <= conformal_spread(off[1 - i :: 2])).mean()) for i in (0, 1)]
-    note = f"{len(off)} pictures; by the spread of the other half {halves[0]:.3f} and {halves[1]:.3f}"
+    note = f"{len(off)} pictures"
+    if len(off) > 1:
+        halves = [float((off[i::2] <= conformal_spread(off[1 - i :: 2])).mean()) for i in (0, 1)]
+        note += f"; by the spread of the other half {halves[0]:.3f} and {halves[1]:.3f}"
     inside, used = float((off <= spread).mean()), f"used: {spread:g}; by 1 inside: {float((off <= 1).mean()):.3f}"
     return [
         Figure("label's area inside the interval of one picture", inside, "", at_least(0.93), "", note),

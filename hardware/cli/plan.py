@@ -243,7 +243,7 @@ def add_train(commands: Commands) -> None:
         "Needs the extra [train]: pip install 'stillbed[train]'.",
         "stillbed train data/fuseg data/medetec -o wound.onnx",
         "stillbed train data/fuseg -o ward.onnx --add monday.mcap tuesday.mcap",
-        "stillbed train data/fuseg data/medetec -o wound.onnx --part 0 & ... --part all & wait; then without --part",
+        "stillbed train data/fuseg data/medetec -o wound.onnx --part 0",
     ).add_argument
     add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is what the recipe is judged by")
     add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="file to write")
@@ -261,7 +261,7 @@ def add_train(commands: Commands) -> None:
     add("--source", metavar="TEXT", help="of its pictures, written into X.toml")
     add("--threads", type=int, default=1, metavar="N", help="of torch")
     add("--seed", type=int, default=1, metavar="N", help="of the weights and of all that is drawn")
-    add("--force", action="store_true", help="overwrite X.onnx and begin anew")
+    add("--force", action="store_true", help="overwrite X.onnx; checkpoints of the same training are gone on from")
 
 
 def _run_segment(a: argparse.Namespace) -> int:

@@ -225,14 +225,15 @@ class _TrackingLoop:
         """Give the page, once a look, pictures on which the outline of the wound can be corrected, and it so far."""
         step, settings = self._step, self._prepared.settings
         if self._sheet is None and settings.page and not settings.unattended:
-            sight = step.sight if isinstance(step, RegionTrackingStep) else None
+            sheet, sight = None, step.sight if isinstance(step, RegionTrackingStep) else None
             if sight is not None:
-                self._sheet = sheet_from_sight(self._rig, sight)
+                sheet = sheet_from_sight(self._rig, sight)
             elif self._by_outline:
-                self._sheet = sheet_from_rois(self._rig, frames, step.roi)
-            if self._sheet is not None:
-                with suppress(InputError):  # larger than their place: nothing is corrected then
-                    self._channels.link.sheet.put(self._sheet.pictures())
+                sheet = sheet_from_rois(self._rig, frames, step.roi)
+            if sheet is not None:
+                with suppress(InputError):  # larger than their place: nothing is offered then
+                    self._channels.link.sheet.put(sheet.pictures())
+                    self._sheet = sheet
         if self._sheet is not None and pose.state.measured and (surface_map := step.map) is not None:
             self._sheet.place(surface_map.points, pose.base_from_surface)
 

@@ -124,6 +124,7 @@ class AreaLog(ExitStack):
         self._segmenter = segmenter
         self._banded = segmenter if isinstance(segmenter, NetworkSegmenter) else None
         self._areas: dict[Path, list[WoundArea | str]] = {path: [] for path in sessions}
+        (folder / AREA_TABLE).unlink(missing_ok=True)  # of an earlier run
         self._write = self.enter_context(_table(folder / AREA_TABLE, AREA_COLUMNS)) if sessions else None
 
     def segmented(self, picture: NamedPicture) -> Segmentation:
@@ -228,7 +229,7 @@ def _is_session(path: Path) -> bool:
 
 def _name(file: Path) -> str:
     """What masks and rows of an input are named for."""
-    return file.resolve().stem
+    return file.resolve().name if file.is_dir() else file.stem
 
 
 def expected_count(file: Path) -> int:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import shutil
+import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -20,7 +23,7 @@ from numpy.typing import NDArray
 from estimation.errors import InputError, StillbedError
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
-from hardware.recording.session_reader import corrected_pictures
+from hardware.recording.session_reader import corrected_pictures, recording_damage
 from perception.training.dataset import Labelled, fold_numbers, healthy_pieces, picture_groups, read_dataset
 from perception.wound.network import TERMS_KEYS
 
@@ -87,8 +90,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     curves = {"all folds" if part == ALL else f"without fold {part}": each.loss for part, each in trained.items()}
     loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
     schedule = replace(schedule, device=trained[ALL].device)
-    terms = {key: text for key in TERMS_KEYS if (text := getattr(options, key)) is not None}
-    return _finish(out, trained, pictures, recipe, schedule, render_view, terms)
+    return _finish(options, trained, pictures, recipe, schedule, render_view)
 
 
 def _trained(
@@ -109,31 +111,34 @@ def _trained(
 
 def _fingerprint(network: str, pictures: Sequence[Labelled], schedule: Schedule, recipe: Recipe) -> str:
     """What a checkpoint is of: pictures with their labels, and all options but those that only say where it is made."""
-    made = hashlib.sha256(repr((network, replace(schedule, device="", threads=0), recipe.augmentation)).encode())
+    said = network, replace(schedule, device="", threads=0), recipe.augmentation, OTHER_SET_WEIGHT
+    made = hashlib.sha256(repr(said).encode())
     for each in pictures:
         made.update(each.name.encode() + each.picture.tobytes() + each.wound.tobytes())
     return made.hexdigest()
 
 
 def _finish(
-    out: Path,
+    options: argparse.Namespace,
     trained: dict[str, Trained],
     pictures: TrainingPictures,
     recipe: Recipe,
     schedule: Schedule,
     render_view: RenderView,
-    terms: dict[str, str],
 ) -> str:
-    """Judge by the folds, choose settings by them, write the network of all pictures, its card and its pictures."""
-    import tempfile
+    """Judge by the folds, choose settings by them, write the network of all pictures, its card and its pictures.
 
+    The network itself comes last: where it is, all is there.
+    """
     from perception.training import export, loop, metrics
-    from perception.wound.network import Settings, WoundNetwork, hash_of
+    from perception.wound.network import Settings, WoundNetwork
     from perception.wound.segmentation import NetworkSegmenter
 
+    out: Path = options.out
+    terms = {key: text for key in TERMS_KEYS if (text := getattr(options, key)) is not None}
     rng = np.random.default_rng(SPLIT_SEED)
     healthy = _pieces(pictures, rng)
-    rendered = [_rendered_view(render_view, number, wounded=False) for number in range(RENDERED_HEALTHY)]
+    rendered = [each.picture for each in _rendered(render_view, [(n, False) for n in range(RENDERED_HEALTHY)])]
     with tempfile.TemporaryDirectory() as folder:
         rounded = []
         for part, each in trained.items():
@@ -145,28 +150,34 @@ def _finish(
         with _progress("choose", "settings") as progress:
             settings, judged = metrics.judge(unseen, recipe.looks, rng, progress)
         segmenters = [NetworkSegmenter(network, settings) for network in rounded]
-        before, after = _covered(segmenters, pictures, rng)
-        silent = [metrics.silent_share(each, [view.picture for view in rendered]) for each in segmenters]
-    export.export(trained[ALL].network, out, settings, terms)
-    alike = export.agreement(trained[ALL].network, out, pictures.judged[:COMPARED], recipe.looks)
-    out.with_name(f"{out.stem}_trained.txt").write_text("".join(f"{each.name}\n" for each in pictures.judged), "utf-8")
-    export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), judged)
-    figures = export.Figures(
-        judged,
-        [each.name for each in pictures.judged],
-        [float(each.wound.mean()) for each in pictures.judged],
-        len(healthy[0]),
-        float(np.mean(silent)),
-        before,
-        after,
-    )
-    data = (
-        f"{len(pictures.judged)} pictures in {pictures.fold.max() + 1} folds, split by {pictures.group_count} groups of"
-        " near-duplicates (small colour copies, mirrored and turned; SIFT), never at random",
-        f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
-    )
-    origin = export.NetworkOrigin(out.stem, loop.parameter_count(trained[ALL].network), data, str(schedule), alike)
-    export.write_card(out.with_suffix(".md"), origin, figures, settings, hash_of(out))
+        with _progress("cover", "pictures") as progress:
+            before, after = _covered(segmenters, pictures, rng, progress)
+        silent = [metrics.silent_share(each, rendered) for each in segmenters]
+        figures = export.Figures(
+            judged,
+            [each.name for each in pictures.judged],
+            [float(each.wound.mean()) for each in pictures.judged],
+            len(healthy[0]),
+            float(np.mean(silent)),
+            before,
+            after,
+        )
+        made = Path(folder) / out.name
+        export.export(trained[ALL].network, made, settings, terms)
+        alike = export.agreement(trained[ALL].network, made, pictures.judged[:COMPARED], recipe.looks)
+        folds = f"{len(pictures.judged)} pictures in {pictures.fold.max() + 1} folds"
+        data = (
+            f"{folds}, split by {pictures.group_count} groups of near-duplicates (small colour copies, mirrored and"
+            " turned; SIFT), never at random",
+            f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
+        )
+        count = loop.parameter_count(trained[ALL].network)
+        origin = export.NetworkOrigin(out.stem, options.network, count, data, str(schedule), alike, WoundNetwork(made))
+        _write_names(out, [*pictures.judged, *pictures.others])
+        export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), judged)
+        export.write_card(out.with_suffix(".md"), origin, figures)
+        for suffix in (".toml", ".onnx"):
+            shutil.copy(made.with_suffix(suffix), out.with_suffix(suffix))
     dice = judged.dice
     return (
         f"mean Dice of {len(dice)} pictures, each by a network that never saw its group: {dice.mean():.3f} (median"
@@ -210,7 +221,10 @@ def _unseen(
 
 
 def _covered(
-    segmenters: Sequence[Segmenter], pictures: TrainingPictures, rng: np.random.Generator
+    segmenters: Sequence[Segmenter],
+    pictures: TrainingPictures,
+    rng: np.random.Generator,
+    seen: Callable[[int, int], None],
 ) -> tuple[float, float]:
     """Mean Dice on the open half of each wound, before its other half is covered and after."""
     from perception.training.metrics import dice_before_and_after_cover
@@ -222,6 +236,7 @@ def _covered(
         if wounded:
             reached.append(dice_before_and_after_cover(segmenter, wounded, rng))
             counts.append(len(wounded))
+            seen(sum(counts), len(pictures.judged))
     before, after = np.average(reached, axis=0, weights=counts)
     return float(before), float(after)
 
@@ -234,7 +249,7 @@ def _fit_shapes(out: Path, pictures: TrainingPictures, seed: int) -> str:
     with _progress("fit", "pictures") as progress:
         model = fit_shapes([(each.picture, each.wound) for each in learned], seed, progress)
     write_shape_model(out, model)
-    out.with_name(f"{out.stem}_trained.txt").write_text("".join(f"{each.name}\n" for each in learned), "utf-8")
+    _write_names(out, learned)
     return f"{out} is written; judge it with stillbed bench segmentation"
 
 
@@ -244,24 +259,48 @@ def _pictures(options: argparse.Namespace, render_view: RenderView) -> TrainingP
     for folder in options.datasets:
         with _progress(f"read {folder.name}", "pictures") as progress:
             data_sets.append(read_dataset(folder, progress))
-    judged = [*data_sets[0], *(each for recording in options.add for each in corrected_pictures(recording))]
+    judged = [*data_sets[0], *(each for recording in options.add for each in _corrected(recording))]
     group = picture_groups(judged)
     count = len(np.unique(group))
     if count < options.folds:
-        raise InputError(options.datasets[0], "groups of pictures", count, f"as many as --folds, {options.folds}")
-    rendered = []
-    with _progress("render", "pictures") as progress:
-        for number in range(options.rendered):  # every fourth of healthy skin
-            rendered.append(_rendered_view(render_view, RENDERED_SEED + number, number % 4 != 3))
-            progress(number + 1, options.rendered)
+        raise InputError(options.datasets[0], "groups of pictures", count, f"{options.folds} or more, as --folds says")
+    wounded = np.array([each.wound.any() for each in judged])
+    if len(np.unique(group[wounded])) < 2:
+        found = len(np.unique(group[wounded]))
+        raise InputError(options.datasets[0], "groups of pictures with a wound", found, "two or more")
+    # every fourth of healthy skin
+    rendered = _rendered(render_view, [(RENDERED_SEED + number, number % 4 != 3) for number in range(options.rendered)])
     others = [each for data_set in data_sets[1:] for each in data_set] + rendered
     fold = fold_numbers(group, options.folds, np.random.default_rng(SPLIT_SEED))
     return TrainingPictures(judged, fold, others, count)
 
 
-def _rendered_view(render_view: RenderView, seed: int, wounded: bool) -> Labelled:
-    view = render_view(seed, wounded)
-    return Labelled(f"rendered/{seed}", np.ascontiguousarray(view.image[..., ::-1]), view.wound)
+def _corrected(recording: Path) -> list[Labelled]:
+    """What operators corrected in a recording; what is lost of it is told."""
+    pictures = corrected_pictures(recording)
+    if damage := recording_damage(recording):
+        print(
+            f"{recording} is damaged: {damage}; {len(pictures)} corrected pictures are left",
+            file=sys.stderr,
+            flush=True,
+        )
+    return pictures
+
+
+def _rendered(render_view: RenderView, views: Sequence[tuple[int, bool]]) -> list[Labelled]:
+    """Rendered pictures by their seeds, and whether there is a wound."""
+    pictures = []
+    with _progress("render", "pictures") as progress:
+        for seed, wounded in views:
+            view = render_view(seed, wounded)
+            pictures.append(Labelled(f"rendered/{seed}", np.ascontiguousarray(view.image[..., ::-1]), view.wound))
+            progress(len(pictures), len(views))
+    return pictures
+
+
+def _write_names(out: Path, pictures: Sequence[Labelled]) -> None:
+    """What was learned from, beside the model: nothing of it can judge it."""
+    out.with_name(f"{out.stem}_trained.txt").write_text("".join(f"{each.name}\n" for each in pictures), "utf-8")
 
 
 def _checkpoint(out: Path, part: str) -> Path:
@@ -277,19 +316,17 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError("command line", "--out", str(out), f"a name that ends in {'.toml' if shapes else '.onnx'}")
     if not out.parent.is_dir():
         raise InputError("command line", "--out", str(out), "a file in a folder that exists")
-    if options.force:
-        for checkpoint in out.parent.glob(f"{out.stem}_*.ckpt"):
-            checkpoint.unlink()
-    elif out.exists():
-        raise InputError(out, "--out", "a file", "a new one, or --force")
-    for name, value, least in (("--folds", options.folds, 2), ("--rendered", options.rendered, 0)):
-        if value < least:
-            raise InputError("command line", name, value, f"{least} or more")
-    if options.rounds is not None and options.rounds < 1:
-        raise InputError("command line", "--rounds", options.rounds, "1 or more")
+    least = {"--folds": (options.folds, 2), "--rendered": (options.rendered, 0), "--rounds": (options.rounds, 1)}
+    least |= {"--threads": (options.threads, 1), "--seed": (options.seed, 0)}
+    for name, (value, low) in least.items():
+        if value is not None and value < low:
+            raise InputError("command line", name, value, f"{low} or more")
     parts = [*map(str, range(options.folds)), ALL]
-    if options.part is not None and options.part not in parts:
-        raise InputError("command line", "--part", options.part, f"one of {', '.join(parts)}")
+    if options.part is not None and (shapes or options.part not in parts):
+        allowed = "nothing with --network shape" if shapes else f"one of {', '.join(parts)}"
+        raise InputError("command line", "--part", options.part, allowed)
+    if options.part is None and out.exists() and not options.force:
+        raise InputError(out, "--out", "a file", "a new one, or --force")
 
 
 def _progress(what: str, unit: str) -> Progress:

@@ -30,7 +30,7 @@ OTHER_REQUEST_SLOTS = 8  # of them for what does not lead towards rest: a flood 
 PICTURES_CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
 MAX_PATH_POINTS, MAX_TRIANGLES = 4000, 1500  # what a browser without a graphics card draws ten times a second
 OUTLINE_CAPACITY = 1 << 15  # bytes: four times a window's longest message
-SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras at their own size
+SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras, 1280 px at most
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
 _RECORD = struct.Struct("=QQBdddI")  # the same, and its check sum

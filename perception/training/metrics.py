@@ -236,6 +236,8 @@ def _some_pixels(unseen: Unseen, rng: np.random.Generator) -> _Pixels:
             odds.append(logits[chosen].astype(float))
             wounds.append(wound[chosen])
             folds.append(np.full(PIXELS_JUDGED, unseen.fold[number]))
+    if not odds:  # nothing that may be a wound's
+        return _Pixels(np.zeros(0), np.zeros(0, bool), np.zeros(0, np.intp))
     return _Pixels(np.concatenate(odds), np.concatenate(wounds), np.concatenate(folds))
 
 
@@ -266,7 +268,7 @@ def calibration_error(probability: Array, right: NDArray[np.bool_], bins: int = 
     weighted by how many fall into them."""
     place = np.minimum((probability * bins).astype(int), bins - 1)
     gaps = [abs(right[place == b].sum() - probability[place == b].sum()) for b in range(bins)]
-    return float(np.sum(gaps) / len(probability))
+    return float(np.sum(gaps) / len(probability)) if len(probability) else float("nan")
 
 
 def _logistic(levels: Array, right: NDArray[np.bool_]) -> tuple[float, float]:

@@ -30,7 +30,7 @@ SIZE_STEP_PX = 32  # the network halves its input five times
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """How the two looks are taken; chosen on pictures that were neither trained on nor evaluated by."""
+    """How the two looks are taken."""
 
     long_side: int = 320  # px of the first look
     window: int = 256  # px, side of the second look; 0: there is none
@@ -93,7 +93,7 @@ OWN_NETWORK = "an ONNX file written by stillbed train"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What was chosen with the network, on pictures it was neither trained on nor evaluated by."""
+    """What was chosen with the network, by networks of its kind that never saw the pictures it was chosen on."""
 
     looks: Looks = field(default_factory=Looks)  # how it is shown a picture
     edge: float = 0.5  # probability at a wound's edge
@@ -101,7 +101,7 @@ class Settings:
     trust: float = 0.5  # confidence below which there is no wound
     slope: float = 1.0  # of the logistic that turns the mean logit of the mask's pixels into a confidence
     offset: float = 0.0  # of the same
-    pixel_slope: float = 1.0  # of the logistic that turns a pixel's logit into how often such a pixel is a wound's
+    pixel_slope: float = 1.0  # of the logistic by which a logit says how often such a pixel is a wound's
     pixel_offset: float = 0.0  # of the same
     spread: float = 2.0  # half a 95 % interval of the area, in half bands of probability (`WoundBand`): so labels ask
 
@@ -124,7 +124,8 @@ class WoundNetwork:
     def __init__(self, file: Path, threads: int = NETWORK_THREADS) -> None:
         """file: NAME.onnx, beside it NAME.toml with its hash and settings. InputError: missing, damaged, not ours."""
         self.size = file.stat().st_size if file.is_file() else 0  # bytes
-        self.settings = read_settings(file.with_suffix(".toml"), hash_of(file))
+        self.sha256 = hash_of(file)
+        self.settings = read_settings(file.with_suffix(".toml"), self.sha256)
         self.terms = read_terms(file.with_suffix(".toml"))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1

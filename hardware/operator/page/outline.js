@@ -27,6 +27,8 @@ export class Outlining {
   }
   // the pictures, and the outline that was found in each of them
   take({ head, images }) {
+    if (this.sheet && head.stamp === this.stamp) return; // the connection was made anew: what was changed stays
+    this.stamp = head.stamp;
     this.sheet = new Map(head.pictures.map((each, k) => [each.camera, { image: images[k][0], found: pairs(each.outline[0] || []), frame: null }]));
     this.restart();
     this.changed();
@@ -102,10 +104,10 @@ export class Outlining {
     this.ask(outline, this.view.turn);
   }
   key(event) {
-    if (!this.on || event.altKey || event.metaKey) return;
+    if (!this.on || event.altKey) return;
     const way = WAYS[event.code], pane = this.chosen && this.panes.get(this.chosen.name);
-    if (event.ctrlKey) {
-      if (event.code !== "KeyZ") return;
+    if (event.ctrlKey || event.metaKey) {
+      if (event.key.toLowerCase() !== "z") return; // wherever the keyboard has it
       this.undo();
     } else if (event.code === "Escape") this.leave();
     else if (event.code === "Delete" || event.code === "Backspace") this.remove();
