@@ -33,7 +33,7 @@ class Looks:
     """How the two looks are taken."""
 
     long_side: int = 320  # px of the first look
-    window: int = 256  # px, side of the second look; 0: there is none
+    window: int = 224  # px, side of the second look; 0: there is none
     share: float = 0.9  # of the window's side that the found place takes
     largest_zoom: float = 2.5  # beyond this the picture holds nothing more
     found: float = 0.3  # probability from which a place of the first look is looked at again
