@@ -15,7 +15,7 @@ from estimation.surface_map import SurfaceMap
 from perception.frames import Image
 from perception.lens import Lenses
 from perception.mapping.colours import BELL_MM, MIN_SHIFT_MM, Colours
-from perception.mapping.masks import TrackingMasks
+from perception.mapping.masks import MASK_SCALE, TrackingMasks
 from tests.campaigns.deceit.judge import Judge, frame_sets, tracker
 from tests.campaigns.deceit.kinds import NAMES, make_session
 from tests.campaigns.deceit.scenes import TRICK, Session
@@ -82,6 +82,20 @@ def test_a_displacement_is_what_a_second_camera_sees_as_well(shares: tuple[float
     explained = 1e3 * (shift**2).sum(1)
     found = colours._judge(normal, pulls, 1.1 * explained + 50, np.full(4, 50.0))
     assert len(found.sizes) == told
+
+
+def test_a_place_beside_the_print_head_of_the_first_picture_is_not_known() -> None:
+    """Its average, or the slope of its colours, would hold some of the head."""
+    look, camera = Looked(made("plain")), 1
+    images, poses = look.seen(0)
+    edge = float(np.median(look.colours._pixels(camera, poses[camera], look.colours._points)[:, 0]))
+    mask = np.zeros(tuple(int(np.ceil(side * MASK_SCALE)) for side in images[camera].shape[:2]), np.uint8)
+    mask[:, : int(edge * MASK_SCALE)] = 255
+    look.colours._masks.print_head[camera] = mask
+    look.colours.begin(images, poses, grid_map(look.session, 25.0))
+    first = look.colours._first[camera]
+    beside = look.colours._pixels(camera, poses[camera], look.colours._points)[first.free, 0] - edge
+    assert len(beside) > 50 and beside.min() > 1.5 * first.scale
 
 
 @pytest.mark.parametrize(("displaced", "told"), [(2, 0), (3, 3)])
