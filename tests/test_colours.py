@@ -88,13 +88,13 @@ def test_a_place_beside_the_print_head_of_the_first_picture_is_not_known() -> No
     """Its average, or the slope of its colours, would hold some of the head."""
     look, camera = Looked(made("plain")), 1
     images, poses = look.seen(0)
-    edge = float(np.median(look.colours._pixels(camera, poses[camera], look.colours._points)[:, 0]))
+    columns = int(np.median(look.colours._pixels(camera, poses[camera], look.colours._points)[:, 0]) * MASK_SCALE)
     mask = np.zeros(tuple(int(np.ceil(side * MASK_SCALE)) for side in images[camera].shape[:2]), np.uint8)
-    mask[:, : int(edge * MASK_SCALE)] = 255
+    mask[:, :columns] = 255
     look.colours._masks.print_head[camera] = mask
     look.colours.begin(images, poses, grid_map(look.session, 25.0))
     first = look.colours._first[camera]
-    beside = look.colours._pixels(camera, poses[camera], look.colours._points)[first.free, 0] - edge
+    beside = look.colours._pixels(camera, poses[camera], look.colours._points)[first.free, 0] - columns / MASK_SCALE
     assert len(beside) > 50 and beside.min() > 1.5 * first.scale
 
 
