@@ -157,6 +157,18 @@ class SurfacePose:
         """Root mean square displacement of the landmarks, mm, that no rigid motion explains."""
         return 0.0 if self.warp is None else self.warp.deformation
 
+    @property
+    def finite(self) -> bool:
+        """Whether all that a motion follows of it is finite."""
+        arrays = [self.base_from_surface, self.covariance, self.twist, self.twist_covariance, self.acceleration_psd]
+        if self.warp is not None:
+            arrays += [self.warp.control, self.warp.coefficients, self.warp.covariance, self.warp.growth]
+        if self.forecast is not None:
+            arrays += [self.forecast.horizons, self.forecast.increments, self.forecast.covariances]
+        if (local := self.local) is not None:
+            arrays += [local.centres, local.variance, local.growth, local.reach, local.support]
+        return bool(np.isfinite(self.stamp) and all(np.isfinite(a).all() for a in arrays))
+
     def predict(self, stamp: float, onwards: bool = True) -> SurfacePose:
         """The pose at `stamp` (s): along the forecast as far as it reaches, then under constant body velocity.
 

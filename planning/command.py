@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from math import nan
 
 import numpy as np
 
@@ -62,6 +63,21 @@ class RefusalCode(StrEnum):
     WATCHDOG = "watchdog"
     STOP_DISTANCE = "stop_distance"
     FLOW = "flow"
+
+
+class HoldReason(str):
+    """Why the planner stops, in words, with the code of what is broken, its number and its limit, as in a Refusal."""
+
+    code: RefusalCode | None
+    got: float
+    limit: float
+
+    def __new__(  # noqa: D102
+        cls, words: str = "", code: RefusalCode | None = None, got: float = nan, limit: float = nan
+    ) -> HoldReason:
+        reason = super().__new__(cls, words)
+        reason.code, reason.got, reason.limit = code, got, limit
+        return reason
 
 
 @dataclass(frozen=True, slots=True)

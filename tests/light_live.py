@@ -132,7 +132,6 @@ def main(folder: Path, record: Path, *flags: str) -> int:
         run.recorded_begin = unkept
     with Console() as console:
         outcome = LiveRun(prepared, console, track_until_printed if "--until-printed" in flags else track_nothing)()
-        outcome.write()
         console.say(outcome.words)
     return outcome.code
 

@@ -23,7 +23,7 @@ from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
 from hardware.files.path_file import ProgressWriter, read_progress, write_path, write_progress_durably
 from hardware.files.ply_file import write_ply
-from hardware.live.checklist import place_path, raised_path
+from hardware.live.checklist import PrintTask, place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.motion_process import LAG_STEP, LiveMotion
 from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
@@ -48,7 +48,6 @@ from hardware.live.settings import (
     read_settings,
     settings_text,
 )
-from hardware.live.state_machine import PrintTask
 from hardware.motion.loop import RecordedTick
 from hardware.process.faults import faults_from_texts
 from hardware.recording.recorder import Recorder

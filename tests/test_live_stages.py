@@ -11,9 +11,9 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.live.checklist import run_checks
+from hardware.live.checklist import PrintTask, run_checks
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
-from hardware.live.state_machine import PrintTask, RunStateMachine
+from hardware.live.state_machine import RunStateMachine
 from hardware.live.view import stage_line
 from hardware.motion.loop import Order, Tick
 from hardware.motion.material import MaterialStatus
@@ -377,7 +377,7 @@ def test_cameras_pass_that_deliver_now_and_one_alone_does_not(
     age: float, delivering: tuple[int, ...], verdict: CheckVerdict
 ) -> None:
     tracking = TrackingReport(5.0, ("a", "b", "c"), delivering, replace(SURFACE, stamp=5.0 - age))
-    checks = run_checks(RunReports(tracking=tracking), raster(), 0.0, None, True, 5.0)
+    checks = run_checks(RunReports(tracking=tracking), PrintTask(raster(), PROFILE, stands_home=True), None, 5.0)
     assert {check.name: check.verdict for check in checks}["cameras"] is verdict
 
 

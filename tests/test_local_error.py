@@ -24,7 +24,6 @@ from estimation.synthetic.world import arc_rig, observations, project_landmarks,
 from hardware.recording.messages import message_from_pose, pose_from_message
 from hardware.simulator.scene.shape import Deformation
 from planning.motion import guard
-from planning.motion.planner import _finite
 from tests.synthetic import breathing, still
 
 RIG = arc_rig()
@@ -216,7 +215,7 @@ def test_however_far_a_place_may_have_gone_nothing_is_said_of_one_beyond_twice_i
 def test_the_guard_refuses_a_pose_whose_local_error_is_not_finite() -> None:
     local = LocalError(np.zeros((1, 3)), np.array([np.nan]), np.zeros(1), np.ones(1), np.zeros((1, 3)), 10.0, 9.0)
     pose = SurfacePose(1.0, still(0.0), 1e-6 * np.eye(6), np.zeros(6), TrackState.TRACKING, local=local)
-    assert not np.isfinite(np.concatenate([np.ravel(a) for a in guard._numbers(pose)])).all() and not _finite(pose)
+    assert not np.isfinite(np.concatenate([np.ravel(a) for a in guard._numbers(pose)])).all() and not pose.finite
 
 
 @pytest.mark.parametrize(("region", "span"), [(True, 25.0), (False, 10.0)])

@@ -291,6 +291,17 @@ def test_a_histogram_of_lateness_gives_percentiles_to_a_tenth_of_a_millisecond(s
     assert histogram.most == late.max()
 
 
+def test_a_percentile_is_never_cut_off_where_the_even_bins_end() -> None:
+    late = np.random.default_rng(5).exponential(0.3, 4000)
+    histogram = Histogram()
+    for each in late:
+        histogram.add(each)
+    assert histogram.counts.sum() == len(late) and histogram.counts[-1] > len(late) / 2
+    for share in (50, 95, 99):
+        assert histogram.percentile(share) == pytest.approx(np.percentile(late, share), rel=0.025)
+    assert histogram.percentile(100) == late.max()
+
+
 def test_what_priority_was_granted_is_said() -> None:
     code = "from hardware.process.system import ask_for_real_time; print(ask_for_real_time())"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

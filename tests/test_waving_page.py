@@ -14,7 +14,8 @@ from estimation.rig import pixels_from_points
 from hardware.calibration.corners import MIN_COMMON_SETS, CoverageGuide
 from hardware.calibration.live import WavingPage
 from hardware.files.rig_file import read_rig, write_board
-from hardware.operator.view import WavingStage, Wish
+from hardware.operator.shared_state import WavingStage
+from hardware.operator.view import Wish
 from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet
 from tests.board_session import BOARD, LENSES, RATE, rendered, small_rig

@@ -37,8 +37,8 @@ from hardware.cameras.sources import CameraSource
 from hardware.files.rig_file import MIN_RIG_SPAN, ImageSource, read_rig
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import OperatorLink
-from hardware.operator.view import RequestAnswer, WavingCamera, WavingStage, WavingView, Wish, refusal
+from hardware.operator.shared_state import OperatorLink, WavingCamera, WavingStage, WavingView
+from hardware.operator.view import RequestAnswer, Wish, refusal
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
 from perception.boards.board import Board, CornerTable

@@ -25,7 +25,7 @@ from hardware.calibration.live import WavingPage, devices_named, watch
 from hardware.calibration.report import MAX_PREDICTED_ERROR, CalibrationVerdict, judge_rig, page, rig_json, rig_text
 from hardware.cameras.live import LiveCameras
 from hardware.files.rig_file import read_board, write_rig
-from hardware.operator.view import WavingStage
+from hardware.operator.shared_state import WavingStage
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress, ProgressReport
 from perception.boards.board import Board, CornerTable, thumbnail, undistort, usable_views

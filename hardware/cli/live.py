@@ -154,7 +154,6 @@ def _run_live(a: argparse.Namespace) -> int:
         prepared = prepare_resumed(a.resume, flags, faults)
     with Console() as console:
         outcome = LiveRun(prepared, console)()
-        outcome.write()
         console.say(outcome.words)
     return outcome.code
 

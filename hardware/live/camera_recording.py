@@ -30,8 +30,8 @@ from hardware.live.settings import LiveSettings
 from hardware.offline.track import region_search
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import DrawnRegion, OperatorLink, scene_from
-from hardware.operator.view import CameraView, CheckVerdict, RecordingStage, RecordingView, RequestAnswer, Wish, refusal
+from hardware.operator.shared_state import DrawnRegion, OperatorLink, RecordingStage, RecordingView, scene_from
+from hardware.operator.view import CameraView, CheckVerdict, RequestAnswer, Wish, refusal
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
 from hardware.process.system import SPAWN, SharedLatest

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,11 +17,36 @@ from hardware.process.progress import count_text
 from planning.kinematics import axes_from_nozzle, joints_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN
 from planning.material import Outlets, with_offsets
-from planning.path import Path
+from planning.path import Path, fingerprint
 from planning.placement import NoSurfaceError, PathPlacement, PlacedBy, SurfaceMove, moved_along
 
 MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver any more
+FIRST_PICTURE_TIME = 30.0  # s in which first pictures come where all is well, on two busy cores
+USUAL_START = "10 to 30 s are usual"
 PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrintTask:
+    """What is to be printed, and how."""
+
+    path: Path  # in its own frame
+    profile: ArmProfile
+    start: float = 0.0  # where it goes on, counted in checkpoints
+    place: bool = False  # put the arm where the surface lies below its home
+    stands_home: bool = False  # the arm is taken to stand at home: the operator says so, or it is virtual
+    virtual: bool = False  # the arm is virtual: it begins at home, and nobody has to say so
+    lift: float | None = None  # mm above the path in a dry run; None for a real one
+    unattended: bool = False  # nobody confirms and nobody resumes: what stops such a run ends it
+    patience: float = 10.0  # s without pictures, after which the arm is stopped
+    dispensers: str = ""  # text of the dispenser file; "": nothing is extruded
+    outlets: Outlets = field(default_factory=dict)  # of the path's materials
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the path as its file has it; "" in a dry run, of which no progress is kept."""
+        return fingerprint(self.path) if self.lift is None else ""
+
 
 SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s
 
@@ -113,14 +138,15 @@ def _outside(values: Array, low: Array, high: Array, names: str | list[str]) -> 
 
 
 def run_checks(
-    reports: RunReports, path: Path, start: float, placed_path: PlacedPath | None, stands_home: bool, now: float
+    reports: RunReports, task: PrintTask, placed_path: PlacedPath | None, now: float, waited: float = 0.0
 ) -> tuple[Check, ...]:
-    """The checks of a run at `now`, s. path, start: to be printed. stands_home: the operator says that the arm does."""
-    begun = f", from checkpoint {start:.2f} on" if start else ""
+    """The checks of a run at `now`, s. waited: s for which it has been checked."""
+    path, start = task.path, task.start
+    begun = f"; goes on at checkpoint {start:.2f}, {start / max(len(path) - 1, 1):.0%}" if start else ""
     layers = count_text(len(np.unique(path.layer)), "layer")
     return (
-        *_camera_checks(reports.tracking, now),
-        _arm_check(reports.motion, stands_home),
+        *_camera_checks(reports.tracking, now, waited),
+        _arm_check(reports.motion, task),
         Check("path", PASS, f"{len(path)} checkpoints, {layers}{begun}"),
         *_material_check(reports.motion),
         _reach_check(placed_path),
@@ -128,14 +154,16 @@ def run_checks(
     )
 
 
-def _camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Check]:
-    """Whether all cameras deliver, and what is known of their calibration."""
+def _camera_checks(report: TrackingReport | None, now: float, waited: float) -> tuple[Check, Check]:
+    """Whether all cameras deliver, and what is known of their calibration. waited: s, so far."""
     if report is None or not report.cameras:
-        return Check("cameras", BUSY, "the tracker starts"), Check("calibration", BUSY, "the tracker starts")
+        loads = f"the tracker loads its libraries, for {waited:.0f} s: {USUAL_START}"
+        return Check("cameras", BUSY, loads), Check("calibration", BUSY, "read once the tracker has started")
     calibration = Check("calibration", PASS, f"{len(report.cameras)} cameras, {', '.join(report.cameras)}")
     if report.pose is None:
-        remedy = "plug in the cameras, or see who else uses them"
-        return Check("cameras", BUSY, "no pictures yet", remedy), calibration
+        remedy = "plug in the cameras, or see who else uses them" if waited > FIRST_PICTURE_TIME else ""
+        words = f"waits for the first pictures, for {waited:.0f} s: {USUAL_START}"
+        return Check("cameras", BUSY, words, remedy), calibration
     if report.pose.state is TrackState.INITIALISING and (silent := now - report.stamp) > MAX_PICTURE_AGE:
         return Check("cameras", BUSY, f"the surface is looked for in their pictures, for {silent:.0f} s"), calibration
     if (age := now - report.pose.stamp) > MAX_PICTURE_AGE:
@@ -146,17 +174,18 @@ def _camera_checks(report: TrackingReport | None, now: float) -> tuple[Check, Ch
     return Check("cameras", PASS, f"all {len(report.cameras)} deliver"), calibration
 
 
-def _arm_check(report: LiveMotionReport | None, stands_home: bool) -> Check:
+def _arm_check(report: LiveMotionReport | None, task: PrintTask) -> Check:
     """Whether the arm is there, and whether anybody knows where it stands."""
     if report is None:
         return Check("arm", BUSY, "its line is opened")
     status = report.tick.status
     if status.state is ArmState.UNPLUGGED:
         return Check("arm", FAIL, f"unplugged: {status.reason}", "plug it in and switch it on")
-    if status.answered is None and not stands_home:
+    if status.answered is None and not task.stands_home:
         remedy = "move it to its home by hand, then say so with --stands-home"
         return Check("arm", BUSY if not status.answers else FAIL, "nobody knows where it stands", remedy)
-    known = "answers" if status.answered is not None else "stands at home by the operator's word"
+    said = "stands at home, where a virtual arm begins" if task.virtual else "stands at home by the operator's word"
+    known = "answers" if status.answered is not None else said
     lag = f", lag {1000 * status.lag:.0f} ms" if np.isfinite(status.lag) else ""
     return Check("arm", PASS, f"{known}{lag}; {report.priority}")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import signal
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from math import nan
 from typing import Any
@@ -21,11 +21,11 @@ from hardware.live.checklist import checks_table
 from hardware.live.prepared import Prepared
 from hardware.live.records import RunReports, StageHistograms, StageTiming
 from hardware.live.state_machine import RunStateMachine
-from hardware.operator.view import RunStage
+from hardware.operator.view import HoldRow, RunResult, RunStage
 from hardware.process.ticks import Histogram
 from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.path import PrintPhase
+from planning.path import PrintPhase, way_lengths
 
 TIMELINE_BINS = 600  # an even number: two bins become one
 FIRST_BIN_WIDTH = 0.1  # s of a bin at first
@@ -33,7 +33,9 @@ _NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 MAX_REASONS = 40  # kinds of holds that are counted apart
 OTHER_REASONS = "other reasons"
 ERROR_BIN, ERROR_BINS = 0.005, 400  # mm of a bin, and how many
+STRETCHES = 500  # of equal checkpoints, of each of which the largest error is kept: 0.2 % of the path
 MAX_TICK_GAP = 0.5  # s from tick to tick that is counted: nobody knows what happened in a longer gap
+MAX_SHOWN_HOLDS = 12  # reasons on the page's end, the longest first
 EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
 TIMELINE_CAPTION = "Predicted, the largest of each moment while material left, over the seconds since the approach."
 
@@ -91,7 +93,11 @@ class RunStatistics:
     due: float = 0.0  # s in which it should have left
     times: StageHistograms = field(default_factory=StageHistograms)
     errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # predicted at the nozzle, mm
+    true_errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # of a simulated world, mm
     last_error: float = nan  # mm, the newest predicted
+    error_stamp: float = nan  # s, when that was
+    ink: float = 0.0  # mm^3 that the dispensers were told
+    stretches: Array = field(default_factory=lambda: np.full(STRETCHES, np.nan))  # mm, largest error of each
     timeline: ErrorTimeline = field(default_factory=ErrorTimeline)
     _updated: float = nan
     _ticked: float = nan
@@ -109,6 +115,23 @@ class RunStatistics:
             self.states[state] = self.states.get(state, 0) + 1
         if reports.motion is not None and reports.motion.tick.stamp != self._ticked:
             self._tick(reports, stage, arm)
+
+    def add_true_error(self, error: float) -> None:
+        """Count the true error at the nozzle, mm, of a simulated world; NaN where none is known."""
+        if not np.isnan(error):
+            self.true_errors.add(error)
+
+    @property
+    def active(self) -> float:
+        """Seconds since the approach in which it went to the wound, printed, was held or waited."""
+        stages = RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED
+        return sum(self.stages.get(stage.value, 0.0) for stage in stages)
+
+    @property
+    def holds_by_time(self) -> list[HoldRow]:
+        """The holds by reason, the longest first."""
+        rows = (HoldRow(reason, hold.count, hold.seconds) for reason, hold in self.holds.items())
+        return sorted(rows, key=lambda row: -row.seconds)
 
     @property
     def duty(self) -> float:
@@ -135,8 +158,11 @@ class RunStatistics:
         error = nan
         if isinstance(command, Move) and command.extrude:
             self.extruding += step
+            self.ink += command.flow * step
             if arm is not None:
                 error = self._error(reports, command, arm)
+                at = min(int(progress.fraction / max(progress.total - 1, 1) * STRETCHES), STRETCHES - 1)
+                self.stretches[at] = np.fmax(self.stretches[at], error)
         self.timeline.add(self._ticked, error, step if reason else 0.0)
 
     def _error(self, reports: RunReports, move: Move, arm: SimpleArm) -> float:
@@ -148,7 +174,7 @@ class RunStatistics:
         nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
         error = float(then.error_at(nozzle[None, :3, 3])[0])
         self.errors.add(error)
-        self.last_error = error
+        self.last_error, self.error_stamp = error, move.stamp
         return error
 
 
@@ -162,6 +188,7 @@ class RunOutcome:
     reports: RunReports
     signal: int  # that ended it, 0 without
     fraction: float  # place on the path, counted in checkpoints, NaN before any
+    written: bool = False  # whether the report is
 
     @property
     def code(self) -> int:
@@ -171,25 +198,70 @@ class RunOutcome:
         return EXIT_SIGNAL + self.signal if self.signal else EXIT_CUT_SHORT
 
     @property
+    def inked(self) -> bool:
+        """Whether any dispenser was there, or a simulated one."""
+        return bool(self.prepared.task.dispensers) or self.prepared.settings.simulated is not None
+
+    @property
+    def place(self) -> float:
+        """Where the path is printed up to, in checkpoints, with what the runs before this one printed."""
+        return self.fraction if self.fraction == self.fraction else self.prepared.task.start
+
+    @property
+    def printed(self) -> float:
+        """The same as a share of the path's length, 0 to 1; none of a dry run."""
+        path, dry = self.prepared.task.path, self.prepared.task.lift is not None
+        ways = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
+        return 0.0 if dry or not ways[-1] > 0 else float(np.interp(self.place, np.arange(len(path)), ways) / ways[-1])
+
+    @property
+    def again(self) -> str:
+        """The command that goes on; "" where nothing is left, or nothing was printed on purpose."""
+        task = self.prepared.task
+        left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1
+        return f"stillbed live --resume {self.prepared.files.record}" if left else ""
+
+    def result(self) -> RunResult:
+        """For the operator's page."""
+        task, statistics, files = self.prepared.task, self.statistics, self.prepared.files
+        two = [(h.percentile(95), h.most if h.count else nan) for h in (statistics.errors, statistics.true_errors)]
+        return RunResult(
+            printed=self.printed,
+            fraction=self.place,
+            total=len(task.path) - 1,
+            begun=task.start,
+            seconds=statistics.active,
+            duty=statistics.duty,
+            error=two[0],
+            true_error=two[1],
+            ink=statistics.ink if self.inked else nan,
+            holds=tuple(statistics.holds_by_time[:MAX_SHOWN_HOLDS]),
+            stretches=tuple(statistics.stretches.tolist()),
+            record=str(files.record),
+            report=str(files.report) if self.written else "",
+            again=self.again,
+        )
+
+    @property
     def words(self) -> str:
         """What happened, and how to go on."""
         total, files = len(self.prepared.task.path) - 1, self.prepared.files
         lines = [self.machine.ended]
         if not self.machine.done:
-            place = self.fraction if self.fraction == self.fraction else self.prepared.task.start
             dry = self.prepared.task.lift is not None
             done = "were passed by, none printed" if dry else "are printed"
-            lines.append(f"{place:.2f} of {total} checkpoints {done}; the arm is at rest")
+            lines.append(f"{self.place:.2f} of {total} checkpoints {done}; the arm is at rest")
             if not dry:
-                again = f"go on with: stillbed live --resume {files.record}"
-                lines.append("the path is printed; there is nothing to go on with" if place >= total else again)
+                nothing = "the path is printed; there is nothing to go on with"
+                lines.append(f"go on with: {self.again}" if self.again else nothing)
         return "\n".join([*lines, f"report: {files.report}"])
 
-    def write(self) -> None:
-        """Write summary.json and report.html."""
+    def write(self) -> RunOutcome:
+        """Write summary.json and report.html; the outcome of which that is said."""
         summary, files = self.summary(), self.prepared.files
         files.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         files.report.write_text(self._page(summary), encoding="utf-8")
+        return replace(self, written=True)
 
     def timings(self) -> tuple[StageTiming, ...]:
         """All stages that were timed."""
@@ -214,12 +286,15 @@ class RunOutcome:
                 "fraction": self.fraction,
                 "duty": statistics.duty,
                 "extruding_s": statistics.extruding,
-                "predicted_error_mm": {"p50": errors.percentile(50), "p95": errors.percentile(95), "max": errors.most},
+                "predicted_error_mm": percentiles(errors),
+                "true_error_mm": percentiles(statistics.true_errors),
+                "ink_mm3": statistics.ink if self.inked else None,
+                "printed_share": self.printed,
                 "stages_s": statistics.stages,
                 "states": statistics.states,
                 "holds": [
-                    {"reason": reason, "count": hold.count, "total_s": hold.seconds}
-                    for reason, hold in sorted(statistics.holds.items(), key=lambda item: -item[1].seconds)
+                    {"reason": row.reason, "count": row.count, "total_s": row.seconds}
+                    for row in statistics.holds_by_time
                 ],
                 "latency_ms": {
                     t.name: {"count": t.count, "p50": 1000 * t.median, "p99": 1000 * t.p99, "max": 1000 * t.largest}
@@ -267,6 +342,11 @@ class RunOutcome:
         ]
         lead = f"{self.machine.ended}. {'. '.join(self.prepared.notes)}"
         return document("live run", self.prepared.files.record.stem, lead, body, "stillbed")
+
+
+def percentiles(errors: Histogram) -> dict[str, float]:
+    """Median, 95 % and largest of a histogram; NaN of none."""
+    return {"p50": errors.percentile(50), "p95": errors.percentile(95), "max": errors.most if errors.count else nan}
 
 
 def _timeline_plot(timeline: ErrorTimeline, limit: float) -> str:

@@ -37,6 +37,7 @@ from hardware.files.dispenser_file import (
 from hardware.files.path_file import read_path, read_progress
 from hardware.files.region_table import check_region
 from hardware.files.rig_file import RIG_FILE, read_rig, scan_of
+from hardware.live.checklist import PrintTask
 from hardware.live.settings import (
     VIRTUAL_ARM,
     LiveSettings,
@@ -46,7 +47,6 @@ from hardware.live.settings import (
     read_settings,
     toml_string,
 )
-from hardware.live.state_machine import PrintTask
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import cache_error, cache_folder
@@ -256,6 +256,7 @@ def _prepared(
         profile=_switching(given or ArmProfile(), dispensers),
         place=given is None,
         stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
+        virtual=settings.arm == VIRTUAL_ARM,
         lift=settings.lift if settings.dry_run else None,
         unattended=settings.unattended,
         patience=settings.patience,

@@ -41,7 +41,7 @@ from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, stat
 from hardware.motion.loop import Order
 from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
-from hardware.operator.view import RunStage, Wish
+from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
 from hardware.recording.schemas import INFO, WARNING
 from hardware.recording.session_reader import input_texts, inputs_from_texts
@@ -50,6 +50,7 @@ from planning.placement import PlacedBy
 POLL_PERIOD = 0.02  # s between looks while nothing happens
 VIEW_PERIOD = 0.15  # s between views for the page
 STATUS_PERIOD = 5.0  # s between status lines
+REPORT_FETCH_TIME = 1.0  # s in which open windows take the report, before the page is closed
 REST_TIMEOUT = 1.0  # s in which the arm has to report that it is at rest
 MOTION_HANG_TIMEOUT = 2.0  # s without a report, after which the motion process is ended and the arm stopped for it
 SIGNAL_TEXTS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "the terminal was closed"}
@@ -91,20 +92,24 @@ class LiveRun:
             stack.callback(self._close_progress, progress_writer)
             self._open_page(stack)
             address = "" if self._page is None else self._page.address
-            processes = channels.processes
-            self._injector = FaultInjector(prepared.faults, processes, files.record, channels.start, address)
+            self._injector = FaultInjector(prepared.faults, channels.processes, files.record, channels.start, address)
             importlib.import_module("scipy.interpolate")  # the prediction needs it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
             while not self._machine.ended:
                 self._cycle(wake, progress_writer)
             self._wait_for_rest(wake)
-            if self._page is not None:  # it shows how the run ended; then it can be asked nothing any more
-                self._put_view(self._clock.now())
-                self._page.close()
+            self._put_view(self._clock.now(), self._outcome().result())
             self._shut_down()
-        fraction = channels.place.value
-        return RunOutcome(prepared, self._machine, self._statistics, self._reports, self._signal, fraction)
+            outcome = self._outcome().write()
+            if self._page is not None and channels.link.requests.windows:
+                self._put_view(self._clock.now(), outcome.result())
+                self._clock.wait_until(self._clock.now() + REPORT_FETCH_TIME)
+        return outcome
+
+    def _outcome(self) -> RunOutcome:
+        place = self._channels.place.value
+        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, self._signal, place)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal that asks the run to end."""
@@ -131,7 +136,7 @@ class LiveRun:
             channels.looks.value = machine.looks
         arm = None if machine.placed_path is None else machine.placed_path.profile.arm
         self._statistics.update(now, machine.stage, reports, arm)
-        self._view_builder.update(reports, self._profile)
+        self._statistics.add_true_error(self._view_builder.update(reports, self._profile))
         self._show_surface()
         self._show_view(now)
         self._announce(now)
@@ -259,8 +264,8 @@ class LiveRun:
         page.tend(now)
         self._put_view(now)
 
-    def _put_view(self, now: float) -> None:
-        self._channels.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics))
+    def _put_view(self, now: float, result: RunResult | None = None) -> None:
+        self._channels.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics, result))
 
     def _show_surface(self) -> None:
         """Show path, surface and scan on the page; keep where the path lies, for a run that resumes."""
@@ -337,7 +342,8 @@ class LiveRun:
 
     def _log(self, text: str, level: int = INFO) -> None:
         self._console.say(text)
-        self._channels.sender.put(EventEntry(self._clock.now(), text, level, "run"))
+        self._view_builder.log(now := self._clock.now(), text, level >= WARNING)
+        self._channels.sender.put(EventEntry(now, text, level, "run"))
 
     # -- the end
 

@@ -7,12 +7,20 @@ the motion process that follow from them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
-from hardware.arm.profile import ArmProfile, measured_lag
-from hardware.live.checklist import PlacedPath, moved_placement, place_path, raised_path, run_checks, silence_text
+from hardware.arm.profile import measured_lag
+from hardware.live.checklist import (
+    PlacedPath,
+    PrintTask,
+    moved_placement,
+    place_path,
+    raised_path,
+    run_checks,
+    silence_text,
+)
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
 from hardware.motion.loop import Order
 from hardware.operator.shared_state import OperatorRequest, Polygons
@@ -29,8 +37,7 @@ from hardware.operator.view import (
     refusal,
 )
 from hardware.process.ticks import tick_in_step
-from planning.material import Outlets
-from planning.path import Path, PrintPhase, fingerprint
+from planning.path import PrintPhase
 from planning.placement import PathPlacement
 
 HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
@@ -42,27 +49,6 @@ ARM_BACK_TEXT = "the arm is back: resume, or go home first"
 ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
 
 Orders = list[Order | PauseOrder | BeginPrint]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PrintTask:
-    """What is to be printed, and how."""
-
-    path: Path  # in its own frame
-    profile: ArmProfile
-    start: float = 0.0  # where it goes on, counted in checkpoints
-    place: bool = False  # put the arm where the surface lies below its home
-    stands_home: bool = False  # the operator says that the arm stands at home
-    lift: float | None = None  # mm above the path in a dry run; None for a real one
-    unattended: bool = False  # nobody confirms and nobody resumes: what stops such a run ends it
-    patience: float = 10.0  # s without pictures, after which the arm is stopped
-    dispensers: str = ""  # text of the dispenser file; "": nothing is extruded
-    outlets: Outlets = field(default_factory=dict)  # of the path's materials
-
-    @property
-    def fingerprint(self) -> str:
-        """Of the path as its file has it; "" in a dry run, of which no progress is kept."""
-        return fingerprint(self.path) if self.lift is None else ""
 
 
 @dataclass(slots=True)
@@ -92,6 +78,7 @@ class RunStateMachine:
     _answers: bool = False  # whether the arm ever answered
     _homed: bool = False  # whether the arm was armed since it was ordered home
     _armed: bool = False  # whether it was armed since that was ordered
+    _at_home: bool = True  # whether it stands where homing led, and has not left for the surface
     _after_homing: RunStage = RunStage.APPROACH
     _outlined: bool = False  # whether the page has pictures of this look, on which the outline can be corrected
     _wanted: str = ""  # material that the operator was asked for in this pause
@@ -102,11 +89,11 @@ class RunStateMachine:
         offers = STAGE_OFFERS.get(self.stage, ())
         if self.stage is RunStage.FIND and self.outline:
             return (Wish.AGAIN, *offers)
-        if self.stage is not RunStage.CONFIRM or self.placement is None:
-            return offers
-        held = [Wish.CONFIRM] if not self.confirmable else []
-        held += [Wish.MOVE] if not self.placement.usable else []
-        held += [Wish.OUTLINE] if not self._outlined else []
+        held = [Wish.LIFT] if self._at_home else []
+        if self.stage is RunStage.CONFIRM and self.placement is not None:
+            held += [Wish.CONFIRM] if not self.confirmable else []
+            held += [Wish.MOVE] if not self.placement.usable else []
+            held += [Wish.OUTLINE] if not self._outlined else []
         return tuple(wish for wish in offers if wish not in held)
 
     @property
@@ -139,7 +126,8 @@ class RunStateMachine:
         for request in requests:
             orders += self._answer(request, tracking, now)
         task = self.task
-        self.checks = run_checks(reports, task.path, task.start, self.placed_path, task.stands_home, now)
+        waited = now - self._since if self.stage is RunStage.CHECK else 0.0
+        self.checks = run_checks(reports, task, self.placed_path, now, waited)
         if not self.ended:
             orders += self._advance(reports, now)
         self.silence = self._silent_process(reports, now) if self.stage in ACTIVE_STAGES else ""
@@ -176,7 +164,7 @@ class RunStateMachine:
                 self._enter(RunStage.STOPPED, "by the operator", now)
             return [Order.STOP]
         if wish is Wish.END:
-            return self.end("ended by the operator", now, RunStage.ENDED)
+            return self.end("finished by the operator", now, RunStage.ENDED)
         if wish is Wish.CONFIRM:
             self._enter(RunStage.READY, "", now)
         elif wish in (Wish.AGAIN, Wish.OUTLINE):
@@ -189,11 +177,15 @@ class RunStateMachine:
             return self.pause("by the operator", now)
         elif wish is Wish.HOME:
             return [PauseOrder.PAUSE, *self._home(RunStage.STOPPED, now)]
+        elif wish is Wish.LIFT:
+            self._enter(RunStage.PAUSED, "lifted by the operator", now)
+            self._ordered, self._armed = now, False
+            return [PauseOrder.PAUSE, Order.ARM]
         elif wish is Wish.RESUME:
             resting = self.stage is RunStage.STOPPED
             material: Orders = [PauseOrder.MATERIAL_IN] if self._wanted else []
             self._enter(RunStage.APPROACH, "", now)
-            self._ordered, self._armed = now, not resting
+            self._ordered, self._armed, self._at_home = now, not resting, False
             return [*material, PauseOrder.RESUME, *([Order.ARM] if resting else [])]
         return []
 
@@ -316,7 +308,8 @@ class RunStateMachine:
             return []
         if self._after_homing is RunStage.DONE:
             return self.end("the path is printed", now, RunStage.DONE)
-        self._enter(self._after_homing, "at home", now)
+        self._at_home = self._after_homing is RunStage.STOPPED
+        self._enter(self._after_homing, "at home" if self._at_home else "", now)
         if self._after_homing is RunStage.STOPPED:
             return []
         self._ordered, self._armed = now, False

@@ -9,12 +9,13 @@ import tty
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import nan
+from math import inf, nan
 from typing import Any
 
 import numpy as np
 
 from estimation import se3
+from estimation.pose import TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile
@@ -25,19 +26,26 @@ from hardware.live.records import FRAMES_TO_WIRE_STAGE, LiveMotionReport, RunRep
 from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import (
     DRAW_QUESTION,
+    WISH_KEYS,
+    WISH_WORDS,
     Activity,
     CameraView,
     CheckVerdict,
     LatencyView,
+    LogLine,
     MotionView,
     OperatorView,
     PlacementView,
     ProgressView,
+    RestView,
+    RunResult,
     RunStage,
     TrackingView,
     Wish,
+    hold_cause,
     tracking_from_pose,
 )
+from hardware.process.progress import TimeLeft
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.path import Path, PrintPhase, way_lengths
@@ -55,17 +63,14 @@ PHASE_ACTIVITIES = {
     PrintPhase.RETREATING: Activity.LEAVING,
 }
 ACTION_KEYS = dict.fromkeys(" \r\n", Wish.STOP) | {
-    "p": Wish.PAUSE,
-    "r": Wish.RESUME,
-    "h": Wish.HOME,
-    "y": Wish.CONFIRM,
-    "s": Wish.START,
-    "a": Wish.AGAIN,
-    "q": Wish.END,
+    key: wish for wish, key in WISH_KEYS.items() if wish is not Wish.STOP
 }
-KEYS_HELP = (
-    "space or Enter: STOP   p: pause   r: resume   h: home   y: the path is right   s: start   a: again   q: end"
+KEYS_HELP = "   ".join(
+    f"{'space or Enter' if wish is Wish.STOP else key}: {WISH_WORDS[wish]}" for wish, key in WISH_KEYS.items()
 )
+LOG_LINES = 16  # newest ones in each view: the page keeps what it was sent before
+REST_SPAN = 10.0  # s over which the surface's movement under a resting nozzle is seen: two breaths
+MIN_REST_POINTS = 4  # of it
 
 
 @dataclass(slots=True)
@@ -79,8 +84,8 @@ class NozzleErrorEstimate:
     path: Path  # as its file has it, in the true surface frame
     last: float = nan  # mm, NaN while it is unknown or nothing is printed
     _commands: deque[tuple[float, Array, float]] = field(default_factory=lambda: deque(maxlen=MAX_COMMANDS_KEPT))
+    compared: float = nan  # s, stamp of the last pose that it was compared at
     _ticked: float = nan  # s, stamp of the last tick
-    _compared: float = nan  # s, stamp of the last pose
 
     def update(
         self, tracking: TrackingReport | None, motion: LiveMotionReport | None, profile: ArmProfile | None
@@ -93,8 +98,8 @@ class NozzleErrorEstimate:
             if isinstance(command, Move) and command.extrude and motion.progress is not None:
                 due = command.stamp + profile.tick + profile.lag
                 self._commands.append((due, command.axes, motion.progress.fraction))
-        if tracking.pose.stamp != self._compared:
-            self._compared = tracking.pose.stamp
+        if tracking.pose.stamp != self.compared:
+            self.compared = tracking.pose.stamp
             self.last = self._error(tracking.pose.stamp, tracking.truth, profile)
 
     def _error(self, stamp: float, base_from_surface: Array, profile: ArmProfile) -> float:
@@ -118,23 +123,49 @@ class ViewBuilder:
     prepared: Prepared
     _true_error: NozzleErrorEstimate = field(init=False)
     _times_left: Array = field(init=False)  # (N,) s from each checkpoint to the end
+    _ways: Array = field(init=False)  # (N,) share of the path's length at each checkpoint
     _last_sets: tuple[float, int] = (nan, 0)  # stamp of the last report, s, and its frame sets
     _rate: float = nan  # frame sets per second, smoothed
+    _time_left: TimeLeft = field(default_factory=TimeLeft)
+    _log: deque[LogLine] = field(default_factory=lambda: deque(maxlen=LOG_LINES))
+    _logged: float = -inf  # s, stamp of the arm's last event that is in the log
+    _resting: deque[tuple[float, Array, float]] = field(default_factory=deque)  # s, tip on the surface, height: mm
 
     def __post_init__(self) -> None:
         path = self.prepared.task.path
         self._true_error = NozzleErrorEstimate(path)
-        seconds = way_lengths(path.surface_from_nozzle) / path.speed[1:]  # at the path's own speeds
+        lengths = way_lengths(path.surface_from_nozzle)
+        seconds = lengths / path.speed[1:]  # at the path's own speeds
+        self._ways = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
         self._times_left = np.concatenate([np.cumsum(seconds[::-1])[::-1], [0.0]])
 
-    def update(self, reports: RunReports, profile: ArmProfile | None) -> None:
-        """Take the newest reports. profile: of the arm since the path was begun; None before."""
+    def update(self, reports: RunReports, profile: ArmProfile | None) -> float:
+        """Take the newest reports; the true error at the nozzle, mm, where a new one is known, else NaN.
+
+        profile: of the arm since the path was begun; None before.
+        """
+        for event in () if reports.motion is None else reports.motion.events:
+            if event.stamp > self._logged:
+                self._logged = event.stamp
+                self.log(event.stamp, event.text)
+        before = self._true_error.compared
         self._true_error.update(reports.tracking, reports.motion, profile)
+        return self._true_error.last if self._true_error.compared != before else nan
+
+    def log(self, stamp: float, text: str, warning: bool = False) -> None:
+        """A line for the page's log."""
+        number = self._log[-1].number + 1 if self._log else 1
+        self._log.append(LogLine(number, stamp, warning, text))
 
     def __call__(
-        self, now: float, machine: RunStateMachine, reports: RunReports, statistics: RunStatistics
+        self,
+        now: float,
+        machine: RunStateMachine,
+        reports: RunReports,
+        statistics: RunStatistics,
+        result: RunResult | None = None,
     ) -> OperatorView:
-        """The view at `now`, s."""
+        """The view at `now`, s. result: once the run is over."""
         motion, tracking = reports.motion, reports.tracking
         draws = tracking is not None and tracking.draws and machine.stage in (RunStage.CHECK, RunStage.FIND)
         estimate: TrackingView | None = None
@@ -149,14 +180,15 @@ class ViewBuilder:
             offers=machine.offers,
             checks=machine.checks,
             tracking=estimate,
-            motion=None if motion is None else self._motion(motion, machine, statistics),
-            progress=None if motion is None else self._progress(motion, statistics),
+            motion=None if motion is None else self._motion(now, motion, machine, reports, statistics),
+            progress=self._progress(now, motion, machine, statistics),
             latency=None if motion is None else _latency(motion),
             cameras=() if tracking is None else self._cameras(tracking, now),
             answer=machine.answer,
             placement=self._placement(machine, tracking),
             notes=self.prepared.notes,
-            events=() if motion is None else tuple(event.text for event in motion.events),
+            log=tuple(self._log),
+            result=result,
             draws=draws,
         )
 
@@ -170,7 +202,14 @@ class ViewBuilder:
         worth = placement.certain, machine.moves > 0, machine.confirmable
         return PlacementView(placement.by.value, placement.verdict, *worth, tangent, *known)
 
-    def _motion(self, motion: LiveMotionReport, machine: RunStateMachine, statistics: RunStatistics) -> MotionView:
+    def _motion(
+        self,
+        now: float,
+        motion: LiveMotionReport,
+        machine: RunStateMachine,
+        reports: RunReports,
+        statistics: RunStatistics,
+    ) -> MotionView:
         status, command = motion.tick.status, motion.tick.command
         placed, base_from_nozzle = machine.placed_path, None
         if placed is not None and status.axes is not None:
@@ -187,17 +226,57 @@ class ViewBuilder:
             arm=f"{status.state.value}: {status.reason}",
             speed=command.feed if isinstance(command, Move) else 0.0,
             material="" if motion.material is None else motion.material.text,
+            error_age=now - statistics.error_stamp,
+            cause=hold_cause(command),
+            rest=self._rest(motion, machine, reports.tracking, base_from_nozzle),
         )
 
-    def _progress(self, motion: LiveMotionReport, statistics: RunStatistics) -> ProgressView | None:
-        progress, path = motion.progress, self.prepared.task.path
-        if progress is None:
+    def _rest(
+        self,
+        motion: LiveMotionReport,
+        machine: RunStateMachine,
+        tracking: TrackingReport | None,
+        base_from_nozzle: Array | None,
+    ) -> RestView | None:
+        """How the surface moves under a nozzle that was stopped or paused; None where it moves, or nobody knows."""
+        pose, placed = None if tracking is None else tracking.pose, machine.placed_path
+        stands = machine.stage in (RunStage.STOPPED, RunStage.PAUSED) and isinstance(motion.tick.command, Hold)
+        if not stands or pose is None or placed is None or base_from_nozzle is None:
+            self._resting.clear()
             return None
-        left = float(np.interp(progress.fraction, np.arange(len(path)), self._times_left))
+        if pose.state.measured and (not self._resting or pose.stamp > self._resting[-1][0]):
+            surface_from_nozzle, height = se3.inverse(pose.base_from_surface) @ base_from_nozzle, nan
+            if motion.progress is not None:
+                goal = placed.path.surface_from_nozzle[min(motion.progress.checkpoint, len(placed.path) - 1)]
+                height = float((se3.inverse(goal) @ surface_from_nozzle)[2, 3])
+            self._resting.append((pose.stamp, surface_from_nozzle[:3, 3], height))
+        while self._resting and self._resting[-1][0] - self._resting[0][0] > REST_SPAN:
+            self._resting.popleft()
+        if len(self._resting) < MIN_REST_POINTS:
+            return None
+        places = np.array([place for _, place, _ in self._resting])
+        along = (places - places.mean(0)) @ np.linalg.svd(places - places.mean(0), full_matrices=False)[2][0]
+        seconds = self._resting[-1][0] - self._resting[0][0]
+        return RestView(float(np.ptp(along)), seconds, float(np.mean([height for *_, height in self._resting])))
+
+    def _progress(
+        self, now: float, motion: LiveMotionReport | None, machine: RunStateMachine, statistics: RunStatistics
+    ) -> ProgressView | None:
+        """How far it is; before a run that resumes goes on, where it will."""
+        task, path = self.prepared.task, self.prepared.task.path
+        progress = None if motion is None else motion.progress
+        if progress is None and not task.start:
+            return None
+        fraction = task.start if progress is None else progress.fraction
+        left, checkpoint = float(np.interp(fraction, np.arange(len(path)), self._times_left)), int(fraction)
+        self._time_left.add(now, left, machine.stage in (RunStage.APPROACH, RunStage.PRINT))
         layers = np.unique(path.layer)
-        layer = int(np.searchsorted(layers, path.layer[min(progress.checkpoint, len(path) - 1)])) + 1
-        share = progress.place / progress.length if progress.length > 0 else nan
-        return ProgressView(progress.fraction, progress.total - 1, share, left, statistics.duty, layer, len(layers))
+        layer = int(np.searchsorted(layers, path.layer[min(checkpoint + 1, len(path) - 1)])) + 1
+        share = float(np.interp(fraction, np.arange(len(path)), self._ways))
+        ink = statistics.ink if task.dispensers or self.prepared.settings.simulated is not None else nan
+        time_left, spread = self._time_left(left)
+        place = fraction, len(path) - 1, share, time_left, spread
+        return ProgressView(*place, statistics.duty, layer, len(layers), ink, task.start)
 
     def _cameras(self, tracking: TrackingReport, now: float) -> tuple[CameraView, ...]:
         stamp, sets = self._last_sets
@@ -207,11 +286,17 @@ class ViewBuilder:
         if tracking.sets > sets or np.isnan(stamp):
             self._last_sets = tracking.stamp, tracking.sets
         late = tracking.pose is None or now - tracking.pose.stamp > MAX_PICTURE_AGE
+        waits = tracking.pose is None or tracking.pose.state is TrackState.INITIALISING  # pictures are looked at slowly
         views = []
         for camera, name in enumerate(tracking.cameras):
             delivers = camera in tracking.delivering and not late
             tracks = tracking.used[camera] if camera < len(tracking.used) else 0
             verdict, words = (CheckVerdict.PASS, "") if delivers else (CheckVerdict.FAIL, "no pictures")
+            if not delivers and waits:
+                verdict, words = (
+                    CheckVerdict.BUSY,
+                    "first picture" if tracking.pose is None else "looking",
+                )
             views.append(CameraView(name, verdict, self._rate if delivers else 0.0, tracks, words))
         return tuple(views)
 

@@ -233,7 +233,9 @@ class PictureReader:
             self._reader = None
 
 
-OPERATOR_FILES = ("camera.js", "lens.js", "panes.js", "scene.js", "words.js", "page.css", "icon.svg")  # of its page
+OPERATOR_FILES = (  # of its page
+    *("camera.js", "delaunator.js", "lens.js", "panes.js", "scene.js", "theme.js", "words.js", "page.css", "icon.svg"),
+)
 STATUS_UNREADABLE = 422  # HTTP, unprocessable content; its text says why
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]

@@ -18,14 +18,12 @@ from typing import Any
 import numpy as np
 
 from estimation.rig import Camera
-from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene
+from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene, RecordingView, WavingView
 from hardware.operator.view import (
     Activity,
-    MotionView,
+    LogLine,
     MoveRequest,
     OperatorView,
-    RecordingView,
-    WavingView,
     Wish,
 )
 
@@ -33,8 +31,10 @@ _HEAD_SIZE = struct.Struct("<I")
 JSON_DIGITS = 7  # significant ones of a number below 1
 STAMP_DECIMALS = 6  # of all others: seven digits of a number would leave whole seconds of a stamp after 100 days
 PIXEL_DECIMALS = 1
-TIMELINE_SECONDS = 60.0  # of the error over time: a few breaths, and what led to the present hold
-TIMELINE_ROWS = 1200  # of it: at 20 views per second, which is more than are taken
+TIMELINE_ROWS = 2400  # of the error over the run, more than a screen has columns; two become one when all are full
+TIMELINE_STEP = 0.1  # s of a row at first
+LOG_ROWS = 1000  # lines of the log that a window is sent when it is opened
+AGED = 1.0  # s, after which an error is one of earlier
 MAX_BROWSER_INTEGER = 2**53 - 1  # up to which a browser's numbers count
 
 
@@ -78,6 +78,7 @@ def scene_text(scene: PageScene) -> str:
         path=np.round(scene.path, 3).ravel(),
         checkpoint=scene.checkpoint,
         extrude=scene.extrude.astype(np.uint8),
+        layer=scene.layer,
         surface=np.round(scene.surface, 2).ravel(),
         triangles=scene.triangles.ravel(),
         scan=np.round(scene.scan, 2).ravel(),
@@ -108,6 +109,51 @@ def pictures_bytes(pictures: PagePictures, kind: str = "live") -> bytes:
     return b"".join([_HEAD_SIZE.pack(len(head)), head, *(each.jpeg + each.near for each in pictures.pictures)])
 
 
+@dataclass(slots=True)
+class TimelineRow:
+    """A moment of the run: the largest errors, mm, NaN of none, the limit, mm, and whether the nozzle was held."""
+
+    stamp: float  # s
+    error: float
+    true_error: float
+    limit: float
+    held: bool
+
+    def add(self, other: TimelineRow) -> None:
+        """Take in a later one."""
+        self.error, self.true_error = _larger(self.error, other.error), _larger(self.true_error, other.true_error)
+        self.limit, self.held = other.limit, self.held or other.held
+
+
+def _larger(a: float, b: float) -> float:
+    return b if math.isnan(a) or a < b else a
+
+
+class ErrorHistory:
+    """The error over the whole run in at most TIMELINE_ROWS rows. step: s of a row."""
+
+    def __init__(self) -> None:
+        self.rows: list[TimelineRow] = []
+        self.step = TIMELINE_STEP
+
+    def add(self, row: TimelineRow) -> None:
+        """Add a moment, which is later than the last."""
+        if self.rows and row.stamp - self.rows[-1].stamp < self.step:
+            self.rows[-1].add(row)
+            return
+        self.rows.append(row)
+        if len(self.rows) <= TIMELINE_ROWS:
+            return
+        self.step *= 2
+        kept = self.rows[:1]
+        for each in self.rows[1:]:
+            if each.stamp - kept[-1].stamp < self.step:
+                kept[-1].add(each)
+            else:
+                kept.append(each)
+        self.rows = kept
+
+
 class Broadcast:
     """The newest of everything that the run has put out, encoded once for all windows.
 
@@ -120,7 +166,7 @@ class Broadcast:
         self._pictures: PagePictures | None = None
         self._sheet: PagePictures | None = None
         self._since = nan
-        self._timeline: deque[tuple[float, float, float, float, bool]] = deque(maxlen=TIMELINE_ROWS)
+        self._history, self._log = ErrorHistory(), deque[LogLine](maxlen=LOG_ROWS)
         self.view: OperatorView | WavingView | RecordingView | None = None
         self.gone, self.refused = False, 0
         self.view_text, self.scene_text, self.pictures_bytes, self.sheet_bytes = "null", "", b"", b""
@@ -132,7 +178,8 @@ class Broadcast:
         new = view is not None and (self.view is None or view.stamp > self.view.stamp)
         if view is not None and new:
             self.view, self.view_text, self._since = view, text_of(view), now
-            self._add_to_timeline(view.stamp, view.motion if isinstance(view, OperatorView) else None)
+            if isinstance(view, OperatorView):
+                self._remember(view)
         if (scene := self._link.scene.get()) is not self._scene and scene is not None:
             self._scene, self.scene_text, new = scene, scene_text(scene), True
         if watched and (sheet := self._link.sheet.get()) is not self._sheet and sheet is not None:
@@ -156,17 +203,19 @@ class Broadcast:
         """For how long, s, the newest view has been the newest; NaN before the first."""
         return now - self._since
 
-    def timeline_text(self) -> str:
-        """The error over the last minute, for a window that has just been opened."""
-        return text(kind="course", rows=list(self._timeline))
+    def history_text(self) -> str:
+        """The error over the run and its log, for a window that has just been opened."""
+        rows = [[row.stamp, row.error, row.true_error, row.limit, row.held] for row in self._history.rows]
+        return text(kind="course", step=self._history.step, rows=rows, log=list(self._log))
 
-    def _add_to_timeline(self, stamp: float, motion: MotionView | None) -> None:
-        if motion is None:
+    def _remember(self, view: OperatorView) -> None:
+        last = self._log[-1].number if self._log else 0
+        self._log.extend(line for line in view.log if line.number > last)
+        if (motion := view.motion) is None:
             return
-        held = motion.activity is Activity.HOLDING
-        self._timeline.append((stamp, motion.error, motion.true_error, motion.limit, held))
-        while stamp - self._timeline[0][0] > TIMELINE_SECONDS:
-            self._timeline.popleft()
+        aged = motion.error_age > AGED  # nothing is extruded: the errors are of earlier
+        errors = (nan, nan) if aged else (motion.error, motion.true_error)
+        self._history.add(TimelineRow(view.stamp, *errors, motion.limit, motion.activity is Activity.HOLDING))
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,18 +31,25 @@ from hardware.operator.shared_state import (
 )
 from hardware.operator.view import (
     ACTIVE_STAGES,
+    OVER_STAGES,
     STAGE_OFFERS,
+    STAGE_QUESTIONS,
     Activity,
     CameraView,
     Check,
     CheckVerdict,
+    HoldCause,
+    HoldRow,
     LatencyView,
+    LogLine,
     MotionView,
     MoveRequest,
     OperatorView,
     PlacementView,
     ProgressView,
     RequestAnswer,
+    RestView,
+    RunResult,
     RunStage,
     TrackingView,
     Wish,
@@ -185,6 +192,7 @@ NEXT_STAGES = {
     Wish.AGAIN: RunStage.FIND,
     Wish.START: RunStage.APPROACH,
     Wish.PAUSE: RunStage.PAUSED,
+    Wish.LIFT: RunStage.PAUSED,
     Wish.RESUME: RunStage.APPROACH,
     Wish.STOP: RunStage.STOPPED,
     Wish.HOME: RunStage.HOMING,
@@ -260,13 +268,22 @@ class DemoRun:
             checks=_checks(now - self._since) if stage is RunStage.CHECK else (),
             tracking=_tracking(stage, now),
             motion=self._motion(now) if known else None,
-            progress=self._progress() if known and stage not in (RunStage.CONFIRM, RunStage.READY) else None,
+            progress=self._progress() if known else None,
             latency=LatencyView(0.0142, 0.0271 + 0.002 * np.sin(now), 0.035) if known else None,
             cameras=tuple(CameraView(f"camera{k}", CheckVerdict.PASS, 29.9, 61 - 7 * k) for k in range(3)),
             answer=self._answer,
             placement=self._placement_view() if stage is RunStage.CONFIRM else None,
             notes=("demonstration",),
+            log=(LogLine(self._turn, now, stage is RunStage.STOPPED, STAGE_QUESTIONS[stage]),),
+            result=self._result() if stage in OVER_STAGES else None,
         )
+
+    def _result(self) -> RunResult:
+        share, path = self._fraction / (len(self._path) - 1), np.linspace(0, 1, 400)
+        error = np.where(path <= share, 0.2 + 0.15 * np.sin(40 * path) ** 2, nan)
+        holds = (HoldRow("the place under the nozzle is known to … mm, limit … mm", 7, 14.2),)
+        place, errors = (share, self._fraction, len(self._path) - 1, 260.0), ((0.31, 0.47), (0.22, 0.35))
+        return RunResult(*place, 61.0, 0.87, *errors, 84.0, holds, tuple(error.tolist()), "run.mcap", "")
 
     def _placement_view(self) -> PlacementView:
         placed, tangent = self.placement, tangent_of(self.placement, self._path, self._points)
@@ -290,13 +307,18 @@ class DemoRun:
             most_in_flight=0.05,
             base_from_nozzle=nozzle_at(surface_at(now), self._path, self._fraction, lift),
             arm="armed" if self.stage in ACTIVE_STAGES else "disarmed",
+            error_age=0.0 if moves else now - self._since,
+            cause=HoldCause("error", "predicted error", "mm", DEMO_HOLD_ERROR, 0.5) if held else None,
+            rest=RestView(5.2, 8.0, 0.1) if self.stage is RunStage.STOPPED else None,
         )
 
     def _progress(self) -> ProgressView:
-        total = len(self._path)
-        share = self._fraction / (total - 1)
+        total, share = len(self._path), self._fraction / (len(self._path) - 1)
         layer = int(self._path.layer[int(self._fraction)]) + 1
-        return ProgressView(self._fraction, total, share, (1 - share) * total / DEMO_SPEED, 0.87, layer, 2)
+        left = (1 - share) * total / DEMO_SPEED / 0.8
+        return ProgressView(
+            self._fraction, total - 1, share, left, (0.9 * left, 1.2 * left), 0.87, layer, 2, 120 * share
+        )
 
 
 def demo_sheet(now: float, shots: Sequence[CameraShot], outline: Mapping[str, Array]) -> PagePictures:
@@ -332,12 +354,7 @@ def _checks(age: float) -> tuple[Check, ...]:
         Check("Calibration", CheckVerdict.PASS, "0.31 px on what is seen now"),
         Check("Arm", CheckVerdict.PASS, "answers, 9.6 ms behind"),
         Check("Path", CheckVerdict.PASS, "700 checkpoints, 2 layers, 1.9 ml"),
-        Check(
-            "Reach",
-            CheckVerdict.WARN,
-            "4 mm from the edge of joint 5",
-            "Move the bed 20 mm nearer to the arm if you can.",
-        ),
+        Check("Reach", CheckVerdict.WARN, "4 mm from the edge of joint 5", "Move the bed 20 mm nearer to the arm."),
         Check("Disk", CheckVerdict.PASS, "212 GB free, enough for 31 h"),
     )
     done = int(age)

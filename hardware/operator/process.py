@@ -32,6 +32,7 @@ RESTART_AFTER = 1.0  # s between two starts of a page that died
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
 CROP_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
+FINE_CROP_WIDTH, FINE_QUALITY = 1920, 90  # of the same where beads of a millimetre are judged: as the camera has it
 CROP_MARGIN = 1.4  # of that part around outline and tracks: breathing stays inside
 MIN_CROP_POINTS = 8  # points that say where the wound is
 THUMBNAIL_PERIOD = 0.2  # s: breathing looks smooth, and 3 % of a core is not missed
@@ -162,7 +163,8 @@ class Thumbnailer:
         if crop is not None:
             self._crops[shot.camera] = crop
             x, y, width, height = crop
-            near = small_jpeg(shot.image[y : y + height, x : x + width], CROP_WIDTH, THUMBNAIL_QUALITY)
+            size = (FINE_CROP_WIDTH, FINE_QUALITY) if self._requests.fine else (CROP_WIDTH, THUMBNAIL_QUALITY)
+            near = small_jpeg(shot.image[y : y + height, x : x + width], *size)
         return CameraPicture(shot.camera, whole, shot.outline, shot.tracks, near, crop)
 
 

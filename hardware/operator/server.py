@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from importlib.resources import files
+from pathlib import Path
 from socket import socket as Listener
 from typing import Any
 
@@ -31,7 +32,7 @@ from hardware.operator.broadcast import (
 )
 from hardware.operator.settings import AccessControl, OperatorSettings, WindowLimits, response_headers
 from hardware.operator.shared_state import DrawnRegion, OperatorLink, Polygons
-from hardware.operator.view import CALMING_WISHES, Wish, refusal
+from hardware.operator.view import CALMING_WISHES, RunStage, Wish, refusal
 from hardware.process.clock import WallClock
 
 STATUS_PULSE = 0.25  # s: so often a window is sent how old everything is, even if nothing is new
@@ -40,6 +41,9 @@ SHUTDOWN_DELAY = 0.2  # s in which the windows show that the run is gone
 MAX_DROPPED_MESSAGES = 400  # messages beyond what is allowed, after which a window is closed
 MAX_OTHER_CONNECTIONS = 32  # connections that are no windows: a browser keeps six
 CONTENT_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+
+FINE_STAGES = (RunStage.FIND, RunStage.CONFIRM, RunStage.READY)  # in which the path's place is judged by the pictures
+REPORT_NAME = "report"  # no file of the page, but the run's
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -139,7 +143,7 @@ class WindowSession:
 
     async def _send_all(self) -> None:
         newest, scene, pictures, sheet = self._newest, "", b"", b""
-        await self._put(newest.timeline_text())
+        await self._put(newest.history_text())
         while True:
             news = newest.news
             self._bundle, self._shown = self._bundle + 1, asyncio.Event()
@@ -209,6 +213,7 @@ class OperatorServer:
         """Take what the run puts out, for ever, and keep connections few. connections: all, the oldest first."""
         while True:
             self._link.requests.windows = len(self._windows)
+            self._link.requests.fine = getattr(self.broadcast.view, "stage", None) in FINE_STAGES
             self.broadcast.refused = sum(self._access.refused.values())
             self.broadcast.update(self._clock.now(), bool(self._windows))
             own = set(self._windows.values())
@@ -235,10 +240,20 @@ class OperatorServer:
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"] or self._settings.page
+        if name == REPORT_NAME:
+            return self._report()
         if name not in self._files:
             raise web.HTTPNotFound
         kind = CONTENT_TYPES[name.rsplit(".", 1)[1]]
         return web.Response(body=self._files[name], content_type=kind, charset="utf-8", headers=self._headers)
+
+    def _report(self) -> web.StreamResponse:
+        """The report of a run that is over, to be saved: the policy for what is shown here allows it no style."""
+        result = getattr(self.broadcast.view, "result", None)
+        if result is None or not result.report or not (file := Path(result.report)).is_file():
+            raise web.HTTPNotFound
+        headers = self._headers | {"Content-Disposition": "attachment"}
+        return web.Response(body=file.read_bytes(), content_type="text/html", charset="utf-8", headers=headers)
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         number = self._link.requests.ask(Wish.STOP, 0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 from ctypes import c_uint64
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from multiprocessing.sharedctypes import RawArray
 from typing import Any
 from zlib import crc32
@@ -21,20 +22,28 @@ from numpy.typing import NDArray
 from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from hardware.files.region_table import Corners
-from hardware.operator.view import CALMING_WISHES, MoveRequest, OperatorView, RecordingView, WavingView, Wish
+from hardware.operator.view import (
+    CALMING_WISHES,
+    CameraView,
+    MoveRequest,
+    OperatorView,
+    RequestAnswer,
+    Wish,
+)
 from hardware.process.system import SharedLatest
 from planning.path import Path
 
 REQUEST_SLOTS = 16  # requests that wait; the run takes them every few ms and a hand gives a few in a second
 OTHER_REQUEST_SLOTS = 8  # of them for what does not lead towards rest: a flood of such requests leaves room for a pause
-PICTURES_CAPACITY = 1 << 20  # bytes: three pictures of 640 px, and near ones, take 250 kB with all that lies over them
+PICTURES_CAPACITY = 1 << 22  # bytes: three pictures of 640 px and fine near ones take 1 MB with all that lies over them
 MAX_PATH_POINTS, MAX_TRIANGLES = 4000, 1500  # what a browser without a graphics card draws ten times a second
 OUTLINE_CAPACITY = 1 << 15  # bytes: four times a window's longest message
 SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras, 1280 px at most
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
 _RECORD = struct.Struct("=QQBdddI")  # the same, and its check sum
-_LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS = range(5)  # last number given, last stop, records written and taken, windows
+_LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS, _FINE = range(6)  # last number given, last stop, records written and taken,
+# windows, whether pictures are wanted as fine as they are
 _WISHES = tuple(Wish)
 
 Polygons = tuple[tuple[str, Corners], ...]  # px, by camera's name
@@ -55,7 +64,7 @@ class RequestLine:
     """The line of requests in shared memory: one page asks, one run takes."""
 
     def __init__(self) -> None:
-        self._counts: Any = RawArray(c_uint64, 5)  # each is written whole, or not at all
+        self._counts: Any = RawArray(c_uint64, 6)  # each is written whole, or not at all
         self._records: Any = RawArray("B", REQUEST_SLOTS * _RECORD.size)
         self._stops_seen = 0
 
@@ -106,6 +115,15 @@ class RequestLine:
     @windows.setter
     def windows(self, count: int) -> None:
         self._counts[_WINDOWS] = count
+
+    @property
+    def fine(self) -> bool:
+        """Whether near pictures are wanted pixel by pixel, as something is judged by them."""
+        return bool(self._counts[_FINE])
+
+    @fine.setter
+    def fine(self, wanted: bool) -> None:
+        self._counts[_FINE] = wanted
 
     def _waiting(self) -> list[OperatorRequest]:
         taken, written, requests = self._counts[_TAKEN], self._counts[_WRITTEN], []
@@ -177,6 +195,7 @@ class PageScene:
     surface: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) mm
     triangles: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))  # (T, 3), or none known
     scan: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))  # (L, 2, 3) mm, lines of the scan
+    layer: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (K,) of each of the places
 
 
 def scene_from(
@@ -202,7 +221,7 @@ def scene_from(
     if path is None:
         return PageScene(rig.cameras, surface=points, triangles=corners, scan=lines)
     places = path.surface_from_nozzle[drawn, :3, 3]
-    return PageScene(rig.cameras, places, drawn, path.extrude[drawn], points, corners, lines)
+    return PageScene(rig.cameras, places, drawn, path.extrude[drawn], points, corners, lines, path.layer[drawn])
 
 
 def _drawn_checkpoints(path: Path) -> NDArray[np.int64]:
@@ -240,6 +259,70 @@ class ScanDrawing:
     lines: Array  # (L, 2, 3) mm, from where to where
     points: Array  # (V, 3) mm
     triangles: NDArray[np.int64]  # (T, 3)
+
+
+class RecordingStage(StrEnum):
+    """Where a recording is."""
+
+    RECORD = "record"
+    ENDED = "ended"  # what is on the disk is whole
+    FAILED = "failed"  # what was written before is kept
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingView:
+    """The state of a recording without an arm."""
+
+    stamp: float  # s
+    turn: int
+    stage: RecordingStage
+    seconds: float  # of it so far
+    size: int  # bytes on the disk
+    sets: int  # frame sets taken
+    dropped: int  # of them, for which the recorder had no room
+    cameras: tuple[CameraView, ...] = ()
+    words: str = ""  # what ended it
+    offers: tuple[Wish, ...] = ()
+    answer: RequestAnswer | None = None
+    draws: bool = False  # whether a region may be drawn now
+
+
+class WavingStage(StrEnum):
+    """Where a calibration is."""
+
+    WAVE = "wave"  # the board is looked for
+    SOLVE = "solve"  # enough was seen: lenses and places are computed
+    PASSED = "passed"
+    FAILED = "failed"  # not good enough, or not to be calibrated from this
+    STOPPED = "stopped"  # the corners are kept
+
+
+@dataclass(frozen=True, slots=True)
+class WavingCamera:
+    """One camera's views of the board so far."""
+
+    name: str
+    size: tuple[int, int]  # (W, H) px of its picture
+    corners: int  # in the newest picture
+    parts: tuple[tuple[float, ...], ...]  # of the picture, row by row: 0 to 1 of the corners that each should have
+    tilts: tuple[float, ...]  # left, right, top, bottom nearer: 0 to 1 of the views that should be tilted so
+    depth: float  # 0 to 1 of how much nearer than the far views the near ones should be
+
+
+@dataclass(frozen=True, slots=True)
+class WavingView:
+    """The state of a calibration."""
+
+    stamp: float  # s
+    turn: int
+    stage: WavingStage
+    hints: tuple[str, ...] = ()  # what to do next, the most needed first
+    cameras: tuple[WavingCamera, ...] = ()
+    together: float = 0.0  # 0 to 1 of the frame sets in which two cameras should have seen the board
+    looked: int = 0  # frame sets looked at
+    words: tuple[str, ...] = ()  # the result
+    offers: tuple[Wish, ...] = ()
+    answer: RequestAnswer | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

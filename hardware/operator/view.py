@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from enum import StrEnum
-from math import nan
+from math import nan, pi
 
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.se3 import Array
+from planning.command import Command, HoldReason, Refusal, RefusalCode
 
 
 class RunStage(StrEnum):
@@ -41,14 +42,40 @@ class Wish(StrEnum):
     AGAIN = "again"  # do this stage anew: check, or look for the wound
     START = "start"  # let the arm move: approach, then print
     PAUSE = "pause"  # hold above the surface, ready to go on
+    LIFT = "lift"  # after a stop: arm, and go up from the surface, as in a pause
     RESUME = "resume"  # go on printing where it left off
     STOP = "stop"  # come to rest now
     HOME = "home"  # move the arm to its home
     END = "end"  # end the run, and write its report
 
 
+WISH_WORDS = {  # on buttons, in messages, in the terminal and in the documents: one word for one thing
+    Wish.CONFIRM: "Yes, it lies right",
+    Wish.MOVE: "Move",
+    Wish.OUTLINE: "Use this outline",
+    Wish.AGAIN: "Look again",
+    Wish.START: "Start",
+    Wish.PAUSE: "Pause",
+    Wish.LIFT: "Lift",
+    Wish.RESUME: "Resume",
+    Wish.STOP: "Stop",
+    Wish.HOME: "Home",
+    Wish.END: "Finish",
+}
+WISH_KEYS = {  # in the terminal and on the page; Enter stops in the terminal only, where no button has the focus
+    Wish.STOP: "space",
+    Wish.PAUSE: "p",
+    Wish.RESUME: "r",
+    Wish.LIFT: "l",
+    Wish.HOME: "h",
+    Wish.CONFIRM: "y",
+    Wish.START: "s",
+    Wish.AGAIN: "a",
+    Wish.END: "q",
+}
 CALMING_WISHES = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead towards rest: right whatever the window showed
 ACTIVE_STAGES = (RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING, RunStage.PAUSED)  # the arm may move, or is armed
+OVER_STAGES = (RunStage.DONE, RunStage.ENDED, RunStage.FAILED)  # nothing more will happen
 STAGE_OFFERS = {
     RunStage.CHECK: (Wish.END,),
     RunStage.FIND: (Wish.END,),
@@ -57,7 +84,7 @@ STAGE_OFFERS = {
     RunStage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
     RunStage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),
     RunStage.PAUSED: (Wish.RESUME, Wish.HOME, Wish.END),
-    RunStage.STOPPED: (Wish.RESUME, Wish.HOME, Wish.END),
+    RunStage.STOPPED: (Wish.RESUME, Wish.LIFT, Wish.HOME, Wish.END),
     RunStage.HOMING: (Wish.END,),
 }
 STAGE_QUESTIONS = {
@@ -67,11 +94,11 @@ STAGE_QUESTIONS = {
     RunStage.READY: "Is nobody within the arm's reach? Then it may start",
     RunStage.APPROACH: "The nozzle goes to where printing begins",
     RunStage.PRINT: "Printing",
-    RunStage.PAUSED: "Paused: resume, go home, or end",
-    RunStage.STOPPED: "Stopped: resume, go home, or end",
+    RunStage.PAUSED: "Paused: resume, go home, or finish",
+    RunStage.STOPPED: "Stopped: resume, lift the nozzle, go home, or finish",
     RunStage.HOMING: "The arm goes home",
     RunStage.DONE: "The path is printed",
-    RunStage.ENDED: "The run was ended; what is left can be resumed",
+    RunStage.ENDED: "The run was finished early; what is left can be resumed",
     RunStage.FAILED: "The run cannot go on; what is left can be resumed",
 }
 DRAW_QUESTION = "Click round what is to be followed, in two pictures or more"
@@ -81,13 +108,13 @@ def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> st
     """Why a wish cannot be followed, "" if it can.
 
     turn: of the view it was asked under; present: of the newest view, which `offers` wishes. A window that shows an
-    older turn may stop, pause or end, and nothing else: it cannot let a run go on that another window has stopped.
+    older turn may stop, pause or finish, and nothing else: it cannot let a run go on that another window has stopped.
     """
     if wish is Wish.STOP:
         return ""
     if wish not in CALMING_WISHES and turn != present:
         return "the run has changed since this was shown: look again, then ask again"
-    return "" if wish in offers else f"{wish} cannot be done at this stage"
+    return "" if wish in offers else f"{WISH_WORDS[wish]} cannot be done at this stage"
 
 
 MAX_MOVE_MM, MAX_MOVE_DEG = 100.0, 180.0  # of one request to move the path
@@ -151,6 +178,55 @@ class TrackingView:
     tracks: int = 0  # in use
 
 
+@dataclass(frozen=True, slots=True)
+class HoldCause:
+    """The figure that holds the nozzle, so that the place that shows it can be marked.
+
+    tile: which of the page's figures it is: age, error, flight, tracking, or "cause" of one not shown otherwise.
+    """
+
+    tile: str
+    words: str  # what is measured
+    unit: str  # of both figures, "" without figures
+    got: float = nan
+    limit: float = nan
+
+
+CAUSE_TILES = {  # tile of the page, what is measured, its unit, and how many of that the guard's unit is
+    RefusalCode.POSE_AGE: ("age", "age of pose", "ms", 1000.0),
+    RefusalCode.POSE_ERROR: ("error", "predicted error", "mm", 1.0),
+    RefusalCode.NO_POSE: ("tracking", "no pose", "", 1.0),
+    RefusalCode.POSE_NOT_FINITE: ("tracking", "no pose", "", 1.0),
+    RefusalCode.TRACK_STATE: ("tracking", "tracking", "", 1.0),
+    RefusalCode.SURFACE_SPEED: ("cause", "surface speed", "mm/s", 1.0),
+    RefusalCode.SURFACE_TURN: ("cause", "surface turn", "°/s", 180 / pi),
+    RefusalCode.JUMP: ("cause", "step", "mm", 1.0),
+    RefusalCode.TURN: ("cause", "turn", "°", 180 / pi),
+    RefusalCode.WATCHDOG: ("cause", "still moving", "s", 1.0),
+    RefusalCode.STOP_DISTANCE: ("cause", "way to rest", "mm", 1.0),
+}
+
+
+def hold_cause(command: Command) -> HoldCause | None:
+    """The figure that holds the nozzle, or makes it brake; None where there is none, or it has no figure."""
+    found: HoldReason | Refusal | None = command if isinstance(command, Refusal) else None
+    if found is None and isinstance(command.reason, HoldReason):
+        found = command.reason
+    if found is None or found.code not in CAUSE_TILES:
+        return None
+    tile, words, unit, scale = CAUSE_TILES[found.code]
+    return HoldCause(tile, words, unit, scale * found.got, scale * found.limit)
+
+
+@dataclass(frozen=True, slots=True)
+class RestView:
+    """A nozzle that stands while the surface moves under it."""
+
+    slip: float  # mm, from end to end, by which the surface has moved against the nozzle
+    seconds: float  # s, over which that was seen
+    height: float  # mm of the tip above its place on the path along the nozzle's axis; NaN before a path was begun
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionView:
     """What the arm does, and why."""
@@ -166,6 +242,9 @@ class MotionView:
     arm: str = ""  # its state in words
     speed: float = nan  # mm/s of the nozzle over the surface
     material: str = ""  # what the dispenser does, in words; "" where nothing is extruded
+    error_age: float = nan  # s since the two errors were taken: while nothing is extruded they are of earlier
+    cause: HoldCause | None = None  # of a hold, where a figure is the cause
+    rest: RestView | None = None  # of a nozzle that stands where it was stopped or paused
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +254,13 @@ class ProgressView:
     fraction: float  # place, in checkpoints
     total: int  # checkpoints
     share: float  # 0 to 1, of the time or of the length
-    left: float = nan  # s until it is done if nothing holds it
+    left: float = nan  # s until it is done, by the share of the time in which it got on so far
+    spread: tuple[float, float] | None = None  # s, between which that lies 9 times of 10; None while unknown
     duty: float = nan  # 0 to 1, share of the time since the start in which it was not held
     layer: int = 0  # from 1; 0 where there are none
     layers: int = 0
+    ink: float = nan  # mm^3 that the dispensers were told to let out in this run; NaN where there is none
+    begun: float = 0.0  # place, in checkpoints, where this run goes on
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +308,45 @@ class RequestAnswer:
     words: str = ""  # why it was not followed
 
 
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """A line of the run's log."""
+
+    number: int  # counts up from 1
+    stamp: float  # s
+    warning: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class HoldRow:
+    """The holds for one reason."""
+
+    reason: str
+    count: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """What a run came to. Errors are at the nozzle while material left it, mm; NaN where none did."""
+
+    printed: float  # 0 to 1, share of the path that is printed, with what runs before this one printed
+    fraction: float  # place reached, in checkpoints
+    total: int  # checkpoints
+    begun: float  # place where this run went on, in checkpoints
+    seconds: float  # s from the approach on
+    duty: float  # 0 to 1
+    error: tuple[float, float]  # predicted, 95 % and largest
+    true_error: tuple[float, float]  # the same of the true error, where the world is simulated
+    ink: float  # mm^3, NaN of none
+    holds: tuple[HoldRow, ...]  # the longest first
+    stretches: tuple[float, ...]  # mm, largest error of each of the path's stretches of equal checkpoints; NaN: none
+    record: str  # files as the user named them
+    report: str
+    again: str = ""  # the command that goes on, "" where nothing is left
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OperatorView:
     """All that the page shows, but for pictures and scene."""
@@ -245,7 +366,8 @@ class OperatorView:
     answer: RequestAnswer | None = None
     placement: PlacementView | None = None
     notes: tuple[str, ...] = ()  # what one should know all the time, such as "dry run" or "simulated"
-    events: tuple[str, ...] = ()  # the last ones, newest last
+    log: tuple[LogLine, ...] = ()  # the last lines, newest last
+    result: RunResult | None = None  # once the run is over
     draws: bool = False  # whether the region has to be drawn now, by whoever sees the newest view
 
 
@@ -253,67 +375,3 @@ def tracking_from_pose(pose: SurfacePose, now: float, tracks: int = 0) -> Tracki
     """The estimate as it is shown at `now`, s. tracks: in use."""
     sigma, place = position_sigma(pose.covariance), pose.covariance[3:, 3:]
     return TrackingView(pose.state, pose.reason, now - pose.stamp, sigma, pose.base_from_surface, place, tracks)
-
-
-class RecordingStage(StrEnum):
-    """Where a recording is."""
-
-    RECORD = "record"
-    ENDED = "ended"  # what is on the disk is whole
-    FAILED = "failed"  # what was written before is kept
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingView:
-    """The state of a recording without an arm."""
-
-    stamp: float  # s
-    turn: int
-    stage: RecordingStage
-    seconds: float  # of it so far
-    size: int  # bytes on the disk
-    sets: int  # frame sets taken
-    dropped: int  # of them, for which the recorder had no room
-    cameras: tuple[CameraView, ...] = ()
-    words: str = ""  # what ended it
-    offers: tuple[Wish, ...] = ()
-    answer: RequestAnswer | None = None
-    draws: bool = False  # whether a region may be drawn now
-
-
-class WavingStage(StrEnum):
-    """Where a calibration is."""
-
-    WAVE = "wave"  # the board is looked for
-    SOLVE = "solve"  # enough was seen: lenses and places are computed
-    PASSED = "passed"
-    FAILED = "failed"  # not good enough, or not to be calibrated from this
-    STOPPED = "stopped"  # the corners are kept
-
-
-@dataclass(frozen=True, slots=True)
-class WavingCamera:
-    """One camera's views of the board so far."""
-
-    name: str
-    size: tuple[int, int]  # (W, H) px of its picture
-    corners: int  # in the newest picture
-    parts: tuple[tuple[float, ...], ...]  # of the picture, row by row: 0 to 1 of the corners that each should have
-    tilts: tuple[float, ...]  # left, right, top, bottom nearer: 0 to 1 of the views that should be tilted so
-    depth: float  # 0 to 1 of how much nearer than the far views the near ones should be
-
-
-@dataclass(frozen=True, slots=True)
-class WavingView:
-    """The state of a calibration."""
-
-    stamp: float  # s
-    turn: int
-    stage: WavingStage
-    hints: tuple[str, ...] = ()  # what to do next, the most needed first
-    cameras: tuple[WavingCamera, ...] = ()
-    together: float = 0.0  # 0 to 1 of the frame sets in which two cameras should have seen the board
-    looked: int = 0  # frame sets looked at
-    words: tuple[str, ...] = ()  # the result
-    offers: tuple[Wish, ...] = ()
-    answer: RequestAnswer | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -81,6 +82,47 @@ def duration_text(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest} s"
     return f"{minutes // 60} h {minutes % 60} min"
+
+
+BLOCK_TIME = 5.0  # s of a block: a hold is shorter, so that blocks are nearly independent
+MIN_BLOCKS = 4  # from which the spread is told
+MIN_RATE = 0.02  # s of the path a second: a print that hardly gets on has no end that can be told
+QUANTILE = 1.645  # of the normal distribution: 9 times of 10
+
+
+class TimeLeft:
+    """When the path is done, by how it got on so far: s of the path at its own speeds for each second that passed.
+
+    These are summed in blocks of BLOCK_TIME. What is left takes more such blocks; their spread, and that of the mean of
+    those seen, give the spread of the time left.
+    """
+
+    def __init__(self) -> None:
+        self._count, self._sum, self._squares = 0, 0.0, 0.0
+        self._time = self._gained = 0.0  # of the block that is not full
+        self._last: tuple[float, float] | None = None  # stamp, and s left of the path
+
+    def add(self, now: float, left: float, moves: bool) -> None:
+        """What was left of the path at `now`, s. moves: whether the run prints or is held: a pause does not count."""
+        if moves and self._last is not None:
+            self._time += max(now - self._last[0], 0.0)
+            self._gained += max(self._last[1] - left, 0.0)
+        self._last = (now, left) if moves else None
+        if self._time >= BLOCK_TIME:
+            rate = self._gained / self._time
+            self._count, self._sum, self._squares = self._count + 1, self._sum + rate, self._squares + rate * rate
+            self._time = self._gained = 0.0
+
+    def __call__(self, left: float) -> tuple[float, tuple[float, float] | None]:
+        """Seconds until `left`, s of the path, are done, and between which 9 of 10 lie; None of few blocks."""
+        if self._count < MIN_BLOCKS:
+            return left, None
+        mean = max(self._sum / self._count, MIN_RATE)
+        variance = max(self._squares - self._sum**2 / self._count, 0.0) / (self._count - 1)
+        ahead = max(left / mean / BLOCK_TIME, 1.0)
+        off = QUANTILE * math.sqrt(variance * (1 / self._count + 1 / ahead))
+        slow = mean - off
+        return left / mean, (left / min(mean + off, 1.0), left / slow if slow > MIN_RATE else math.inf)
 
 
 MAX_NAMED_FILES = 20  # files of an interrupted command that are named; more are counted

@@ -117,28 +117,44 @@ class PoseLockedSchedule(TickSchedule):
 
 
 LATENESS_BIN, LATENESS_BINS = 1e-4, 1000  # s of a bin, and how many: a tenth of a second
+TAIL_STEP, TAIL_BINS = 1.02, 600  # ratio of two bins beyond that, and how many: good to 2 % up to 10^5 times as far
 
 
 class Histogram:
-    """Counts of values from 0 on, of lateness, s, unless said otherwise. most: the largest value."""
+    """Counts of values from 0 on, of lateness, s, unless said otherwise. most: the largest value.
+
+    counts: of even bins; the last one counts all that is larger, which is counted by itself in bins that become wider,
+    so that a percentile is never cut off where the even bins end.
+    """
 
     def __init__(self, width: float = LATENESS_BIN, bins: int = LATENESS_BINS) -> None:
-        """width: of a bin; the last one counts all that is larger."""
+        """width: of an even bin."""
         self.width, self.counts = width, np.zeros(bins, np.int64)
         self.count, self.most = 0, 0.0
+        self._tail = np.zeros(TAIL_BINS, np.int64)  # of what lies in the last even bin and beyond
+        self._end = (bins - 1) * width  # where that begins
 
     def add(self, value: float) -> None:
         """Count a value."""
-        self.counts[min(int(max(value, 0.0) / self.width), len(self.counts) - 1)] += 1
+        index = min(int(max(value, 0.0) / self.width), len(self.counts) - 1)
+        self.counts[index] += 1
+        if index == len(self.counts) - 1:
+            step = math.log(max(value / self._end, 1.0)) / math.log(TAIL_STEP) if self._end > 0 else 0.0
+            self._tail[min(int(step), TAIL_BINS - 1)] += 1
         self.count += 1
         self.most = max(self.most, value)
 
     def percentile(self, share: float) -> float:
-        """What `share` percent of the values do not exceed, rounded up to a bin; NaN of none."""
+        """What `share` percent of the values do not exceed, rounded up to a bin, `most` at most; NaN of none."""
         if not self.count:
             return math.nan
-        rank = max(share / 100 * self.count, 1.0)
-        return (int(np.searchsorted(np.cumsum(self.counts), rank)) + 1) * self.width
+        rank, summed = max(share / 100 * self.count, 1.0), np.cumsum(self.counts)
+        index = int(np.searchsorted(summed, rank))
+        if index < len(self.counts) - 1:
+            return (index + 1) * self.width
+        before = int(summed[-2]) if len(summed) > 1 else 0
+        step = int(np.searchsorted(np.cumsum(self._tail), rank - before))
+        return min(self._end * TAIL_STEP ** (step + 1), self.most)
 
 
 PROBE_CALLS = 20  # of each kind in a piece of work: a quarter of a millisecond, a fraction of a tick of the motion

@@ -20,7 +20,7 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import Command, Hold, Move, feed_for
+from planning.command import Command, Hold, HoldReason, Move, RefusalCode, feed_for
 from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
 from planning.material import FlowCommands, FlowOrder, Outlets, RestsAhead, material_plan
@@ -105,7 +105,7 @@ class Planner:
         if self._finished:
             return self._stop(now, "path finished")
         if pose is None:
-            return self._stop(now, "no pose yet")
+            return self._stop(now, HoldReason("no pose yet", RefusalCode.NO_POSE))
         if reason := self._pose_fault(pose, now):
             return self._stop(now, reason)
         self._flow.lag = self.lag  # which whoever has learned it sets
@@ -162,26 +162,30 @@ class Planner:
     def _pose_fault(self, pose: SurfacePose, now: float) -> str:
         """Why the pose must not be followed, "" if it may."""
         limits, then = self._limits, now + self._tick + self.lag
-        if not _finite(pose):
-            return "the pose is not finite"
+        if not pose.finite:
+            return HoldReason("the pose is not finite", RefusalCode.POSE_NOT_FINITE)
         if not pose.state.measured:
-            return f"surface is {pose.state.value}" + (f": {pose.reason}" if pose.reason else "")
+            words = f"surface is {pose.state.value}" + (f": {pose.reason}" if pose.reason else "")
+            return HoldReason(words, RefusalCode.TRACK_STATE)
         age = now - pose.stamp
         if not 0 <= age <= POSE_LIMIT_FRACTION * limits.pose_age:
-            return f"pose is {age:.3f} s old, limit {limits.pose_age:g} s"
+            words = f"pose is {age:.3f} s old, limit {limits.pose_age:g} s"
+            return HoldReason(words, RefusalCode.POSE_AGE, age, limits.pose_age)
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
         low, high = self._zone
         place = np.clip((se3.inverse(pose.base_from_surface) @ base_from_nozzle)[:3, 3], low, high)
-        turn, speed = pose.twist[:3], pose.twist[3:] + se3.cross(pose.twist[:3], place)
-        if np.linalg.norm(speed) > POSE_LIMIT_FRACTION * limits.surface_speed:
-            return f"surface moves at {np.linalg.norm(speed):.1f} mm/s, limit {limits.surface_speed:g} mm/s"
-        if np.linalg.norm(turn) > POSE_LIMIT_FRACTION * limits.surface_turn:
-            turn_deg, limit_deg = np.rad2deg(np.linalg.norm(turn)), np.rad2deg(limits.surface_turn)
-            return f"surface turns at {turn_deg:.1f} degrees/s, limit {limit_deg:g} degrees/s"
+        speed = float(np.linalg.norm(pose.twist[3:] + se3.cross(pose.twist[:3], place)))
+        if speed > POSE_LIMIT_FRACTION * (limit := limits.surface_speed):
+            words = f"surface moves at {speed:.1f} mm/s, limit {limit:g} mm/s"
+            return HoldReason(words, RefusalCode.SURFACE_SPEED, speed, limit)
+        if (turn := float(np.linalg.norm(pose.twist[:3]))) > POSE_LIMIT_FRACTION * (limit := limits.surface_turn):
+            words = f"surface turns at {np.rad2deg(turn):.1f} degrees/s, limit {np.rad2deg(limit):g} degrees/s"
+            return HoldReason(words, RefusalCode.SURFACE_TURN, turn, limit)
         with np.errstate(invalid="ignore"):  # of a matrix that is no covariance: NaN, which is too much
             error = float(pose.error_ahead(then, place[None])[0])
         if not error <= POSE_LIMIT_FRACTION * limits.pose_error:
-            return f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
+            words = f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
+            return HoldReason(words, RefusalCode.POSE_ERROR, error, limits.pose_error)
         return ""
 
     # -- which segment, and where on it
@@ -387,14 +391,3 @@ class Planner:
         unit = "mm" if axis in "XYZ" else "degrees"
         got, low, high = (got, low, high) if unit == "mm" else np.rad2deg([got, low, high])
         return f"{where}: {axis} = {got:.1f}, allowed {low:g} to {high:g} {unit}"
-
-
-def _finite(pose: SurfacePose) -> bool:
-    arrays = [pose.base_from_surface, pose.covariance, pose.twist, pose.twist_covariance, pose.acceleration_psd]
-    if pose.warp is not None:
-        arrays += [pose.warp.control, pose.warp.coefficients, pose.warp.covariance, pose.warp.growth]
-    if pose.forecast is not None:
-        arrays += [pose.forecast.horizons, pose.forecast.increments, pose.forecast.covariances]
-    if pose.local is not None:
-        arrays += [pose.local.centres, pose.local.variance, pose.local.growth, pose.local.reach, pose.local.support]
-    return bool(np.isfinite(pose.stamp) and all(np.isfinite(a).all() for a in arrays))

@@ -1,11 +1,11 @@
 // The buttons: what may be asked now, asked twice where it moves the arm from rest, and what became of it.
-import { AGAIN, upper, WISHES } from "./words.js";
+import { AGAIN, KEYS, OVER, WISHES } from "./words.js";
 
 const GO = ["confirm", "start", "resume"]; // share the place in the middle
 const BEFORE = ["check", "find", "confirm", "ready"]; // the arm has moved
 const SURE = {
   start: "Let the arm move and print?", home: "Let the arm move to its home?", end: "Finish this run?",
-  resume: "Let the arm move again and go on?", // only out of a stop
+  resume: "Let the arm move again and go on?", lift: "Let the arm lift the nozzle off the surface?",
 };
 const UNTOUCHED = 700; // ms for which a button that has just come to mean something else is not pressed
 const PATIENCE = 1500; // ms until a request without an answer is spoken of
@@ -40,36 +40,61 @@ export class Buttons {
       this.wish(button.dataset.wish, turn);
     });
   }
+  // the terminal's keys; whatever has the focus, the space bar stops
   key(event) {
-    if (event.code === "Escape") this.drop();
-    if (event.code !== "Space") return;
-    event.preventDefault(); // else it would press whichever button is focused
-    event.stopPropagation();
-    if (event.type === "keydown" && !event.repeat) this.wish("stop", this.turn());
+    const down = event.type === "keydown" && !event.repeat;
+    if (event.code === "Space") {
+      event.preventDefault(); // else it would press whichever button is focused
+      event.stopPropagation();
+      if (down) this.wish("stop", this.turn());
+      return;
+    }
+    if (!down || event.ctrlKey || event.altKey || event.metaKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+    if (event.code === "Escape") return this.drop();
+    const key = event.key.toLowerCase();
+    if (this.asking && (key === "y" || key === "n")) return key === "y" ? this.accept() : this.drop();
+    const wish = KEYS[key];
+    if (wish) this.press(wish);
+  }
+  // as if the button had been pressed, where there is one to press
+  press(wish) {
+    const button = this.bar.querySelector(`[data-wish="${wish}"]`);
+    if (!button || button.disabled) return this.say(`“${WISHES[wish]}” cannot be done now.`, true);
+    button.focus();
+    button.click();
   }
   turn() {
     return this.view ? this.view.turn : 0;
   }
   wish(wish, turn) {
-    if (!(wish in SURE) || (wish === "resume" && this.view.stage !== "stopped")) return this.send(wish, turn);
+    if (!(wish in SURE)) return this.send(wish, turn);
     this.asking = { wish, turn };
     document.getElementById("sure-words").textContent = SURE[wish];
     document.getElementById("sure-yes").textContent = `Yes, ${WISHES[wish].toLowerCase()}`;
     this.sure.hidden = false;
+    document.getElementById("sure-no").focus();
   }
   accept() {
+    if (document.getElementById("sure-yes").disabled) return;
     const { wish, turn } = this.asking;
     this.drop();
     this.send(wish, turn);
   }
   drop() {
+    if (!this.asking) return;
+    const focused = this.sure.contains(document.activeElement), { wish } = this.asking;
     this.sure.hidden = true;
     this.asking = null;
+    if (focused) this.focus(this.bar.querySelector(`[data-wish="${wish}"]`));
+  }
+  // the focus goes to a button that can be pressed; else to Stop, and never to nothing
+  focus(button) {
+    (button && !button.disabled ? button : this.bar.querySelector("[data-wish=stop]")).focus();
   }
   send(wish, turn, more) {
     const tag = this.ask(wish, turn, more);
     if (tag === null) {
-      this.say(`${upper(wish)} was not sent: no connection.`, true);
+      this.say(`“${WISHES[wish]}” was not sent: no connection.`, true);
       return null;
     }
     this.waiting.set(tag, { wish, number: null, since: performance.now() });
@@ -83,7 +108,7 @@ export class Buttons {
     waiting.number = message.number;
     if (message.words) {
       this.waiting.delete(message.tag);
-      this.say(`${upper(message.wish)} was not followed: ${message.words}.`, true);
+      this.say(`“${WISHES[message.wish]}” was not followed: ${message.words}.`, true);
     }
     this.settle();
   }
@@ -96,10 +121,13 @@ export class Buttons {
       if (button === this.go) this.showGo(offers);
       else if (button.dataset.wish !== "stop") button.disabled = !offers.includes(button.dataset.wish);
     }
+    const focused = document.activeElement;
+    if (focused && focused.disabled && this.bar.contains(focused)) this.focus(null);
+    this.bar.classList.toggle("over", Boolean(view && OVER.includes(view.stage)));
     const again = this.bar.querySelector("[data-wish=again]");
     again.textContent = (view && AGAIN[view.stage]) || WISHES.again;
     if (this.asking && before !== this.turn() && !(this.asking.wish === "end" && offers.includes("end"))) {
-      this.say(`${upper(WISHES[this.asking.wish])} was not asked: the run has changed meanwhile.`, true);
+      this.say(`“${WISHES[this.asking.wish]}” was not asked: the run has changed meanwhile.`, true);
       this.drop();
     }
     document.getElementById("sure-yes").disabled = !live;
@@ -121,7 +149,7 @@ export class Buttons {
     if (answer && answer.number !== this.answered) {
       this.answered = answer.number;
       const words = answer.words ? `: ${answer.words}.` : ".";
-      if (answer.wish !== "move" || !answer.followed) this.say(`${upper(answer.wish)} ${answer.followed ? "was followed" : "was not followed"}${words}`, !answer.followed);
+      if (answer.wish !== "move" || !answer.followed) this.say(`“${WISHES[answer.wish]}” ${answer.followed ? "was followed" : "was not followed"}${words}`, !answer.followed);
     }
     for (const [tag, each] of this.waiting) if (answer && each.number !== null && answer.number >= each.number) this.waiting.delete(tag);
     this.mark();
@@ -136,15 +164,15 @@ export class Buttons {
     for (const [tag, each] of this.waiting) {
       if (now - each.since < PATIENCE) continue;
       this.waiting.delete(tag);
-      this.say(each.wish === "stop" ? "STOP was not confirmed. Use the emergency stop." : `${upper(each.wish)} was not answered.`, true);
+      this.say(each.wish === "stop" ? "Stop was not confirmed. Use the emergency stop." : `“${WISHES[each.wish]}” was not answered.`, true);
     }
-    if (!this.toast.hidden && now > this.until) this.toast.hidden = true;
+    if (this.toast.textContent && now > this.until) this.toast.textContent = "";
     this.mark();
   }
+  // in a line of its own, which is always there: nothing moves and nothing is covered when it comes
   say(words, refused) {
     this.toast.textContent = words;
     this.toast.classList.toggle("refused", Boolean(refused));
-    this.toast.hidden = false;
     this.until = performance.now() + SHOWN;
   }
 }

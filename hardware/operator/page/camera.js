@@ -12,6 +12,13 @@ export class CameraPane {
     this.root.className = "camera";
     this.root.dataset.camera = name;
     this.canvas = document.createElement("canvas");
+    this.canvas.tabIndex = 0;
+    this.canvas.setAttribute("role", "button"); // it makes its picture large; what is moved by pulling has keys of its own
+    this.canvas.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter") return;
+      event.preventDefault();
+      chosen(name);
+    });
     const caption = document.createElement("figcaption");
     this.title = document.createElement("span");
     this.fare = document.createElement("span");
@@ -64,6 +71,10 @@ export class CameraPane {
     for (const each of [this.image, this.close]) if (each) each.close();
     [this.image, this.close, this.found, this.since] = [image, close, found, performance.now()];
   }
+  choose(on) {
+    this.root.classList.toggle("chosen", on);
+    this.canvas.setAttribute("aria-pressed", String(on && document.body.dataset.large === "yes"));
+  }
   // whether it is small beside another, so that a click makes it large
   get small() {
     return document.body.dataset.large === "yes" && !this.root.classList.contains("chosen");
@@ -80,6 +91,8 @@ export class CameraPane {
   tick() {
     const age = this.image ? performance.now() - this.since : 0, old = age > OLD && !this.standing;
     this.root.classList.toggle("still", old);
+    const what = [this.name, "live picture", this.fare.textContent].filter(Boolean).join(", ");
+    if (this.canvas.ariaLabel !== what) this.canvas.ariaLabel = what;
     this.title.textContent = this.standing ? `${this.name}, still picture` : old ? `${this.name}, ${(age / 1000).toFixed(0)} s old` : this.name;
   }
   fares(view) {

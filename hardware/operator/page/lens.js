@@ -74,15 +74,17 @@ export function split(scene, fraction) {
 }
 
 // Draws the path into a canvas: `pixel` maps points of it; printed ways in one style, those to come in another.
-export function drawPath(g, scene, fraction, pixel, styles) {
-  const { done, place } = split(scene, fraction), count = scene.checkpoint.length, p = scene.path, at = new Array(count);
+// only: whether nothing but the layer is drawn that is printed now
+export function drawPath(g, scene, fraction, pixel, styles, only = false) {
+  const { done, place } = split(scene, fraction), layer = only && scene.layer && scene.layer.length ? scene.layer[Math.min(done, scene.layer.length - 1)] : null;
+  const count = scene.checkpoint.length, p = scene.path, at = new Array(count);
   for (let i = 0; i < count; i++) at[i] = pixel(p[3 * i], p[3 * i + 1], p[3 * i + 2]);
   const here = place && pixel(...place);
   const run = (first, last, extruding, begin, end) => {
     g.beginPath();
     for (let i = first; i < last; i++) {
       const a = i === first && begin ? begin : at[i - 1], b = at[i];
-      if (Boolean(scene.extrude[i]) !== extruding || !a || !b) continue;
+      if (Boolean(scene.extrude[i]) !== extruding || !a || !b || (layer !== null && scene.layer[i] !== layer)) continue;
       g.moveTo(a[0], a[1]);
       g.lineTo(b[0], b[1]);
     }

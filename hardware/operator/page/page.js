@@ -1,29 +1,36 @@
-// The operator's page: hears the run, shows it, and asks. The newest wins; nothing is kept but the last minute's error.
+// The operator's page: hears the run, shows it, and asks. The newest wins; only the error over the run and its log are kept.
+import { Alerts } from "./alerts.js";
 import { Buttons } from "./buttons.js";
-import { Course } from "./course.js";
+import { ErrorChart } from "./chart.js";
 import { Drawing } from "./draw.js";
+import { RunLog } from "./log.js";
 import { Outlining } from "./outline.js";
 import { Panes, unpacked } from "./panes.js";
 import { Placing } from "./placing.js";
+import { ResultView } from "./result.js";
 import { SceneView } from "./scene.js";
 import { Line } from "./socket.js";
-import { ACTIVITIES, duration, figure, milliseconds, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
+import { onTheme, themeButton } from "./theme.js";
+import { about, ACTIVITIES, DOES, duration, figure, milliseconds, OVER, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
 
 const LARGE = ["find", "confirm"]; // stages in which the pictures are what matters
-const EVENTS = 2; // of the last ones that there is room for
+const AGED = 2; // s, after which an error is one of earlier
 const CHECKED = ["check", "find", "confirm", "ready", "failed"];
 const by = (id) => document.getElementById(id);
 const state = { view: null, scene: null, poses: null, age: Infinity, since: 0, stale: 1, refused: 0, gone: false, full: false, chosen: null, large: null, near: true };
 const placing = new Placing(by("placing"), (move, turn) => buttons.send("move", turn, { move }), (words, bad) => buttons.say(words, bad), refresh);
 const panes = new Panes(by("pictures"), choose, placing);
 const outlining = new Outlining(by("outlining"), by("outline"), panes, (outline, turn) => buttons.send("outline", turn, { outline }), (words, bad) => buttons.say(words, bad), show);
-const course = new Course(document.querySelector("#course canvas"));
+const course = new ErrorChart(document.querySelector("#course .chart"), document.querySelectorAll("#course [data-span]"));
+const log = new RunLog(by("log"), by("opener"), by("last"));
+const alerts = new Alerts(by("sound"));
+const result = new ResultView(by("result"));
 const space = new SceneView(by("scene"));
 
 async function hear(message) {
   if (message instanceof ArrayBuffer) return pictures(message);
   if (message.kind === "scene") scene(message);
-  else if (message.kind === "course") course.begin(message.rows);
+  else if (message.kind === "course") begun(message);
   else if (message.kind === "asked" && message.wish === "region") drawing.asked(message);
   else if (message.kind === "asked") {
     buttons.asked(message);
@@ -33,6 +40,11 @@ async function hear(message) {
   else if (message.kind === "view" || message.kind === "gone") view(message);
 }
 
+function begun(message) {
+  course.begin(message);
+  log.add(message.log);
+}
+
 function view(message) {
   state.gone = message.kind === "gone";
   state.full = false;
@@ -40,7 +52,10 @@ function view(message) {
   state.age = message.age === null ? Infinity : message.age;
   state.since = performance.now();
   state.view = message.view;
-  if (state.view) course.add(state.view);
+  if (state.view) {
+    course.add(state.view);
+    log.add(state.view.log);
+  }
   show();
 }
 
@@ -77,9 +92,11 @@ function choose(name) {
 function show() {
   const seen = state.view, age = state.age + (performance.now() - state.since) / 1000;
   const news = state.full ? "full" : state.gone ? "gone" : !line.connected ? "lost" : !seen ? "wait" : age > state.stale ? "old" : "live";
+  const over = Boolean(seen && OVER.includes(seen.stage) && seen.result);
   document.body.dataset.news = news;
-  by("news").textContent = (state.refused ? `${state.refused} refused · ` : "") + { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
-  alarm(news, age);
+  document.body.dataset.over = over ? "yes" : "no";
+  by("news").textContent = over ? "the run is over" : (state.refused ? `${state.refused} refused · ` : "") + { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
+  alarm(over && news !== "full" ? "live" : news, age);
   if (seen) stage(seen);
   sees();
   outlining.show(seen, news === "live");
@@ -95,7 +112,8 @@ function show() {
     states(seen);
     tiles(seen);
     progress(seen);
-    events(seen.events);
+    result.show(seen, state.scene);
+    alerts.see(kind(seen, news), by("said").textContent);
     for (const camera of seen.cameras) panes.of(camera.name).fares(camera);
   }
   refresh();
@@ -116,25 +134,71 @@ function stage(seen) {
   if (document.body.dataset.stage !== seen.stage) state.large = null;
   document.body.dataset.stage = seen.stage;
   document.body.dataset.turn = seen.turn;
-  const about = STAGES[seen.stage], holds = held(seen);
-  by("chip").textContent = holds ? "Holding" : about.word;
-  document.body.dataset.tone = holds ? "hold" : about.tone;
-  const same = seen.question.toLowerCase() === about.word.toLowerCase(); // it stands beside it already
-  by("question").textContent = outlining.on ? "Where is the wound's edge?" : (!same && seen.question) || (holds ? "Holding until it is safe to print." : about.say);
-  by("reason").textContent = upper((holds && seen.motion.reason) || (seen.placement && seen.placement.verdict === seen.reason ? "" : seen.reason));
-  by("notes").replaceChildren(...seen.notes.map((note) => {
+  const at = STAGES[seen.stage], does = doing(seen), holds = does && seen.motion.activity === "holding", now = does || at;
+  const same = seen.question.toLowerCase() === at.word.toLowerCase(); // it stands beside it already
+  const question = outlining.on ? "Where is the wound's edge?" : (holds && "Holding until it is safe to go on.") || (!same && seen.question) || at.say;
+  put("chip", now.word);
+  document.body.dataset.tone = now.tone;
+  put("question", question);
+  put("reason", [why(seen, does), resting(seen)].filter(Boolean).join(" "));
+  const share = seen.progress ? `${(100 * seen.progress.share).toFixed(0)} % ` : "";
+  document.title = `${share}${now.word} · stillbed`;
+  announce(now.word, question, holds ? seen.motion.reason : seen.reason);
+  const notes = JSON.stringify(seen.notes);
+  if (by("notes").dataset.notes !== notes) by("notes").replaceChildren(...seen.notes.map((note) => {
     const made = text("span", note.split(/[:;]/)[0]); // the rest is told to whoever points at it
     made.title = note;
     return made;
   }));
+  by("notes").dataset.notes = notes;
   document.body.dataset.large = (state.large ?? LARGE.includes(seen.stage)) ? "yes" : "no";
   const names = [...panes.keys()];
-  for (const [name, each] of panes) each.root.classList.toggle("chosen", name === (state.chosen ?? names[0]));
+  for (const [name, each] of panes) each.choose(name === (state.chosen ?? names[0]));
 }
 
-// whether it would print if it could; the reason then stands at the top
+function put(name, words) {
+  if (by(name).textContent !== words) by(name).textContent = words;
+}
+
+// what the nozzle does, where that is the news of the stage
+function doing(seen) {
+  const motion = seen.motion;
+  if (!motion || !DOES.includes(seen.stage) || motion.activity === "resting") return null;
+  return seen.stage === "approach" && motion.activity === "entering" ? STAGES.approach : ACTIVITIES[motion.activity];
+}
+
+function why(seen, does) {
+  const words = (does && seen.motion.reason) || (seen.placement && seen.placement.verdict === seen.reason ? "" : seen.reason);
+  return words ? `${upper(words)}.`.replace(/([.!?])\.$/, "$1") : "";
+}
+
+// what a nozzle that stands does to the tissue, and the tissue to it
+function resting(seen) {
+  const rest = seen.motion && seen.motion.rest;
+  if (!rest) return "";
+  const high = rest.height === null ? "" : Math.abs(rest.height) < 1 ? " at the surface" : ` ${rest.height.toFixed(0)} mm above its place`;
+  return `The nozzle stands${high}; the surface moves ${rest.slip.toFixed(1)} mm against it.`;
+}
+
+// told to whoever does not see the page, when it changes: figures in a reason do so all the time
+function announce(...words) {
+  const wanted = words.map((each) => each.replace(/-?\d+(\.\d+)?/g, "…")).join("|");
+  if (by("said").dataset.wanted === wanted) return;
+  by("said").dataset.wanted = wanted;
+  by("said").textContent = words.filter(Boolean).join(". ");
+}
+
+// what is told by sound
+function kind(seen, news) {
+  if (OVER.includes(seen.stage)) return "end";
+  if (seen.stage === "stopped" || news === "lost" || news === "old") return "stop";
+  return held(seen) ? "hold" : "";
+}
+
+// whether it would move if it could; the reason then stands at the top
 function held(seen) {
-  return seen.stage === "print" && seen.motion !== null && seen.motion.activity === "holding";
+  const does = doing(seen);
+  return does !== null && seen.motion.activity === "holding";
 }
 
 function text(kind, words, style) {
@@ -162,59 +226,68 @@ function checks(all) {
 }
 
 function states(seen) {
-  const put = (name, about, words) => {
+  const put = (name, about, words, cause) => {
     const row = document.querySelector(`[data-state=${name}]`);
     row.dataset.tone = about.tone;
+    row.classList.toggle("cause", Boolean(cause));
     row.querySelector("b").textContent = about.word;
     row.querySelector("span").textContent = words;
   };
-  const none = { word: "–", tone: "" }, { tracking, motion } = seen;
-  put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason || `${tracking.tracks} tracks` : "");
-  put("motion", motion ? ACTIVITIES[motion.activity] : none, motion ? doing(seen) : "");
+  const none = { word: "–", tone: "" }, { tracking, motion } = seen, caused = motion && motion.cause && motion.cause.tile === "tracking";
+  put("tracking", tracking ? TRACKING[tracking.state] : none, tracking ? tracking.reason || `${tracking.tracks} tracks` : "", caused);
+  put("motion", motion ? ACTIVITIES[motion.activity] : none, motion ? action(seen) : "");
 }
 
 // what the nozzle does, in words: why it stands, or how fast it goes
-function doing(seen) {
+function action(seen) {
   const motion = seen.motion;
   if (motion.activity === "resting") return motion.arm ? `arm ${motion.arm}` : motion.reason;
   const speed = motion.speed ? `${motion.speed.toFixed(1)} mm/s` : "", arm = motion.arm.split(":")[0];
   return [held(seen) ? "" : motion.reason, speed, arm && `arm ${arm}`, motion.material].filter(Boolean).join(" · ");
 }
 
-function events(all) {
-  const list = by("events"), wanted = all.slice(-EVENTS);
-  list.hidden = !wanted.length;
-  if (list.textContent !== wanted.join("")) list.replaceChildren(...wanted.map((words) => text("li", words)));
-}
-
 function tiles(seen) {
-  const { tracking, motion, latency } = seen;
-  const put = (name, value, unit, words, over) => {
-    const box = document.querySelector(`[data-tile=${name}]`);
+  const { tracking, motion, latency } = seen, cause = motion && motion.cause, rest = motion && motion.rest;
+  const put = (name, value, unit, words, over, aged) => {
+    const box = document.querySelector(`[data-tile=${name}]`), caused = cause && cause.tile === name;
+    if (caused && cause.got !== null) [value, unit, words] = [figure(cause.got, cause.unit === "ms" ? 0 : 2), cause.unit, `${cause.words}, limit ${+cause.limit.toPrecision(3)}`];
     box.firstElementChild.replaceChildren(value, text("small", value === "–" ? "" : unit));
     box.lastElementChild.textContent = words;
-    box.classList.toggle("over", Boolean(over));
+    box.classList.toggle("over", Boolean(over) && !aged);
+    box.classList.toggle("cause", Boolean(caused));
+    box.classList.toggle("aged", Boolean(aged) && !caused);
   };
   const beyond = (value, limit) => value !== null && limit !== null && value > limit;
-  put("error", figure(motion && motion.error, 2), motion && motion.limit !== null ? `mm, limit ${motion.limit}` : "mm", "predicted error", motion && beyond(motion.error, motion.limit));
-  put("truth", figure(motion && motion.true_error, 2), "mm", "true error", motion && beyond(motion.true_error, motion.limit));
+  const old = motion && motion.error !== null && (motion.error_age === null || motion.error_age > AGED), ago = old && motion.error_age !== null ? `, ${duration(motion.error_age)} ago` : "";
+  put("error", figure(motion && motion.error, 2), motion && motion.limit !== null ? `mm, limit ${motion.limit}` : "mm", `predicted error${ago}`, motion && beyond(motion.error, motion.limit), old);
+  put("truth", figure(motion && motion.true_error, 2), "mm", `true error${ago}`, motion && beyond(motion.true_error, motion.limit), old);
   document.querySelector("[data-tile=truth]").hidden = !motion || motion.true_error === null;
   put("sigma", figure(tracking && tracking.sigma, 3), "mm", "uncertainty");
   put("age", milliseconds(tracking && tracking.age), "ms", "age of pose");
   put("latency", latency ? `${milliseconds(latency.median)} / ${milliseconds(latency.high)}` : "–", "ms", "image to arm", latency && beyond(latency.high, latency.limit));
   put("flight", milliseconds(motion && motion.in_flight), "ms", "under way", motion && beyond(motion.in_flight, motion.most_in_flight));
+  put("rest", figure(rest && rest.slip, 1), "mm", rest ? `under the nozzle, in ${rest.seconds.toFixed(0)} s` : "", true);
+  document.querySelector("[data-tile=rest]").hidden = !rest;
+  put("cause", "–", "", cause ? cause.words : "", false);
+  document.querySelector("[data-tile=cause]").hidden = !cause || cause.tile !== "cause";
 }
 
 function progress(seen) {
   const far = seen.progress;
-  by("progress").hidden = !far;
+  by("progress").hidden = !far || Boolean(seen.result);
   if (!far) return;
-  document.querySelector("#progress i").style.width = `${(100 * far.share).toFixed(2)}%`;
-  const words = [`${(100 * far.share).toFixed(1)} %`, `checkpoint ${Math.floor(far.fraction) + 1} of ${far.total}`];
+  const share = Math.min(100 * far.share, 100), bar = document.querySelector("#progress .track");
+  bar.firstElementChild.style.width = `${share.toFixed(2)}%`;
+  bar.setAttribute("aria-valuenow", share.toFixed(0));
+  const words = [`${share.toFixed(1)} %`, `checkpoint ${Math.min(Math.floor(far.fraction) + 1, far.total)} of ${far.total}`];
+  if (far.begun && CHECKED.includes(seen.stage)) words[0] = `goes on at ${words[0]}`;
   if (far.layers) words.push(`layer ${far.layer} of ${far.layers}`);
-  if (far.duty !== null) words.push(`printing ${(100 * far.duty).toFixed(0)} % of the time`);
+  if (far.duty !== null) words.push(`printing ${(100 * far.duty).toFixed(0)} %`);
+  if (far.ink !== null) words.push(`ink ${far.ink.toFixed(far.ink < 10 ? 2 : 0)} mm³`);
   by("place").textContent = words.join(" · ");
-  by("left").textContent = far.left === null ? "" : far.share >= 1 ? "done" : `${duration(far.left)} left`;
+  const [low, high] = far.spread || [null, null], until = high === null ? "or more" : `to ${about(high)}`;
+  const spread = far.spread ? ` (${about(low)} ${until})` : "";
+  by("left").textContent = far.left === null ? "" : far.share >= 1 ? "done" : far.spread ? `about ${about(far.left)} left${spread}` : `${duration(far.left)} of path left`;
 }
 
 let due = false;
@@ -239,6 +312,8 @@ async function stayAwake() {
 document.addEventListener("visibilitychange", stayAwake);
 document.addEventListener("pointerdown", stayAwake, { once: true });
 
+themeButton(by("theme"));
+onTheme(refresh);
 for (const button of by("closer").querySelectorAll("button")) button.addEventListener("click", () => {
   state.near = button.dataset.near === "yes";
   for (const each of by("closer").querySelectorAll("button")) each.setAttribute("aria-pressed", String(each === button));

@@ -1,8 +1,14 @@
 // The scene in three dimensions on a plain canvas: cheap without a graphics card, and there in every browser.
+import Delaunator from "./delaunator.js";
 import { drawPath, moved } from "./lens.js";
+import { colours, dark, onTheme } from "./theme.js";
 
 const SIGMAS = 20; // the uncertainty is drawn so many times as large: 0.05 mm would not be seen
 const TOOL = { long: 0.55, wide: 0.06 }; // shares of what the view near the wound reaches
+const TURN = 0.12; // rad of a key
+const STEP = 0.1; // of what the view reaches, of a key
+const MAX_TILT = Math.PI / 2;
+const LONG = 4; // times the median edge of the landmarks' mesh: longer ones bridge what was not seen
 const PYRAMID = 0.2; // of a camera, as a share of what the view reaches
 
 export class SceneView {
@@ -11,6 +17,8 @@ export class SceneView {
     this.scale = root.querySelector(".scale");
     this.fit = "near";
     this.eye = { turn: -0.6, tilt: 0.75, near: 1 };
+    this.pan = [0, 0, 0]; // mm, of the middle of the view
+    this.layers = false; // whether only the present layer is drawn
     this.scene = this.middle = null;
     this.pose = null;
     this.fingers = new Map();
@@ -18,6 +26,7 @@ export class SceneView {
     this.listen(root);
   }
   see(scene) {
+    if (!scene.triangles.length && scene.surface.length > 9) scene.triangles = meshed(scene.surface);
     this.scene = scene;
     this.middle = null;
     const places = scene.cameras.map((c) => [0, 1, 2].map((r) => c.base_from_camera[r][3])), one = places[0] || [0, 0, 0];
@@ -42,9 +51,19 @@ export class SceneView {
       e.preventDefault();
       this.zoom(Math.exp(e.deltaY * 0.001));
     }, { passive: false });
+    canvas.addEventListener("contextmenu", (e) => e.preventDefault()); // the right button pulls the view along
+    canvas.addEventListener("keydown", (e) => this.key(e));
+    for (const button of root.querySelectorAll("[data-eye]")) button.addEventListener("click", () => this.top());
+    for (const button of root.querySelectorAll("[data-layers]")) button.addEventListener("click", () => {
+      this.layers = !this.layers;
+      button.setAttribute("aria-pressed", String(this.layers));
+      this.changed();
+    });
+    onTheme(() => this.changed());
     for (const button of root.querySelectorAll("[data-fit]")) button.addEventListener("click", () => {
       this.fit = button.dataset.fit;
       this.eye.near = 1;
+      this.pan = [0, 0, 0];
       for (const each of root.querySelectorAll("[data-fit]")) each.setAttribute("aria-pressed", String(each === button));
       this.changed();
     });
@@ -58,9 +77,36 @@ export class SceneView {
       const far = (p) => Math.hypot(p[0] - others[0][0], p[1] - others[0][1]) || 1;
       return this.zoom(far(before) / far([e.clientX, e.clientY]));
     }
-    this.eye.turn -= (e.clientX - before[0]) * 0.008;
-    this.eye.tilt = Math.min(Math.max(this.eye.tilt + (e.clientY - before[1]) * 0.008, 0.05), Math.PI / 2);
+    if (e.shiftKey || e.buttons & 6) return this.shift(e.clientX - before[0], e.clientY - before[1]);
+    this.turn((e.clientX - before[0]) * 0.008, (e.clientY - before[1]) * 0.008);
+  }
+  turn(right, down) {
+    this.eye.turn -= right;
+    this.eye.tilt = Math.min(Math.max(this.eye.tilt + down, 0.05), MAX_TILT);
     this.changed();
+  }
+  // pull the view by so many css px
+  shift(right, down) {
+    if (!this.px) return;
+    const { turn, tilt } = this.eye, by = window.devicePixelRatio / this.px, st = Math.sin(turn), ct = Math.cos(turn), sp = Math.sin(tilt);
+    const axes = [[ct, st, 0], [-st * sp, ct * sp, Math.cos(tilt)]];
+    this.pan = this.pan.map((v, k) => v - by * right * axes[0][k] + by * down * axes[1][k]);
+    this.changed();
+  }
+  // from above, the base's y upwards
+  top() {
+    this.eye = { turn: 0, tilt: MAX_TILT, near: this.eye.near };
+    this.pan = [0, 0, 0];
+    this.changed();
+  }
+  key(e) {
+    const step = STEP * Math.min(this.canvas.clientWidth, this.canvas.clientHeight), way = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[e.key];
+    if (way) e.shiftKey ? this.shift(step * way[0], step * way[1]) : this.turn(TURN * way[0], TURN * way[1]);
+    else if (e.key === "+" || e.key === "-") this.zoom(e.key === "+" ? 0.85 : 1 / 0.85);
+    else if (e.key === "t") this.top();
+    else return;
+    e.preventDefault();
+    e.stopPropagation();
   }
   zoom(factor) {
     this.eye.near = Math.min(Math.max(this.eye.near * factor, 0.1), 4);
@@ -69,7 +115,7 @@ export class SceneView {
   // from a place in the base, mm, to canvas px and depth
   project(w, h) {
     const { turn, tilt, near } = this.eye, ct = Math.cos(turn), st = Math.sin(turn), cp = Math.cos(tilt), sp = Math.sin(tilt);
-    const right = [ct, st, 0], up = [-st * sp, ct * sp, cp], back = [st * cp, -ct * cp, sp], m = this.middle;
+    const right = [ct, st, 0], up = [-st * sp, ct * sp, cp], back = [st * cp, -ct * cp, sp], m = this.middle.map((v, k) => v + this.pan[k]);
     const reach = this.reach[this.fit] * near, scale = (0.5 * Math.min(0.8 * w, h)) / reach, eye = 6 * reach;
     this.px = scale;
     return ([x, y, z]) => {
@@ -91,15 +137,25 @@ export class SceneView {
     g.lineJoin = g.lineCap = "round";
     if (pose) {
       this.surface(g, place, pose);
-      drawPath(g, this.scene, fraction, (x, y, z) => place(moved(pose, x, y, z)), {
-        hop: { colour: "rgb(42 111 151 / .18)", width: ratio }, next: { colour: "#2a6f97", width: 1.4 * ratio },
-        done: { colour: "#1f9d57", width: 3 * ratio },
-      });
+      const here = drawPath(g, this.scene, fraction, (x, y, z) => place(moved(pose, x, y, z)), {
+        hop: { colour: dark() ? "rgb(120 180 215 / .22)" : "rgb(42 111 151 / .18)", width: ratio }, next: { colour: colours.path, width: 1.4 * ratio },
+        done: { colour: colours.done, width: 3 * ratio },
+      }, this.layers);
+      if (here) this.mark(g, here, ratio);
       this.uncertainty(g, place, pose, view.tracking.covariance, ratio);
     }
     this.cameras(g, place, ratio);
     if (view && view.motion && view.motion.base_from_nozzle) this.tool(g, place, view.motion.base_from_nozzle);
     this.ruler(ratio);
+  }
+  // the place that is printed next, or where a run goes on
+  mark(g, [x, y], ratio) {
+    g.beginPath();
+    g.arc(x, y, 6 * ratio, 0, 2 * Math.PI);
+    for (const [colour, width] of [[colours.card, 5], [colours.ink, 2]]) {
+      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
+      g.stroke();
+    }
   }
   // the middle stays where it is, so that the wound is seen to move, unless it leaves
   follow(pose) {
@@ -133,7 +189,7 @@ export class SceneView {
     for (const [, a, b, c] of faces) {
       const u = at[b].map((v, k) => v - at[a][k]), v = at[c].map((t, k) => t - at[a][k]);
       const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-      const lit = 0.72 + 0.28 * Math.abs((0.35 * n[0] - 0.25 * n[1] + 0.9 * n[2]) / (Math.hypot(...n) || 1));
+      const lit = (dark() ? 0.5 : 0.72) + 0.28 * Math.abs((0.35 * n[0] - 0.25 * n[1] + 0.9 * n[2]) / (Math.hypot(...n) || 1));
       g.fillStyle = g.strokeStyle = `rgb(${(240 * lit) | 0} ${(212 * lit) | 0} ${(198 * lit) | 0})`;
       g.lineWidth = 1; // hides the seams between neighbours
       g.beginPath();
@@ -170,7 +226,7 @@ export class SceneView {
       const long = PYRAMID * this.reach[this.fit];
       const corner = (x, y) => place(moved(t, (long * x * w) / (2 * f), (long * y * h) / (2 * f), long));
       const tip = place(moved(t, 0, 0, 0)), rim = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
-      g.strokeStyle = g.fillStyle = "#4f5a66";
+      g.strokeStyle = g.fillStyle = colours.soft;
       g.lineWidth = 1.5 * ratio;
       g.beginPath();
       for (const p of rim) {
@@ -211,6 +267,23 @@ export class SceneView {
     this.scale.firstElementChild.style.width = `${((mm * this.px) / ratio).toFixed(1)}px`;
     this.scale.lastElementChild.textContent = `${mm} mm`;
   }
+}
+
+// triangles over landmarks, seen along the direction in which they spread least; none over gaps
+function meshed(points) {
+  const count = points.length / 3, mean = [0, 1, 2].map((k) => sum(count, (i) => points[3 * i + k]) / count), off = (i, k) => points[3 * i + k] - mean[k];
+  const spread = [0, 1, 2].map((k) => sum(count, (i) => off(i, k) ** 2)), flat = spread.indexOf(Math.min(...spread)), [a, b] = [0, 1, 2].filter((k) => k !== flat);
+  const made = new Delaunator(Float64Array.from({ length: 2 * count }, (_, i) => points[3 * (i >> 1) + (i & 1 ? b : a)])).triangles;
+  const edge = (i, j) => Math.hypot(...[0, 1, 2].map((k) => points[3 * i + k] - points[3 * j + k]));
+  const longest = [];
+  for (let i = 0; i < made.length; i += 3) longest.push(Math.max(edge(made[i], made[i + 1]), edge(made[i + 1], made[i + 2]), edge(made[i + 2], made[i])));
+  const most = LONG * [...longest].sort((p, q) => p - q)[longest.length >> 1];
+  return Array.from(made).filter((_, i) => longest[Math.floor(i / 3)] <= most);
+}
+function sum(count, value) {
+  let total = 0;
+  for (let i = 0; i < count; i++) total += value(i);
+  return total;
 }
 
 // lower triangle of a covariance (3, 3); null where it is none

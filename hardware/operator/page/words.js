@@ -5,7 +5,7 @@ export const STAGES = {
   find: { word: "Looking", tone: "wait", say: "The wound is being looked for." },
   confirm: { word: "Confirm", tone: "wait", say: "Does the path lie where it should in every picture?" },
   ready: { word: "Ready", tone: "wait", say: "Ready to print. The arm waits." },
-  approach: { word: "Approach", tone: "good", say: "The nozzle goes to the wound." },
+  approach: { word: "Approach", tone: "good", say: "The nozzle goes to the wound." }, // unless the nozzle does something else: DOES
   print: { word: "Printing", tone: "good", say: "The path is being printed." },
   paused: { word: "Paused", tone: "hold", say: "Paused. The arm stands and can go on." },
   stopped: { word: "Stopped", tone: "bad", say: "Stopped. Nothing is sent to the arm." },
@@ -14,6 +14,8 @@ export const STAGES = {
   ended: { word: "Finished", tone: "wait", say: "The run was ended. The arm is at rest." },
   failed: { word: "Failed", tone: "bad", say: "The run cannot go on. The arm is at rest." },
 };
+export const OVER = ["done", "ended", "failed"]; // stages after which nothing happens
+export const DOES = ["approach", "print", "homing"]; // stages in which the nozzle's own activity is the news
 export const TRACKING = {
   INITIALISING: { word: "Starting", tone: "hold" },
   TRACKING: { word: "Good", tone: "good" },
@@ -31,10 +33,11 @@ export const ACTIVITIES = {
   homing: { word: "Going home", tone: "good" },
 };
 export const WISHES = {
-  confirm: "Yes, it lies right", move: "Move", outline: "Use this outline", start: "Start", resume: "Resume", pause: "Pause", again: "Again", home: "Home",
-  end: "Finish", stop: "Stop",
+  confirm: "Yes, it lies right", move: "Move", outline: "Use this outline", again: "Look again", start: "Start", pause: "Pause", lift: "Lift",
+  resume: "Resume", stop: "Stop", home: "Home", end: "Finish",
 };
-export const AGAIN = { check: "Check again", find: "Look again", confirm: "No, look again" };
+export const KEYS = { p: "pause", r: "resume", l: "lift", h: "home", y: "confirm", s: "start", a: "again", q: "end" }; // the terminal's
+export const AGAIN = { check: "Check again", confirm: "No, look again" };
 export const VERDICTS = { pass: "✓ good", warn: "! look", fail: "✗ mend", busy: "… busy" };
 
 export function figure(value, digits) {
@@ -47,7 +50,12 @@ export function milliseconds(seconds) {
 export function duration(seconds) {
   const whole = Math.max(0, Math.round(seconds)), h = Math.floor(whole / 3600), m = Math.floor(whole / 60) % 60, s = whole % 60;
   if (h) return `${h} h ${m} min`;
-  return m ? `${m} min ${s} s` : `${s} s`;
+  return m ? `${m} min${s ? ` ${s} s` : ""}` : `${s} s`;
+}
+/** Seconds about which little is known, to few digits. */
+export function about(seconds) {
+  const step = seconds < 60 ? 5 : seconds < 600 ? 10 : 60;
+  return duration(Math.max(step * Math.round(seconds / step), step));
 }
 export function upper(words) {
   return words ? words[0].toUpperCase() + words.slice(1) : "";
