@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import importlib.util
 import itertools
 import json
 import shutil
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import aiohttp
+import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = (
@@ -162,3 +164,22 @@ class Page:
 
     def close(self) -> None:
         self._browser.tell("Target.closeTarget", targetId=self._target)
+
+
+def axe_source() -> str:
+    """axe-core's script, as a package of the extra [dev] brings it; skips without."""
+    found = importlib.util.find_spec("axe_core_python")
+    if found is None or found.origin is None:
+        pytest.skip("axe-core-python is not installed")
+    return (Path(found.origin).parent / "axe.min.js").read_text(encoding="utf-8")
+
+
+def axe_findings(page: Page) -> list[str]:
+    """What axe-core finds to be serious or critical on a page that is open."""
+    page.js(axe_source() + ";0")
+    found = page.js(
+        """axe.run(document, { resultTypes: ["violations"] }).then((r) => r.violations
+        .filter((v) => ["serious", "critical"].includes(v.impact))
+        .flatMap((v) => v.nodes.map((n) => `${v.id}: ${n.target.join(" ")}: ${n.failureSummary}`)))"""
+    )
+    return list(found)

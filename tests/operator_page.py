@@ -30,7 +30,9 @@ from hardware.operator.view import (
     TrackingView,
     Wish,
 )
+from tests.browser import Browser, Page
 
+LIVE = 'document.body.dataset.news === "live"'
 OFFERED = tuple(wish for wish in Wish if wish is not Wish.STOP)
 
 
@@ -38,7 +40,7 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: RunStage = RunStage.PRIN
     """A view with something in every place."""
     pose = np.eye(4)
     tracking = TrackingView(TrackState.TRACKING, "three cameras agree", 0.018, 0.052, pose, np.diag([1e-3] * 3), 182)
-    motion = MotionView(Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0)
+    motion = MotionView(Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0, error_age=0.0)
     made = OperatorView(
         stamp,
         turn,
@@ -50,7 +52,7 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: RunStage = RunStage.PRIN
         ),
         tracking=tracking,
         motion=motion,
-        progress=ProgressView(1203.4, 3420, 0.352, 754.0, 0.87, 3, 12),
+        progress=ProgressView(1203.4, 3420, 0.352, 754.0, (690.0, 850.0), 0.87, 3, 12),
         latency=LatencyView(0.0142, 0.0271, 0.035),
         cameras=tuple(CameraView(f"camera{k}", CheckVerdict.PASS, 29.9, 60) for k in range(3)),
     )
@@ -60,8 +62,8 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: RunStage = RunStage.PRIN
 class Served:
     """The page being served. address: to open. It can be ended and begun again on the same port, as its process is."""
 
-    def __init__(self, limits: WindowLimits | None = None) -> None:
-        self.link, self.settings = OperatorLink(), OperatorSettings()
+    def __init__(self, limits: WindowLimits | None = None, page: str = "index.html") -> None:
+        self.link, self.settings = OperatorLink(), OperatorSettings(page=page)
         self._limits = limits or WindowLimits(stale=30.0, patience=30.0)
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.host = f"127.0.0.1:{self.listener.getsockname()[1]}"
@@ -103,3 +105,35 @@ def served(limits: WindowLimits | None = None) -> Iterator[Served]:
     finally:
         made.end()
         made.listener.close()
+
+
+class Run:
+    """A run whose views are put by hand, each newer than the last; `page` is a window of it."""
+
+    def __init__(self, browser: Browser, limits: WindowLimits | None = None) -> None:
+        self.served, self._browser, self._stamp = Served(limits), browser, 0.0
+        self.view = full_view()
+        self.pages: list[Page] = []
+
+    def show(self, **changed: object) -> OperatorView:
+        """Put the view, changed, one turn on if the turn was not told."""
+        self._stamp += 1.0
+        turn = changed.pop("turn", self.view.turn + 1)
+        self.view = replace(self.view, stamp=self._stamp, turn=turn, **changed)
+        self.served.put(self.view)
+        for page in self.pages:
+            page.until(f"{LIVE} && document.body.dataset.turn === '{turn}'")
+        return self.view
+
+    def open(self, size: tuple[int, int] = (1024, 768)) -> Page:
+        """A window that shows the newest view."""
+        page = self._browser.page(self.served.address, size)
+        page.until(f"{LIVE} && document.body.dataset.turn === '{self.view.turn}'")
+        self.pages.append(page)
+        return page
+
+    def close(self) -> None:
+        for page in self.pages:
+            page.close()
+        self.served.end()
+        self.served.listener.close()

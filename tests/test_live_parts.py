@@ -334,6 +334,7 @@ def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_
     for _ in range(3):
         record.touch()
         again = prepare_resumed(record, {})
+        assert again.notes[0].startswith("goes on at ") and f"where {record.name} stopped" in again.notes[0]
         assert again.task.start == 2.5 and again.placement is not None and again.placement.map == rig
         assert (again.task.profile.arm.arm_from_base == se3.inverse(place)).all() and not again.task.place
         record = again.files.record

@@ -221,7 +221,7 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Sta
         run.press("r")
         at = run.wait_for(r"\nprint\n", at)
         run.press("q")
-        assert run.end() == 1 and "ended by the operator" in run.said
+        assert run.end() == 1 and "finished by the operator" in run.said
     assert not open_session(record).damage
 
 
@@ -315,7 +315,7 @@ def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browse
     ended = press(page, "end", '["ended"]', sure=True)
     page.until('document.body.dataset.news === "gone"', timeout=60)
     assert page.text("#chip") == "Finished" and "by the operator" in page.text("#reason")
-    assert run.end() == 1 and "\nended by the operator\n" in run.said
+    assert run.end() == 1 and "\nfinished by the operator\n" in run.said
     record = tmp_path / "run.mcap"
     closed(record)
     moves = moves_sent(record)

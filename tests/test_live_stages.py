@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path as File
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.live.checklist import PrintTask, run_checks
+from hardware.live.checklist import FIRST_PICTURE_TIME, PrintTask, run_checks
+from hardware.live.outcome import RunOutcome, RunStatistics
+from hardware.live.prepared import Prepared, RunFiles
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
+from hardware.live.settings import LiveSettings
 from hardware.live.state_machine import RunStateMachine
-from hardware.live.view import stage_line
+from hardware.live.view import ViewBuilder, stage_line
 from hardware.motion.loop import Order, Tick
 from hardware.motion.material import MaterialStatus
 from hardware.operator.shared_state import OperatorRequest, Polygons
@@ -28,10 +32,12 @@ from hardware.operator.view import (
     RunStage,
     Wish,
 )
+from hardware.process.progress import TimeLeft
 from planning.command import Hold
-from planning.path import PrintPhase, PrintProgress
+from planning.path import PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
 from tests.moving import raster
+from tests.session_files import rig
 
 PROFILE = ArmProfile()
 CERTAIN = PathPlacement(np.eye(4), PlacedBy.SCAN, "found", True, True, 0.05, 0.001)
@@ -589,3 +595,126 @@ def test_a_tracker_that_looks_for_a_scan_for_long_is_no_camera_that_fails(state:
         run.orders += run.conductor(run.now, run.seen, [])
         run.conductor.stage = run.conductor.stage if run.conductor.ended else RunStage.CHECK
     assert bool(run.conductor.ended) is ends
+
+
+def test_while_the_first_pictures_are_waited_for_nobody_is_told_to_plug_in_cameras() -> None:
+    task, reports = PrintTask(raster(), PROFILE, stands_home=True), RunReports(TrackingReport(1.0, ("a", "b")))
+    early = run_checks(reports, task, None, 5.0, 5.0)[0]
+    late = run_checks(reports, task, None, 50.0, FIRST_PICTURE_TIME + 1)[0]
+    assert early.verdict is late.verdict is CheckVerdict.BUSY and not early.remedy and "plug in" in late.remedy
+    assert "first pictures, for 5 s" in early.found
+
+
+@pytest.mark.parametrize(("virtual", "words"), [(True, "a virtual arm begins"), (False, "by the operator's word")])
+def test_a_row_says_who_said_so(virtual: bool, words: str) -> None:
+    run = Staged()
+    run.look()
+    task = replace(run.conductor.task, stands_home=True, virtual=virtual)
+    checks = {check.name: check for check in run_checks(run.seen, task, None, run.now)}
+    assert words in checks["arm"].found
+
+
+def test_after_a_stop_the_nozzle_is_lifted_on_a_word_and_waits_as_in_a_pause() -> None:
+    run = Staged().to_print()
+    assert Wish.LIFT not in run.conductor.offers
+    run.look(Wish.STOP)
+    run.arm = ArmState.STOPPED
+    run.look()
+    assert Wish.LIFT in run.conductor.offers
+    run.orders.clear()
+    assert run.look(Wish.LIFT) is RunStage.PAUSED
+    assert run.orders == [PauseOrder.PAUSE, Order.ARM]
+    run.stays(RunStage.PAUSED, 5)  # the arm was not seen to be armed yet, and is asked again
+    run.arm = ArmState.ARMED
+    run.stays(RunStage.PAUSED, 20)
+    run.orders.clear()
+    assert run.look(Wish.RESUME) is RunStage.PRINT
+    assert run.orders == [PauseOrder.RESUME]
+
+
+def test_an_arm_at_home_has_nothing_to_be_lifted_off() -> None:
+    run = Staged().to_print()
+    run.look(Wish.HOME)
+    run.look()
+    run.arm = ArmState.DISARMED
+    assert run.look() is RunStage.STOPPED and Wish.LIFT not in run.conductor.offers
+
+
+def views_of(run: Staged, start: float = 0.0) -> ViewBuilder:
+    task = replace(run.conductor.task, start=start)
+    files = RunFiles(File("run.mcap"))
+    return ViewBuilder(Prepared(LiveSettings(), File("s"), rig(), False, None, task, None, None, files, ()))
+
+
+def test_the_view_says_how_far_the_surface_moves_under_a_nozzle_that_was_stopped() -> None:
+    run, statistics = Staged().to_print(), RunStatistics()
+    build = views_of(run)
+    assert build(run.now, run.conductor, run.seen, statistics).motion.rest is None
+    run.look(Wish.STOP)
+    run.arm = ArmState.STOPPED
+    turned = se3.make(se3.exp_rotation(np.array([0.3, -0.2, 0.1])), np.zeros(3))
+    for k in range(150):
+        breath = se3.make(np.eye(3), np.array([0.0, 0.0, 2.0 * np.sin(2 * np.pi * 0.1 * k / 4)]))
+        run.pose = replace(SURFACE, base_from_surface=ARM_FROM_BENCH @ breath @ turned)
+        run.look()
+        rest = build(run.now, run.conductor, run.seen, statistics).motion.rest
+    assert rest.slip == pytest.approx(4.0, abs=0.05) and 9 < rest.seconds <= 10.1
+    run.look(Wish.RESUME)
+    assert build(run.now, run.conductor, run.seen, statistics).motion.rest is None
+
+
+def test_a_run_that_resumes_shows_its_place_before_it_moves() -> None:
+    run = Staged(start=2.5)
+    run.look(seconds=0.0)
+    progress = views_of(run, 2.5)(run.now, run.conductor, run.seen, RunStatistics()).progress
+    assert progress is not None and progress.begun == progress.fraction == 2.5 and 0 < progress.share < 1
+    assert views_of(Staged())(run.now, run.conductor, run.seen, RunStatistics()).progress is None
+
+
+@pytest.mark.parametrize("rate", [1.0, 0.6, 0.25])
+def test_the_time_left_is_what_the_print_takes_by_how_it_got_on_so_far(rate: float) -> None:
+    """Prints of 300 s, held at random: the time left is right on average, and its spread holds 9 of 10."""
+    ratios, inside = [], []
+    for seed in range(60):
+        rng, left, done, now, holds = np.random.default_rng(seed), TimeLeft(), 0.0, 0.0, 0.0
+        told = None
+        while done < 300.0:
+            if told is None and done >= 120.0:
+                told = now, left(300.0 - done)
+            left.add(now, 300.0 - done, True)
+            now += 0.2
+            if holds > 0:
+                holds -= 0.2
+            elif rate < 1 and rng.random() < 0.1 * (1 - rate):
+                holds = rng.exponential(2.0)
+            done += 0.2 if holds <= 0 else 0.0
+        assert told is not None
+        then, (expected, spread) = told
+        assert spread is not None
+        ratios.append((now - then) / expected)
+        inside.append(spread[0] - 1.0 <= now - then <= spread[1] + 1.0)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
+    assert np.mean(inside) >= 0.8
+
+
+def test_a_pause_does_not_count_against_the_time_left_and_little_is_said_of_few_blocks() -> None:
+    left = TimeLeft()
+    for k in range(100):
+        left.add(0.2 * k, 300 - 0.2 * k, True)
+    assert left(280.0)[0] == 280.0 and left(280.0)[1] is None
+    left.add(20.0, 280.0, False)
+    for k in range(200):
+        left.add(500.0 + 0.2 * k, 280 - 0.2 * k, True)
+    assert left(240.0)[0] == pytest.approx(240.0, rel=0.01)
+
+
+def test_what_a_run_came_to_counts_what_runs_before_it_printed() -> None:
+    run = Staged(start=2.5)
+    prepared, seen = views_of(run, 2.5).prepared, run.seen
+    for fraction, printed in ((float("nan"), 2.5), (4.0, 4.0)):
+        outcome = RunOutcome(prepared, run.conductor, RunStatistics(), seen, 0, fraction)
+        result = outcome.result()
+        ways = np.concatenate([[0.0], np.cumsum(way_lengths(raster().surface_from_nozzle))])
+        assert result.fraction == printed
+        assert result.printed == pytest.approx(np.interp(printed, np.arange(len(ways)), ways) / ways[-1])
+        assert result.begun == 2.5 and result.again == "stillbed live --resume run.mcap" and not result.report

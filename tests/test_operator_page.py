@@ -15,45 +15,19 @@ from estimation.rig import Camera, distort, pixels_from_points
 from hardware.files.images import encode
 from hardware.operator.settings import WindowLimits
 from hardware.operator.shared_state import CameraPicture, OperatorRequest, PagePictures, PageScene
-from hardware.operator.view import Activity, CheckVerdict, OperatorView, RequestAnswer, RunStage, Wish
+from hardware.operator.view import (
+    Activity,
+    CheckVerdict,
+    LogLine,
+    RequestAnswer,
+    RunStage,
+    Wish,
+)
 from tests.browser import Browser, Page
-from tests.operator_page import OFFERED, Served, full_view
+from tests.operator_page import LIVE, OFFERED, Run
 
 SIZES = [(1024, 768), (768, 1024), (1440, 900)]
-SURE = (Wish.START, Wish.HOME, Wish.END)
-LIVE = 'document.body.dataset.news === "live"'
-
-
-class Run:
-    """A run whose views are put by hand, each newer than the last; `page` is a window of it."""
-
-    def __init__(self, browser: Browser, limits: WindowLimits | None = None) -> None:
-        self.served, self._browser, self._stamp = Served(limits), browser, 0.0
-        self.view = full_view()
-        self.pages: list[Page] = []
-
-    def show(self, **changed: object) -> OperatorView:
-        """Put the view, changed, one turn on if the turn was not told."""
-        self._stamp += 1.0
-        turn = changed.pop("turn", self.view.turn + 1)
-        self.view = replace(self.view, stamp=self._stamp, turn=turn, **changed)
-        self.served.put(self.view)
-        for page in self.pages:
-            page.until(f"{LIVE} && document.body.dataset.turn === '{turn}'")
-        return self.view
-
-    def open(self, size: tuple[int, int] = SIZES[0]) -> Page:
-        """A window that shows the newest view."""
-        page = self._browser.page(self.served.address, size)
-        page.until(f"{LIVE} && document.body.dataset.turn === '{self.view.turn}'")
-        self.pages.append(page)
-        return page
-
-    def close(self) -> None:
-        for page in self.pages:
-            page.close()
-        self.served.end()
-        self.served.listener.close()
+SURE = (Wish.START, Wish.RESUME, Wish.LIFT, Wish.HOME, Wish.END)
 
 
 @pytest.fixture
@@ -117,7 +91,7 @@ def test_a_question_whether_one_is_sure_is_dropped_in_words_when_the_run_has_cha
     page.until('!document.getElementById("sure").hidden')
     run.show(stage=RunStage.STOPPED)
     page.until('document.getElementById("sure").hidden')
-    assert page.text("#toast") == "Home was not asked: the run has changed meanwhile."
+    assert page.text("#toast") == "“Home” was not asked: the run has changed meanwhile."
     page.click('[data-wish="end"]')
     page.click("#sure-no")
     page.until('document.getElementById("sure").hidden')
@@ -149,6 +123,7 @@ def test_a_button_that_has_just_come_to_mean_something_else_is_not_pressed_by_a_
     settle(page)
     assert run.served.link.requests.take() == []
     page.click("#go")
+    page.click("#sure-yes")
     assert [request.wish for request in run.served.taken()] == [Wish.RESUME]
 
 
@@ -161,6 +136,7 @@ def test_a_finger_that_was_down_when_another_window_stopped_the_run_does_not_res
     other.click('[data-wish="stop"]')
     run.show(stage=RunStage.PAUSED, offers=(Wish.RESUME,))
     page.js("document.getElementById('go').click()")
+    page.click("#sure-yes")
     page.until('document.getElementById("toast").textContent.includes("changed")')
     assert [request.wish for request in run.served.taken()] == [Wish.STOP]
     assert run.served.link.requests.take() == []
@@ -174,7 +150,7 @@ def test_both_windows_show_what_became_of_a_request(run: Run) -> None:
     first.until('document.querySelector("[data-wish=pause]").classList.contains("asked")')
     run.show(stage=RunStage.PAUSED, answer=RequestAnswer(request.number, Wish.PAUSE, True), offers=(Wish.RESUME,))
     for page in (first, second):
-        page.until('document.getElementById("toast").textContent === "Pause was followed."')
+        page.until('document.getElementById("toast").textContent === "“Pause” was followed."')
         assert page.text("#chip") == "Paused"
     assert not first.js('document.querySelector("[data-wish=pause]").classList.contains("asked")')
 
@@ -201,12 +177,13 @@ def test_a_reloaded_window_shows_the_same_and_knows_the_last_minute(run: Run) ->
 def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
     page = run.open((1440, 900))
     motion = replace(run.view.motion, activity=Activity.HOLDING, error=0.62, reason="the surface moves too fast")
-    run.show(motion=motion, notes=("dry run",), events=("one", "camera1 was late", "it is back"))
+    log = tuple(LogLine(k, float(k), False, words) for k, words in enumerate(("camera1 was late", "it is back"), 1))
+    run.show(motion=motion, notes=("dry run",), log=log)
     body = "".join(page.js("document.body.innerText").split())
     for words in (
         "Holding", "The surface moves too fast", "Good", "three cameras agree", "0.62 mm", "limit 0.5", "0.19 mm",
         "18 ms", "14 / 27 ms", "31 ms", "0.052 mm", "35.2 %", "checkpoint 1204 of 3420", "layer 3 of 12",
-        "12 min 34 s left", "30 Hz", "60 tracks", "dry run", "live", "6.0 mm/s", "camera1 was late", "it is back",
+        "about 13 min left", "12 min to 14 min", "30 Hz", "60 tracks", "dry run", "live", "6.0 mm/s", "it is back",
     ):  # fmt: skip
         assert words.replace(" ", "") in body, words
 

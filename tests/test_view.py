@@ -31,7 +31,7 @@ from hardware.offline.viewer import PictureReader, Playback, instant_text, open_
 from hardware.operator.settings import OperatorSettings
 from hardware.recording.recorder import Recorder
 from perception.frames import Frame
-from tests.browser import Browser
+from tests.browser import Browser, axe_findings
 from tests.moving import raster
 from tests.recorded import pose, whole_recording
 from tests.runs import breathing
@@ -162,6 +162,18 @@ def test_the_slider_moves_the_scene(address: str, browser: Browser) -> None:
     page.until("document.body.dataset.shown === '0'")
     page.key("Space", " ")
     page.until(f"document.body.dataset.playing === 'no' && document.body.dataset.shown === '{COUNT - 1}'")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_axe_finds_nothing_serious_in_the_viewer(address: str, browser: Browser, theme: str) -> None:
+    page = browser.page(address)
+    page.until('document.body.dataset.shown === "0"')
+    page.js(f"localStorage.setItem('stillbed.theme', '{theme}')")
+    page.reload()
+    page.until(f"document.body.dataset.shown === '0' && document.documentElement.dataset.theme === '{theme}'")
+    assert axe_findings(page) == []
+    page.js("localStorage.clear()")
+    page.close()
 
 
 def test_a_recording_without_tracks_has_no_surface(tmp_path: Path) -> None:

@@ -218,7 +218,9 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
     if placement is not None:
         profile = replace(profile, arm=replace(profile.arm, arm_from_base=placement.arm_from_base))
     task = replace(prepared.task, start=start, profile=profile, place=prepared.task.place and placement is None)
-    return replace(prepared, task=task)
+    share = start / max(len(path) - 1, 1)
+    goes_on = f"goes on at {share:.0%}: checkpoint {start:.2f} of {len(path) - 1}, where {record.name} stopped"
+    return replace(prepared, task=task, notes=(goes_on, *prepared.notes))
 
 
 def _prepared(

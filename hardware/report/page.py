@@ -72,6 +72,7 @@ def legend(keys: Sequence[str]) -> str:
     return f'<div class="legend">{"".join(keys)}</div>'
 
 
+NAMELESS = "chart, as the words above it say"  # for a screen reader, of a chart without a label
 MAX_LINE_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
 CURVE_SPACING = 2.0  # px between the points of a curve that is drawn
 
@@ -254,7 +255,7 @@ class Plot:
         label = escape(self.label)
         name = f'<text class="label" x="{self.left}" y="{self.top - 12}">{label}</text>'
         box = f'viewBox="0 0 {self.width} {self.height}"'
-        return f'<svg class="plot" {box} role="img" aria-label="{label}">{"".join(self._parts)}{name}</svg>'
+        return f'<svg class="plot" {box} role="img" aria-label="{label or NAMELESS}">{"".join(self._parts)}{name}</svg>'
 
     def _text(self, x: float, y: float, text: str, anchor: str) -> None:
         at = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'

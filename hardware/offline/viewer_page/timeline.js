@@ -1,6 +1,7 @@
 // Where the surface was all along: x, y and z against the first pose, the state as a ribbon, a line where one is.
+import { colours } from "./theme.js";
 
-const COLOURS = ["#2a6f97", "#b8630b", "#7a5ea8"];
+const COLOURS = ["blue", "true", "green"]; // of the theme: x, y, z
 const STATES = { TRACKING: "#4c9a6a", DEGRADED: "#e3b23c", COASTING: "#e58a5a", LOST: "#c8553d", INITIALISING: "#b4b9bf" };
 const LEFT = 44, FOOT = 40;
 
@@ -44,12 +45,12 @@ export class Timeline {
     const x = (t) => left + ((right - left) * t) / last, y = (v) => floor - ((floor - top) * (v - this.low)) / (this.high - this.low);
     g.clearRect(0, 0, w, h);
     g.font = `${13 * ratio}px system-ui, "DejaVu Sans", sans-serif`;
-    g.strokeStyle = "#e3e2dc";
+    g.strokeStyle = colours.faint;
     g.lineWidth = ratio;
     g.strokeRect(left, top, right - left, floor - top);
     const every = Math.max(1, Math.floor(stamps.length / (2 * w)));
     COLOURS.forEach((colour, axis) => {
-      g.strokeStyle = colour;
+      g.strokeStyle = colours[colour];
       g.lineWidth = 1.6 * ratio;
       g.beginPath();
       let pen = false;
@@ -63,17 +64,17 @@ export class Timeline {
     for (let i = 0; i < stamps.length; ) {
       let end = i;
       while (end < stamps.length && states[end] === states[i]) end++;
-      g.fillStyle = STATES[states[i]] || "#e3e2dc";
+      g.fillStyle = STATES[states[i]] || colours.faint;
       g.fillRect(x(stamps[i]), floor + 3 * ratio, Math.max(x(stamps[Math.min(end, stamps.length - 1)]) - x(stamps[i]), ratio), 7 * ratio);
       i = end;
     }
-    g.strokeStyle = "#1c2430";
+    g.strokeStyle = colours.ink;
     g.lineWidth = 2 * ratio;
     g.beginPath();
     g.moveTo(x(stamps[k]), top);
     g.lineTo(x(stamps[k]), floor + 11 * ratio);
     g.stroke();
-    g.fillStyle = "#4f5a66";
+    g.fillStyle = colours.soft;
     g.textAlign = "right";
     g.fillText(this.high.toFixed(1), left - 5 * ratio, top + 11 * ratio);
     g.fillText(this.low.toFixed(1).replace(/^-0\.0$/, "0.0"), left - 5 * ratio, floor);
@@ -81,7 +82,7 @@ export class Timeline {
     g.textAlign = "left";
     let at = left;
     for (const [words, colour] of [["x", COLOURS[0]], ["y", COLOURS[1]], ["z in mm, the base's axes", COLOURS[2]]]) {
-      g.fillStyle = colour;
+      g.fillStyle = colours[colour];
       g.fillText(words, at, h - 8 * ratio);
       at += g.measureText(words).width + 12 * ratio;
     }

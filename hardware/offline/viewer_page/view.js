@@ -2,6 +2,7 @@
 import { inverse, moved, product } from "./lens.js";
 import { Panes } from "./panes.js";
 import { SceneView } from "./scene.js";
+import { onTheme, themeButton } from "./theme.js";
 import { Timeline } from "./timeline.js";
 import { figure, TRACKING } from "./words.js";
 
@@ -108,7 +109,7 @@ async function fetchNewest() {
 function choose(name) {
   state.chosen = state.chosen === name ? null : name;
   document.body.dataset.large = state.chosen ? "yes" : "no";
-  for (const [each, made] of panes) made.root.classList.toggle("chosen", each === state.chosen);
+  for (const [each, made] of panes) made.choose(each === state.chosen);
   refresh();
 }
 
@@ -193,7 +194,7 @@ by("time").addEventListener("input", () => {
   go(Number(by("time").value));
 });
 document.addEventListener("keydown", (e) => {
-  if (e.target.tagName === "SELECT") return;
+  if (e.target.tagName === "SELECT" || (e.target.tagName === "CANVAS" && e.key !== " ")) return; // the scene has keys of its own
   const act = { " ": toggle, ArrowLeft: () => step(e.shiftKey ? -10 : -1), ArrowRight: () => step(e.shiftKey ? 10 : 1), Home: () => step(-Infinity), End: () => step(Infinity) }[e.key];
   if (!act) return;
   e.preventDefault();
@@ -204,5 +205,7 @@ timeline.chosen = (k) => {
   go(k);
 };
 space.changed = refresh;
+themeButton(by("theme"));
+onTheme(refresh);
 window.addEventListener("resize", refresh);
 begin().catch((error) => alarm(error.message));

@@ -13,6 +13,7 @@ export class CameraPane {
     this.root.dataset.camera = name;
     this.canvas = document.createElement("canvas");
     this.canvas.tabIndex = 0;
+    this.canvas.ariaLabel = `${name}, live picture`;
     this.canvas.setAttribute("role", "button"); // it makes its picture large; what is moved by pulling has keys of its own
     this.canvas.addEventListener("keydown", (event) => {
       if (event.key !== "Enter") return;

@@ -1,4 +1,4 @@
-/*! Delaunator 5.1.0, https://github.com/mapbox/delaunator, as published, and exported as a module.
+/*! Delaunator 5.1.0, github.com/mapbox/delaunator, as published, and exported as a module.
 
 ISC License
 

@@ -2,6 +2,7 @@
 import { Drawing } from "./draw.js";
 import { Panes } from "./panes.js";
 import { Line } from "./socket.js";
+import { themeButton } from "./theme.js";
 import { duration, toast, upper } from "./words.js";
 
 const STAGES = {
@@ -66,3 +67,4 @@ setInterval(() => {
   for (const each of panes.values()) each.tick();
   show();
 }, 250);
+themeButton(by("theme"));

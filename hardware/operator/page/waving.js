@@ -1,6 +1,7 @@
 // The page beside a calibration: live pictures with the corners that were found, what each camera still needs, the hint.
 import { unpacked } from "./panes.js";
 import { Line } from "./socket.js";
+import { themeButton } from "./theme.js";
 import { duration, toast, upper } from "./words.js";
 
 const STAGES = {
@@ -190,3 +191,4 @@ setInterval(() => {
   for (const each of boards.values()) each.tick();
   show();
 }, 250);
+themeButton(by("theme"));
