@@ -5,7 +5,11 @@ from __future__ import annotations
 import itertools
 import os
 import pickle
+import signal
+import subprocess
+import sys
 import threading
+import time
 from ctypes import c_double
 from dataclasses import replace
 from multiprocessing import Pipe
@@ -21,6 +25,7 @@ from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
+from hardware.cli.main import main
 from hardware.files.path_file import ProgressWriter, read_progress, write_path, write_progress_durably
 from hardware.files.ply_file import write_ply
 from hardware.live.checklist import PrintTask, place_path, raised_path
@@ -35,6 +40,7 @@ from hardware.live.prepared import (
     read_placement,
     write_placement,
 )
+from hardware.live.prerender import cached
 from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
 from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry
@@ -568,3 +574,58 @@ def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_a
         prepare(LiveSettings(**given), "here", True, asked)  # type: ignore[arg-type]
     assert all(word in str(caught.value) for word in words)
     assert not (tmp_path / "cache" / "stillbed").exists() and files.progress.read_text() == "an earlier place"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_a_scene_is_rendered_ends_within_a_second_and_leaves_nothing(
+    tmp_path: Path, number: int
+) -> None:
+    cache = tmp_path / "stillbed"
+    (cache / "old-1.part-999999999").mkdir(parents=True)  # left by one that was killed
+    scenario = Path(__file__).parents[1] / "data" / "live" / "small.toml"
+    command = [sys.executable, "-m", "hardware.cli.main", "live", "--simulated", str(scenario), "--no-page"]
+    run = subprocess.Popen(
+        [*command, "--record", str(tmp_path / "run.mcap"), "--yes"],
+        env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)}, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    end = time.monotonic() + 60
+    while not (halves := [half for half in cache.glob("*.part-*") if (half / "session.mcap").exists()]):
+        assert run.poll() is None and time.monotonic() < end
+        time.sleep(0.02)
+    child = int(halves[0].name.rpartition("-")[2])
+    (os.killpg if number == signal.SIGINT else os.kill)(run.pid, number)  # Ctrl-C reaches all of them
+    begun = time.monotonic()
+    _, said = run.communicate(timeout=20)
+    assert time.monotonic() - begun < 1.0
+    assert not list(cache.glob("*")) and not Path(f"/proc/{child}").exists()
+    assert "Traceback" not in said and run.returncode == 130
+
+
+def test_a_scene_is_found_again_by_what_is_in_its_files(tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_text("a")
+    (tmp_path / "rig.toml").write_text("b")
+    file = tmp_path / "x.toml"
+    file.write_text('path = "path.csv"\n[rig]\nfile = "rig.toml"\n')
+    first = cached(file, tmp_path).folder
+    assert cached(file, tmp_path).folder == first != cached(file, tmp_path, 2.0).folder
+    (tmp_path / "rig.toml").write_text("c")
+    second = cached(file, tmp_path).folder
+    (tmp_path / "rig.toml").write_text("")
+    (tmp_path / "path.csv").write_text("ac")  # the same letters, of another file
+    assert len({first, second, cached(file, tmp_path).folder}) == 3
+
+
+def test_the_cache_tells_its_size_and_is_cleared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    scene = tmp_path / "stillbed" / "small-1"
+    scene.mkdir(parents=True)
+    (scene / "scenario").write_text("/x/small.toml")
+    (scene / "session.mcap").write_bytes(bytes(2_500_000))
+    assert main(["cache"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "   2.5 MB  small-1: /x/small.toml", f"1 scene in {tmp_path / 'stillbed'}: 2.5 MB",
+    ]  # fmt: skip
+    assert main(["cache", "--clear"]) == 0 and not scene.exists()
+    assert capsys.readouterr().out == f"1 scene removed from {tmp_path / 'stillbed'}: 2.5 MB\n"

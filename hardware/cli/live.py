@@ -67,6 +67,7 @@ def add_live(commands: Commands) -> None:
     add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
     add("--no-page", action="store_true", help="without it")
+    add("--open", action="store_true", help="open it in a browser")
     add("--page-address", metavar="ADDR", help="serve other machines too, at this address, by TLS alone")
     add("--page-port", type=int, metavar="N", help="by default any that is free")
     add("--page-cert", dest="page_certificate", type=Path, metavar="PEM", help="certificate for that")
@@ -152,7 +153,7 @@ def _run_live(a: argparse.Namespace) -> int:
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
     else:
         prepared = prepare_resumed(a.resume, flags, faults)
-    with Console() as console:
+    with Console(a.open) as console:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)
     return outcome.code

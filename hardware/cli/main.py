@@ -140,6 +140,35 @@ def _verdict_text(verdicts: list[CheckVerdict], broken: bool) -> str:
     return "all works; try: make demo, or stillbed init FOLDER"
 
 
+def add_cache(commands: Commands) -> None:
+    """Add the sub-command `cache`."""
+    add = commands.add(
+        "cache",
+        _run_cache,
+        "how much rendered scenes take, and take them away",
+        "Tell where the scenes lie that `stillbed live --simulated` has rendered, and how large each is. They are\n"
+        "found again by what is in their files, and rendered anew where they are gone.",
+        "stillbed cache",
+        "stillbed cache --clear",
+    ).add_argument
+    add("--clear", action="store_true", help="remove them all")
+
+
+def _run_cache(a: argparse.Namespace) -> None:
+    from hardware.process.progress import cache_folder, clear_cache, count_text, folder_size, size_text
+
+    cache = cache_folder()
+    if a.clear:
+        count, size = clear_cache(cache)
+        print(f"{count_text(count, 'scene')} removed from {cache}: {size_text(size)}")
+        return
+    scenes = sorted(folder for folder in cache.glob("*") if (folder / "scenario").is_file())
+    for folder in scenes:
+        scenario = (folder / "scenario").read_text(encoding="utf-8")
+        print(f"{size_text(folder_size(folder)):>9}  {folder.name}: {scenario}")
+    print(f"{count_text(len(scenes), 'scene')} in {cache}: {size_text(sum(map(folder_size, scenes)))}")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command; returns its exit code.
 
@@ -183,7 +212,7 @@ def parser() -> Parser:
     for add in (
         _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_plan, add_live, add_record,
         add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras, add_import, add_export,
-        add_train, add_bench, add_doctor,
+        add_train, add_bench, add_doctor, add_cache,
     ):  # fmt: skip
         add(commands)
     return top
@@ -218,6 +247,7 @@ def _add_simulate(commands: Commands) -> None:
     add("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
     add_fault(add)
     add("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
+    add("--open", action="store_true", help="open the page that shows the run in a browser")
     add("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
@@ -227,7 +257,7 @@ def _simulate(a: argparse.Namespace) -> int:
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)
-    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force)
+    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force, a.open)
     outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
     return 0 if outcome.met else FAILED

@@ -238,9 +238,10 @@ def add_view(commands: Commands) -> None:
     add("--poses", metavar="FILE", help="other poses than the recording's, as stillbed compare reads")
     add("--path", type=Path, metavar="PATH.csv", help="the path, where the recording has none")
     add("--port", type=int, default=0, metavar="N", help="of 127.0.0.1; default: whichever is free")
+    add("--open", action="store_true", help="open it in a browser")
 
 
 def _view(a: argparse.Namespace) -> None:
     from hardware.offline.viewer import run_view
 
-    run_view(a.session, a.poses, a.path, a.port)
+    run_view(a.session, a.poses, a.path, a.port, a.open)

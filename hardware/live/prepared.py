@@ -49,8 +49,8 @@ from hardware.live.settings import (
 )
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
-from hardware.process.progress import cache_error, cache_folder
-from hardware.process.system import SPAWN
+from hardware.process.progress import UNFINISHED, cache_error, cache_folder
+from hardware.process.system import SPAWN, blocked_sigint
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
 from planning.material import Outlets, with_offsets
@@ -342,14 +342,18 @@ def _rendered(scenario: File, check_rig: Callable[[Rig], None]) -> File:
     """
     answer, theirs = SPAWN.Pipe(duplex=False)
     process = SPAWN.Process(target=_render, args=(scenario, check_rig, theirs))
-    process.start()
+    with blocked_sigint():  # it is ended from here, and says nothing of its own
+        process.start()
     theirs.close()
     try:
         folder, wrong = answer.recv()
     except EOFError:
         raise StillbedError(f"{scenario}: rendering ended before it was done") from None
-    finally:
+    finally:  # Ctrl-C and SIGTERM come here as well, and wait for nothing
+        process.kill()
         process.join()
+        for half in cache_folder().glob(f"*{UNFINISHED}{process.pid}"):
+            shutil.rmtree(half, ignore_errors=True)
     if wrong:
         raise StillbedError(wrong)
     return File(folder)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +25,7 @@ from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.path_file import read_path, write_path
 from hardware.process.clock import WallClock
 from hardware.process.faults import FaultPart
-from hardware.process.progress import Progress, cache_error
+from hardware.process.progress import UNFINISHED, Progress, cache_error, clear_unfinished, folder_size, size_text
 from hardware.recording.recorder import Recorder
 from hardware.simulator.arm.settings import write_virtual_arm
 from hardware.simulator.cameras import Shot
@@ -50,24 +52,31 @@ class PrerenderedSession:
 
 
 def cached(file: Path, cache: Path, seconds: float | None = None) -> PrerenderedSession:
-    """Where the session of a scenario lies or will lie; another text of scenario or path is another folder.
+    """Where the session of a scenario lies or will lie; another text of it, or of what it names, is another folder.
 
     seconds: of its beginning, None for all of it.
     """
-    text = file.read_bytes() + _path_bytes(file) + CACHE_VERSION.encode()
+    text = file.read_bytes() + _named_bytes(file) + CACHE_VERSION.encode()
     text += b"" if seconds is None else f"{seconds:g} s".encode()
     return PrerenderedSession(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
 
 
-def _path_bytes(file: Path) -> bytes:
-    """The bytes of the path that a scenario names, none where it names none that can be read."""
+def _named_bytes(file: Path) -> bytes:
+    """The bytes of the files that a scenario names: path, rig, arm, each after its length; none of a missing one."""
     import tomllib
 
     try:
-        named = str(tomllib.loads(file.read_text(encoding="utf-8"))["path"])
-        return (file.parent / named).read_bytes()
-    except (OSError, ValueError, KeyError, TypeError):
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
         return b""
+    parts = [table.get(name) for name in ("rig", "arm")]
+    named = [table.get("path"), *(part.get("file") for part in parts if isinstance(part, dict))]
+    text = b""
+    for name in named:
+        with suppress(OSError):
+            data = b"" if not isinstance(name, str) else (file.parent / name).read_bytes()
+            text += f"{len(data)} ".encode() + data
+    return text
 
 
 def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None = None) -> PrerenderedSession:
@@ -82,10 +91,11 @@ def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None =
     if others := [fault for fault in scenario.faults if fault.part is not FaultPart.ARM]:
         raise InputError(file, "faults", str(others[0]), "faults of the arm; a live run takes others as --fault")
     rendered = cached(file, cache, seconds)
-    beside = rendered.folder.with_name(f"{rendered.folder.name}.{os.getpid()}")
+    beside = rendered.folder.with_name(f"{rendered.folder.name}{UNFINISHED}{os.getpid()}")
     try:
         if (rendered.folder / "scenario").exists():
             return rendered
+        clear_unfinished(cache)
         beside.mkdir(parents=True)
     except OSError as error:
         raise cache_error(cache, error) from None
@@ -94,6 +104,7 @@ def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None =
         (beside / "scenario").write_text(str(file.resolve()), encoding="utf-8")
         shutil.rmtree(rendered.folder, ignore_errors=True)
         beside.rename(rendered.folder)
+        print(f"kept in {rendered.folder}: {size_text(folder_size(rendered.folder))}", file=sys.stderr)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return rendered

@@ -249,7 +249,7 @@ class LiveRun:
         stack.callback(self._page.close)
         self._page.tend(self._clock.now())
         link.scene.put(scene_from(self._prepared.rig))
-        self._console.say(f"open {self._page.address} to see and operate the run")
+        self._console.offer_page(self._page.address)
 
     def _show_view(self, now: float) -> None:
         """Put a view for the page, and restart the page where it has died: the run pauses, as nobody saw it."""

@@ -45,7 +45,7 @@ from hardware.operator.view import (
     hold_cause,
     tracking_from_pose,
 )
-from hardware.process.progress import TimeLeft
+from hardware.process.progress import TimeLeft, open_in_browser
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.path import Path, PrintPhase, way_lengths
@@ -327,7 +327,9 @@ class Console:
     file: to wait on, None where there is no terminal.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, opens: bool = False) -> None:
+        """opens: whether the page is opened in a browser."""
+        self._opens = opens
         self.file: int | None = None
         self._before: list[Any] | None = None
 
@@ -355,6 +357,12 @@ class Console:
             self.file = None
         wishes = [ACTION_KEYS[key] for key in keys if key in ACTION_KEYS]
         return [Wish.STOP] if Wish.STOP in wishes else wishes
+
+    def offer_page(self, address: str) -> None:
+        """Tell where the page is, and open it where that is wanted."""
+        self.say(f"open {address} to see and operate the run")
+        if self._opens and not open_in_browser(address):
+            self.say("no browser could be opened: this system has no xdg-open")
 
     def say(self, text: str) -> None:
         """Write a line to standard error."""

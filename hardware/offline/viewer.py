@@ -35,6 +35,7 @@ from hardware.operator.server import CONTENT_TYPES, page_files
 from hardware.operator.settings import AccessControl, OperatorSettings, check_settings, response_headers
 from hardware.operator.shared_state import CameraPicture, PagePictures, PageScene, scene_from
 from hardware.operator.view import Activity, MotionView, TrackingView, tracking_from_pose
+from hardware.process.progress import open_in_browser
 from hardware.recording.session_reader import (
     open_session,
     read_commands,
@@ -334,8 +335,11 @@ async def serve(playback: Playback, settings: OperatorSettings, listener: socket
         await runner.cleanup()
 
 
-def run_view(session: Path, poses: str | None, toolpath: Path | None, port: int) -> None:
-    """Print the page's address and serve it until interrupted; InputError where the session cannot be opened."""
+def run_view(session: Path, poses: str | None, toolpath: Path | None, port: int, shown: bool = False) -> None:
+    """Print the page's address and serve it until interrupted; InputError where the session cannot be opened.
+
+    shown: open it in a browser as well.
+    """
     settings = check_settings(OperatorSettings(port=port))
     playback = open_playback(session, poses, toolpath)
     with socket.create_server((settings.host, settings.port)) as listener:
@@ -344,5 +348,8 @@ def run_view(session: Path, poses: str | None, toolpath: Path | None, port: int)
         if playback.session.damage:
             print(damage_text(playback.session.damage))
         print(f"{len(playback)} frame sets over {seconds:.1f} s, poses: {playback.source or 'none'}")
-        print(f"open http://{settings.host}:{port}/{settings.token}/ in a browser; Ctrl-C ends", flush=True)
+        address = f"http://{settings.host}:{port}/{settings.token}/"
+        print(f"open {address} in a browser; Ctrl-C ends", flush=True)
+        if shown:
+            open_in_browser(address)
         asyncio.run(serve(playback, settings, listener))

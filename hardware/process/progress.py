@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -172,6 +174,47 @@ def write_error_text(error: Exception, out: Path | None) -> str:
 def cache_folder() -> Path:
     """Where it is, as the XDG rules have it; it may not be there yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"
+
+
+UNFINISHED = ".part-"  # in the name of a folder that is being written, before the number of its process
+
+
+def folder_size(folder: Path) -> int:
+    """Bytes of all files in it."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+def size_text(size: int) -> str:
+    """Bytes as a person says them."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
+
+
+def clear_unfinished(cache: Path) -> None:
+    """Remove from a cache what a process that is gone has left unfinished."""
+    for half in cache.glob(f"*{UNFINISHED}*"):
+        number = half.name.rpartition(UNFINISHED)[2]
+        if not (number.isdigit() and Path(f"/proc/{number}").exists()):
+            shutil.rmtree(half, ignore_errors=True)
+
+
+def clear_cache(cache: Path) -> tuple[int, int]:
+    """Remove all rendered scenes from a cache; how many there were, and their bytes."""
+    scenes = [folder for folder in cache.glob("*") if (folder / "scenario").is_file()]
+    size = sum(map(folder_size, scenes))
+    for folder in scenes:
+        shutil.rmtree(folder, ignore_errors=True)
+    clear_unfinished(cache)
+    return len(scenes), size
+
+
+def open_in_browser(address: str) -> bool:
+    """Open an address with what the system opens addresses with; whether there is such a thing. Waits for nothing."""
+    opener = shutil.which("xdg-open") or shutil.which("open")
+    if opener is None:
+        return False
+    null = subprocess.DEVNULL
+    subprocess.Popen([opener, address], stdin=null, stdout=null, stderr=null, start_new_session=True)
+    return True
 
 
 def cache_error(folder: Path, error: OSError) -> InputError:

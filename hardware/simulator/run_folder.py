@@ -56,7 +56,7 @@ WATCH_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{tit
 <style>body{{margin:0;padding:1.2rem;background:#14171a;color:#e6e9ec;font:16px/1.5 system-ui,sans-serif}}
 h1{{font-size:1.15rem;font-weight:600;margin:0 0 .6rem}}img{{max-width:100%;border-radius:8px;display:block}}
 dl{{display:flex;flex-wrap:wrap;gap:.3rem 2rem;margin:.9rem 0}}dt{{color:#9aa4ad;font-size:.8rem}}dd{{margin:0}}
-a{{color:#7fc4ff}}</style><h1>{title}</h1><img src="watch.jpg?{number}" alt="what the cameras see">
+a{{color:#7fc4ff}}</style><h1>{title}</h1>{picture}
 <dl>{facts}</dl>{foot}</html>
 """
 
@@ -80,6 +80,10 @@ class WatchPage:
         cv2.imwrite(str(self._folder / "watch.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, WATCH_JPEG_QUALITY])
         self._write('<meta http-equiv="refresh" content="1">', "<p>This page renews itself while the run goes on.</p>")
 
+    def begin(self) -> None:
+        """There is no picture yet, but a page that will show it."""
+        self._write('<meta http-equiv="refresh" content="1">', "<p>The first pictures are being rendered.</p>")
+
     def finish(self, verdict: str) -> None:
         """The run is over: the page stands still and leads to the report."""
         self._write("", f'<p>{escape(verdict)} <a href="report.html">The report</a></p>')
@@ -87,7 +91,8 @@ class WatchPage:
     def _write(self, refresh: str, foot: str) -> None:
         facts = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in self._facts)
         title = escape(self._title)
-        text = WATCH_PAGE.format(title=title, refresh=refresh, number=self._number, facts=facts, foot=foot)
+        picture = f'<img src="watch.jpg?{self._number}" alt="what the cameras see">' if self._number else ""
+        text = WATCH_PAGE.format(title=title, refresh=refresh, picture=picture, facts=facts, foot=foot)
         self.page.write_text(text, encoding="utf-8")
 
     def _montage(self, frames: FrameSet, pose: SurfacePose, line: Array | None) -> Image:

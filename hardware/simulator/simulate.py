@@ -34,7 +34,7 @@ from hardware.files.pose_file import read_poses
 from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
-from hardware.process.progress import Progress, prepare_out
+from hardware.process.progress import Progress, open_in_browser, prepare_out
 from hardware.report.evaluation import Evaluation, evaluate, write_summary
 from hardware.report.report import write_report
 from hardware.simulator.arm.ports import PtyLink
@@ -176,6 +176,7 @@ class SimulationOptions:
     threads: int = 2  # that render
     pty: bool = False  # send the arm's bytes through a pseudo-terminal
     force: bool = False  # write into a folder that is not empty
+    open: bool = False  # open the page that shows it in a browser
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +222,10 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
             step = stack.enter_context(_tracking(scenario, truth, scene.shape, wound_rois, scan, exposures))
             line = stack.enter_context(closing(PtyLink())).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
+            folder.watch.begin()
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
+            if options.open:
+                open_in_browser(folder.watch.page.resolve().as_uri())
             loop = step, exposures, folder, WallClock(), options.threads, line
             world = SimulatedWorld(scenario, scene, path, truth, *loop)
             try:
