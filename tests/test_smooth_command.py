@@ -5,16 +5,19 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import tomllib
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from estimation import se3, smooth
 from estimation.errors import InputError
 from estimation.synthetic.follow import follow_steps
+from estimation.synthetic.movements import BreathingSpec, draw_breathing, draw_pulse, draw_walk
 from estimation.synthetic.world import arc_rig, synthetic_world
 from hardware.cli.main import main
 from hardware.files.folder_tables import read_tum
@@ -22,12 +25,15 @@ from hardware.files.rig_file import read_rig
 from hardware.files.session import FrameRef
 from hardware.offline import smooth as run_module
 from hardware.offline.smooth import session_hash
-from hardware.offline.smooth_tracks import reobserve, source_hash, tracks_of
+from hardware.offline.smooth_tracks import Rhythm, breathing_rhythm, pulse_rhythm, reobserve, source_hash, tracks_of
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session, read_observations, read_poses, read_smoothed
 from hardware.report.evaluation import best_constant
+from hardware.simulator.scenario import read_scenario
 from perception.frames import Frame, Image
 from tests.synthetic import write_session
+
+ROOT = Path(__file__).parents[1]
 
 BLANK = np.full((720, 1280), 90, np.uint8)
 
@@ -176,3 +182,72 @@ class Unreadable:
 
     def close(self) -> None:
         """Nothing is open."""
+
+
+def chest(seed: int, seconds: float, pulse: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Times (N,), s, positions (N, 3), mm, of a breathing chest with a pulse of some mm, and the pulse's rate, Hz."""
+    rng, times = np.random.default_rng(seed), np.arange(0, seconds, 1 / 30)
+    spec = BreathingSpec(rng.uniform(3, 5.5), period_spread=float(rng.choice([0.03, 0.1])), depth_spread=0.1)
+    waves = draw_breathing(spec, rng), draw_walk(rng), draw_pulse(rng.uniform(0.9, 1.9), 0.03, 0.1, rng)
+    axes = np.array([[0.8, 1.6, 7.8], [0.15, 0.15, 0.2], pulse * rng.normal(size=3) / 3**0.5])
+    noise = gaussian_filter1d(rng.normal(size=(len(times), 3)), 1.0, axis=0)
+    positions = sum(wave(times)[:, None] * axis for wave, axis in zip(waves, axes, strict=True)) + 0.01 * noise
+    beats = int(np.searchsorted(waves[2].starts, seconds))
+    return times, positions, beats / float(waves[2].starts[beats])
+
+
+def rhythms_of(times: np.ndarray, positions: np.ndarray) -> tuple[Rhythm, Rhythm]:
+    centred = positions - positions.mean(0)
+    breathing = breathing_rhythm(times, centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1])
+    return breathing, pulse_rhythm(times, positions, breathing)
+
+
+def test_a_pulse_is_found_where_there_is_one_within_its_claim_and_none_where_there_is_none() -> None:
+    found = []
+    for seed in range(16):
+        times, positions, rate = chest(seed, 60.0, 0.15 if seed % 2 else 0.0)
+        pulse = rhythms_of(times, positions)[1]
+        if seed % 2 == 0:
+            assert pulse.why and np.isnan(pulse.rate) and pulse.words("pulse") == f"No pulse found: {pulse.why}."
+        elif not pulse.why:
+            found.append(abs(pulse.rate - rate) <= pulse.claim)
+            assert pulse.claim < 0.05 * rate
+    assert len(found) >= 6 and sum(found) >= len(found) - 1
+
+
+@pytest.mark.parametrize("rate", [0.25, 0.4])
+def test_the_harmonics_of_an_even_breath_are_no_pulse(rate: float) -> None:
+    times = np.arange(0, 60, 1 / 30)
+    breath = 8 * np.abs(np.sin(np.pi * rate * times)) ** 3  # a ventilator: each like the other, with a kink
+    noise = 0.005 * np.random.default_rng(1).normal(size=(len(times), 3))
+    breathing, pulse = rhythms_of(times, breath[:, None] * [0.1, 0.2, 0.97] + noise)
+    assert breathing.rate == pytest.approx(rate, abs=breathing.claim) and pulse.why
+
+
+@pytest.mark.parametrize("kind", ["noise", "walk"])
+def test_chance_has_no_rhythm(kind: str) -> None:
+    for seed in range(12):
+        rng, times = np.random.default_rng(seed), np.arange(0, 60, 1 / 30)
+        steps = rng.normal(size=(len(times), 3))
+        positions = np.cumsum(steps, axis=0) if kind == "walk" else steps
+        assert all(rhythm.why for rhythm in rhythms_of(times, 0.05 * positions))
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "data" / "scenarios").glob("*.toml")), ids=lambda file: file.stem)
+def test_no_scenario_gets_a_rate_that_is_off_by_more_than_its_claim(file: Path) -> None:
+    """By its exact surface, for as long as it lasts and for a minute, with a smoothed session's noise."""
+    scenario, table = read_scenario(file), tomllib.loads(file.read_text(encoding="utf-8"))
+    rates = {part["kind"]: part.get("rate_hz", 1.15) for part in table.get("motion", [])}
+    rng = np.random.default_rng(7)
+    for seconds in (scenario.seconds, 60.0):
+        times = np.arange(0, seconds, 1 / 30)
+        noise = gaussian_filter1d(rng.normal(size=(len(times), 3)), 1.0, axis=0)
+        positions = (scenario.rest @ scenario.motion(times))[:, :3, 3]
+        breathing, pulse = rhythms_of(times, positions + 0.01 * noise)
+        if not pulse.why:
+            assert "pulse" in rates and abs(pulse.rate - rates["pulse"]) <= pulse.claim + 0.02 * rates["pulse"], pulse
+        if not breathing.why and "breathing" in rates:
+            assert abs(breathing.rate - rates["breathing"]) <= breathing.claim + 0.1 * rates["breathing"], breathing
+        elif not breathing.why:  # of a table or of steps: then it comes back after that time
+            again = scenario.motion(times + 1 / breathing.rate)[:, :3, 3] - scenario.motion(times)[:, :3, 3]
+            assert again.std() < 0.4 * positions.std(axis=0).max(), breathing

@@ -140,8 +140,10 @@ def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -
         "offset_ms": dict(zip(names, (1000 * result.offsets).tolist(), strict=True)),
         "offset_sigma_ms": dict(zip(names, (1000 * result.offset_sigma).tolist(), strict=True)),
         "jitter_ms": 1000 * fitted.jitter,
-        "breathing_per_minute": 60 * evaluation.spectrum.breathing,
-        "pulse_per_minute": 60 * evaluation.spectrum.pulse,
+        "breathing_per_minute": 60 * evaluation.spectrum.breathing.rate,
+        "breathing_claim": 60 * evaluation.spectrum.breathing.claim,
+        "pulse_per_minute": 60 * evaluation.spectrum.pulse.rate,
+        "pulse_claim": 60 * evaluation.spectrum.pulse.claim,
         "live_rms_mm": evaluation.live_rms,
         "error_mm": ours,
         "live_error_mm": live,
@@ -216,7 +218,7 @@ SESSION_TABLE = "sessions.csv"
 SMOOTHED, ALREADY_DONE, FAILED = "smoothed", "done already", "failed"
 SUMMARY_FIGURES = (  # of a session's summary.json
     *("poses", "seconds", "landmarks", "sigma_mm", "error_mm", "live_error_mm", "live_rms_mm", "jitter_ms"),
-    *("breathing_per_minute", "pulse_per_minute"),
+    *("breathing_per_minute", "breathing_claim", "pulse_per_minute", "pulse_claim"),
 )
 
 

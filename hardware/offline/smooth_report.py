@@ -11,39 +11,31 @@ from estimation import se3
 from estimation.batch.smoothed import Smoothed
 from estimation.pose import Trajectory
 from estimation.se3 import Array
-from hardware.offline.smooth_tracks import SessionTracks
+from hardware.offline.smooth_tracks import Rhythm, SessionTracks, breathing_rhythm, pulse_rhythm
 from hardware.report.evaluation import PoseErrors, associate, best_constant, errors_under, figure, spread
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components, deviations
 
-BREATHING_BAND_HZ = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
-PULSE_BAND_HZ = (0.75, 3.0)  # Hz: 45 to 180 beats a minute
-MIN_CYCLES = 4  # of a rhythm within the recording: slower ones are not reported
-MIN_SPECTRUM_S = 10.0  # s: of a shorter recording no rhythm is reported
-MIN_PEAK_POWER_RATIO = 8.0  # times the band's own median power: a peak that stands out
-HARMONIC_TOLERANCE = 0.08  # of the breathing's rate: a peak so near to one of its multiples is a harmonic
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionSpectrum:
-    """The spectrum of the motion along the direction in which the surface moves most."""
+    """The spectrum of the motion along the direction in which the surface moves most, and the rhythms in the motion."""
 
     hertz: Array  # (F,)
     amplitude: Array  # (F,) mm
     direction: Array  # (3,) in base
-    breathing: float  # Hz, nan where no peak stands out
-    pulse: float  # Hz, likewise
+    breathing: Rhythm
+    pulse: Rhythm
 
     @property
-    def rhythms(self) -> tuple[tuple[str, float], ...]:
-        """Name and rate, Hz, of each rhythm that stands out."""
-        pairs = ("breathing", self.breathing), ("pulse", self.pulse)
-        return tuple((name, rate) for name, rate in pairs if np.isfinite(rate))
+    def rhythms(self) -> tuple[tuple[str, Rhythm], ...]:
+        """Each rhythm that was looked for, with its name."""
+        return ("breathing", self.breathing), ("pulse", self.pulse)
 
 
 def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
     """The spectrum (Hann window) of the origin's position, resampled at `rate` Hz."""
-    times, seconds = smoothed.times(rate), float(np.ptp(smoothed.stamps))
+    times = smoothed.times(rate)
     positions = smoothed.at(times).base_from_surface[:, :3, 3]
     centred = positions - positions.mean(0)
     direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
@@ -52,28 +44,8 @@ def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
     window = np.hanning(len(along))
     hertz = np.asarray(np.fft.rfftfreq(len(along), 1 / rate), float)
     amplitude = np.asarray(2 * np.abs(np.fft.rfft(along * window)) / max(window.sum(), 1e-9), float)
-    breathing = _peak(hertz, amplitude, BREATHING_BAND_HZ, seconds)
-    pulse = _peak(hertz, amplitude, PULSE_BAND_HZ, seconds, breathing)
-    return MotionSpectrum(hertz, amplitude, direction, breathing, pulse)
-
-
-def _peak(
-    hertz: Array, amplitude: Array, band: tuple[float, float], seconds: float, apart_from: float = float("nan")
-) -> float:
-    """The clearest peak of a band, Hz, or nan; not a multiple of `apart_from`."""
-    inside = (hertz >= max(band[0], MIN_CYCLES / seconds)) & (hertz <= band[1])
-    if np.isfinite(apart_from):
-        times = hertz / apart_from
-        inside &= np.abs(times - np.round(times)) > HARMONIC_TOLERANCE * np.maximum(1.0, times / 4)
-    peaks = np.zeros(len(hertz), bool)
-    peaks[1:-1] = (amplitude[1:-1] > amplitude[:-2]) & (amplitude[1:-1] >= amplitude[2:])
-    candidates = np.flatnonzero(inside & peaks)
-    if not len(candidates) or seconds < MIN_SPECTRUM_S:
-        return float("nan")
-    best = candidates[amplitude[candidates].argmax()]
-    median_power = np.median(amplitude[(hertz >= band[0]) & (hertz <= band[1])] ** 2)
-    clear = amplitude[best] ** 2 > MIN_PEAK_POWER_RATIO * median_power
-    return float(hertz[best]) if clear else float("nan")
+    breathing = breathing_rhythm(times, along)
+    return MotionSpectrum(hertz, amplitude, direction, breathing, pulse_rhythm(times, positions, breathing))
 
 
 LOOP_DELAYS_S = (0.02, 0.033, 0.05, 0.1, 0.15, 0.2, 0.3)  # s, from exposure to the nozzle's arrival
@@ -193,7 +165,7 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
         ours, live = (None if rmse is None else figure(rmse) for rmse in evaluation.rmse)
         live_text = "" if live is None else f", live {live} mm"
         words.append(f"Against the {_reference_name(evaluation)}: {ours} mm{live_text} (RMS, aligned).")
-    words += [f"{name.capitalize()}: {60 * rate:.1f} a minute." for name, rate in evaluation.spectrum.rhythms]
+    words += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
     return " ".join(words)
 
 
@@ -214,7 +186,8 @@ def _tiles(evaluation: SmoothEvaluation) -> str:
     if evaluation.live is not None:
         tiles.append(tile(figure(1000 * evaluation.live_rms), "µm", "live against smoothed, RMS"))
     labels = {"breathing": "breaths a minute", "pulse": "beats a minute"}
-    tiles += [tile(f"{60 * rate:.1f}", "", labels[name]) for name, rate in evaluation.spectrum.rhythms]
+    found = [(name, rhythm) for name, rhythm in evaluation.spectrum.rhythms if not rhythm.why]
+    tiles += [tile(rhythm.per_minute, "", labels[name]) for name, rhythm in found]
     return row_of_tiles(tiles)
 
 
@@ -303,10 +276,12 @@ def _spectrum(spectrum: MotionSpectrum) -> str:
     span = 0.0, float(spectrum.hertz[shown][-1])
     plot = Plot(PAGE_CHART_WIDTH, 190, span, (max(high / 1e4, 1e-5), high), log_y=True, label="amplitude, mm")
     plot.line(spectrum.hertz[shown], amplitude, "estimate")
-    for name, rate in spectrum.rhythms:
-        plot.mark(rate, f"{name} {60 * rate:.1f}/min", "median")
+    for name, rhythm in spectrum.rhythms:
+        if not rhythm.why:
+            plot.mark(rhythm.rate, f"{name} {rhythm.per_minute}/min", "median")
     along = ", ".join(f"{v:.2f}" for v in spectrum.direction)
-    text = f"Of the origin's motion along the direction in which it moves most, ({along}) in base; frequency in Hz."
+    text = f"Of the origin's motion along the direction in which it moves most, ({along}) in base; frequency in Hz. "
+    text += " ".join(rhythm.words(name) for name, rhythm in spectrum.rhythms)
     return section("Spectrum", text, plot.svg())
 
 

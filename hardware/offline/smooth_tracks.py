@@ -1,4 +1,5 @@
 """The tracks of a session that is smoothed: recorded ones, else the tracker's on its images; and reobserved landmarks.
+Then the rhythms in what they are smoothed to.
 
 Tracks take long to compute, so they are kept as a recording beside the results, with the hash of their source.
 """
@@ -6,9 +7,10 @@ Tracks take long to compute, so they are kept as a recording beside the results,
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from math import nan
 from pathlib import Path
 from typing import TextIO
 
@@ -19,6 +21,7 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
+from estimation.se3 import Array
 from hardware.files.session import Session
 from hardware.offline.track import tracker
 from hardware.process.clock import WallClock
@@ -208,3 +211,146 @@ def _searched(
                 progress(done, total)
         finally:
             yield from map(relinker.as_tracks, looks)
+
+
+BREATHING_BAND_HZ = (0.1, 0.7)  # Hz: 6 to 42 breaths a minute
+PULSE_BAND_HZ = (0.75, 3.0)  # Hz: 45 to 180 beats a minute
+WINDOW_S = {"breathing": 20.0, "pulse": 15.0}  # s of each of the windows that have to agree
+MIN_WINDOWS = {"breathing": 2, "pulse": 3}
+MIN_SECONDS = {"breathing": 24.0, "pulse": 45.0}  # s: of a shorter recording none is reported
+MIN_CYCLES = 3  # of a rhythm in each window: slower ones are not told from drift
+HARMONICS = 3  # of a rhythm that are fitted; of two alone, three times a pulse's rate fits as well as its own
+RATE_STEPS = 160  # candidate rates of a band, evenly apart in their logarithm
+MIN_EXPLAINED = 0.6  # share of the motion in each window that breathing has to explain
+MAX_SPREAD = {"breathing": 0.25, "pulse": 0.05}  # of the windows' rates, relative: more is no rhythm, but chance
+MIN_COMB = (
+    0.7  # mean over the windows of the log ratio of power on a pulse's harmonics to that between them, summed over
+)
+# the harmonics: with pulses of 0.1 mm beside 8 mm of breathing it is 1.0 and more, without one 0.2 at most
+MIN_WINDOW_SPREAD = 0.01  # of the rate of a window, relative: beats differ by 5 %, and a window holds some fifteen
+CLAIMED = 0.975  # quantile of Student's distribution: with few windows their spread is itself not known well
+MULTIPLES, MULTIPLE_BINS = 12, 1.5  # of an even breathing's rate at which no pulse can be told from it, and how near
+
+
+@dataclass(frozen=True, slots=True)
+class Rhythm:
+    """A rate that the motion has, and what it is good to. why: none is found, "" where one is."""
+
+    rate: float  # Hz, NaN where none is found
+    claim: float  # Hz, within which of the rate the true one is 19 times of 20
+    why: str = ""
+
+    @property
+    def per_minute(self) -> str:
+        """In words."""
+        digits = 0 if 60 * self.claim >= 1 else 1
+        return f"{60 * self.rate:.{digits}f} ± {60 * self.claim:.{digits}f}"
+
+    def words(self, name: str) -> str:
+        """A sentence about it. name: what it is."""
+        return f"No {name} found: {self.why}." if self.why else f"{name.capitalize()}: {self.per_minute} a minute."
+
+
+def breathing_rhythm(times: Array, along: Array) -> Rhythm:
+    """The breathing in a motion (N,) mm at even times (N,), s: a harmonic model with a trend, window by window."""
+    windows = _windows(times, "breathing")
+    if not windows:
+        return Rhythm(nan, nan, "the recording is too short")
+    low = max(BREATHING_BAND_HZ[0], MIN_CYCLES / (times[windows[0]][-1] - times[windows[0]][0]))
+    rates = np.geomspace(low, BREATHING_BAND_HZ[1], RATE_STEPS)
+    best = []
+    for part in windows:
+        explained = np.array([_explained(times[part], along[part, None], rate) for rate in rates])
+        at = int(explained.argmax())
+        if explained[at] < MIN_EXPLAINED or at == 0:  # at the slowest rate a drift fits best
+            return Rhythm(nan, nan, "the motion has no regular rhythm")
+        best.append(float(rates[at]))
+    return _agreed(best, times, "breathing")
+
+
+def pulse_rhythm(times: Array, positions: Array, breathing: Rhythm) -> Rhythm:
+    """The pulse in positions (N, 3) mm at even times (N,), s.
+
+    A pulse is a comb in the spectrum of the acceleration, in which breathing, however large, has little power beyond
+    its first harmonics: power on the comb is compared with that between its teeth, in multitaper spectra of windows.
+    """
+    windows = _windows(times, "pulse")
+    if not windows:
+        return Rhythm(nan, nan, "the recording is too short")
+    rates = np.geomspace(*PULSE_BAND_HZ, RATE_STEPS)
+    scores = np.array([_comb_scores(times[part], positions[part], rates) for part in windows])  # (W, R)
+    mean = scores.mean(axis=0)
+    if not mean.max() > MIN_COMB:
+        return Rhythm(nan, nan, "what there is, chance explains")
+    rate = float(rates[mean.argmax()])
+    fine = rate * np.linspace(0.94, 1.06, 61)
+    best = []
+    for part in windows:
+        faster = np.gradient(np.gradient(positions[part], times[part], axis=0), times[part], axis=0)
+        best.append(float(fine[np.argmax([_explained(times[part], faster, each) for each in fine])]))
+    found, near = _agreed(best, times, "pulse"), MULTIPLE_BINS / float(times[-1] - times[0])
+    for k in range(2, MULTIPLES + 1):
+        blurred = k * breathing.claim > near  # breaths differ, so that there is no line at this multiple of their rate
+        if abs(found.rate - k * breathing.rate) < near and not blurred:
+            return Rhythm(nan, nan, f"{k} times the breathing's rate cannot be told from the breathing")
+    return found
+
+
+def _windows(times: Array, name: str) -> list[slice]:
+    """Parts of the recording that have to agree on a rhythm; none of one that is too short."""
+    seconds = len(times) * float(times[1] - times[0]) if len(times) > 1 else 0.0
+    if seconds < MIN_SECONDS[name]:
+        return []
+    count = max(int(seconds / WINDOW_S[name]), MIN_WINDOWS[name])
+    size = len(times) // count
+    return [slice(k * size, (k + 1) * size) for k in range(count)]
+
+
+def _agreed(rates: Sequence[float], times: Array, name: str) -> Rhythm:
+    """The rate that windows agree on, with what that is good to; none where they do not."""
+    mean, spread = float(np.mean(rates)), float(np.std(rates, ddof=1))
+    if spread > MAX_SPREAD[name] * mean:
+        return Rhythm(nan, nan, "its parts do not agree")
+    from scipy.stats import t as student
+
+    error = max(spread, MIN_WINDOW_SPREAD * mean) / len(rates) ** 0.5
+    return Rhythm(mean, float(student.ppf(CLAIMED, len(rates) - 1)) * error)
+
+
+def _explained(times: Array, values: Array, rate: float) -> float:
+    """Share of values (N, D) that a trend and the harmonics of a rate, Hz, explain beyond the trend."""
+    turn = 2 * np.pi * rate * (times - times[0])
+    waves = [wave(k * turn) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
+    trend = np.vander((times - times.mean()) / np.ptp(times), 3)
+    rest = values - trend @ np.linalg.lstsq(trend, values, rcond=None)[0]
+    design = np.column_stack([*waves, trend])
+    left = rest - design @ np.linalg.lstsq(design, rest, rcond=None)[0]
+    return 1.0 - float((left**2).sum()) / max(float((rest**2).sum()), 1e-30)
+
+
+def _comb_scores(times: Array, positions: Array, rates: Array) -> Array:
+    """(R,) of each rate: log ratio of the acceleration's power on its harmonics to that midway between them, summed."""
+    from scipy.signal.windows import dpss
+
+    step = float(times[1] - times[0])
+    faster = np.diff(positions, 2, axis=0) / step**2
+    tapers = dpss(len(faster), 3, 5)  # five windows of a bandwidth of three bins
+    size = 4 * len(faster)
+    power = (np.abs(np.fft.rfft(tapers[:, :, None] * (faster - faster.mean(0)), size, axis=1)) ** 2).mean(0).sum(-1)
+    hertz, total = np.fft.rfftfreq(size, step), np.concatenate([[0.0], np.cumsum(power)])
+
+    def between(low: Array, high: Array) -> Array:
+        """Mean power of the bins from low to high (R,), Hz."""
+        first, last = np.searchsorted(hertz, low), np.maximum(np.searchsorted(hertz, high, "right"), 1)
+        return np.asarray((total[last] - total[np.minimum(first, last - 1)]) / np.maximum(last - first, 1))
+
+    score = np.zeros(len(rates))
+    for k in range(1, HARMONICS + 1):
+        tooth, gap = np.maximum(3 / (len(faster) * step), 0.02 * k * rates), 0.5 * rates
+        wide = np.maximum(tooth, 0.125 * rates)
+        beside = 0.5 * (
+            between(k * rates - gap - wide, k * rates - gap + wide)
+            + between(k * rates + gap - wide, k * rates + gap + wide)
+        )
+        score += np.log(between(k * rates - tooth, k * rates + tooth) + 1e-30) - np.log(beside + 1e-30)
+    return score
