@@ -43,8 +43,7 @@ from hardware.live.prepared import (
 from hardware.live.prerender import cached
 from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
-from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry
-from hardware.live.run import recorded_begin
+from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry, recorded_begin
 from hardware.live.session_player import schedule, turning_sets
 from hardware.live.settings import (
     LiveSettings,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from ctypes import c_double, c_uint64
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from math import nan
 from multiprocessing.connection import Connection
@@ -162,6 +162,23 @@ class PoseEntry:
     truth: Array | None = None  # (4, 4) mm, true base_from_surface where it is known
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceEntry:
+    """What viewers are shown of the surface: landmarks (V, 3) and outlines of the region (K, 3), mm, in its frame."""
+
+    stamp: float  # s
+    landmarks: Array
+    outlines: tuple[Array, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedScanEntry:
+    """The scan as viewers are shown it: vertices (N, 3), mm, where they lie in the surface frame."""
+
+    stamp: float  # s
+    points: Array
+
+
 @dataclass(frozen=True, slots=True)
 class WireEntry:
     """Bytes that passed the arm's port."""
@@ -177,7 +194,7 @@ class EventEntry:
 
     stamp: float  # s
     text: str
-    level: int  # of hardware.recording.schemas
+    level: int  # of Python's logging
     name: str  # of whom it comes from
 
 
@@ -202,7 +219,8 @@ class UsedEntry:
 
 # the rig comes first: nothing is written before the cameras are known
 Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
-Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | EventEntry | LatencyEntry
+Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry
+Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
 
 
 class StageHistograms:
@@ -262,3 +280,15 @@ class MotionChannels:
     requests: RequestLine  # of the operator's page
     trouble: SharedLatest[str]  # why the arm cannot be used at all
     recorder: Connection
+
+
+def recorded_begin(order: BeginPrint, dispensers: str = "") -> tuple[dict[str, str], BeginPrint]:
+    """Path, arm and dispensers of an order as texts for the recording, and the order with what is read of those texts.
+
+    dispensers: text of their file, "" without one.
+    """
+    from hardware.recording.session_reader import input_texts, inputs_from_texts  # loads what the motion must not
+
+    texts = input_texts(order.path, order.profile, dispensers)
+    inputs = inputs_from_texts(texts, File("kept"))
+    return texts, replace(order, path=inputs.path, profile=inputs.profile, outlets=inputs.outlets)
