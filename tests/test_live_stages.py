@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
+from pathlib import Path
 from pathlib import Path as File
 
 import numpy as np
@@ -13,7 +16,7 @@ from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.live.checklist import FIRST_PICTURE_TIME, PrintTask, run_checks
-from hardware.live.outcome import RunOutcome, RunStatistics
+from hardware.live.outcome import HoldTotal, RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, RunFiles
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
 from hardware.live.settings import LiveSettings
@@ -718,3 +721,26 @@ def test_what_a_run_came_to_counts_what_runs_before_it_printed() -> None:
         assert result.fraction == printed
         assert result.printed == pytest.approx(np.interp(printed, np.arange(len(ways)), ways) / ways[-1])
         assert result.begun == 2.5 and result.again == "stillbed live --resume run.mcap" and not result.report
+
+
+def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
+    run = Staged(start=2.5)
+    statistics = RunStatistics(stages={"approach": 10.0, "print": 50.0, "homing": 9.0}, extruding=40.0, due=50.0)
+    statistics.holds = {"pose is … s old": HoldTotal(3, 12.5), "paused by the operator": HoldTotal(1, 2.5)}
+    for k in range(100):
+        statistics.errors.add(0.2 + 0.001 * k)
+        statistics.add_true_error(0.1 + 0.001 * k)
+    statistics.add_true_error(float("nan"))
+    statistics.stretches[300:350] = 0.3
+    prepared = replace(views_of(run, 2.5).prepared, files=RunFiles(tmp_path / "run.mcap"))
+    outcome = RunOutcome(prepared, run.conductor, statistics, run.seen, 0, 4.0).write()
+    assert outcome.result().report == str(tmp_path / "run.report.html")
+    page = (tmp_path / "run.report.html").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"<tr[^>]*><td>([^<]*)</td><td>\d*</td><td>([\d.]+)</td></tr>", page))
+    parts = ("pose is … s old", "paused by the operator", "material left", "on the way without material")
+    assert [rows[name] for name in parts] == ["12.50", "2.50", "40.00", "5.00"]
+    assert rows["since the approach"] == "60.00"
+    for words in ("true error, 95 % / largest", "printed by the runs before", "the beads from above", "var(--amber)"):
+        assert words in page
+    summary = json.loads((tmp_path / "run.summary.json").read_text())
+    assert summary["true_error_mm"]["max"] == pytest.approx(0.199) and summary["printed_share"] > 0.5

@@ -30,6 +30,7 @@ from hardware.offline.trajectory_files import PoseSeries, read_pose_series
 from hardware.offline.viewer import PictureReader, Playback, instant_text, open_playback, serve, session_text
 from hardware.operator.settings import OperatorSettings
 from hardware.recording.recorder import Recorder
+from hardware.report.evaluation import calibration_words
 from perception.frames import Frame
 from tests.browser import Browser, axe_findings
 from tests.moving import raster
@@ -308,6 +309,7 @@ def test_the_command_writes_page_and_figures(tmp_path: Path, capsys: pytest.Capt
     assert figures["pairs"] == 90 and figures["reference_is_exact"]
     plain, aligned = (figures[name]["ape"]["translation_mm"]["rmse"] for name in ALIGNMENTS[:2])
     assert aligned < plain and f"{plain:#.3g} mm" in told
+    assert told.partition(". ")[0].endswith("apart (RMSE) over 90 of 90 poses, in the surface frame that fits best")
     page = (out / "report.html").read_text()
     assert "Absolute pose error" in page and "NEES" not in page and "http" not in page.replace("http://www.w3.org", "")
 
@@ -338,3 +340,10 @@ def test_errors_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["compare", str(tmp_path / "a.tum"), str(tmp_path / "truth.tum")]) == WRONG_INPUT
     told = capsys.readouterr().err
     assert words in told and told.count("\n") == 1
+
+
+@pytest.mark.parametrize(("nees", "honest"), [(0.79, False), (0.81, True), (1.24, True), (1.81, False)])
+def test_covariances_that_are_not_calibrated_are_said_not_to_be(nees: float, honest: bool) -> None:
+    words = calibration_words(nees)
+    assert ("not calibrated" in words) is not honest
+    assert honest or f"{nees**0.5:.2g} times" in words

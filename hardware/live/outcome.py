@@ -38,6 +38,7 @@ STRETCHES = 500  # of equal checkpoints, of each of which the largest error is k
 MAX_TICK_GAP = 0.5  # s from tick to tick that is counted: nobody knows what happened in a longer gap
 MAX_SHOWN_HOLDS = 12  # reasons on the page's end, the longest first
 EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
+BEADS_CAPTION = "The path from above, by the largest predicted error of each stretch while material left."
 TIMELINE_CAPTION = "Predicted, the largest of each moment while material left, over the seconds since the approach."
 
 
@@ -211,9 +212,18 @@ class RunOutcome:
     @property
     def printed(self) -> float:
         """The same as a share of the path's length, 0 to 1; none of a dry run."""
+        return self._share(self.place)
+
+    @property
+    def printed_before(self) -> float:
+        """What of that the runs before this one printed."""
+        return self._share(self.prepared.task.start)
+
+    def _share(self, place: float) -> float:
+        """Share of the path's length, 0 to 1, up to a place in checkpoints; none of a dry run."""
         path, dry = self.prepared.task.path, self.prepared.task.lift is not None
         ways = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
-        return 0.0 if dry or not ways[-1] > 0 else float(np.interp(self.place, np.arange(len(path)), ways) / ways[-1])
+        return 0.0 if dry or not ways[-1] > 0 else float(np.interp(place, np.arange(len(path)), ways) / ways[-1])
 
     @property
     def again(self) -> str:
@@ -314,13 +324,21 @@ class RunOutcome:
     def _page(self, summary: dict[str, Any]) -> str:
         from hardware.report.evaluation import figure, percent
         from hardware.report.page import document, figures_table, row_of_tiles, section, tile
+        from hardware.report.report import bead_map, error_timeline
 
-        error, duty = summary["predicted_error_mm"], self.statistics.duty
+        duty, task, timeline = self.statistics.duty, self.prepared.task, self.statistics.timeline
+        limit, count = task.profile.limits.pose_error, len(timeline.stamps)
         tiles = [
-            tile(f"{self.fraction:.1f}" if self.fraction == self.fraction else "0", "", "checkpoints printed"),
+            tile(percent(self.printed), "", f"printed, checkpoint {self.place:.1f} of {len(task.path) - 1}"),
             tile(percent(duty) if duty == duty else "–", "", "of the time material left the nozzle"),
-            tile(figure(error["p95"]) if error["p95"] is not None else "–", "mm", "predicted error, 95 %"),
         ]
+        for name in ("true", "predicted"):
+            error = summary[f"{name}_error_mm"]
+            if error["p95"] is not None:
+                values = f"{figure(error['p95'])} / {figure(error['max'])}"
+                tiles.append(tile(values, "mm", f"{name} error, 95 % / largest"))
+        tiles += [tile(figure(self.statistics.ink), "mm³", "of ink")] if self.inked else []
+        tiles += [tile(percent(self.printed_before), "", "printed by the runs before")] if task.start else []
         rows = [
             [s.name, str(s.count), *(f"{1000 * seconds:.1f}" for seconds in (s.median, s.p99, s.largest))]
             for s in self.timings()
@@ -330,13 +348,18 @@ class RunOutcome:
         states = [[name, str(count)] for name, count in self.statistics.states.items()]
         checks = f"<pre>{escape(checks_table(self.machine.checks))}</pre>" if self.machine.checks else ""
         timings = figures_table(("stage", "times", "median", "99 %", "largest"), rows)
-        reasons = figures_table(("reason", "times", "s"), holds or [["none", "0", "0"]])
-        timeline = _timeline_plot(self.statistics.timeline, self.prepared.task.profile.limits.pose_error)
+        reasons = figures_table(("what", "times", "s"), [*holds, *self._other_times()], last_total=True)
+        drawn = error_timeline(
+            timeline.error[:count], timeline.held[:count] > timeline.width / 2, timeline.width, limit
+        )
+        points = task.path.surface_from_nozzle[:, :3, 3]
+        beads = bead_map(points, task.path.extrude, self.statistics.stretches, limit)
         body = [
             row_of_tiles(tiles),
-            section("Error at the nozzle", TIMELINE_CAPTION, timeline),
+            section("Error at the nozzle", TIMELINE_CAPTION, drawn),
+            section("Beads", BEADS_CAPTION, beads),
             section("How long each stage took", "Milliseconds.", timings),
-            section("Holds", "Why the nozzle stood, and for how long.", reasons),
+            section("Holds", "Why the nozzle stood, and all other time since the approach began.", reasons),
             section("Stages", "Of the run.", figures_table(("stage", "s"), stages)),
             section("States", "Of the tracked surface.", figures_table(("state", "frame sets"), states)),
             section("Check", "As it was last.", checks),
@@ -344,24 +367,16 @@ class RunOutcome:
         lead = f"{self.machine.ended}. {'. '.join(self.prepared.notes)}"
         return document("live run", self.prepared.files.record.stem, lead, body, "stillbed")
 
+    def _other_times(self) -> list[list[str]]:
+        """Rows of the time that is no hold, and of the sum."""
+        statistics = self.statistics
+        held = sum(row.seconds for row in statistics.holds_by_time)
+        rest = max(statistics.active - held - statistics.extruding, 0.0)
+        times = ("material left", statistics.extruding), ("on the way without material", rest)
+        rows = [[name, "", f"{seconds:.2f}"] for name, seconds in times]
+        return [*rows, ["since the approach", "", f"{held + statistics.extruding + rest:.2f}"]]
+
 
 def percentiles(errors: Histogram) -> dict[str, float]:
     """Median, 95 % and largest of a histogram; NaN of none."""
     return {"p50": errors.percentile(50), "p95": errors.percentile(95), "max": errors.most if errors.count else nan}
-
-
-def _timeline_plot(timeline: ErrorTimeline, limit: float) -> str:
-    """The predicted error over the run, beside its limit, mm."""
-    from hardware.report.page import Plot, area_key, legend, line_key, spanning, stretches
-
-    stamps = timeline.stamps
-    error, held = timeline.error[: len(stamps)], timeline.held[: len(stamps)] > timeline.width / 2
-    if not np.isfinite(error).any():
-        return "<p>Nothing was extruded.</p>"
-    end = len(stamps) * timeline.width
-    plot = Plot(900, 220, (0.0, end), spanning([error, np.array([0.0, limit])]), label="predicted error, mm")
-    runs = np.array([(run.start, run.stop) for run in stretches(held)], float).reshape(-1, 2) * timeline.width
-    plot.shade(runs[:, 0], runs[:, 1], "holding")
-    plot.level(limit, "limit", "limit")
-    plot.line(stamps, error, "estimate")
-    return legend([line_key("estimate", "predicted error"), area_key("holding", "held")]) + plot.svg()

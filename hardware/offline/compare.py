@@ -26,6 +26,7 @@ from hardware.report.evaluation import (
     PoseErrors,
     associate,
     best_constant,
+    calibration_words,
     errors_under,
     figure,
     finite,
@@ -193,17 +194,21 @@ ErrorLine = tuple[str, Array, Errors]  # name of the alignment, stamps (M,) s, e
 
 def comparison_verdict(comparison: TrajectoryComparison) -> str:
     """The verdict in a few sentences."""
-    words = [f"{len(comparison.stamps)} of {len(comparison.estimated)} poses have one beside them in the reference."]
+    fit = [error_statistics(values).rmse for _, values in _by_unit(comparison.fitted.absolute)]
+    paired = f"over {len(comparison.stamps)} of {len(comparison.estimated)} poses"
+    words = [f"{figure(fit[0])} mm and {figure(fit[1])}° apart (RMSE) {paired}, in the surface frame that fits best."]
     if comparison.gap > 1e-6:
         words.append(f"Their stamps lie {figure(1000 * comparison.gap)} ms apart (median).")
     for aligned in comparison.alignments[:-1]:
         off = [error_statistics(values).rmse for _, values in _by_unit(aligned.absolute)]
-        words.append(f"{aligned.name.capitalize().replace('se(3)', 'SE(3)')}: {figure(off[0])} mm, {figure(off[1])}°.")
+        if aligned is not comparison.fitted:
+            name = aligned.name.capitalize().replace("se(3)", "SE(3)")
+            words.append(f"{name}: {figure(off[0])} mm, {figure(off[1])}°.")
     if comparison.of(ALIGNMENTS[1]) is None:
         words.append("The positions lie on a line and determine no SE(3) alignment.")
     nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        words.append(f"NEES/6: {figure(nees)} laid at one pose, 1 where covariances are honest.")
+        words.append(f"NEES/6: {figure(nees)} laid at one pose, {calibration_words(nees)}.")
     return " ".join(words)
 
 

@@ -12,7 +12,15 @@ from estimation.batch.smoothed import Smoothed
 from estimation.pose import Trajectory
 from estimation.se3 import Array
 from hardware.offline.smooth_tracks import Rhythm, SessionTracks, breathing_rhythm, pulse_rhythm
-from hardware.report.evaluation import PoseErrors, associate, best_constant, errors_under, figure, spread
+from hardware.report.evaluation import (
+    PoseErrors,
+    associate,
+    best_constant,
+    calibration_words,
+    errors_under,
+    figure,
+    spread,
+)
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components, deviations
 
@@ -165,6 +173,8 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
         ours, live = (None if rmse is None else figure(rmse) for rmse in evaluation.rmse)
         live_text = "" if live is None else f", live {live} mm"
         words.append(f"Against the {_reference_name(evaluation)}: {ours} mm{live_text} (RMS, aligned).")
+        nees = evaluation.errors[0].mean_nees / 6
+        words += [f"NEES/6: {figure(nees)}, {calibration_words(nees)}."] if np.isfinite(nees) else []
     words += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
     return " ".join(words)
 

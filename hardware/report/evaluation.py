@@ -26,6 +26,15 @@ from hardware.process.provenance import provenance
 
 MAX_TRACKING_ERROR_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
 NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
+CALIBRATED_NEES = (0.8, 1.25)  # of NEES/6: between them a covariance may be used as it is
+
+
+def calibration_words(nees: float) -> str:
+    """What a mean NEES/6 says of the covariances."""
+    low, high = CALIBRATED_NEES
+    if low <= nees <= high:
+        return "1 where covariances are honest"
+    return f"so the covariances are not calibrated: errors are {nees**0.5:.2g} times what they claim"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.pose import TrackState
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 from hardware.report import page
 from hardware.report.evaluation import (
     MAX_TRACKING_ERROR_MM,
@@ -284,3 +284,57 @@ def _latency(result: Evaluation) -> str:
     plot.mark(float(late.p99[-1]), "99 %", "median")
     caption = '<div class="caption">frame sets by their total, ms</div>'
     return page.section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
+
+
+def error_timeline(error: Array, held: Mask, width: float, limit: float) -> str:
+    """The predicted error (N,), mm, NaN where nothing was extruded, in bins of `width` s, beside its limit, mm.
+
+    held: (N,) bins in which the nozzle was held.
+    """
+    if not np.isfinite(error).any():
+        return "<p>Nothing was extruded.</p>"
+    stamps, end = np.asarray((np.arange(len(error)) + 0.5) * width, float), len(error) * width
+    plot = page.Plot(900, 220, (0.0, end), page.spanning([error, np.array([0.0, limit])]), label="predicted error, mm")
+    runs = np.array([(run.start, run.stop) for run in page.stretches(held)], float).reshape(-1, 2) * width
+    plot.shade(runs[:, 0], runs[:, 1], "holding")
+    plot.level(limit, "limit", "limit")
+    plot.line(stamps, error, "estimate")
+    return page.legend([page.line_key("estimate", "predicted error"), page.area_key("holding", "held")]) + plot.svg()
+
+
+BEAD_COLOURS = ("var(--grey)", "var(--green)", "var(--amber)", "var(--rose)")  # not printed, good, to the limit, beyond
+GOOD_BEAD = 0.5  # of the limit
+
+
+def bead_map(points: Array, extrude: Mask, errors: Array, limit: float) -> str:
+    """A path from above, each bead in the colour of its largest error.
+
+    points: (N, 3) mm of the checkpoints. extrude: (N,) whether on the way to each. errors: (S,) mm of as many stretches
+    of equal checkpoints, NaN where nothing was printed. limit: mm.
+    """
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    scale = min(PAGE_CHART_WIDTH / max(high[0] - low[0], 1e-6), 420 / max(high[1] - low[1], 1e-6)) * 0.96
+    size = scale * (high - low) + 20
+    places = np.column_stack([points[:, 0] - low[0], high[1] - points[:, 1]]) * scale + 10
+    stretch = (np.arange(len(points)) / max(len(points) - 1, 1) * len(errors)).astype(int)
+    of = errors[np.minimum(stretch, len(errors) - 1)]
+    kind = np.where(np.isnan(of), 0, np.where(of <= GOOD_BEAD * limit, 1, np.where(of <= limit, 2, 3)))
+    parts = []
+    for number, colour in enumerate(BEAD_COLOURS):  # the worst on top, as layers lie over each other
+        ways = "".join(
+            f"M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}"
+            for a, b, at, out in zip(places[:-1], places[1:], kind[1:], extrude[1:], strict=True)
+            if out and at == number
+        )
+        parts.append(f'<path style="fill:none;stroke:{colour};stroke-width:2;stroke-linecap:round" d="{ways}"/>')
+    keys = f"good: to {GOOD_BEAD * limit:g} mm", f"to the limit of {limit:g} mm", "beyond", "not printed by this run"
+    colours = (*BEAD_COLOURS[1:], BEAD_COLOURS[0])
+    shown = [
+        f'<span><svg viewBox="0 0 18 10"><path style="stroke:{colour};stroke-width:3" d="M0 5H18"/></svg>{words}</span>'
+        for words, colour in zip(keys, colours, strict=True)
+    ]
+    box = f'viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" style="max-height:440px"'
+    return (
+        page.legend(shown)
+        + f'<svg class="plot" {box} role="img" aria-label="the beads from above">{"".join(parts)}</svg>'
+    )
