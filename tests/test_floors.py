@@ -89,7 +89,15 @@ OWNERS = {  # library: the files that may import it
 }
 ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
 FREE = {"numpy", "scipy"}  # arrays are everywhere
-TOOLS = {"mypy", "rerun_sdk", "ruff", "pytest_timeout", "pytest_xdist", "evo", "dask"}  # of the extra [dev]: run, not imported
+TOOLS = {
+    "mypy",
+    "rerun_sdk",
+    "ruff",
+    "pytest_timeout",
+    "pytest_xdist",
+    "evo",
+    "dask",
+}  # of the extra [dev]: run, not imported
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 ALLOWED |= {"CHANGELOG.md", "CITATION.cff"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
