@@ -25,6 +25,13 @@ def test_an_installation_carries_every_folder_of_data() -> None:
     assert carried == {f"share/stillbed/{name}": [f"data/{name}/*"] for name in folders}
 
 
+def test_a_type_checker_believes_what_is_installed() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    for name in ("estimation", "perception", "planning", "hardware"):
+        assert (ROOT / name / "py.typed").is_file()
+        assert "py.typed" in project["tool"]["setuptools"]["package-data"][name]
+
+
 def test_a_documented_path_leads_to_the_shipped_file_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert named_path("data/arms/s6h4d.toml").read_bytes() == (ROOT / "data/arms/s6h4d.toml").read_bytes()
