@@ -1,15 +1,16 @@
-# make demo | test | slow | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser | deceit: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser | deceit | docs: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
 STAMP  := .venv/.installed
 AUDIT  := .venv/audit
+DOCS   := .venv/docs
 DEMO   := demo
 
 # Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test slow mutants bench check format install outages faults fuzz hazards references audit browser deceit
+.PHONY: demo test slow mutants bench check format install outages faults fuzz hazards references audit browser deceit docs
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -59,6 +60,11 @@ audit:
 	@test -x $(AUDIT)/bin/pip-audit || { $(PYTHON) -m venv $(AUDIT) && $(AUDIT)/bin/python -m pip install --quiet pip-audit==2.10.1; } || \
 		echo "pip-audit cannot be installed; is there a network?"
 	@$(PYTHON) -m tests.audit $(AUDIT)/bin/pip-audit
+
+# The reference of all names, from their docstrings. pdoc has a place of its own, as pip-audit has.
+docs: $(STAMP)
+	@test -d $(DOCS) || $(BIN)/python -m pip install --quiet --constraint constraints.txt --target $(DOCS) pdoc==16.0.0 markdown2==2.5.5
+	@rm -rf out/api && PYTHONPATH=$(DOCS) OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.api_links out/api
 
 # The operator's page is tested in Chromium; where there is none those tests are skipped, and say so.
 browser:

@@ -12,6 +12,7 @@ import pytest
 
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import main, parser, subject_parser
+from tests.api_links import broken_links
 from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
 from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 
@@ -121,3 +122,17 @@ def test_commands_that_need_nothing_run_as_shown(text: str, tmp_path: Path, monk
     except SystemExit as ended:
         code = int(ended.code or 0)
     assert code == 0 and (tmp_path / QUICK[text]).exists()
+
+
+def test_a_link_of_the_reference_that_leads_nowhere_is_found(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "a.html").write_text('<p id="x"></p><a href="sub/b.html#y">b</a><a href="https://elsewhere">c</a>')
+    (tmp_path / "sub" / "b.html").write_text(
+        '<p id="y"></p><a href="../a.html#x">a</a><script>"<a href=${u}>"</script>'
+    )
+    assert list(broken_links(tmp_path)) == []
+    (tmp_path / "sub" / "b.html").write_text('<a href="../a.html#z">a</a><a href="c.html">c</a>')
+    assert list(broken_links(tmp_path)) == [
+        "a.html: sub/b.html#y: no such place", "sub/b.html: ../a.html#z: no such place",
+        "sub/b.html: c.html: no such file",
+    ]  # fmt: skip
