@@ -36,6 +36,7 @@ from hardware.operator.view import (
     Wish,
 )
 from hardware.process.progress import TimeLeft
+from hardware.report.report import bead_map
 from planning.command import Hold
 from planning.path import PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
@@ -744,3 +745,14 @@ def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
         assert words in page
     summary = json.loads((tmp_path / "run.summary.json").read_text())
     assert summary["true_error_mm"]["max"] == pytest.approx(0.199) and summary["printed_share"] > 0.5
+
+
+def test_a_way_to_a_checkpoint_has_the_largest_error_of_all_stretches_on_it() -> None:
+    points, errors = np.column_stack([np.arange(4.0), np.zeros((4, 2))]), np.full(12, np.nan)
+    errors[[1, 5, 6]] = 0.1, 0.3, 0.9
+    ways = re.findall(
+        r"stroke:var\(--(\w+)\);stroke-width:2;[^>]*d=\"([^\"]*)\"",
+        bead_map(points, np.array([0, 1, 1, 0], bool), errors, 0.5),
+    )
+    drawn = {colour: way.count("M") for colour, way in ways if way}
+    assert drawn == {"green": 1, "rose": 1}  # the last way carries no bead

@@ -148,7 +148,7 @@ def test_after_a_stop_the_page_says_how_the_tissue_moves_and_that_figures_are_ol
         page.text("#reason")
         == "By the operator. The nozzle stands at the surface; the surface moves 4.1 mm against it."
     )
-    assert "12 s ago" in page.text("[data-tile=error]")
+    assert page.text("[data-tile=error] span") == "predicted, 12 s ago"
     assert page.js("document.querySelector('[data-tile=error]').className") == "aged"
     assert "4.1mm" in page.text("[data-tile=rest]")
     page.click('[data-wish="lift"]')

@@ -317,7 +317,8 @@ def bead_map(points: Array, extrude: Mask, errors: Array, limit: float) -> str:
     size = scale * (high - low) + 20
     places = np.column_stack([points[:, 0] - low[0], high[1] - points[:, 1]]) * scale + 10
     stretch = (np.arange(len(points)) / max(len(points) - 1, 1) * len(errors)).astype(int)
-    of = errors[np.minimum(stretch, len(errors) - 1)]
+    begin, end = np.minimum(np.append(0, stretch[:-1]), len(errors) - 1), np.minimum(stretch, len(errors) - 1)
+    of = np.array([np.fmax.reduce(errors[a : b + 1]) for a, b in zip(begin, end, strict=True)])
     kind = np.where(np.isnan(of), 0, np.where(of <= GOOD_BEAD * limit, 1, np.where(of <= limit, 2, 3)))
     parts = []
     for number, colour in enumerate(BEAD_COLOURS):  # the worst on top, as layers lie over each other

@@ -75,7 +75,7 @@ export class Buttons {
     document.getElementById("sure-no").focus();
   }
   accept() {
-    if (document.getElementById("sure-yes").disabled) return;
+    if (document.getElementById("sure-yes").disabled) return this.say("Nothing is heard from the run just now: answer again.", true);
     const { wish, turn } = this.asking;
     this.drop();
     this.send(wish, turn);

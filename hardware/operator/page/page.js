@@ -136,7 +136,7 @@ function stage(seen) {
   document.body.dataset.turn = seen.turn;
   const at = STAGES[seen.stage], does = doing(seen), holds = does && seen.motion.activity === "holding", now = does || at;
   const same = seen.question.toLowerCase() === at.word.toLowerCase(); // it stands beside it already
-  const question = outlining.on ? "Where is the wound's edge?" : (holds && "Holding until it is safe to go on.") || (!same && seen.question) || at.say;
+  const question = outlining.on ? "Where is the wound's edge?" : (holds && "Holding until it is safe to go on.") || (seen.result && seen.result.printed >= 1 && at.say === STAGES.ended.say && "The path is printed; the run was finished before the arm was home.") || (!same && seen.question) || at.say;
   put("chip", now.word);
   document.body.dataset.tone = now.tone;
   put("question", question);
@@ -259,8 +259,8 @@ function tiles(seen) {
   };
   const beyond = (value, limit) => value !== null && limit !== null && value > limit;
   const old = motion && motion.error !== null && (motion.error_age === null || motion.error_age > AGED), ago = old && motion.error_age !== null ? `, ${duration(motion.error_age)} ago` : "";
-  put("error", figure(motion && motion.error, 2), motion && motion.limit !== null ? `mm, limit ${motion.limit}` : "mm", `predicted error${ago}`, motion && beyond(motion.error, motion.limit), old);
-  put("truth", figure(motion && motion.true_error, 2), "mm", `true error${ago}`, motion && beyond(motion.true_error, motion.limit), old);
+  put("error", figure(motion && motion.error, 2), motion && motion.limit !== null ? `mm, limit ${motion.limit}` : "mm", old ? `predicted${ago}` : "predicted error", motion && beyond(motion.error, motion.limit), old);
+  put("truth", figure(motion && motion.true_error, 2), "mm", old ? `true${ago}` : "true error", motion && beyond(motion.true_error, motion.limit), old);
   document.querySelector("[data-tile=truth]").hidden = !motion || motion.true_error === null;
   put("sigma", figure(tracking && tracking.sigma, 3), "mm", "uncertainty");
   put("age", milliseconds(tracking && tracking.age), "ms", "age of pose");

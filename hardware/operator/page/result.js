@@ -79,7 +79,11 @@ export class ResultView {
     const [low, high] = [along.map((v) => Math.min(...v)), along.map((v) => Math.max(...v))], margin = 8 * ratio;
     const scale = Math.min(...[w, h].map((size, k) => (size - 2 * margin) / Math.max(high[k] - low[k], 1)));
     const place = (i) => [w / 2 + scale * (p[3 * i] - (low[0] + high[0]) / 2), h / 2 - scale * (p[3 * i + 1] - (low[1] + high[1]) / 2)];
-    const of = (i) => result.stretches[Math.min(Math.floor((scene.checkpoint[i] / Math.max(result.total, 1)) * result.stretches.length), result.stretches.length - 1)];
+    const count = result.stretches.length, stretch = (number) => Math.min(Math.floor((number / Math.max(result.total, 1)) * count), count - 1);
+    const of = (i) => { // the largest error on the way to a place, null where none was printed there
+      const known = result.stretches.slice(stretch(scene.checkpoint[i - 1]), stretch(scene.checkpoint[i]) + 1).filter((error) => error !== null);
+      return known.length ? Math.max(...known) : null;
+    };
     g.lineCap = "round";
     g.lineWidth = Math.max(Math.min(0.4 * scale, 4 * ratio), 1.2 * ratio);
     const pieces = [];
