@@ -327,7 +327,7 @@ class LiveRun:
             self._channels.sender.put(EventEntry(now, machine.silence, WARNING, "run"))
         self._silence_logged = bool(machine.silence)
         if machine.turn != self._turn:
-            self._turn = machine.turn
+            self._turn, self._view_put = machine.turn, -1e9  # the page is told at once
             if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.value):
                 self._channels.start.value = now
             self._log(stage_line(machine.stage, machine.reason))
