@@ -576,9 +576,7 @@ def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_a
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_while_a_scene_is_rendered_ends_within_a_second_and_leaves_nothing(
-    tmp_path: Path, number: int
-) -> None:
+def test_a_signal_while_a_scene_is_rendered_ends_it_at_once_and_leaves_nothing(tmp_path: Path, number: int) -> None:
     cache = tmp_path / "stillbed"
     (cache / "old-1.part-999999999").mkdir(parents=True)  # left by one that was killed
     scenario = Path(__file__).parents[1] / "data" / "live" / "small.toml"
@@ -595,7 +593,7 @@ def test_a_signal_while_a_scene_is_rendered_ends_within_a_second_and_leaves_noth
     (os.killpg if number == signal.SIGINT else os.kill)(run.pid, number)  # Ctrl-C reaches all of them
     begun = time.monotonic()
     _, said = run.communicate(timeout=20)
-    assert time.monotonic() - begun < 3.0  # 0.2 s on an idle machine, 1.1 s beside ten busy processes
+    assert time.monotonic() - begun < 3.0  # at most 1.1 s were seen, beside ten busy processes
     assert not list(cache.glob("*")) and not Path(f"/proc/{child}").exists()
     assert "Traceback" not in said and run.returncode == 130
 
