@@ -70,6 +70,7 @@ OWNERS = {  # library: the files that may import it
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
+    "open3d": ("estimation/scans/*.py", "hardware/files/mesh_reader.py"),
     "orjson": ("hardware/recording/recorder.py",),
     "packaging": ("hardware/cli/doctor.py",),
     "pycolmap": ("hardware/bench/smoothing.py",),
@@ -91,7 +92,7 @@ TOOLS = {"mypy", "ruff", "pytest_timeout", "pytest_xdist", "evo", "dask"}  # of 
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 ALLOWED |= {"CHANGELOG.md", "CITATION.cff"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
-MOTION_NEVER = {"gtsam", "numba", "cv2", "onnxruntime"}
+MOTION_NEVER = {"gtsam", "numba", "cv2", "onnxruntime", "open3d"}
 
 MAX_MODULES, MAX_ROOM, MAX_LINES = 300, 20, 400
 MIN_LONE_LINES = 60  # a module with a single importer has at least so many, or belongs into it
@@ -343,7 +344,7 @@ TESTS = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "docs" / "examples").glob("*.
 
 def _packages(requirements: list[str]) -> Set[str]:
     """The names under which requirements are imported."""
-    imports = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyyaml": "yaml"}
+    imports = {"opencv-python-headless": "cv2", "open3d-cpu": "open3d", "pyserial": "serial", "pyyaml": "yaml"}
     names = [re.split(r"[><=~\[ ]", line)[0] for line in requirements]
     return {imports.get(name, name.replace("-", "_")) for name in names}
 
