@@ -19,11 +19,10 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.cli.main import main
-from hardware.files.mesh_file import SCAN_UNITS, in_mm
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_contour, read_path
-from hardware.files.ply_file import write_ply
 from hardware.plan import run as planning_command
-from hardware.plan.order import SETTING_RANGES, PlanSettings, example_scan, order_of
+from hardware.plan.order import SCAN_UNITS, SETTING_RANGES, PlanSettings, example_scan, in_mm, order_of
 from hardware.plan.run import MAX_MIDDLE_DISTANCE, WoundSighting, _sighting, placement_lines
 from perception.lens import Lenses
 from planning.command import Move

@@ -15,7 +15,7 @@ from estimation.errors import InputError
 from estimation.scans.scan import face_normals
 from estimation.se3 import Array
 from hardware.cli.main import main
-from hardware.files.ply_file import write_ply
+from hardware.files.mesh_file import write_ply
 from planning.fill.bead import Pattern
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits, tilt_field, tool_rotations
 from planning.layers.grid import grid_over, unroll
