@@ -196,8 +196,9 @@ class ScanIndex:
         """Nearest points of the scan to points (N, 3)."""
         triangle, weights = self._scene.closest(points)
         nearest = np.einsum("nk,nki->ni", weights, self._corners[triangle])
-        rim = (weights < RIM_WEIGHT) & self._open[triangle] | (weights > 1 - RIM_WEIGHT) & self._rim[triangle]
-        return ClosestPoints(nearest, normals_at(self.scan, triangle, weights), rim.any(axis=1))
+        beside = (weights < RIM_WEIGHT) & self._open[triangle]
+        rim = np.any(beside | ((weights > 1 - RIM_WEIGHT) & self._rim[triangle]), axis=1)
+        return ClosestPoints(nearest, normals_at(self.scan, triangle, weights), rim)
 
 
 def _spread(scan: Scan, spacing: float) -> tuple[Index, Array]:

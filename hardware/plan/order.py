@@ -206,7 +206,7 @@ MAX_COORDINATE = 1e6  # mm: a kilometre; beyond it a scan has lost the hundredth
 MIN_SCAN_WITH_SKIN, MAX_SCAN_WITH_SKIN = 20.0, 1000.0  # mm, longest side: from a finger to a leg
 
 
-def in_mm(vertices: Array, triangles: Array, unit: str, where: object) -> Array:
+def in_mm(vertices: Array, triangles: Index, unit: str, where: object) -> Array:
     """Vertices (V, 3) in mm; InputError where the scan is too small or too large, with the units that would fit."""
     used = vertices[np.unique(np.clip(triangles, 0, len(vertices) - 1))]
     used = used[np.isfinite(used).all(axis=1)]

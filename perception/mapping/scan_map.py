@@ -340,9 +340,8 @@ class ScanPlacing:
         lattice = np.stack(np.meshgrid(*lines), -1)
         size = float(np.ptp(self.scan.vertices, axis=0).max())
         above = np.concatenate([lattice, np.full((*lattice.shape[:2], 1), size)], -1).reshape(-1, 3)
-        down = np.broadcast_to(-z, above.shape)
-        hits = cast_rays(self.scan, se3.transform_points(surface_from_plane, above), down)
-        return hits.points.reshape(*lattice.shape[:2], 3)
+        above = se3.transform_points(surface_from_plane, above)
+        return cast_rays(self.scan, above, np.broadcast_to(-z, above.shape)).points.reshape(*lattice.shape[:2], 3)
 
 
 def as_at_one_instant(rig: Rig, pose: Array, single: dict[int, Array]) -> Rig:

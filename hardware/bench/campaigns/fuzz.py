@@ -29,12 +29,12 @@ from hardware.arm import protocol
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream, Reply, ReplyKind
 from hardware.bench.campaigns.fuzz_process import (
-    Block,
     Reader,
     ReaderSum,
     Task,
     append_log,
     fuzz_figures,
+    print_failure,
     read_log,
     run_tasks,
 )
@@ -105,10 +105,7 @@ BINARY_PLY_HEADER = (
     "ply\nformat binary_big_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
     "property uchar red\nelement face 5\nproperty list uchar uint vertex_indices\nend_header\n"
 )
-PCD_HEADER = (
-    "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
-    "POINTS {0}\nDATA binary\n"
-)
+PCD_HEADER = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA binary\n"
 OFF_TEXT = "OFF\n4 2 0\n0 0 0\n20 0 0\n0 20 0\n20 20 1\n3 0 1 2\n3 1 3 2\n"
 GLTF_TEXT = """{"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
 "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}], "accessors": [
@@ -124,6 +121,7 @@ SMALL_SIZE, VIDEO_RATE, FRAME_COUNT = (48, 32), 30, 3  # px, Hz
 CORNERS_KEY = "0123456789abcdef" * 4  # of the recording that the corners belong to
 HAS_INDEX, KEY_FRAME = 0x10, 0x10  # flags of an AVI
 FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}
+XYZ_TEXT = "".join(f"{k % 9} {k // 9} {k % 7 / 10}\n" for k in range(81))
 
 
 def _small_picture(number: int) -> Image:
@@ -352,7 +350,7 @@ def readers() -> dict[str, Reader]:
         "OFF": _plain("x.off", OFF_TEXT, _read_mesh),
         "glTF": _plain("x.gltf", GLTF_TEXT, _read_mesh),
         "cloud": Reader("x.pcd", _make_cloud, _read_mesh),
-        "text of a cloud": _plain("x.xyz", "".join(f"{k % 9} {k // 9} {k % 7 / 10}\n" for k in range(81)), _read_mesh),
+        "text of a cloud": _plain("x.xyz", XYZ_TEXT, _read_mesh),
         "scan to plan on": Reader("x.ply", _make_skin, _read_skin),
         "settings of a network": Reader("wound.toml", _make_model, _read_model),
         "network": Reader("wound.onnx", _make_model, _read_model),
@@ -380,7 +378,7 @@ def run_fuzz(options: argparse.Namespace) -> list[Figure]:
         for block in read_log(options.log, options.seed):
             if block.name in sums:
                 sums[block.name].add(block)
-                _print_failure(block)
+                print_failure(block)
     share = -(-options.count // len(sums))
     tasks = [Task(name, range(done.count, share)) for name, done in sums.items() if done.count < share]
     count, total = 0, sum(len(task.numbers) for task in tasks)
@@ -392,21 +390,10 @@ def run_fuzz(options: argparse.Namespace) -> list[Figure]:
             if block.wrong:
                 progress.close()
                 save = options.out is not None and sums[block.name].wrong <= MAX_SAVED_INPUTS
-                _print_failure(block, options.out if save else None)
+                print_failure(block, options.out if save else None)
             count += block.count
             progress(count, total)
     for name, done in sums.items():
         each = 1e6 * done.seconds / max(done.count, 1)
         print(f"{name:<24}{done.count:>9}  refused {done.refused:>9}  wrong {done.wrong:>3}  {each:>7.0f} us each")
     return fuzz_figures(list(sums.values()))
-
-
-def _print_failure(block: Block, out: Path | None = None) -> None:
-    """Print what failed, if anything. out: the folder in which the input is saved, too."""
-    text = ""
-    if out is not None:
-        file = out / f"{block.name.replace(' ', '_')}_{block.number}.bin"
-        file.write_bytes(block.case)
-        text = f"; kept as {file}"
-    if block.wrong:
-        print(f"{block.name}, input {block.number}: {block.wrong}{text}", flush=True)

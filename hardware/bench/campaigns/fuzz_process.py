@@ -130,6 +130,17 @@ class ReaderSum:
         self.wrong += bool(block.wrong)
 
 
+def print_failure(block: Block, out: Path | None = None) -> None:
+    """Print what failed, if anything. out: the folder in which the input is saved, too."""
+    text = ""
+    if out is not None:
+        file = out / f"{block.name.replace(' ', '_')}_{block.number}.bin"
+        file.write_bytes(block.case)
+        text = f"; kept as {file}"
+    if block.wrong:
+        print(f"{block.name}, input {block.number}: {block.wrong}{text}", flush=True)
+
+
 def fuzz_figures(sums: Sequence[ReaderSum]) -> list[Figure]:
     """The figures of all readers."""
     count, refused = sum(each.count for each in sums), sum(each.refused for each in sums)
