@@ -372,6 +372,12 @@ def test_the_motion_process_loads_none_of_the_heavy_libraries() -> None:
     assert "planning.command" in loaded.stdout.split() and MOTION_NEVER.isdisjoint(loaded.stdout.split())
 
 
+def test_tracking_and_planning_load_open3d_only_where_there_is_a_scan_to_be_placed() -> None:
+    code = "import sys, hardware.plan.run, hardware.live.tracking_process; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "perception.mapping.scan_map" in loaded.stdout.split() and "open3d" not in loaded.stdout.split()
+
+
 HOUSE = (ROOT / "docs" / "house.md").read_text(encoding="utf-8")
 STEP = re.compile(r"^\d+\. `([\w/]+\.py)` `([\w.]+)`", re.MULTILINE)
 

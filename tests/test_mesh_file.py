@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,12 +18,14 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.scans.scan import Scan
+from estimation.scans.scan import Scan, ScanIndex, face_areas, face_normals
+from estimation.se3 import Array
+from hardware.bench.campaigns.fuzz import GLTF_TEXT, OFF_TEXT, PCD_HEADER
 from hardware.files import mesh_file
 from hardware.files.mesh_file import MeshFile, write_ply
 from hardware.files.mesh_file import read_mesh as read_mesh_apart
 from hardware.files.mesh_file import read_raw_mesh as read_raw_mesh_apart
-from hardware.files.mesh_reader import MAX_LINE_BYTES, MAX_MESH_ROWS, STL_HEADER_BYTES, MeshReader, RawMesh
+from hardware.files.mesh_reader import MAX_LINE_BYTES, MAX_MESH_ROWS, STL_HEADER_BYTES, MeshReader, RawMesh, _ending
 from hardware.plan.order import in_mm
 from tests import scans
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
@@ -406,3 +411,123 @@ def test_a_vertex_that_is_kilometres_away_is_named(far: float) -> None:
         in_mm(vertices, BALL.triangles, "mm", "x.ply")
     vertices[5, 1] = np.nan  # is left out, and counted
     assert in_mm(vertices, BALL.triangles, "mm", "x.ply").shape == vertices.shape
+
+
+DEADLY = (
+    HEAD.replace(b"vertex 3", b"vertex 4") + FACE + b"end_header\n0 0 0\n20 0 0\n20 20 0\n0 20 0\n4 0 1 2 99999999\n"
+)
+
+
+def test_a_file_that_ends_the_library_is_one_error_and_the_next_is_read(tmp_path: Path) -> None:
+    assert "SIGSEGV" in refused(
+        tmp_path, "x.ply", DEADLY
+    )  # open3d 0.20 cuts the polygon before it looks at its corners
+    assert len(read_mesh(write(tmp_path / "ball.ply", BALL)).scan.triangles)
+
+
+def test_a_reader_that_is_gone_is_one_error(tmp_path: Path) -> None:
+    path = write(tmp_path / "ball.ply", BALL)
+    with MeshReader() as reader:
+        os.kill(reader._process.pid, signal.SIGKILL)
+        with pytest.raises(InputError, match="the process that reads it ended with -9"):
+            read_mesh_apart(path, reader)
+
+
+def test_how_a_fork_ended_is_said_in_words() -> None:
+    assert "within 120 s" in _ending(-signal.SIGALRM, "") == _ending(-signal.SIGXCPU, "")
+    assert "SIGABRT" in _ending(-signal.SIGABRT, "x") and _ending(1, "words") == "words" and "with 1" in _ending(1, "")
+
+
+def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "ball.ply", BALL)
+
+    class Slow(MeshReader):
+        def __init__(self) -> None: ...
+
+        def read(self, path: Path, cloud: bool) -> dict[str, Any]:
+            found = KEPT[0].read(path, cloud)
+            path.write_bytes(path.read_bytes() + b"0 0 0\n")
+            return found
+
+    with pytest.raises(InputError, match="changed while it was read"):
+        read_mesh_apart(path, Slow())
+
+
+def cloud_file(path: Path, points: Array) -> Path:
+    rows = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in points.tolist())
+    if path.suffix == ".ply":
+        head = HEAD.replace(b"vertex 3", b"vertex %d" % len(points)).replace(b"float", b"double")
+        path.write_bytes(head + b"end_header\n" + rows.encode())
+    elif path.suffix == ".pcd":
+        path.write_bytes(PCD_HEADER.format(len(points)).encode() + points.astype("<f4").tobytes())
+    else:
+        path.write_text("# a comment\n" + rows)
+    return path
+
+
+SKIN = scans.height_field(scans.body)
+SCATTERED = np.random.default_rng(2).permutation(SKIN.vertices)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
+def test_a_surface_is_laid_through_a_cloud_its_outside_up(tmp_path: Path, suffix: str) -> None:
+    mesh = read_mesh(cloud_file(tmp_path / f"cloud{suffix}", SCATTERED)).scan
+    assert face_areas(mesh).sum() == pytest.approx(face_areas(SKIN).sum(), rel=0.01)
+    assert (face_normals(mesh)[:, 2] > 0).all()
+    away = ScanIndex(SKIN).closest(mesh.corners.mean(axis=1)).points - mesh.corners.mean(axis=1)
+    assert np.linalg.norm(away, axis=1).max() < 0.1
+
+
+def test_a_hole_in_a_cloud_stays_open_and_dust_is_left_out(tmp_path: Path) -> None:
+    beside = np.linalg.norm(SCATTERED[:, :2], axis=1) > 6
+    dust = np.array([[0.0, 0, 25], [3, 60, 10], [-70, 0, 0]])
+    mesh = read_mesh(cloud_file(tmp_path / "cloud.xyz", np.concatenate([SCATTERED[beside], dust]))).scan
+    expected = face_areas(SKIN).sum() - np.pi * 6**2
+    assert face_areas(mesh).sum() == pytest.approx(expected, rel=0.02) and mesh.vertices[:, 2].max() < 10
+
+
+def test_a_cloud_gives_the_same_bytes_on_one_core_and_on_all(tmp_path: Path) -> None:
+    path, cores = cloud_file(tmp_path / "cloud.xyz", SCATTERED), os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        alone = read_raw_mesh_apart(path)  # in a process that has one core
+    finally:
+        os.sched_setaffinity(0, cores)
+    beside = read_raw_mesh(path)
+    assert alone.vertices.tobytes() == beside.vertices.tobytes()
+    assert alone.triangles.tobytes() == beside.triangles.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("x.xyz", b"0 0 0\n" * 100, "1 different points"),
+        ("x.xyz", b"", "0 bytes"),
+        ("x.xyz", b"0 0 0\n1 2\n", "line 2 = '1 2'"),
+        ("x.xyz", b"0 0 0\n1 2 3x\n", "line 2 = '1 2 3x'"),
+        ("x.pcd", b"FIELDS x y z\nDATA ascii\n", "no line POINTS"),
+        ("x.pcd", b"POINTS 9000000\n", "points = 9000000"),
+        ("x.off", OFF_TEXT.replace("4 2 0", "4 3 0").encode(), "could not read"),
+        ("x.off", OFF_TEXT.replace("4 2 0", "4 1 0").encode() + b"?", "x.off"),
+        ("x.off", b"OFF\n", "line 2"),
+        ("x.gltf", GLTF_TEXT[:-5].encode(), "in its JSON"),
+        (
+            "x.gltf",
+            GLTF_TEXT.replace('"count": 3, "type": "SCALAR"', '"count": 6, "type": "SCALAR"').encode(),
+            "x.gltf",
+        ),
+        ("x.glb", b"glTF" + bytes(16), "bytes = 20, allowed 0"),
+    ],
+)
+def test_what_is_wrong_in_another_format_is_said(name: str, data: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(data)
+    if data.endswith(b"?"):  # of an OFF file what follows its faces is passed over
+        assert len(read_raw_mesh(tmp_path / name).triangles) == 1
+        return
+    assert said in refused(tmp_path, name, data)
+
+
+def test_off_and_gltf_are_read(tmp_path: Path) -> None:
+    assert read(tmp_path, "x.off", OFF_TEXT.encode()).triangles.tolist() == [[0, 1, 2], [1, 3, 2]]
+    mesh = read(tmp_path, "x.gltf", GLTF_TEXT.encode())
+    np.testing.assert_array_equal(mesh.vertices[mesh.triangles], [[[0, 0, 0], [20, 0, 0], [0, 20, 0]]])

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 PLAN_TEXT = """\
 Plan the print of a wound. SCAN is a mesh (.ply, .stl, .obj, .off, .gltf, .glb) or a cloud of points (.ply, .pcd,
-.xyz) of the wound with skin around it, or a flat contour
-(.csv with x_mm,y_mm): one layer. The mesh is repaired, the wound found as the depression in the skin, the healthy
-skin interpolated over it, the volume between cut into layers, each filled with beads, and the tool led over them.
+.xyz) of the wound with skin around it, or a flat contour (.csv with x_mm,y_mm): one layer. The mesh is repaired, the
+wound found as the depression in the skin, the healthy skin interpolated over it, the volume between cut into layers,
+each filled with beads, and the tool led over them.
 
 Writes PATH.csv, whole or not at all, and beside it PATH_layers.csv and PATH.json (coverage, lengths, times, volumes),
 PATH_scan.ply (the scan as repaired), PATH_layers/ (a picture of each layer) and PATH.html (a report with a view in

@@ -41,10 +41,10 @@ MODULE = "hardware.files.mesh_reader"
 SHARED_LIBRARIES = "libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0"  # Debian's packages that open3d links to
 
 MAX_CLOUD_POINTS = 200_000  # a surface through more takes minutes, and is no better: 0.3 mm apart on a forearm
-OUTLIER_NEIGHBOURS, OUTLIER_SIGMAS = 20, 4.0  # a point whose neighbours are further than most others' is dust
+DUST_NEIGHBOURS, DUST_REACH = 4, 4.0  # a point with fewer neighbours within so many usual distances is dust
 NORMAL_NEIGHBOURS = 24  # points that a normal is laid through
 ORIENTATION_NEIGHBOURS = 12  # points over which neighbours' normals are made to agree
-BALL_RADII = (1.0, 2.0, 4.0)  # of the balls, in mean distances of points: the first closes an even cloud, the last gaps
+BALL_RADII = (1.5, 3.0)  # of the balls, in usual distances of points: the first closes an even cloud, the second gaps
 
 COLOURS = re.compile("\x1b\\[[0-9;]*m")  # of words on a terminal
 Arrays = dict[str, Any]
@@ -225,7 +225,8 @@ def surface_through(cloud: Any) -> Arrays:
         cloud = _thinned(cloud)
     if len(cloud.points) <= NORMAL_NEIGHBOURS:
         raise MeshReaderError(f"{len(cloud.points)} different points, {NORMAL_NEIGHBOURS + 1} or more are needed")
-    cloud, _ = cloud.remove_statistical_outlier(OUTLIER_NEIGHBOURS, OUTLIER_SIGMAS)
+    apart = float(np.median(np.asarray(cloud.compute_nearest_neighbor_distance())))
+    cloud, _ = cloud.remove_radius_outlier(DUST_NEIGHBOURS, DUST_REACH * apart)
     if not cloud.has_normals():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
         cloud.orient_normals_consistent_tangent_plane(ORIENTATION_NEIGHBOURS)
@@ -233,8 +234,7 @@ def surface_through(cloud: Any) -> Arrays:
         if np.einsum("ni,ni->", normals, points - points.mean(axis=0)) < 0:
             cloud.normals = o3d.utility.Vector3dVector(-normals)
     cloud.normalize_normals()
-    apart = float(np.mean(np.asarray(cloud.compute_nearest_neighbor_distance())))
-    radii = o3d.utility.DoubleVector([1.5 * apart * radius for radius in BALL_RADII])
+    radii = o3d.utility.DoubleVector([apart * radius for radius in BALL_RADII])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
     return {"vertices": np.asarray(mesh.vertices), "triangles": np.asarray(mesh.triangles, np.int64), "count": count}
 
