@@ -364,10 +364,10 @@ def test_what_is_wrong_in_an_obj_file_is_said(line: str, said: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("vertex 20.0 0.0 0.0\n", "", "allowed vertex, of"),
-        ("vertex 20.0 0.0 0.0", "vertex 20.0 0.0", "allowed vertex, of"),
-        ("vertex 20.0 0.0 0.0", "vertex 20.0 x 0.0", "allowed vertex, of"),
-        ("vertex 20.0 0.0 0.0", "vertex 20.0 0.0 0.0\nvertex 1 2 3", "allowed endloop, of"),
+        ("vertex 20.0 0.0 0.0\n", "", "allowed vertex and three numbers"),
+        ("vertex 20.0 0.0 0.0", "vertex 20.0 0.0", "allowed vertex and three numbers"),
+        ("vertex 20.0 0.0 0.0", "vertex 20.0 x 0.0", "allowed vertex and three numbers"),
+        ("vertex 20.0 0.0 0.0", "vertex 20.0 0.0 0.0\nvertex 1 2 3", "allowed endloop"),
         ("outer loop\n", "", "allowed outer"),
         ("endsolid a b", "endsolit", "allowed facet"),
         ("endsolid a b\n", "endsolid\nendsolid", "allowed solid"),

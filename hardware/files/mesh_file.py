@@ -21,9 +21,7 @@ from estimation.errors import InputError
 from estimation.scans.scan import Scan, open_edges, scan_from_triangles
 from estimation.se3 import Array
 from hardware.files.mesh_reader import (
-    NUMBER,
     PLAIN_READERS,
-    THREE_NUMBERS,
     MeshReader,
     MeshReaderError,
     RawMesh,
@@ -203,6 +201,9 @@ def announced_by_pcd(path: Path) -> Announcement:
     raise InputError(path, "header", "no line POINTS before DATA", "POINTS and how many there are")
 
 
+# open3d takes what begins like a number for one
+NUMBER = rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)"
+THREE_NUMBERS = rb"(?: " + NUMBER + rb"){3}"
 XYZ_LINE = re.compile(THREE_NUMBERS + rb"(?: " + NUMBER + rb")*", re.IGNORECASE)
 
 

@@ -18,6 +18,7 @@ import subprocess
 import sys
 from array import array
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -100,7 +101,8 @@ class MeshReader:
         """End the process."""
         for stream in (self._process.stdin, self._process.stdout):
             assert stream is not None
-            stream.close()
+            with suppress(BrokenPipeError):  # of a request that nobody took any more
+                stream.close()
         self._process.wait()
 
     def __enter__(self) -> MeshReader:
@@ -268,14 +270,10 @@ def check_rows(path: Path, what: str, count: int) -> None:
         raise InputError(path, what, count, f"{MAX_MESH_ROWS} or fewer: make the mesh coarser")
 
 
-# the libraries that read text take what begins like a number for one, or leave a line out of which they can make none
-NUMBER = rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)"
-THREE_NUMBERS = rb"(?: " + NUMBER + rb"){3}"
 STL_HEADER_BYTES = 84  # bytes: eighty of anything, and the number of triangles
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-STL_LINES = "solid, facet normal and vertex with three numbers each, outer loop, endloop, endfacet or endsolid"
 STL_ORDER = (b"facet", b"outer", b"vertex", b"vertex", b"vertex", b"endloop", b"endfacet")  # a triangle, line by line
-STL_LINE = re.compile(rb"(?:facet normal|vertex)" + THREE_NUMBERS + rb"|outer loop|endloop|endfacet", re.IGNORECASE)
+STL_REST = {b"facet": " or endsolid", b"vertex": " and three numbers"}  # what may follow, or stand there instead
 
 
 def read_stl(path: Path) -> RawMesh:
@@ -303,24 +301,27 @@ def _text_corners(file: BinaryIO, path: Path) -> array[float]:
     """Nine numbers for each triangle of a text STL file, of all its solids."""
     corners, step, solid = array("d"), 0, False
     for number, words in text_rows(file, path):
-        word = words[0].lower()
+        word, expected = words[0].lower(), STL_ORDER[step]
         if step == 0 and word == (b"endsolid" if solid else b"solid"):
             solid = not solid
-        elif solid and word == STL_ORDER[step] and STL_LINE.fullmatch(b" ".join(words)):
-            corners.extend(map(float, words[1:] if word == b"vertex" else ()))
-            check_rows(path, "triangles", len(corners) // 9)
-            step = (step + 1) % len(STL_ORDER)
-        else:
-            allowed = STL_ORDER[step].decode() + (" or endsolid" if step == 0 else "") if solid else "solid"
-            raise wrong_line(path, number, words, f"{allowed}, of {STL_LINES}")
+            continue
+        try:
+            if not solid or word != expected:
+                raise ValueError
+            if word == b"vertex":
+                x, y, z = words[1:]
+                corners.extend((float(x), float(y), float(z)))
+                check_rows(path, "triangles", len(corners) // 9)
+        except ValueError:
+            allowed = expected.decode() + STL_REST.get(expected, "") if solid else "solid"
+            raise wrong_line(path, number, words, allowed) from None
+        step = (step + 1) % len(STL_ORDER)
     if solid:
         raise InputError(path, "scan", "ends within a solid", "endsolid as its last line (is it cut short?)")
     return corners
 
 
-OBJ_LINES = "v and the three numbers of a place, or f and three or more numbers of vertices, counted from 1"
-OBJ_VERTEX = re.compile(rb"v" + THREE_NUMBERS + rb"(?: " + NUMBER + rb")*", re.IGNORECASE)
-OBJ_FACE = re.compile(rb"f(?: -?\d{1,9}(?:/(?:-?\d+)?){0,2}){3,}")
+OBJ_VERTEX, OBJ_FACE = "v and the three numbers of a place", "f and three or more numbers of vertices, counted from 1"
 IGNORED_OBJ_WORDS = frozenset(
     b"vt vn vp g o s mg l p usemtl mtllib usemap maplib bevel c_interp d_interp lod shadow_obj trace_obj".split()
 )
@@ -335,31 +336,38 @@ def read_obj(path: Path) -> RawMesh:
     places, triangles, faces = array("d"), array("q"), 0
     with path.open("rb") as file:
         for number, words in text_rows(file, path):
-            words = words[: next((k for k, word in enumerate(words) if word.startswith(b"#")), None)]
-            if not words or words[0] in IGNORED_OBJ_WORDS:
-                continue
-            corners = [int(word.partition(b"/")[0]) for word in words[1:]] if _is_face(words) else []
-            vertices = len(places) // 3
-            if (
-                0 in corners
-                or min(corners, default=0) < -vertices
-                or (not corners and not OBJ_VERTEX.fullmatch(b" ".join(words)))
-            ):
-                raise wrong_line(path, number, words, OBJ_LINES)
-            if not corners:
-                places.extend(map(float, words[1:4]))
-                check_rows(path, "vertices", vertices + 1)
-                continue
-            corners = [corner + vertices if corner < 0 else corner - 1 for corner in corners]
-            for one, other in pairwise(corners[1:]):
-                triangles.extend((corners[0], one, other))
-            faces += 1
-            check_rows(path, "faces", faces)
+            word = words[0]
+            if word not in (b"v", b"f"):
+                if word in IGNORED_OBJ_WORDS or word.startswith(b"#"):
+                    continue
+                raise wrong_line(path, number, words, f"{OBJ_VERTEX}, or {OBJ_FACE}")
+            try:
+                if word == b"v":
+                    x, y, z = words[1:4]
+                    places.extend((float(x), float(y), float(z)))
+                    check_rows(path, "vertices", len(places) // 3)
+                else:
+                    first, *others = _corners(words[1:], len(places) // 3)
+                    for one, other in pairwise(others):
+                        triangles.extend((first, one, other))
+                    faces += 1
+                    check_rows(path, "faces", faces)
+            except (ValueError, OverflowError):
+                raise wrong_line(path, number, words, OBJ_VERTEX if word == b"v" else OBJ_FACE) from None
     return RawMesh(np.array(places).reshape(-1, 3), np.array(triangles, np.int64).reshape(-1, 3))
 
 
-def _is_face(words: list[bytes]) -> bool:
-    return OBJ_FACE.fullmatch(b" ".join(words)) is not None
+def _corners(words: list[bytes], vertices: int) -> list[int]:
+    """Numbers, from 0, of the corners that the words i, i/t, i//n or i/t/n name. vertices: how many have come so far.
+
+    ValueError: they are no face.
+    """
+    if b"#" in words:
+        words = words[: words.index(b"#")]
+    corners = [int(word.partition(b"/")[0]) for word in words]
+    if len(corners) < 3 or 0 in corners or min(corners) < -vertices:
+        raise ValueError
+    return [one - 1 if one > 0 else vertices + one for one in corners]
 
 
 PLAIN_READERS = {".stl": read_stl, ".obj": read_obj}
