@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -29,6 +31,7 @@ from perception.frames import PrintHead
 from tests.recorded import write_frames
 from tests.session_files import NAMES, rig, trajectory
 
+ROOT = Path(__file__).parents[1]
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 BEGAN = 1_764_150_000_123_456_789  # ns, UTC at stamp 0
 SETS = 5
@@ -149,6 +152,16 @@ def test_ros_knows_every_message_but_foxgloves_as_its_own(recording: Path) -> No
             if connection.topic not in own and not connection.msgtype.startswith("foxglove_msgs"):
                 assert reader.typestore.fielddefs[connection.msgtype] == STORE.fielddefs[connection.msgtype]
     assert own == {"/rig", "/frames", "/head", "/observations", "/pose"}
+
+
+def test_foxgloves_layout_shows_channels_that_there_are(recording: Path) -> None:
+    layout = json.loads((ROOT / "data" / "viewers" / "foxglove.json").read_text(encoding="utf-8"))
+    named = set(re.findall(r'"(/[a-z_0-9/]+)(?:\.data)?"', json.dumps(layout["configById"])))
+    named = {re.sub(r"^/camera/cam_\d/", f"/camera/{NAMES[0]}/", topic) for topic in named}
+    with AnyReader([recording]) as reader:
+        assert named - set(reader.topics) == {"/error/tracking"}  # there is no truth in this one
+    shown, panels = json.dumps(layout["layout"]), set(layout["configById"])
+    assert all(f'"{panel}"' in shown for panel in panels) and len(panels) == 6
 
 
 WORDS = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=12)
