@@ -517,6 +517,9 @@ def test_a_cloud_gives_the_same_bytes_on_one_core_and_on_all(tmp_path: Path) -> 
             "x.gltf",
         ),
         ("x.glb", b"glTF" + bytes(16), "bytes = 20, allowed 0"),
+        ("x.obj", b"f 1 2 3\n", "0 points, 1 triangles"),
+        ("x.obj", b"v 0 0 0\n", "1 points, 0 triangles"),
+        ("x.xyz", b"0 0 0\n1 2 3\x004\n", "bytes that are 0"),
     ],
 )
 def test_what_is_wrong_in_another_format_is_said(name: str, data: bytes, said: str, tmp_path: Path) -> None:

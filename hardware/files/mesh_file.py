@@ -282,10 +282,8 @@ def read_raw_mesh(path: str | Path, reader: MeshReader | None = None) -> RawMesh
     after = path.stat()
     if (after.st_size, after.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
         raise InputError(path, "scan", "a file that changed while it was read", "one that is finished")
-    if not len(mesh.triangles):
-        got = (
-            f"{len(mesh.vertices)} points and no triangles" if len(mesh.vertices) else f"{before.st_size} bytes, empty"
-        )
+    if not len(mesh.triangles) or not len(mesh.vertices):
+        got = f"{before.st_size} bytes, {len(mesh.vertices)} points, {len(mesh.triangles)} triangles"
         raise InputError(path, "scan", got, WHOLE_MESH)
     return mesh
 

@@ -255,6 +255,8 @@ def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int,
         if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
             raise InputError(path, f"line {number}", f"{MAX_LINE_BYTES} bytes or more", f"fewer than {MAX_LINE_BYTES}")
         words = line.split()
+        if b"\0" in line:  # where C ends a word
+            raise wrong_line(path, number, words, "text without bytes that are 0")
         if words:
             yield number, words
 
