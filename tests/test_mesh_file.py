@@ -453,6 +453,22 @@ def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
         read_mesh_apart(path, Slow())
 
 
+@pytest.mark.parametrize(("name", "what"), [("x.ply", "faces"), ("x.gltf", "triangles"), ("x.off", "vertices")])
+def test_a_part_of_a_file_is_not_taken_for_all_of_it(tmp_path: Path, name: str, what: str) -> None:
+    data = {"x.ply": SQUARE + b"3 0 1 2\n", "x.gltf": GLTF_TEXT.encode(), "x.off": OFF_TEXT.encode()}[name]
+    (tmp_path / name).write_bytes(data)
+
+    class Forgetful(MeshReader):
+        def __init__(self) -> None: ...
+
+        def read(self, path: Path, cloud: bool) -> dict[str, Any]:
+            found = KEPT[0].read(path, cloud)
+            return found | ({"count": 3} if what == "vertices" else {"triangles": found["triangles"][1:]})
+
+    with pytest.raises(InputError, match=f"{what} that could be read"):
+        read_raw_mesh_apart(tmp_path / name, Forgetful())
+
+
 def cloud_file(path: Path, points: Array) -> Path:
     rows = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in points.tolist())
     if path.suffix == ".ply":
