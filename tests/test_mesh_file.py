@@ -455,7 +455,11 @@ def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "what"), [("x.ply", "faces"), ("x.gltf", "triangles"), ("x.off", "vertices")])
 def test_a_part_of_a_file_is_not_taken_for_all_of_it(tmp_path: Path, name: str, what: str) -> None:
-    data = {"x.ply": SQUARE + b"3 0 1 2\n", "x.gltf": GLTF_TEXT.encode(), "x.off": OFF_TEXT.encode()}[name]
+    data = {
+        "x.ply": DEADLY.replace(b"4 0 1 2 99999999", b"3 0 1 2"),
+        "x.gltf": GLTF_TEXT.encode(),
+        "x.off": OFF_TEXT.encode(),
+    }[name]
     (tmp_path / name).write_bytes(data)
 
     class Forgetful(MeshReader):
