@@ -29,19 +29,21 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
+from hardware.process.system import signal_at_parents_end
 
 MAX_LINE_BYTES = 1 << 16  # bytes of a line of text: a triangle takes some fifty
 MAX_MESH_ROWS = 2_000_000  # vertices, and faces: a plan of so many takes 1 GB, and a minute or two
-MAX_READER_BYTES = 4 << 30  # bytes that a fork may allocate: two million triangles take a quarter
-MAX_READER_SECONDS = 120  # s that it may take: a cloud of MAX_CLOUD_POINTS takes some twenty on a slow machine
+MAX_READER_BYTES = 4 << 30  # bytes that a fork may allocate: two million triangles take 0.3 GB, a large cloud 0.6
+MAX_READER_SECONDS = 120  # s of processor that it may take: a cloud of MAX_CLOUD_POINTS takes ten
+MAX_READER_WAIT = 600  # s that it may take on a machine that is busy
 TIME_SIGNALS = (signal.SIGALRM, signal.SIGXCPU)
 LENGTH_BYTES = 8  # of the length before each answer
 MODULE = "hardware.files.mesh_reader"
 SHARED_LIBRARIES = "libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0"  # Debian's packages that open3d links to
 
-MAX_CLOUD_POINTS = 200_000  # a surface through more takes minutes, and is no better: 0.3 mm apart on a forearm
+MAX_CLOUD_POINTS = 100_000  # a surface through more takes minutes, and is no better: 0.5 mm apart on a hand's breadth
 DUST_NEIGHBOURS, DUST_REACH = 4, 4.0  # a point with fewer neighbours within so many usual distances is dust
 NORMAL_NEIGHBOURS = 24  # points that a normal is laid through
 ORIENTATION_NEIGHBOURS = 12  # points over which neighbours' normals are made to agree
@@ -59,7 +61,7 @@ class RawMesh:
     triangles: NDArray[np.int64]  # (T, 3) numbers of vertices
 
 
-class MeshReaderError(Exception):
+class MeshReaderError(StillbedError):
     """No mesh was read; the text says why."""
 
 
@@ -103,6 +105,7 @@ class MeshReader:
             assert stream is not None
             with suppress(BrokenPipeError):  # of a request that nobody took any more
                 stream.close()
+        self._process.kill()
         self._process.wait()
 
     def __enter__(self) -> MeshReader:
@@ -155,7 +158,7 @@ def _contents(file: int) -> bytes:
 def _ending(status: int, words: str) -> str:
     """How a fork that has not read its file ended."""
     if -status in TIME_SIGNALS:
-        return f"not read within {MAX_READER_SECONDS} s"
+        return f"not read within {MAX_READER_SECONDS} s of processor time, or {MAX_READER_WAIT} s"
     if status < 0:
         return f"the library that reads it dies of it ({signal.Signals(-status).name})"
     return words or f"the library that reads it ends with {status}"
@@ -165,6 +168,7 @@ def _read_and_exit(path: str, cloud: bool, memory: int, printed: int) -> None:
     """The whole life of a fork."""
     status = 1
     try:
+        signal_at_parents_end(signal.SIGKILL)
         os.dup2(printed, 1)
         os.dup2(printed, 2)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -172,7 +176,7 @@ def _read_and_exit(path: str, cloud: bool, memory: int, printed: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CPU, (MAX_READER_SECONDS, MAX_READER_SECONDS))
-        signal.alarm(MAX_READER_SECONDS)
+        signal.alarm(MAX_READER_WAIT)
         arrays = surface_through(_points_of(path)) if cloud else _mesh_of(path)
         words = _plain_words(_contents(printed))
         answer = _packed(failure=words) if words else _packed(**arrays)
