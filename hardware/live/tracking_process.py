@@ -165,8 +165,7 @@ class _TrackingLoop:
         stack.callback(self._source.close)
         session, placement = self._session, prepared.placement
         self._rig, self._truth = rig, None if session is None else session.truth
-        own = None if session is None else session.surface
-        self._surface = agreed_scan(prepared.scan, own, prepared.session)
+        self._surface = agreed_scan(prepared.scan, None if session is None else session.surface, prepared.session)
         self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
         self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)

@@ -96,8 +96,8 @@ def tracker(
 
     roi: where the surface is at the start; without one `find`, given one thread, makes what finds it, by default the
     search of the wound by a network. model: the network, an ONNX file; None: the one that comes along. surface: the
-    scan, or its file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm, profile
-    of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+    scan, or its file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm,
+    profile of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
