@@ -92,7 +92,6 @@ ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plug
 FREE = {"numpy", "scipy"}  # arrays are everywhere
 TOOLS = {
     "mypy",
-    "rerun_sdk",
     "ruff",
     "pytest_timeout",
     "pytest_xdist",
