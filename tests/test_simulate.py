@@ -33,12 +33,14 @@ FAULTY = {  # whatever chance may bring
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with pictures and faults, rendered by one thread."""
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A run with pictures and faults, rendered by one thread, at a time of day that stands still."""
     folder = tmp_path_factory.mktemp("recorded")
     file = write_scenario(folder, SMALL, FAULTY, motion=[BREATHING], seconds=1.0, seed=8, clearance_mm=0.4)
-    run_simulation(file, folder / "one", SimulationOptions(threads=1))
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1764150000")
+        run_simulation(file, folder / "one", SimulationOptions(threads=1))
+        yield folder
 
 
 @pytest.fixture(scope="module")
