@@ -19,6 +19,7 @@ from estimation.runtime import compiled
 from estimation.se3 import Array
 
 WINDOW_LAG_S = 0.6  # longer changed the newest pose by nothing (0.5, 1 s, windows of 5 to 20 agree to 1e-4 mm)
+GTSAM_ERRORS = RuntimeError, IndexError, ValueError  # what its smoother was seen to throw
 MAX_PRIOR_CHI2 = 4.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
 
 GRID_RATIO = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second
@@ -114,7 +115,7 @@ class Smoother:
         self._last: MeasuredPose | None = None
         self._motion = AccelerationPsd()
         self._psd = self._motion.psd
-        self.restarts = 0
+        self.rebuilds = 0  # after an exception of GTSAM, since the start
         self._clear()
 
     def _clear(self) -> None:
@@ -144,11 +145,39 @@ class Smoother:
         self._last, self._psd = measured, self._motion.psd
         try:
             self.newest = self._extend(measured)
-        except (RuntimeError, IndexError, ValueError):  # GTSAM's smoother cannot be used after it has thrown
-            self.restarts += 1
-            self._clear()
-            self.newest = self._extend(measured)
+        except GTSAM_ERRORS:
+            self.newest = self._rebuild(measured)
         return self.newest
+
+    def _rebuild(self, measured: MeasuredPose) -> WindowEstimate:
+        """The estimate by a new window, as GTSAM's smoother cannot be used after it has thrown.
+
+        It begins at the last estimate; where that is what cannot be used, at the measurement, without a velocity.
+        """
+        self.rebuilds += 1
+        last = self.newest
+        self._clear()
+        if last is not None:
+            try:
+                self._begin_at(last)
+                return self._extend(measured)
+            except GTSAM_ERRORS:
+                self._clear()
+        return self._extend(measured)
+
+    def _begin_at(self, last: WindowEstimate) -> None:
+        """Take an estimate as the first pose and twist of an empty window; their correlation is left out."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
+        known = gtsam.noiseModel.Gaussian.Covariance(last.covariance)
+        graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(last.pose), known))
+        known = gtsam.noiseModel.Gaussian.Covariance(last.twist_covariance)
+        graph.add(gtsam.PriorFactorVector(twist, last.twist, known))
+        values.insert(pose, gtsam.Pose3(last.pose))
+        values.insert(twist, last.twist)
+        self._window.update(graph, values, {pose: last.stamp, twist: last.stamp})
+        self._key += 1
+        self.newest = last
 
     def _density(self, measured: MeasuredPose) -> Array:
         """Density (6,) of the acceleration since the last pose: the recent motion's, or that of a sudden jerk."""
