@@ -82,6 +82,11 @@ class Estimator:
         return None if self._mapped is None else self._mapped.reported_pose
 
     @property
+    def window_graph(self) -> str:
+        """The window's factors and variables as `Smoother.graph`."""
+        return self._smoother.graph
+
+    @property
     def confirmed(self) -> bool:
         """Whether a frame set after the one of the first map has been measured."""
         return self._mapped is not None and self._mapped.accepted > 0

@@ -225,6 +225,37 @@ class Smoother:
             raise ValueError("the window's estimate is not finite")
         return window
 
+    @property
+    def graph(self) -> str:
+        """The factors and variables that the window holds, in Graphviz's language (DOT)."""
+        return dot(self._window.getFactors(), self._window.timestamps())
+
+
+VARIABLE_NAMES = {"x": "pose", "v": "twist"}
+FACTOR_NAMES = {
+    "PriorFactorPose3": "tracks of a frame set",
+    "WnoaMotionFactorPose3": "white noise on acceleration",
+    "PriorFactorVector": "twist before it is seen",
+    "LinearContainerFactor": "what has left the window",
+}
+
+
+def dot(factors: gtsam.NonlinearFactorGraph, stamps: gtsam.FixedLagSmootherKeyTimestampMap) -> str:
+    """A factor graph in Graphviz's language: variables as ellipses, factors as boxes. stamps: s, of the variables."""
+    lines = ["graph window {"]
+    for key, stamp in sorted(stamps.items(), key=lambda each: (each[1], each[0])):
+        symbol = gtsam.Symbol(key)
+        name = VARIABLE_NAMES[chr(symbol.chr())]
+        lines.append(f'  {chr(symbol.chr())}{symbol.index()} [label="{name}\\n{stamp:.3f} s"];')
+    for number in range(factors.size()):
+        factor = factors.at(number)
+        if factor is None:  # an unused slot
+            continue
+        lines.append(f'  f{number} [shape=box, label="{FACTOR_NAMES[type(factor).__name__]}"];')
+        symbols = map(gtsam.Symbol, list(factor.keys()))
+        lines += [f"  f{number} -- {chr(symbol.chr())}{symbol.index()};" for symbol in symbols]
+    return "\n".join([*lines, "}", ""])
+
 
 def _symmetric(matrix: Array) -> Array:
     return np.asarray((matrix + matrix.T) / 2)
