@@ -137,7 +137,7 @@ class Estimator:
         solution, outliers, offsets = self.health.solve(tracks, start, scales, allowed, expected)
         inlier = solution.weights > INLIER_WEIGHT
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
-        parts = fit_covariance(seen, solution, shared, surface.map_error, surface.warp)
+        parts = fit_covariance(seen, solution, shared, surface.map_error, surface.warp, twist_variance)
         # is it a measurement?
         count, whole = int((~np.isin(seen.camera, list(outliers))).sum()), parts.noise + parts.smear + parts.lasting
         reason = self._rejection(count, used, whole, tracks.incoherent_residual(solution, inlier))
@@ -301,7 +301,8 @@ class Estimator:
         surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
         rebuilds = self._smoother.rebuilds
-        window = self._smoother.add(MeasuredPose(fit.stamp, fit.solution.base_from_surface, fit.parts.noise))
+        place = fit.solution.base_from_surface @ se3.exp(fit.parts.step)
+        window = self._smoother.add(MeasuredPose(fit.stamp, place, fit.parts.noise))
         late = self.cameras.delays.sigma
         unsteady = f"the cameras expose {late:.3f} s apart, now more, now less" if late > MAX_DELAY_SIGMA_S else ""
         quality = Measurement(

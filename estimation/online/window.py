@@ -9,6 +9,7 @@ surface's velocity about its own origin, and the prior does not couple rotations
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -228,7 +229,7 @@ class Smoother:
     @property
     def graph(self) -> str:
         """The factors and variables that the window holds, in Graphviz's language (DOT)."""
-        return dot(self._window.getFactors(), self._window.timestamps())
+        return dot(self._window.getFactors(), dict(self._window.timestamps()))
 
 
 VARIABLE_NAMES = {"x": "pose", "v": "twist"}
@@ -240,7 +241,7 @@ FACTOR_NAMES = {
 }
 
 
-def dot(factors: gtsam.NonlinearFactorGraph, stamps: gtsam.FixedLagSmootherKeyTimestampMap) -> str:
+def dot(factors: gtsam.NonlinearFactorGraph, stamps: Mapping[int, float]) -> str:
     """A factor graph in Graphviz's language: variables as ellipses, factors as boxes. stamps: s, of the variables."""
     lines = ["graph window {"]
     for key, stamp in sorted(stamps.items(), key=lambda each: (each[1], each[0])):
