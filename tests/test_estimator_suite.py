@@ -145,7 +145,10 @@ def test_a_part_that_comes_into_view_moves_nothing() -> None:
     assert found.error_mm < 1.8 * found.bound_mm and found.nees < 1.4
 
 
-@pytest.mark.parametrize("instants", [{"offsets": OFFSETS}, {"jitter": 0.005}], ids=["late", "unsteady"])
+OUT_OF_STEP: list[dict[str, Any]] = [{"offsets": OFFSETS}, {"jitter": 0.005}]
+
+
+@pytest.mark.parametrize("instants", OUT_OF_STEP, ids=["late", "unsteady"])
 def test_cameras_out_of_step_are_followed_better_than_by_their_plain_mean(
     monkeypatch: pytest.MonkeyPatch, instants: dict[str, Any]
 ) -> None:
