@@ -50,7 +50,7 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
 
     from estimation.observations import no_observations
     from hardware.live.recorder_process import RecorderSender
-    from hardware.live.records import PoseEntry, PoseHandover, SetEntry, TrackingReport
+    from hardware.live.records import PoseEntry, PoseHandover, SetEntry, SurfaceEntry, TrackingReport
     from hardware.process.clock import WallClock
     from hardware.process.system import pipe_closed, set_up_process
     from planning.placement import PathPlacement, PlacedBy
@@ -59,6 +59,7 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
     set_up_process("tracking")
     clock, outbox, picture = WallClock(), RecorderSender(channels.recorder), png()
     outbox.put(prepared.rig)
+    outbox.put(SurfaceEntry(clock.now(), np.eye(3), ()))
     names = tuple(camera.name for camera in prepared.rig.cameras)
     begin = due = clock.now()
     earlier = prepared.placement
@@ -122,6 +123,8 @@ def main(folder: Path, record: Path, *flags: str) -> int:
         rig, path, profile = (folder / name for name in ("rig.toml", "path.csv", "arm.toml"))
         device = next((flag for flag in flags if not flag.startswith("--")), "virtual")
         more = {"unattended": "--yes" in flags, "page": "--page" in flags, "stands_home": True}
+        ports = [int(flag.partition("=")[2]) for flag in flags if flag.startswith("--foxglove=")]
+        more |= {"foxglove_port": sum(ports), "operator": "Ada" if ports else ""}
         given = LiveSettings(rig=rig, path=path, arm=device, profile=profile, record=record, **more)
         texts = [flag.partition("=")[2] for flag in flags if flag.startswith("--fault=")]
         faults = faults_from_texts("command line", "--fault", texts)  # allowed, as what is tracked is simulated

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
 from estimation.surface_map import Warp
+from hardware.recording import ros_messages
+from hardware.recording.mcap_file import ChunkMessages, FileMetadata, epoch_of, walk
 from hardware.recording.recorder import Recorder
 from perception.frames import Frame
 from tests.session_files import image, rig, stamps, trajectory
@@ -52,3 +55,27 @@ def whole_recording(folder: Path) -> Path:
             if number == 12:
                 recorder.surface(folder / "scan.ply")
     return folder / "x.mcap"
+
+
+@dataclass(frozen=True)
+class Event:
+    """A line of a recording's log."""
+
+    stamp: float  # s, to the ns
+    level: int
+    text: str
+    name: str
+
+
+def events(path: Path) -> list[Event]:
+    """All of them, in the order of the file, up to its damage if there is any."""
+    epoch, found = 0, []
+    for part in walk(path):
+        if isinstance(part, FileMetadata):
+            epoch = epoch_of(part.table) or 0
+        elif isinstance(part, ChunkMessages):
+            told = (each.data for each in part.messages if each.topic == "/events")
+            for log in (ros_messages.unpacked(ros_messages.LOG, data) for data in told):
+                instant = log.stamp.sec * 1_000_000_000 + log.stamp.nanosec
+                found.append(Event((instant - epoch) / 1e9, log.level, log.msg, log.name))
+    return found

@@ -32,11 +32,13 @@ from tests.board_session import rendered
 from tests.documents import commands
 from tests.live_runs import ROOT, Running, asks_to_move
 from tests.moving import raster
+from tests.recorded import whole_recording
 from tests.shown_commands import MADE, to_run
 from tests.streams import HttpCamera, served
 from tests.synthetic import write_session
 from tests.test_arm_port import serving
 from tests.test_dispenser import served as dispensing
+from tests.test_viewers import columns, rerun
 from tests.workspace import left_by, prepare
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -101,6 +103,15 @@ def test_poses_are_judged_by_evo(tmp_path: Path, capsys: pytest.CaptureFixture[s
     write_tum(tmp_path / "poses.tum", Trajectory(stamps, true @ shift @ moved, True))
     run("evaluate_with_evo.py", tmp_path / "poses.tum", tmp_path / "truth.tum")
     assert "off by: rmse 0.3536, median 0.2500, max 0.5000" in capsys.readouterr().out
+
+
+def test_a_recording_is_made_ready_for_rerun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = whole_recording(tmp_path)
+    run("show_in_rerun.py", recording)
+    assert capsys.readouterr().out == f"rerun {tmp_path / 'x.rrd'} {tmp_path / 'x.rbl'}\n"
+    assert {"/surface", "/camera/left/image"} <= set(columns(recording, tmp_path))
+    plotted = rerun("rrd", "print", "-vvv", tmp_path / "x.rbl")
+    assert "std_msgs.msg.Float64:message" in plotted and "Scalars:scalars" in plotted
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)

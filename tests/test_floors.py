@@ -67,6 +67,7 @@ OWNERS = {  # library: the files that may import it
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/recording/mcap_*.py", "hardware/offline/trajectory_files.py"),
+    "foxglove": ("hardware/live/recorder_process.py",),
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
@@ -74,6 +75,7 @@ OWNERS = {  # library: the files that may import it
     "packaging": ("hardware/cli/doctor.py",),
     "pycolmap": ("hardware/bench/smoothing.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
+    "rosbags": ("hardware/recording/ros_messages.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
     "shapely": ("hardware/bench/fill.py", "hardware/plan/page.py", "planning/fill/*.py", "planning/layers/*.py"),
@@ -87,7 +89,15 @@ OWNERS = {  # library: the files that may import it
 }
 ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
 FREE = {"numpy", "scipy"}  # arrays are everywhere
-TOOLS = {"mypy", "ruff", "pytest_timeout", "pytest_xdist", "evo", "dask"}  # of the extra [dev]: run, not imported
+TOOLS = {
+    "mypy",
+    "rerun_sdk",
+    "ruff",
+    "pytest_timeout",
+    "pytest_xdist",
+    "evo",
+    "dask",
+}  # of the extra [dev]: run, not imported
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 ALLOWED |= {"CHANGELOG.md", "CITATION.cff"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
@@ -328,7 +338,9 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     """Every dependency is imported by someone, and every library that is imported is declared; in tests as well."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    run = _packages([*project["dependencies"], *extras["bench"], *extras["cluster"], *extras["train"]])
+    run = _packages(
+        [*project["dependencies"], *extras["bench"], *extras["cluster"], *extras["foxglove"], *extras["train"]]
+    )
     imported = set().union(*(module.roots for module in ours().modules.values()))
     assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run
     names = [name for path in TESTS for name in _imported(ast.parse(path.read_text("utf-8")), path.name)]
@@ -343,7 +355,7 @@ TESTS = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "docs" / "examples").glob("*.
 
 def _packages(requirements: list[str]) -> Set[str]:
     """The names under which requirements are imported."""
-    imports = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyyaml": "yaml"}
+    imports = {"foxglove-sdk": "foxglove", "opencv-python-headless": "cv2", "pyserial": "serial", "pyyaml": "yaml"}
     names = [re.split(r"[><=~\[ ]", line)[0] for line in requirements]
     return {imports.get(name, name.replace("-", "_")) for name in names}
 

@@ -20,6 +20,7 @@ from hardware.live.recorded_run import replay_run
 from hardware.process.faults import fault_from_text, faults_from_texts
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.live_runs import CLOCK, Running, light_runs, messages
+from tests.recorded import events
 from tests.test_arm_port import serving
 
 Start = Callable[..., Running]
@@ -40,8 +41,7 @@ def ticks(record: Path) -> np.ndarray:
 
 def span(record: Path, seconds: float) -> tuple[float, float]:
     """From when until when, s, the run's one fault went on."""
-    told = [event for event in messages(record, "/events") if "on purpose" in str(event["message"])]
-    begun = float(str(told[0]["stamp"]))
+    begun = next(event.stamp for event in events(record) if "on purpose" in event.text)
     return begun, begun + seconds
 
 

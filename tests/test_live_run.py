@@ -35,6 +35,7 @@ from tests.live_runs import (
     rests,
     summary,
 )
+from tests.recorded import events
 from tests.slowly import slowly
 from tests.test_arm_port import serving
 
@@ -153,7 +154,7 @@ def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: St
     inputs = used_inputs(record)
     printed, profile = inputs.path, inputs.profile
     assert printed.surface_from_nozzle == pytest.approx(placed.surface_from_path @ path.surface_from_nozzle, abs=1e-6)
-    assert any("moved by hand, move 1: x 3.00 mm" in str(m["message"]) for m in messages(record, "/events"))
+    assert any("moved by hand, move 1: x 3.00 mm" in event.text for event in events(record))
     nozzle_lies_on(record, printed, profile)
     ticks = list(replay_run(record))
     assert len(ticks) > 20 and all(tick.frame == tick.recorded for tick in ticks)
@@ -236,8 +237,8 @@ def test_what_goes_wrong_on_purpose_is_said_held_through_and_stops_the_arm(start
     assert run.end() == 1 and "recording stopped" in run.said and "go on with: stillbed live --resume" in run.said
     holds = [m for m in messages(record, "/hold") if hung < float(str(m["stamp"])) < hung + 1.2]
     assert any("pose is" in str(m["reason"]) for m in holds)
-    missed = [m for m in messages(record, "/events") if "the tracking process has said nothing" in str(m["message"])]
-    assert any(hung < float(str(m["stamp"])) < hung + 1.2 for m in missed)
+    missed = [event for event in events(record) if "the tracking process has said nothing" in event.text]
+    assert any(hung < event.stamp < hung + 1.2 for event in missed)
     went_on = [m for m in messages(record, "/move") if hung + 1.0 < float(str(m["stamp"])) < struck]
     assert len(went_on) > 20 and rests(record, struck, 1.0)
     assert kept(record, tmp_path / "path.csv") >= last_place(record) - 1e-9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from dataclasses import fields
+from logging import WARNING
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,26 +12,24 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.reader import SeekingReader
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from estimation.errors import InputError, StillbedError
 from estimation.observations import Observations
 from estimation.pose import TrackState
 from hardware.files.folder_tables import rows_from_trajectory
-from hardware.files.images import IMAGE_SCHEMA_NAME, MAX_TIME_SECOND, decode, encode, pack_image, unpack_image
+from hardware.files.images import encode
 from hardware.files.rig_file import table_from_rig
 from hardware.recording import session_reader as channels
 from hardware.recording.mcap_file import ChunkMessages, StoredMessage, walk
 from hardware.recording.messages import bytes_from_message
 from hardware.recording.recorder import Recorder
-from hardware.recording.schemas import WARNING
+from hardware.recording.ros_messages import image_from
 from hardware.recording.session_reader import open_session
 from perception.frames import Frame, Roi
 from planning.command import Hold, Move
-from tests.recorded import LOST, pose, write_frames
+from tests.recorded import LOST, events, pose, write_frames
 from tests.session_files import image, rig, stamps, trajectory
 
 EXACT_STAMPS = st.floats(-1e8, 1e8) | st.floats(1e9, 4e9)
@@ -97,8 +96,8 @@ def test_round_trips(tmp_path_factory: pytest.TempPathFactory, stamp: float, see
     sent, received = (channels.read_channels(path, {f"/arm/{way}": dict}) for way in ("sent", "received"))
     assert [(m["stamp"], bytes_from_message(m)) for m in sent] == [(stamp, data)]
     assert [(m["stamp"], bytes_from_message(m)) for m in received] == [(stamp, data[::-1])]
-    (event,) = channels.read_channels(path, {"/events": dict})
-    assert (event["stamp"], event["level"], event["message"]) == (stamp, WARNING, "drape moved")
+    (event,) = events(path)
+    assert (event.level, event.text) == (WARNING, "drape moved") and event.stamp == pytest.approx(stamp, abs=1e-6)
     assert channels.read_truth_rows(path).tobytes() == rows_from_trajectory(moved).tobytes()
 
 
@@ -189,8 +188,8 @@ class LibraryWriter:
         self.register_schema, self.register_channel = writer.register_schema, writer.register_channel
         self.add_metadata, self.flush, self.finish = writer.add_metadata, writer.flush, writer.finish
 
-    def start(self, library: str) -> None:
-        self.writer.start("", library)
+    def start(self, profile: str, library: str) -> None:
+        self.writer.start(profile, library)
 
     @property
     def chunks(self) -> int:
@@ -227,55 +226,13 @@ def test_an_index_as_bytes_gives_the_very_file(tmp_path: Path, monkeypatch: pyte
     assert packed == plain and held == 0 and chunks > 2
 
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-WORDS = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=12)
-
-
-@given(kind=WORDS, frame=WORDS, data=st.binary(max_size=70), log_time=st.integers(0, MAX_TIME_SECOND * 10**9))
-def test_ros_reads_what_is_packed_and_so_do_we(kind: str, frame: str, data: bytes, log_time: int) -> None:
-    packed = pack_image(kind, data, frame, log_time)
-    assert unpack_image(packed) == (kind, data)
-    told = STORE.deserialize_cdr(packed, IMAGE_SCHEMA_NAME)
-    stamp = told.header.stamp
-    assert (told.format, told.header.frame_id, bytes(told.data)) == (kind, frame, data)
-    assert stamp.sec * 10**9 + stamp.nanosec == log_time
-    assert bytes(STORE.serialize_cdr(told, IMAGE_SCHEMA_NAME)) == packed
-
-
-@given(data=st.binary(max_size=30), cut=st.integers(0, 200))
-def test_bytes_that_are_cut_are_refused(data: bytes, cut: int) -> None:
-    packed = pack_image("png", data, "camera/left", 5)
-    if cut < len(packed):
-        with pytest.raises(ValueError, match=r"ends at byte|begins with"):
-            unpack_image(packed[:cut])
-
-
-def test_a_time_that_ros_cannot_tell_is_its_last() -> None:
-    packed = pack_image("png", b"", "", (MAX_TIME_SECOND + 9) * 10**9 + 7)
-    stamp = STORE.deserialize_cdr(packed, IMAGE_SCHEMA_NAME).header.stamp
-    assert (stamp.sec, stamp.nanosec) == (MAX_TIME_SECOND, 7)
-
-
-def test_the_schema_in_the_file_is_the_one_that_ros_knows(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
-        write_frames(recorder, 3)
-    with open(tmp_path / "x.mcap", "rb") as file:
-        found = list(SeekingReader(file, validate_crcs=True).iter_messages(topics=["/camera/left/image"]))
-    for number, (schema, channel, message) in enumerate(found):
-        assert (schema.name, schema.encoding, channel.message_encoding) == (IMAGE_SCHEMA_NAME, "ros2msg", "cdr")
-        defined = get_types_from_msg(schema.data.decode(), schema.name)
-        assert all(STORE.fielddefs[name] == fields for name, fields in defined.items())
-        picture = decode(bytes(STORE.deserialize_cdr(message.data, IMAGE_SCHEMA_NAME).data), "x", "image")
-        assert np.array_equal(picture, image(0, number))
-
-
 def test_an_image_that_is_broken_inside_a_sound_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     with Recorder(path, rig(2)) as recorder:
         recorder.write(Frame(0, 0.0, image(0, 0)))
     chunks = (part for part in walk(path) if isinstance(part, ChunkMessages))
     stored = next(message for chunk in chunks for message in chunk.messages if "image" in message.topic)
-    assert isinstance(stored, StoredMessage) and unpack_image(stored.data) == encode(image(0, 0))
+    assert isinstance(stored, StoredMessage) and image_from(stored.data) == encode(image(0, 0))
     with Recorder(path, rig(2), overwrite=True) as recorder:
         recorder.encoded_frame(0, 0.0, "png", b"no picture")
     with pytest.raises(InputError, match="undecodable"):

@@ -133,13 +133,12 @@ def test_behind_a_broken_chunk_all_is_read_and_the_seconds_that_are_lost_are_tol
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_without_its_first_chunk_a_recording_opens_closed_or_not(whole: Path, closed: bool, tmp_path: Path) -> None:
-    starts = [part.offset for part in walk(whole) if isinstance(part, ChunkMessages)]
+    chunks = [part for part in walk(whole) if isinstance(part, ChunkMessages)]
     data = bytearray(whole.read_bytes())
-    data[starts[0] + 500] ^= 4
+    data[chunks[0].offset + 500] ^= 4
     struck = tmp_path / "struck.mcap"
-    struck.write_bytes(data if closed else data[: starts[-1]])
-    first, whole_session, session = next(walk(whole)), open_session(whole), open_session(struck)
-    assert isinstance(first, ChunkMessages)
+    struck.write_bytes(data if closed else data[: chunks[-1].offset])
+    first, whole_session, session = chunks[0], open_session(whole), open_session(struck)
     lost = sum(message.topic == "/frames" for message in first.messages)
     assert 0 < lost < 24 and "what was recorded before " in session.damage
     assert message_from_rig(session.rig) == message_from_rig(whole_session.rig)

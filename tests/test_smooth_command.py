@@ -21,8 +21,8 @@ from hardware.files.folder_tables import read_tum
 from hardware.files.rig_file import read_rig
 from hardware.files.session import FrameRef
 from hardware.offline import smooth as run_module
-from hardware.offline.smooth import session_hash
 from hardware.offline.smooth_tracks import reobserve, source_hash, tracks_of
+from hardware.process.provenance import file_hash
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session, read_observations, read_poses, read_smoothed
 from hardware.report.evaluation import best_constant
@@ -151,7 +151,7 @@ def test_changed_pictures_are_tracked_anew(pictures: Path, tmp_path: Path, capsy
     shutil.copytree(pictures, changed)
     picture, other = sorted((changed / "cam_0").iterdir())[3:5]
     shutil.copyfile(other, picture)
-    tracks_of(open_session(changed), out, session_hash(changed))
+    tracks_of(open_session(changed), out, file_hash(changed))
     assert times()[0] > first[0] and source_hash(out / "tracks.mcap") not in ("", kept)
 
 

@@ -22,8 +22,9 @@ from hardware.files.pose_file import read_poses
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.files.session import FrameRef
 from hardware.offline.convert import TrackRecorder
-from hardware.recording.session_reader import open_session, read_channels
+from hardware.recording.session_reader import open_session
 from hardware.recording.session_reader import read_poses as read_recorded_poses
+from tests.recorded import events
 from tests.runs import Replayed
 from tests.session_files import change
 from tests.started import started
@@ -78,8 +79,7 @@ def test_the_recording_of_a_run_is_its_session_again(session: Path, tmp_path: Pa
         assert all(np.array_equal(x.image, y.image) for x, y in zip(a.frames, b.frames, strict=True))
     poses = list(read_recorded_poses(tmp_path / "run.mcap"))
     assert [p.state for p in poses] == list(step.table.states[:10])
-    events = read_channels(tmp_path / "run.mcap", {"/events": lambda message: str(message["message"])})
-    assert [text.split(":")[0] for text in events] == ["INITIALISING", "TRACKING"]
+    assert [event.text.split(":")[0] for event in events(tmp_path / "run.mcap")] == ["INITIALISING", "TRACKING"]
 
 
 def test_a_run_leaves_its_files_and_they_agree(tracked: Path) -> None:

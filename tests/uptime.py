@@ -22,10 +22,12 @@ def moved(recording: Path, out: Path, first: float) -> Path:
     by = first - min(ref.stamp for refs in open_session(recording).sets for ref in refs)
     with recording.open("rb") as source, out.open("wb") as target:
         reader, writer = make_reader(source), Writer(target, compression=CompressionType.NONE)
-        writer.start("stillbed")
+        writer.start("ros2", "stillbed")
         channels: dict[int, int] = {}
         for metadata in reader.iter_metadata():
-            writer.add_metadata(metadata.name, {**metadata.metadata, "epoch_s": str(LOG_EPOCH)})
+            writer.add_metadata(
+                metadata.name, {**metadata.metadata, "epoch_ns": str(LOG_EPOCH * 10**9), "log_times": "not known"}
+            )
         for kept in reader.iter_attachments():
             writer.add_attachment(kept.create_time, kept.log_time, kept.name, kept.media_type, kept.data)
         for schema, channel, message in reader.iter_messages(log_time_order=False):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from logging import WARNING
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.files.path_file import read_path
 from hardware.process.clock import SimClock
-from hardware.recording.schemas import WARNING
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
 from hardware.simulator.deposit import NozzleLog, join_logs, planned_line

@@ -9,7 +9,6 @@ import math
 import os
 import platform
 import signal
-import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
+from hardware.process.provenance import code_commit
 from hardware.process.system import SPAWN, exit_with_parent
 
 Item = TypeVar("Item")
@@ -98,7 +98,7 @@ def this_machine() -> Machine:
     """What this process runs on and with."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     versions = {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}}
-    return Machine(_cpu(), cores, platform.platform(), _commit(), versions)
+    return Machine(_cpu(), cores, platform.platform(), code_commit(), versions)
 
 
 def _cpu() -> str:
@@ -115,15 +115,6 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return ""
-
-
-def _commit() -> str:
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty=+", "--abbrev=12"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):  # no git, or an installed package
-        return ""
-    return done.stdout.strip()
 
 
 FIGURE_COLUMNS = ("what", "value", "unit", "low", "high", "verdict", "reference", "note")

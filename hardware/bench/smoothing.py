@@ -40,11 +40,12 @@ from estimation.synthetic.world import synthetic_world
 from hardware.bench.figures import CONSISTENT_NEES, Figure, at_least, at_most, columns, rms
 from hardware.files.session import Session
 from hardware.live.prerender import prerender
-from hardware.offline.smooth import Cluster, SmoothOptions, local_cluster, run_smooth, session_hash
+from hardware.offline.smooth import Cluster, SmoothOptions, local_cluster, run_smooth
 from hardware.offline.smooth_report import evaluate_smoothed
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reobserve, tracks_of
 from hardware.process.clock import CpuClock, ProcessorClock, WallClock
 from hardware.process.progress import cache_folder, no_progress
+from hardware.process.provenance import file_hash
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import best_constant, spread
@@ -133,7 +134,7 @@ def smooth_rendered(path: Path) -> RenderedErrors:
     """A session of pictures with its truth, tracked and smoothed."""
     session = open_session(path)
     with tempfile.TemporaryDirectory() as folder:
-        contents, out = session_hash(path), Path(folder)
+        contents, out = file_hash(path), Path(folder)
         tracks = tracks_of(session, out, contents)
         before = smooth(session.rig, tracks.observations, start=tracks.start)
         again = reobserve(session, tracks, before, out, contents)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SETTINGS_FLAGS = (
     "rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift", "stands_home",
     "jpeg_quality",
-    "dispensers", "page_address", "page_port", "page_certificate", "page_key",
+    "dispensers", "operator", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
@@ -64,6 +64,9 @@ def add_live(commands: Commands) -> None:
     add("--yes", action="store_true", default=None, help="nobody confirms the path and the start")
     add("--stands-home", action="store_true", default=None, help="an arm that does not answer stands so")
     add("--jpeg-quality", type=int, metavar="Q", help="record unencoded pictures smaller and not exactly")
+    add("--operator", metavar="NAME", help="who runs it, as recording and reports keep it")
+    port = "show the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
+    add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
     add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
     add("--no-page", action="store_true", help="without it")

@@ -24,6 +24,7 @@ from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
 from hardware.process.progress import left_files_text, prepare_out, write_error_text
+from hardware.process.provenance import state_inputs
 from hardware.process.system import fill_standard_streams
 from perception import named_path
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from hardware.operator.view import CheckVerdict
 
 BENCH_OUT = Path("out/bench")
+WRITTEN_OPTIONS = ("out", "record", "log", "link", "gcode")  # paths of the command line that are written to
 
 
 def add_bench(commands: Commands) -> None:
@@ -148,6 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     fill_standard_streams()
     arguments = parser().parse_args(argv)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
+    state_inputs(input_files(arguments))
     code: int | None = None
     out: Path | None = getattr(arguments, "out", None)
     was_there = out is not None and out.exists()
@@ -169,6 +172,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\nstillbed: interrupted; {left_files_text(getattr(arguments, 'out', None))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def input_files(arguments: argparse.Namespace) -> list[Path]:
+    """The files and folders of the command line that are there already and are not written to."""
+    given = [value for name, value in vars(arguments).items() if name not in WRITTEN_OPTIONS]
+    named = [each for value in given for each in (value if isinstance(value, list) else [value])]
+    return [each for each in named if isinstance(each, Path) and each != Path() and each.exists()]
 
 
 def parser() -> Parser:

@@ -25,6 +25,7 @@ from estimation.se3 import Array
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.files.session import NO_PRINT_HEADS, FrameRef, PrintHeadLog
 from hardware.process import checks
+from hardware.process.provenance import provenance
 from perception.frames import Roi
 
 TUM_HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"
@@ -263,11 +264,37 @@ def write_roi(path: Path, rig: Rig, rois: Sequence[Roi], frames: Sequence[int]) 
 PICTURE_SUFFIXES = {"png": ".png", "jpeg": ".jpg"}
 
 
+RECORDED_FILE = "recorded.toml"
+
+
+def write_recorded(folder: Path, began: int | None) -> None:
+    """recorded.toml: when a session was recorded, and by what. began: UTC at stamp 0, ns since 1970."""
+    table = provenance().texts() | ({} if began is None else {"began_utc_ns": str(began)})
+    lines = [f"{json.dumps(key)} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
+    (folder / RECORDED_FILE).write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def read_recorded(folder: Path) -> int | None:
+    """UTC at stamp 0, ns since 1970, by recorded.toml; None without it. InputError where it is none."""
+    file = folder / RECORDED_FILE
+    if not file.exists():
+        return None
+    began = checks.read_toml(file).get("began_utc_ns")
+    if began is None:
+        return None
+    if not isinstance(began, str) or not began.removeprefix("-").isdecimal():
+        raise InputError(file, "began_utc_ns", began, 'whole ns since 1970 in quotes, as "1764150000000000000"')
+    return int(began)
+
+
 class SessionFolderWriter(ExitStack):
     """Writes a session folder; readable at every instant, whole once the context ends."""
 
-    def __init__(self, folder: Path, rig: Rig, rois: Sequence[Roi]) -> None:
-        """folder: made if it is not there. rois: where the surface is in the first picture of each camera."""
+    def __init__(self, folder: Path, rig: Rig, rois: Sequence[Roi], began: int | None = None) -> None:
+        """folder: made if it is not there. rois: where the surface is in the first picture of each camera.
+
+        began: UTC at stamp 0, ns since 1970.
+        """
         super().__init__()
         self.folder, self._rig = folder, rig
         self._counts = [0] * len(rig)
@@ -278,6 +305,7 @@ class SessionFolderWriter(ExitStack):
         if rois:
             write_roi(folder / "roi.toml", rig, rois, [0] * len(rois))
         write_frames(folder / "frames.csv", rig, [])
+        write_recorded(folder, began)
         self._frames = self.enter_context((folder / "frames.csv").open("a", encoding="utf-8"))
 
     def picture(self, camera: int, stamp: float, kind: str, data: bytes) -> None:

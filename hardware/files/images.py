@@ -1,15 +1,8 @@
-"""Images in and out of files: videos frame by frame, pictures, and the messages that recordings hold (owns cv2).
-
-A recording holds an encoded picture as it is, in ROS 2's sensor_msgs/msg/CompressedImage. Its encoding (`cdr`) is plain
-little-endian CDR: a header of four bytes, then each field at a multiple of its own size, counted from behind the header
-(OMG DDS-XTypes, section 7.4, XCDR1). Foxglove, Rerun and ROS 2 show it; JSON would need the picture as base64, a third
-larger and to be encoded and decoded.
-"""
+"""Images in and out of files: videos frame by frame, and pictures (owns cv2)."""
 
 from __future__ import annotations
 
 import os
-import struct
 from contextlib import suppress
 from pathlib import Path
 
@@ -118,62 +111,3 @@ def small_jpeg(image: Image, width: int, quality: int) -> bytes:
     if width < image.shape[1]:
         image = np.asarray(cv2.resize(image, (width, max(height, 1)), interpolation=cv2.INTER_AREA), np.uint8)
     return encode(image, quality)[1]
-
-
-IMAGE_SCHEMA_NAME, IMAGE_ENCODING = "sensor_msgs/msg/CompressedImage", "cdr"
-_IMAGE_SCHEMA = f"""std_msgs/Header header
-string format
-uint8[] data
-{80 * "="}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{80 * "="}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-IMAGE_CHANNEL = IMAGE_SCHEMA_NAME, "ros2msg", IMAGE_ENCODING, _IMAGE_SCHEMA.encode()  # schema's name and kind; encoding
-MAX_TIME_SECOND = 2**31 - 1  # that a Time holds: in 2038
-
-_CDR = b"\x00\x01\x00\x00"  # plain CDR, little endian, no options
-_WORD = struct.Struct("<I")
-_TIME = struct.Struct("<iI")
-
-
-def pack_image(kind: str, data: bytes, frame: str, log_time: int) -> bytes:
-    """The message of a picture of `kind` ("png" or "jpeg") in the camera frame `frame`, at log_time, ns.
-
-    A time after 2038 is written as the last one there is; the exact stamp stands in /frames.
-    """
-    seconds, rest = divmod(log_time, 1_000_000_000)
-    head = _TIME.pack(min(seconds, MAX_TIME_SECOND), rest) + _text(frame) + _text(kind)
-    return b"".join((_CDR, head, _WORD.pack(len(data)), data))
-
-
-def unpack_image(message: bytes) -> tuple[str, bytes]:
-    """Kind and bytes of the picture in a message; ValueError where it is none."""
-    if message[: len(_CDR)] != _CDR:
-        raise ValueError(f"begins with {message[: len(_CDR)]!r}, not as little-endian CDR does")
-    _, start = _counted(message, len(_CDR) + _TIME.size)
-    kind, start = _counted(message, start)
-    data, _ = _counted(message, start)
-    return kind.rstrip(b"\x00").decode(), data
-
-
-def _text(text: str) -> bytes:
-    """A string as CDR: its length, its bytes, a zero, and zeros up to a multiple of 4."""
-    data = text.encode() + b"\x00"
-    return _WORD.pack(len(data)) + data + bytes(-len(data) % 4)
-
-
-def _counted(message: bytes, start: int) -> tuple[bytes, int]:
-    """The field whose length stands at `start`, and where the next field's length stands."""
-    begin = start + _WORD.size
-    if begin > len(message):
-        raise ValueError(f"ends at byte {len(message)}, before a count at {start}")
-    (count,) = _WORD.unpack_from(message, start)
-    end = begin + int(count)
-    if end > len(message):
-        raise ValueError(f"ends at byte {len(message)}, in a field that ends at {end}")
-    return message[begin:end], end + -count % 4

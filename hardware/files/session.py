@@ -91,6 +91,7 @@ class Session:
     open_reader: Callable[[], FrameReader]  # each call gives a new reader, at the beginning
     damage: str = ""  # which part of the file could not be read, "" if none
     heads: PrintHeadLog = NO_PRINT_HEADS
+    began: int | None = None  # ns since 1970, UTC, at stamp 0; None where nobody knows it
 
     def __len__(self) -> int:
         return len(self.sets)

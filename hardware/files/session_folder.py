@@ -1,7 +1,7 @@
 """A session as a plain folder that a person can write by hand: rig.toml, frames.csv, videos or pictures, and more.
 
 Optional beside them: roi.toml, head.csv, truth.tum (exact) or reference.tum (measured; truth wins), surface.ply, .stl
-or .obj.
+or .obj, recorded.toml (when it was recorded).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from estimation.errors import InputError
 from estimation.pose import Trajectory
 from estimation.rig import Camera
-from hardware.files.folder_tables import read_frames, read_heads, read_roi, read_tum
+from hardware.files.folder_tables import read_frames, read_heads, read_recorded, read_roi, read_tum
 from hardware.files.images import Video, check_size, count_by_decoding, decode
 from hardware.files.rig_file import ImageSource, RigFile, read_rig, surface_of_folder
 from hardware.files.session import NO_PRINT_HEADS, FrameRef, Session, common_stamps, frame_refs
@@ -97,7 +97,8 @@ def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
     heads = read_heads(head) if head.exists() else NO_PRINT_HEADS
     sets, open_reader = frame_refs(rig, stamps), partial(FolderReader, cameras)
     surface = surface_of_folder(folder, rig_file)
-    return Session(folder, rig, rois, surface, truth_of(folder), sets, open_reader, heads=heads)
+    truth, began = truth_of(folder), read_recorded(folder)
+    return Session(folder, rig, rois, surface, truth, sets, open_reader, heads=heads, began=began)
 
 
 def truth_of(folder: Path) -> Trajectory | None:

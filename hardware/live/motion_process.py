@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from ctypes import c_double
 from dataclasses import replace
+from logging import WARNING
 from types import FrameType
 
 from estimation.errors import StillbedError
@@ -44,7 +45,6 @@ from hardware.motion.step import MotionStep
 from hardware.process.clock import WallClock
 from hardware.process.system import ask_for_real_time, set_up_process, take_messages
 from hardware.process.ticks import PoseLockedSchedule
-from hardware.recording.schemas import WARNING
 from planning.command import Command, Hold
 from planning.path import Path, PrintProgress
 

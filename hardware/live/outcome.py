@@ -22,6 +22,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import RunReports, StageHistograms, StageTiming
 from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import RunStage
+from hardware.process.provenance import provenance
 from hardware.process.ticks import Histogram
 from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
@@ -233,7 +234,7 @@ class RunOutcome:
                 "recorder_share_of_core": None if recorder is None else recorder.share,
             }
         )
-        return cleaned
+        return cleaned | {"provenance": provenance().table()}
 
     def _page(self, summary: dict[str, Any]) -> str:
         from hardware.report.evaluation import figure, percent

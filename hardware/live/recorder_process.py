@@ -29,22 +29,25 @@ from hardware.live.records import (
     Entry,
     EventEntry,
     LatencyEntry,
+    PlacedScanEntry,
     PoseEntry,
     RecorderReport,
     ScanEntry,
     SetEntry,
+    SurfaceEntry,
     UsedEntry,
     WireEntry,
 )
-from hardware.live.settings import LiveSettings
+from hardware.live.settings import LOOPBACK, LiveSettings, used_files
 from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
-from hardware.process.clock import ProcessorClock, WallClock
+from hardware.process.clock import ProcessorClock, WallClock, utc_now
+from hardware.process.provenance import state_inputs
 from hardware.process.system import SharedLatest, set_up_process
 from perception.frames import OutlinedPicture, Roi
 
 if TYPE_CHECKING:
-    from hardware.recording.recorder import Recorder
+    from hardware.recording.recorder import PublishedMessage, Recorder
 
 ENTRY_HEAD = struct.Struct("=Q")  # bytes of the pickled entry that follows
 PIPE_BYTES = 2**20  # bytes that a pipe holds: 0.1 s of three cameras' pictures, and as much as anyone may ask for
@@ -55,6 +58,9 @@ FLUSH_AFTER = 0.2  # s without anything new after which what is there goes to th
 GATHER_TIME = 0.08  # s in which entries gather: woken for each, this process took twice as long for all of them
 FREE_PAGES_BYTES = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
 RECORDER_NICENESS = 10  # below all that moves the arm
+FOXGLOVE_BACKLOG = 60  # messages that wait for a slow client, 0.2 s of them; then the oldest is dropped
+REPEAT_PERIOD = 2.0  # s after which what seldom comes is served again, for clients that came since
+SELDOM = ("/tf_static", "/path", "/scan", "/landmarks", "/camera_info")  # ends of such topics
 
 
 class RecorderSender:
@@ -178,6 +184,7 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
     A fault of the disk ends it, and is named in the last report.
     """
     set_up_process("recorder", settings.cores_recorder, RECORDER_NICENESS, outlives=True)
+    state_inputs(used_files(settings), settings.operator)
     retain_freed_pages(FREE_PAGES_BYTES)
     writer = _EntryWriter(settings, reports)
     try:
@@ -191,6 +198,58 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
             writer.report(str(error))
 
 
+class FoxgloveServer:
+    """Serves what is recorded to Foxglove on this machine, as it is written.
+
+    Clients listen; nothing that they send counts. The library's threads have this process's low priority. A client that
+    reads slowly loses messages, nobody else does.
+    """
+
+    def __init__(self, port: int) -> None:
+        import foxglove  # the extra [foxglove]
+
+        self._library, self._context = foxglove, foxglove.Context()
+        self._server = foxglove.start_server(
+            name="stillbed",
+            host=LOOPBACK,
+            port=port,
+            capabilities=[],  # what a client wants to publish, set or call is refused
+            context=self._context,
+            message_backlog_size=FOXGLOVE_BACKLOG,
+        )
+        self._channels: dict[str, foxglove.Channel] = {}
+        self._seldom: dict[str, PublishedMessage] = {}
+        self._clock, self._repeated = WallClock(), 0.0
+
+    def publish(self, message: PublishedMessage) -> None:
+        """Serve a message; now and then those that seldom come as well."""
+        self._send(message)
+        if message.topic.endswith(SELDOM):
+            self._seldom[message.topic] = message
+        if (now := self._clock.now()) > self._repeated + REPEAT_PERIOD:
+            self._repeated = now
+            for each in self._seldom.values():
+                self._send(each)
+
+    def _send(self, message: PublishedMessage) -> None:
+        from hardware.recording.ros_messages import definition
+
+        if message.topic not in self._channels:
+            schema, encoding = None, "json"
+            if message.name is not None:
+                text = definition(message.name).encode()
+                schema, encoding = self._library.Schema(name=message.name, encoding="ros2msg", data=text), "cdr"
+            channel = self._library.Channel(
+                message.topic, schema=schema, message_encoding=encoding, context=self._context
+            )
+            self._channels[message.topic] = channel
+        self._channels[message.topic].log(message.data, log_time=message.log_time)
+
+    def close(self) -> None:
+        """End the service."""
+        self._server.stop()
+
+
 class _EntryWriter:
     """Writes entries to the file, which is opened once the rig is known; earlier entries wait for that."""
 
@@ -199,8 +258,19 @@ class _EntryWriter:
 
         assert settings.record is not None
         self._file, self._reports, quality = settings.record, reports, settings.jpeg_quality or None
-        self._opened = partial(Recorder, self._file, jpeg_quality=quality, overwrite=True, compress=False)
         self._clock, self._processor = WallClock(), ProcessorClock()
+        began = round((utc_now() - self._clock.now()) * 1e9)
+        self._server = FoxgloveServer(settings.foxglove_port) if settings.foxglove_port else None
+        listener = None if self._server is None else self._server.publish
+        self._opened = partial(
+            Recorder,
+            self._file,
+            jpeg_quality=quality,
+            overwrite=True,
+            compress=False,
+            began=began,
+            listener=listener,
+        )
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
         self._early: list[Entry] = []
@@ -252,6 +322,8 @@ class _EntryWriter:
 
     def close(self) -> None:
         """Close the file, and report."""
+        if self._server is not None:
+            self._server.close()
         if self._recorder is not None:
             self._recorder.close()
         self.report()
@@ -275,11 +347,26 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
     elif isinstance(entry, LatencyEntry):
         recorder.latency(entry.stamp, entry.stage, entry.width, entry.counts, entry.largest)
     elif isinstance(entry, UsedEntry):
-        recorder.attach(entry.name, entry.text.encode())
+        _write_used(recorder, entry)
+    elif isinstance(entry, SurfaceEntry):
+        recorder.show_surface(entry.stamp, entry.landmarks, entry.outlines)
+    elif isinstance(entry, PlacedScanEntry):
+        recorder.show_scan(entry.stamp, entry.points)
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
     elif isinstance(entry, Roi | OutlinedPicture | DispenserRecord):
         recorder.write(entry)
+
+
+def _write_used(recorder: Recorder, entry: UsedEntry) -> None:
+    """Keep the file; the path, which is now in the tracker's surface frame, is shown as well."""
+    from hardware.files.path_file import path_from_text
+    from hardware.recording.session_reader import PATH_ATTACHMENT
+
+    recorder.attach(entry.name, entry.text.encode())
+    if entry.name == PATH_ATTACHMENT:
+        points = path_from_text(entry.text, PATH_ATTACHMENT).surface_from_nozzle[:, :3, 3]
+        recorder.show_path(WallClock().now(), points, np.arange(len(points), dtype=float))
 
 
 def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:

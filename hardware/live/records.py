@@ -162,6 +162,23 @@ class PoseEntry:
     truth: Array | None = None  # (4, 4) mm, true base_from_surface where it is known
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceEntry:
+    """What viewers are shown of the surface: landmarks (V, 3) and outlines of the region (K, 3), mm, in its frame."""
+
+    stamp: float  # s
+    landmarks: Array
+    outlines: tuple[Array, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedScanEntry:
+    """The scan as viewers are shown it: vertices (N, 3), mm, where they lie in the surface frame."""
+
+    stamp: float  # s
+    points: Array
+
+
 @dataclass(frozen=True, slots=True)
 class WireEntry:
     """Bytes that passed the arm's port."""
@@ -177,7 +194,7 @@ class EventEntry:
 
     stamp: float  # s
     text: str
-    level: int  # of hardware.recording.schemas
+    level: int  # of Python's logging
     name: str  # of whom it comes from
 
 
@@ -202,7 +219,8 @@ class UsedEntry:
 
 # the rig comes first: nothing is written before the cameras are known
 Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
-Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | EventEntry | LatencyEntry
+Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry
+Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
 
 
 class StageHistograms:

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from logging import INFO, WARNING
 from multiprocessing.connection import wait
 from pathlib import Path as File
 from types import FrameType
@@ -34,8 +35,8 @@ from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
-from hardware.live.records import BeginPrint, EventEntry, OutlineOrder, RunReports, UsedEntry
-from hardware.live.settings import page_settings, settings_text
+from hardware.live.records import BeginPrint, EventEntry, OutlineOrder, PlacedScanEntry, RunReports, UsedEntry
+from hardware.live.settings import page_settings, settings_text, used_files
 from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
 from hardware.motion.loop import Order
@@ -43,7 +44,7 @@ from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunStage, Wish
 from hardware.process.clock import WallClock
-from hardware.recording.schemas import INFO, WARNING
+from hardware.process.provenance import state_inputs
 from hardware.recording.session_reader import input_texts, inputs_from_texts
 from planning.placement import PlacedBy
 
@@ -82,6 +83,7 @@ class LiveRun:
     def __call__(self) -> RunOutcome:
         """Run to the end. On return all files are complete and all processes have ended."""
         prepared, files = self._prepared, self._prepared.files
+        state_inputs(used_files(prepared.settings), prepared.settings.operator)
         with tempfile.TemporaryDirectory() as folder, _signal_wakeup(self) as wake, ExitStack() as stack:
             channels = self._channels = start_processes(prepared, File(folder), self._tracker)
             stack.callback(channels.processes.kill_all)
@@ -282,7 +284,9 @@ class LiveRun:
             return scene_from(rig, path, surface)
         lies = placement.surface_from_path
         lines = se3.transform_points(lies, scan.lines.reshape(-1, 3)).reshape(-1, 2, 3)
-        return scene_from(rig, path, se3.transform_points(lies, scan.points), scan.triangles, lines)
+        points = se3.transform_points(lies, scan.points)
+        self._channels.sender.put(PlacedScanEntry(self._clock.now(), points))
+        return scene_from(rig, path, points, scan.triangles, lines)
 
     def _placement(self) -> SurfacePlacement | None:
         """Where the path lies, if that has changed since it was kept."""

@@ -10,6 +10,7 @@ named, and then encrypted (TLS) alone.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import socket
@@ -78,6 +79,10 @@ class LiveSettings:
     record: Path | None = _key("record.file", '"run.mcap"', "the recording; what else a run leaves stands beside it")
     jpeg_quality: int = _key(  # three cameras' exact pictures take three cores to encode
         "record.jpeg_quality", "90", "of pictures that come unencoded, 1 to 100; 0: exact", 90
+    )
+    operator: str = _key("record.operator", '"A. Name"', "who runs it, as recording and reports keep it", "")
+    foxglove_port: int = _key(
+        "record.foxglove_port", "8765", "port on which Foxglove sees the run on this machine; 0: none", 0
     )
     page: bool = _key("page.serve", "true", "the operator's page in the browser", True)
     page_address: str = _key(
@@ -170,6 +175,7 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         if not set(usable).issuperset(cores := getattr(s, setting.name)):
             allowed = f"cores that there are: {', '.join(map(str, usable))}"
             raise InputError(where, f"cores.{key}", list(cores), allowed)
+    _check_foxglove(s.foxglove_port, where)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
     for name in ("rig", "simulated", "model", "path", "scan", "profile", "dispensers"):
@@ -177,6 +183,28 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         if file is not None and not file.exists():
             raise InputError(where, name, file, "a file that exists")
     return replace(s, arm=s.arm or VIRTUAL_ARM)
+
+
+def _check_foxglove(port: int, where: object) -> None:
+    """InputError unless the port is 0, or one of this machine's that is free while the library is there."""
+    key, free = "record.foxglove_port", f"1 to {MAX_PORT}, free on this machine, or 0: none"
+    if port and importlib.util.find_spec("foxglove") is None:
+        raise InputError(where, key, port, "0, or stillbed with its extra: pip install 'stillbed[foxglove]'")
+    if not 0 <= port <= MAX_PORT:
+        raise InputError(where, key, port, free)
+    if port:
+        try:
+            socket.create_server((LOOPBACK, port)).close()
+        except OSError as error:
+            raise InputError(where, key, port, f"{free} ({error.strerror})") from None
+
+
+def used_files(settings: LiveSettings) -> list[Path]:
+    """The files that the settings name, a session by its rig.toml."""
+    s, rig = settings, settings.rig
+    rig = rig / "rig.toml" if rig is not None and rig.is_dir() else rig
+    named = rig, s.simulated, s.model, s.path, s.scan, s.profile, s.dispensers
+    return [file for file in named if file is not None]
 
 
 def available_cores() -> tuple[int, ...]:

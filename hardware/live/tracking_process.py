@@ -33,6 +33,7 @@ from hardware.live.records import (
     ScanEntry,
     SetEntry,
     StageHistograms,
+    SurfaceEntry,
     TrackingChannels,
     TrackingReport,
 )
@@ -274,8 +275,7 @@ class _TrackingLoop:
         return replace(frames, head=head)
 
     def _count_times(self, arrived: TimedFrameSet, pose: SurfacePose, start: float, sent: float) -> None:
-        times = self.times
-        times.add(EXPOSURE_STAGE, arrived.handed - pose.stamp)
+        (times := self.times).add(EXPOSURE_STAGE, arrived.handed - pose.stamp)
         times.add(QUEUE_STAGE, start - arrived.handed)
         for stage, seconds in zip(STAGES, self._step.last.seconds, strict=False):
             times.add(f"tracking: {stage}", float(seconds))
@@ -340,7 +340,9 @@ class _TrackingLoop:
             return self.report.surface
         if not self._outline.on_surface and pose.state.measured:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
-        return np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
+        shown = np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
+        self._sender.put(SurfaceEntry(pose.stamp, shown, tuple(self._outline.on_surface)))
+        return shown
 
     def _interval(self, arrived: TimedFrameSet) -> float:
         """The time between two sets, s, those that were dropped included; NaN before the second."""
@@ -372,10 +374,9 @@ class _TrackingLoop:
             self._sender.put(region_since(roi, stamp))
 
     def _record(self, arrived: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
-        stamps = {frame.camera: frame.stamp for frame in frames.frames}
         unencoded = tuple(frame for frame in frames.frames if frame.camera not in arrived.encoded)
         self._sender.check()
-        self._sender.put(SetEntry(stamps, arrived.encoded, unencoded))
+        self._sender.put(SetEntry({f.camera: f.stamp for f in frames.frames}, arrived.encoded, unencoded))
         self._sender.put(PoseEntry(pose, self._step.last.observations, frames.head, self.report.truth))
         if (now := self._clock.now()) > self._histograms_recorded + HISTOGRAM_PERIOD:
             self._histograms_recorded = now

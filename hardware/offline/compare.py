@@ -20,6 +20,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series, read_truth_series
 from hardware.process.progress import prepare_out
+from hardware.process.provenance import provenance
 from hardware.report.evaluation import (
     NEES_BOUND,
     PoseErrors,
@@ -362,7 +363,7 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     if out is None:
         return report
     prepare_out(out, force=True)
-    figures = json.dumps(finite(comparison_figures(comparison)), indent=2)
+    figures = json.dumps(finite(comparison_figures(comparison) | {"provenance": provenance().table()}), indent=2)
     (out / "compare.json").write_text(figures + "\n", encoding="utf-8")
     (out / "report.html").write_text(comparison_page(comparison), encoding="utf-8")
     return f"{report}\nreport: {out / 'report.html'}"

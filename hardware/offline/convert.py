@@ -15,6 +15,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
+from logging import INFO, WARNING
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from hardware.files.folder_tables import (
     rows_from_trajectory,
     write_frames,
     write_heads,
+    write_recorded,
     write_roi,
     write_rows,
 )
@@ -36,7 +38,6 @@ from hardware.files.session_folder import TRUTH_FILES, truth_file
 from hardware.process.checks import error_text
 from hardware.process.progress import ProgressReport, no_progress
 from hardware.recording.recorder import NOT_KEPT, Recorder
-from hardware.recording.schemas import INFO, WARNING
 from hardware.recording.session_reader import open_session, read_truth_rows
 from perception.frames import Frame, FrameSet, Roi
 from perception.tracking.step import StepReport
@@ -65,7 +66,7 @@ def import_folder(
     part = _part_name(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with Recorder(part, session.rig, jpeg_quality, overwrite=True, kept=False) as recorder:
+        with Recorder(part, session.rig, jpeg_quality, overwrite=True, kept=False, began=session.began) as recorder:
             _record(session, folder, recorder, progress, jpeg_quality is None)
         os.replace(part, target)
     except (StillbedError, OSError) as error:
@@ -150,6 +151,7 @@ def _write_folder(session: Session, folder: Path, progress: ProgressReport) -> N
     rig, refs = session.rig, _renumbered(session)
     write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{glob.escape(c.name)}/*") for c in rig.cameras])
     write_frames(folder / "frames.csv", rig, [new for _, new in refs])
+    write_recorded(folder, session.began)
     if session.roi:
         numbers = [_frame_at(session, roi, refs) for roi in session.roi]
         write_roi(folder / "roi.toml", rig, session.roi, numbers)
@@ -207,7 +209,7 @@ class TrackRecorder:
 
     def __init__(self, path: Path, session: Session, overwrite: bool) -> None:
         """Create the file at `path`; InputError where it exists and `overwrite` is not set."""
-        self._recorder = Recorder(path, session.rig, overwrite=overwrite)
+        self._recorder = Recorder(path, session.rig, overwrite=overwrite, began=session.began)
         self._truth = deque(() if session.truth is None else rows_from_trajectory(session.truth))
         self._exact = session.truth is not None and session.truth.exact
         self._heads = deque(zip(session.heads.rows, session.heads.extruding, strict=True))

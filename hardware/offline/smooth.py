@@ -31,12 +31,12 @@ from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reob
 from hardware.offline.trajectory_files import write_copy, write_instants, write_map
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, prepare_out
+from hardware.process.provenance import file_hash, provenance
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import finite
 
 SUMMARY_FILE = "summary.json"
 EXPECTED_PASSES = 12  # of a long recording, by which the time left is estimated
-HASH_BLOCK_BYTES = 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def smooth_session(path: Path, out: Path, options: SmoothOptions, stream: TextIO
     stream: for progress, by default stderr.
     """
     session = open_session(path)
-    recorded = session_hash(path)
+    recorded = file_hash(path)
     contents = content_hash(recorded, options)
     summary = _summary(out)
     if "text" in summary and summary.get("contents") == contents:
@@ -74,20 +74,9 @@ def smooth_session(path: Path, out: Path, options: SmoothOptions, stream: TextIO
     text = f"{words}\nreport: {out / 'report.html'}"
     (out / "report.html").write_text(smooth_page(session.path.name, words, result, evaluation), encoding="utf-8")
     summary = {"contents": contents, "text": text, **_figures(result, evaluation, session), **reobserved.figures}
+    summary["provenance"] = provenance().table()
     (out / SUMMARY_FILE).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
     return False, text
-
-
-def session_hash(path: Path) -> str:
-    """SHA-256 of all bytes of a session, of a folder with its files' names."""
-    digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        digest.update(file.name.encode())
-        with file.open("rb") as stream:
-            while block := stream.read(HASH_BLOCK_BYTES):
-                digest.update(block)
-    return digest.hexdigest()
 
 
 def content_hash(recorded: str, options: SmoothOptions) -> str:

@@ -49,10 +49,10 @@ def part_path(target: Path) -> Path:
 
 
 @contextmanager
-def track_writer(target: Path, rig: Rig, contents: str) -> Iterator[Recorder]:
+def track_writer(target: Path, rig: Rig, contents: str, began: int | None = None) -> Iterator[Recorder]:
     """A recorder for tracks computed from a source of the hash `contents`; the file gets its name once it is whole."""
     part = part_path(target)
-    with Recorder(part, rig, overwrite=True) as recorder:
+    with Recorder(part, rig, overwrite=True, began=began) as recorder:
         recorder.attach(SOURCE_ATTACHMENT, contents.encode())
         yield recorder
     os.replace(part, target)
@@ -108,7 +108,7 @@ def _track(session: Session, target: Path, contents: str, stream: TextIO | None)
     clock = WallClock()
     with (
         tracker(session.rig, session.roi, session.surface, clock.now) as step,
-        track_writer(target, session.rig, contents) as recorder,
+        track_writer(target, session.rig, contents, session.began) as recorder,
         Progress("track", "frame sets", clock.now, stream) as progress,
     ):
         for done, frames in enumerate(session.frame_sets(), 1):

@@ -29,9 +29,8 @@ from hardware.files.pose_file import COVARIANCE_COLUMNS, TRANSFORM_COLUMNS, TWIS
 from hardware.files.pose_file import read_poses as read_pose_table
 from hardware.files.session import Session
 from hardware.process.checks import read_csv
-from hardware.recording.mcap_file import Damage, record_groups
+from hardware.recording.mcap_file import NO_SCHEMA, Damage, epoch_of, profile_of, record_groups
 from hardware.recording.messages import message_from_pose
-from hardware.recording.schemas import TOPICS
 from hardware.recording.session_reader import open_session, read_poses, read_smoothed, recording_damage
 from perception.frames import Image
 
@@ -219,7 +218,7 @@ def _poses_of(path: Path, name: str, read: Callable[[Path], Iterator[SurfacePose
     return PoseSeries(name, Trajectory(np.array([pose.stamp for pose in poses]), transforms, exact=False), covariance)
 
 
-SMOOTHED_TOPIC = "/smoothed"
+ADDED_TOPICS = SMOOTHED_TOPIC, VIEWERS_TOPIC = "/smoothed", "/smoothed_surface"  # ours, and the same as ROS has it
 
 
 def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
@@ -228,7 +227,7 @@ def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
     try:
         with part.open("wb") as stream:
             writer = Writer(stream)
-            writer.start(profile="", library="stillbed")
+            writer.start(profile=profile_of(source), library="stillbed")
             copier = _RecordCopier(writer)
             for group in record_groups(source):
                 for record in () if isinstance(group, Damage) else group.records:
@@ -246,7 +245,7 @@ class _RecordCopier:
     """Writes the records of one file into another, where channels have other numbers."""
 
     def __init__(self, writer: Writer) -> None:
-        self.epoch = 0  # s added to log times, by the file's metadata
+        self.epoch = 0  # ns added to log times, by the file's metadata
         self._writer = writer
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -256,8 +255,7 @@ class _RecordCopier:
         """Write a record; schemas and channels are kept until a message needs them."""
         if isinstance(record, Metadata):
             self._writer.add_metadata(record.name, record.metadata)
-            epoch = record.metadata.get("epoch_s", "")
-            self.epoch = int(epoch) if epoch.isdecimal() else self.epoch
+            self.epoch = self.epoch if (epoch := epoch_of(record.metadata)) is None else epoch
         elif isinstance(record, Attachment):
             self._writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
@@ -266,7 +264,10 @@ class _RecordCopier:
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             self._channels[record.id] = record
-        elif isinstance(record, Message) and self._channels[record.channel_id].topic != SMOOTHED_TOPIC:
+        elif isinstance(record, Message) and self._channels[record.channel_id].topic not in (
+            SMOOTHED_TOPIC,
+            VIEWERS_TOPIC,
+        ):
             number, m = self._number(record.channel_id), record
             self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
 
@@ -279,9 +280,13 @@ class _RecordCopier:
 
 
 def _add_smoothed(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
-    schema = TOPICS["/pose"]
-    number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
-    channel = writer.register_channel(SMOOTHED_TOPIC, "json", number)
+    from hardware.recording import ros_messages  # slow to load
+
+    text = ros_messages.definition(ros_messages.ODOMETRY).encode()
+    shown = writer.register_channel(
+        VIEWERS_TOPIC, "cdr", writer.register_schema(ros_messages.ODOMETRY, "ros2msg", text)
+    )
+    channel = writer.register_channel(SMOOTHED_TOPIC, "json", NO_SCHEMA)
     used = smoothed.fitted.used.sum(1)
     at = smoothed.instants
     for k, stamp in enumerate(smoothed.stamps):
@@ -289,5 +294,7 @@ def _add_smoothed(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
         twist, twist_covariance = at.twist[k], at.twist_covariance[k]
         pose = SurfacePose(float(stamp), at.base_from_surface[k], at.covariance[k], twist, state, twist_covariance)
         data = json.dumps(message_from_pose(pose), allow_nan=False, separators=(",", ":")).encode()
-        log_time = round(float(stamp) * 1e9) + epoch * 1_000_000_000
+        log_time = round(float(stamp) * 1e9) + epoch
         writer.add_message(channel, log_time, data, log_time)
+        lies = pose.base_from_surface, pose.covariance, pose.twist, pose.twist_covariance
+        writer.add_message(shown, log_time, ros_messages.odometry(*lies, log_time), log_time)

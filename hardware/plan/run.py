@@ -28,6 +28,7 @@ from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, orde
 from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text
+from hardware.process.provenance import provenance
 from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
 from planning.layers.wound import WoundVolume
 from planning.path import check_path
@@ -114,7 +115,7 @@ def _tables(
         "wound": asdict(plan.wound.findings), "total": asdict(total),
         "repairs": None if subject.repairs is None else asdict(subject.repairs), "settings": asdict(request.settings),
         "bumps": bump_facts(plan), "feasible": arm,
-        "surface_from_plane": plan.wound.surface_from_plane.tolist(),
+        "surface_from_plane": plan.wound.surface_from_plane.tolist(), "provenance": provenance().table(),
     }  # fmt: skip
     _write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
     meshes = {"_scan.ply": None if subject.repairs is None else _surface(plan.wound), "_example.ply": subject.example}

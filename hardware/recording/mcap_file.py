@@ -11,7 +11,7 @@ import json
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
@@ -24,6 +24,7 @@ from mcap.records import (
     Attachment,
     Channel,
     Chunk,
+    Header,
     McapRecord,
     Message,
     Metadata,
@@ -41,6 +42,7 @@ _SHAPE_BYTES = 512  # of a record, in which its inner lengths stand
 _RECORD_START = re.compile(rb"(?s)(?=[\x02\x06\x09\x0c\x0f].{5}\0\0\0)")  # kinds to go on at, of less than 2**40 bytes
 SCAN_BYTES = 2**22  # read at once in search of a whole record
 MAX_TOLD_DAMAGES = 5  # in one text
+NO_SCHEMA = 0  # of a channel of JSON: readers of ROS refuse a file with any schema but ROS's
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,13 @@ class AttachedFile:
 
 
 @dataclass(frozen=True, slots=True)
+class FileMetadata:
+    """What the file says of itself: of what and when it was made."""
+
+    table: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
 class Damage:
     """A stretch of the file that cannot be read: why, where, and from when to when records are lost."""
 
@@ -91,7 +100,7 @@ class RecordGroup:
     records: tuple[McapRecord, ...]
 
 
-def walk(path: Path) -> Iterator[ChunkMessages | AttachedFile | Damage]:
+def walk(path: Path) -> Iterator[ChunkMessages | AttachedFile | FileMetadata | Damage]:
     """The parts of a recording in the order of the file; a Damage stands where a stretch of it cannot be read."""
     channels: dict[int, Channel] = {}
     for group in record_groups(path):
@@ -101,7 +110,9 @@ def walk(path: Path) -> Iterator[ChunkMessages | AttachedFile | Damage]:
         first = next(iter(group.records), None)
         if isinstance(first, Attachment):
             yield AttachedFile(first.name, first.data)
-        elif not isinstance(first, Metadata):
+        elif isinstance(first, Metadata):
+            yield FileMetadata(first.metadata)
+        else:
             channels.update((r.id, r) for r in group.records if isinstance(r, Channel))
             pairs = ((channels[r.channel_id], r) for r in group.records if isinstance(r, Message))
             stored = (StoredMessage(of.topic, r.sequence, r.data, of.message_encoding) for of, r in pairs)
@@ -142,13 +153,41 @@ class _Break:
     indexed: bool  # whether in the index, behind the data
 
 
+def profile_of(path: Path) -> str:
+    """The profile in the head of an MCAP file; "" where it cannot be read."""
+    with suppress(Exception), open(path, "rb") as file:  # of broken bytes the library and struct raise many kinds
+        file.seek(len(MCAP0_MAGIC))
+        opcode, length = _RECORD_HEAD.unpack(file.read(_RECORD_HEAD.size))
+        if opcode == Opcode.HEADER:
+            return str(Header.read(ReadDataStream(BytesIO(file.read(min(length, _SHAPE_BYTES))))).profile)
+    return ""
+
+
+def epoch_of(metadata: Mapping[str, str]) -> int | None:
+    """By how many ns log times are ahead of stamps, by a recording's metadata; None where they do not say."""
+    now, before = (metadata.get(key, "") for key in ("epoch_ns", "epoch_s"))  # whole s in older recordings
+    if now.removeprefix("-").isdecimal():
+        return int(now)
+    return int(before) * 1_000_000_000 if before.isdecimal() else None
+
+
+UTC_LOG_TIMES = "UTC"  # what the metadata `log_times` say where these are real times
+
+
+def began_of(metadata: Mapping[str, str]) -> int | None:
+    """UTC at stamp 0, ns since 1970, by a recording's metadata; None where they do not know it."""
+    epoch = epoch_of(metadata)
+    known = metadata.get("log_times", UTC_LOG_TIMES if epoch == 0 else "") == UTC_LOG_TIMES
+    return epoch if known else None
+
+
 class _RecordWalk:
     """One pass over the records of a file, from behind its magic to its end; what is broken is skipped."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._size = file, size
         self._known: set[int] = set()  # channels so far
-        self._epoch = 0  # s that log times are ahead of stamps, by the metadata
+        self._epoch = 0  # ns that log times are ahead of stamps, by the metadata
         self._last: float | None = None  # s, last stamp of the newest chunk so far
         self._indexed = False  # behind the data: only the index follows
         self._broken: _Break | None = None  # not told yet
@@ -165,14 +204,13 @@ class _RecordWalk:
                 checked = offset + 1  # from here on it only goes forward
                 continue
             self._known |= {r.id for r in found.records if isinstance(r, Channel)}
-            stamps = [r.log_time / 1e9 - self._epoch for r in found.records if isinstance(r, Message)]
+            stamps = [(r.log_time - self._epoch) / 1e9 for r in found.records if isinstance(r, Message)]
             if stamps:
                 if self._broken is not None:
                     yield self._damage(self._broken, min(stamps))
                 self._last, self._broken = max(stamps), None
             for metadata in (r for r in found.records if isinstance(r, Metadata)):
-                epoch = metadata.metadata.get("epoch_s", "")
-                self._epoch = int(epoch) if epoch.isdecimal() else self._epoch
+                self._epoch = self._epoch if (epoch := epoch_of(metadata.metadata)) is None else epoch
             if found.records:
                 yield RecordGroup(offset, found.records)
             opcode, offset = found.opcode, found.end

@@ -54,9 +54,9 @@ class McapWriter:
         self._first, self._last = 0, 0  # log times of the file, ns
         self._counts: dict[int, int] = {}  # messages of each channel
 
-    def start(self, library: str) -> None:
+    def start(self, profile: str, library: str) -> None:
         """Write the head of the file."""
-        self._file.write(MCAP0_MAGIC + _bytes(Header("", library)))
+        self._file.write(MCAP0_MAGIC + _bytes(Header(profile, library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """The number of a new schema."""

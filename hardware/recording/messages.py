@@ -1,7 +1,7 @@
 """Records as the JSON messages of a recording, and back: every float64 is read back as it was written.
 
 Matrices are flat, row by row. An array with a number that is not finite is written as an empty one, which reads as NaN
-throughout. `schemas.py` says what each field of a message is.
+throughout. docs/recordings.md says what each field of a message is.
 """
 
 from __future__ import annotations
@@ -11,24 +11,31 @@ from typing import Any
 
 import numpy as np
 
-from estimation import se3
 from estimation.observations import Observations
 from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
-from estimation.rig import Camera, Rig
+from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import LocalError, Warp
 from hardware.files.images import decode, encode
 from hardware.files.rig_file import rig_from_table, table_from_rig
 from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
-from hardware.recording.schemas import camera_frame
 from perception.frames import OutlinedPicture, Roi
 from planning.command import Hold, Move
 
 Message = dict[str, Any]
 
-SURFACE_FRAME = "surface"
-BASE_FRAME = "base"
+
+def image_topic(camera: str) -> str:
+    """The channel of a camera's pictures."""
+    return f"/camera/{camera}/image"
+
+
+def camera_frame(camera: str) -> str:
+    """The name of a camera's frame."""
+    return f"camera/{camera}"
+
+
 _POSE_SHAPES = {
     "base_from_surface": (4, 4),
     "covariance": (6, 6),
@@ -41,12 +48,6 @@ _WARP_ARRAYS = {"control": 1, "coefficients": 1, "covariance": 2, "growth": 2}  
 _WARP_NUMBERS = ("reach", "deformation", "deformation_sigma")
 _LOCAL = {"centres": (3,), "variance": (), "growth": (), "reach": (), "support": (3,)}  # shapes of one entry
 _LOCAL_NUMBERS = ("span", "unsupported")
-_M_PER_MM = 1e-3  # viewers count in metres
-
-
-def time_of(log_time: int) -> dict[str, int]:
-    """A log time in ns as Foxglove's time."""
-    return {"sec": log_time // 1_000_000_000, "nsec": log_time % 1_000_000_000}
 
 
 def message_from_rig(rig: Rig) -> Message:
@@ -270,41 +271,6 @@ def message_from_bytes(stamp: float, data: bytes) -> Message:
 def bytes_from_message(message: Message) -> bytes:
     """Bytes from a message with base64 `data`."""
     return base64.b64decode(message["data"], validate=True)
-
-
-def message_from_calibration(camera: Camera, log_time: int) -> Message:
-    """A camera as Foxglove's CameraCalibration."""
-    matrix = camera.matrix
-    return {
-        "timestamp": time_of(log_time),
-        "frame_id": camera_frame(camera.name),
-        "width": camera.size[0],
-        "height": camera.size[1],
-        "distortion_model": "plumb_bob",
-        "D": camera.distortion.tolist(),
-        "K": matrix.ravel().tolist(),
-        "R": np.eye(3).ravel().tolist(),
-        "P": np.concatenate([matrix, np.zeros((3, 1))], axis=1).ravel().tolist(),
-    }
-
-
-def message_from_transform(base_from_child: Array, child: str, log_time: int) -> Message:
-    """The pose of a frame in the base frame (4, 4), mm, as Foxglove's FrameTransform, metres."""
-    position = base_from_child[:3, 3] * _M_PER_MM
-    quaternion = se3.quaternion_from_rotation(base_from_child[:3, :3])
-    return {
-        "timestamp": time_of(log_time),
-        "parent_frame_id": BASE_FRAME,
-        "child_frame_id": child,
-        "translation": dict(zip("xyz", position.tolist(), strict=True)),
-        "rotation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
-    }
-
-
-def message_from_event(stamp: float, level: int, text: str, name: str, log_time: int) -> Message:
-    """An event as Foxglove's Log. stamp: s. log_time: ns. name: of the part that tells it."""
-    time = time_of(log_time)
-    return {"timestamp": time, "level": level, "message": text, "name": name, "file": "", "line": 0, "stamp": stamp}
 
 
 def _flat(array: Array) -> list[float]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from logging import INFO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,25 +21,27 @@ from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.files.folder_tables import rows_from_trajectory
-from hardware.files.images import IMAGE_CHANNEL, check_size, encode, pack_image
-from hardware.files.session import SURFACE_SUFFIXES
+from hardware.files.images import check_size, encode
+from hardware.files.session import SURFACE_SUFFIXES, head_from_row
 from hardware.motion.loop import RecordedTick
 from hardware.motion.material import DispenserRecord
 from hardware.process.checks import read_bytes
-from hardware.recording import messages
-from hardware.recording.mcap_file import ChunkMessages, walk
+from hardware.process.provenance import provenance
+from hardware.recording import messages, ros_messages
+from hardware.recording.mcap_file import NO_SCHEMA, UTC_LOG_TIMES, ChunkMessages, walk
 from hardware.recording.mcap_writer import McapWriter
-from hardware.recording.messages import SURFACE_FRAME, Message
-from hardware.recording.schemas import CALIBRATION, INFO, TOPICS, Schema, calibration_topic, camera_frame, image_topic
+from hardware.recording.messages import Message, camera_frame, image_topic
+from hardware.recording.ros_messages import RosMessage
 from perception.frames import Frame, OutlinedPicture, Roi
 from planning.command import Command, Hold, Move
 
 MAX_CHUNK_SECONDS = 0.5  # s of stamps that a killed run may lose: half of the second that is promised
 MAX_CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
-LOG_EPOCH = 1_000_000_000  # s added to log times where stamps do not count from 1970: MCAP has none below zero
+LOG_EPOCH = 1_000_000_000  # s added to log times where nobody knows when stamps began: MCAP has none below zero
 MIN_WALL_CLOCK_STAMP = 1e8  # s: a first stamp above it counts from 1970
 NOT_KEPT = "; nothing is kept of it"
 MAX_LOG_TIME = 2**63 - 1  # ns
+NO_LOG_TIMES = f"stamps + {LOG_EPOCH} s; when they began is not known"
 
 RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic and encoder of each kind of record
     Observations: ("/observations", messages.message_from_observations),
@@ -52,6 +56,16 @@ RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic a
 T = TypeVar("T")
 
 
+@dataclass(frozen=True, slots=True)
+class PublishedMessage:
+    """A message as it was written."""
+
+    topic: str
+    name: str | None  # of the ROS message; None: JSON
+    data: bytes
+    log_time: int  # ns since 1970
+
+
 class Recorder:
     """Writes a recording; a context manager. Stamps, s, may start anywhere, also below zero.
 
@@ -59,6 +73,9 @@ class Recorder:
     any instant loses no more than that (a power cut may take more). A full or lost disk is a StillbedError: what was
     written before stays readable, and later writes raise the same error. The rig and what the channels are stand in the
     first chunk and again in the second: whichever of them is damaged, the other opens the recording.
+
+    Beside our own channels (JSON without a schema: exact, in mm, s, rad and px) the same is told in those that every
+    viewer knows (`ros_messages`: ROS 2, SI units). The file has the profile `ros2`.
     """
 
     def __init__(
@@ -69,18 +86,24 @@ class Recorder:
         overwrite: bool = False,
         compress: bool = True,
         kept: bool = True,
+        began: int | None = None,
+        listener: Callable[[PublishedMessage], None] | None = None,
     ) -> None:
         """Create the file at `path`; images are stored as PNG, or as JPEG of `jpeg_quality` (0-100).
 
         compress: whether chunks are compressed, which saves a quarter of the file and costs a third of the time.
         kept: whether the caller leaves the file where it stands after a failure; said in the error.
+        began: UTC at stamp 0, ns since 1970; None where nobody knows it.
+        listener: is given every message that is written.
         """
         self.path, self.rig = Path(path), rig
         self._jpeg_quality, self._kept = jpeg_quality, kept
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._numbers = [0] * len(rig)  # next frame number per camera
-        self._epoch: int | None = None  # s, known at the first stamp
+        self._epoch: int | None = None  # ns that log times are ahead of stamps, known at the first stamp
+        self._began, self._listener = began, listener
+        self._viewers = ros_messages.ViewerChannels(rig)
         self._chunk_start = math.nan  # s, stamp of the open chunk's first message
         self._repeated = False  # whether the second chunk has begun, with the rig once more
         self._last: dict[str, float] = {}  # s, per stream of images or truth
@@ -94,7 +117,7 @@ class Recorder:
         except OSError as error:
             raise StillbedError(f"{self.path}: cannot write: {error}") from error
         self._writer = McapWriter(self._file, MAX_CHUNK_BYTES, compress)
-        self._guarded(lambda: self._writer.start("stillbed"))
+        self._guarded(lambda: self._writer.start("ros2", "stillbed"))
 
     def __enter__(self) -> Recorder:
         return self
@@ -118,6 +141,10 @@ class Recorder:
         else:
             topic, encoded = next(each for kind, each in RECORD_CHANNELS.items() if isinstance(record, kind))
             self._message(topic, record.stamp, encoded(record))
+        if isinstance(record, Observations):
+            self._viewers.take_tracks(record)
+        elif isinstance(record, RecordedTick):
+            self.progress(record.stamp, record.fraction)
 
     def frame(self, frame: Frame, camera_stamp: float | None = None) -> None:
         """Write an image; camera_stamp: s on the camera's own clock, by default the frame's less the clock offset."""
@@ -132,8 +159,8 @@ class Recorder:
         own = stamp - self.rig.cameras[camera].clock_offset if camera_stamp is None else camera_stamp
         name, number = self.rig.cameras[camera].name, self._numbers[camera]
         self._check_rising(f"stamp of camera {name!r}", stamp)
-        image = pack_image(kind, data, camera_frame(name), self._log_time(stamp))
-        self._add(image_topic(name), None, stamp, image, number)
+        image = ros_messages.image(kind, data, camera_frame(name), self._log_time(stamp))
+        self._publish([RosMessage(image_topic(name), ros_messages.IMAGE, image)], stamp, number)
         entry = {"stamp": stamp, "camera_stamp": own, "camera": int(camera), "number": number}
         self._message("/frames", stamp, entry)  # after the image: where this can be read, the image can
         self._numbers[camera] += 1
@@ -147,11 +174,35 @@ class Recorder:
         """Write one pose (8,): stamp x y z qx qy qz qw, s and mm, unchanged."""
         self._check_rising("stamp of truth", float(row[0]))
         self._message("/truth", float(row[0]), messages.message_from_truth(row, exact))
+        self._viewers.take_truth(float(row[0]), head_from_row(row, False).base_from_nozzle)
 
     def head_row(self, row: Array, extruding: bool) -> None:
         """Write where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm, base_from_nozzle."""
         self._check_rising("stamp of the print head", float(row[0]))
-        self._message("/head", float(row[0]), messages.message_from_head(row, extruding))
+        stamp = float(row[0])
+        self._message("/head", stamp, messages.message_from_head(row, extruding))
+        nozzle = head_from_row(row, extruding).base_from_nozzle
+        self._publish(self._viewers.head(nozzle, self._log_time(stamp)), stamp)
+
+    def show_path(self, stamp: float, points: Array, places: Array) -> None:
+        """Show viewers the path: points (N, 3), mm, surface frame, and how far along it each is (N,), rising."""
+        self._publish(self._viewers.path(points, places, self._log_time(stamp)), stamp)
+
+    def progress(self, stamp: float, place: float) -> None:
+        """Show viewers how far the print is, in the unit of the path's places."""
+        self._publish(self._viewers.progress(stamp, place, self._log_time(stamp)), stamp)
+
+    def show_surface(self, stamp: float, landmarks: Array, outlines: Sequence[Array] = ()) -> None:
+        """Show viewers landmarks (N, 3) and outlines (K, 3), mm, surface frame."""
+        self._publish(self._viewers.surface(landmarks, outlines, self._log_time(stamp)), stamp)
+
+    def show_scan(self, stamp: float, points: Array) -> None:
+        """Show viewers the scan's vertices (N, 3), mm, where they lie in the surface frame."""
+        self._publish(self._viewers.scan(points, self._log_time(stamp)), stamp)
+
+    def error(self, stamp: float, name: str, millimetres: float) -> None:
+        """Show viewers an error, as /error/`name`."""
+        self._publish([self._viewers.error(name, millimetres)], stamp)
 
     def surface(self, path: Path) -> None:
         """Attach the scan (ply, stl or obj, mm) as it is."""
@@ -170,9 +221,9 @@ class Recorder:
         self._message("/arm/received", stamp, messages.message_from_bytes(stamp, data))
 
     def event(self, stamp: float, text: str, level: int = INFO, name: str = "stillbed") -> None:
-        """Write an event at `stamp`, s."""
-        log_time = self._log_time(stamp)
-        self._message("/events", stamp, messages.message_from_event(stamp, level, text, name, log_time))
+        """Write an event at `stamp`, s. level: of Python's logging, whose numbers are ROS's."""
+        told = ros_messages.log(level, text, name, self._log_time(stamp))
+        self._publish([RosMessage("/events", ros_messages.LOG, told)], stamp)
 
     def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:
         """Write how long a stage took until `stamp`, s: counts (N,) in bins of `width` s, and the largest, s."""
@@ -205,10 +256,7 @@ class Recorder:
 
     def _pose(self, pose: SurfacePose) -> None:
         self._message("/pose", pose.stamp, messages.message_from_pose(pose))
-        if np.isfinite(pose.base_from_surface).all():
-            log_time = self._log_time(pose.stamp)
-            transform = messages.message_from_transform(pose.base_from_surface, SURFACE_FRAME, log_time)
-            self._message("/tf", pose.stamp, transform)
+        self._publish(self._viewers.pose(pose, self._log_time(pose.stamp)), pose.stamp)
 
     def _check_rising(self, stream: str, stamp: float) -> None:
         """InputError for a stamp not later than the stream's last: the reader would refuse the whole file."""
@@ -224,29 +272,35 @@ class Recorder:
         if self._epoch is None:
             self._begin(stamp)
         assert self._epoch is not None
-        log_time = round(stamp * 1e9) + self._epoch * 1_000_000_000
+        log_time = round(stamp * 1e9) + self._epoch
         if not 0 <= log_time <= MAX_LOG_TIME:
-            raise InputError(self.path, "stamp", stamp, f"-{self._epoch} .. {MAX_LOG_TIME / 1e9 - self._epoch:.0f} s")
+            allowed = f"{-self._epoch / 1e9:.0f} .. {(MAX_LOG_TIME - self._epoch) / 1e9:.0f} s"
+            raise InputError(self.path, "stamp", stamp, allowed)
         return log_time
 
     def _begin(self, stamp: float) -> None:
-        """Write the rig at the first stamp: at 0 s viewers would see a recording that starts in 1970."""
-        self._epoch = 0 if stamp > MIN_WALL_CLOCK_STAMP else LOG_EPOCH
-        epoch = {"epoch_s": str(self._epoch), "units": "mm, s, rad, px"}
-        self._guarded(lambda: self._writer.add_metadata("stillbed", epoch))
+        """Write the rig at the first stamp, when it is known what log times are."""
+        known = self._began if self._began is not None else 0 if stamp > MIN_WALL_CLOCK_STAMP else None
+        self._epoch = LOG_EPOCH * 1_000_000_000 if known is None else known
+        table = {"epoch_ns": str(self._epoch), "log_times": UTC_LOG_TIMES if known is not None else NO_LOG_TIMES}
+        table |= {"units": "own channels: mm, s, rad, px; ROS's: m, s, rad, px", **provenance().texts()}
+        self._guarded(lambda: self._writer.add_metadata("stillbed", table))
+        self._define(stamp)
+
+    def _define(self, stamp: float) -> None:
+        """The rig, as we read it and as viewers do."""
         self._message("/rig", stamp, messages.message_from_rig(self.rig))
-        log_time = self._log_time(stamp)
-        for camera in self.rig.cameras:
-            calibration = messages.message_from_calibration(camera, log_time)
-            self._message(calibration_topic(camera.name), stamp, calibration, CALIBRATION)
-            transform = messages.message_from_transform(camera.base_from_camera, camera_frame(camera.name), log_time)
-            self._message("/tf", stamp, transform)
+        self._publish(self._viewers.start(self._log_time(stamp)), stamp)
 
-    def _message(self, topic: str, stamp: float, message: Message, schema: Schema | None = None) -> None:
-        self._add(topic, TOPICS[topic] if schema is None else schema, stamp, self._text(topic, message))
+    def _message(self, topic: str, stamp: float, message: Message) -> None:
+        self._add(topic, None, stamp, self._text(topic, message))
 
-    def _add(self, topic: str, schema: Schema | None, stamp: float, data: bytes, sequence: int = 0) -> None:
-        """Write an encoded message; schema: None for an image."""
+    def _publish(self, shown: Iterable[RosMessage], stamp: float, sequence: int = 0) -> None:
+        for each in shown:
+            self._add(each.topic, each.name, stamp, each.data, sequence)
+
+    def _add(self, topic: str, name: str | None, stamp: float, data: bytes, sequence: int = 0) -> None:
+        """Write an encoded message; name: of the ROS message that it is, None for JSON."""
         log_time = self._log_time(stamp)
         if abs(stamp - self._chunk_start) >= MAX_CHUNK_SECONDS:
             self.flush()
@@ -255,9 +309,11 @@ class Recorder:
         if self._writer.chunks == 1 and not self._repeated:
             self._repeated = True  # before the rig comes here itself
             self._guarded(self._writer.repeat_definitions)
-            self._message("/rig", stamp, messages.message_from_rig(self.rig))
-        channel = self._channel(topic, schema)
+            self._define(stamp)
+        channel = self._channel(topic, name)
         self._guarded(lambda: self._writer.add_message(channel, log_time, data, sequence))
+        if self._listener is not None:
+            self._listener(PublishedMessage(topic, name, data, log_time))
 
     def _text(self, topic: str, message: Message) -> bytes:
         data = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY)
@@ -268,14 +324,12 @@ class Recorder:
                 raise InputError(self.path, topic, message, "finite numbers") from None
         return data
 
-    def _channel(self, topic: str, schema: Schema | None) -> int:
+    def _channel(self, topic: str, name: str | None) -> int:
         if topic not in self._channels:
-            name, kind, encoding, text = IMAGE_CHANNEL
-            if schema is not None:
-                name, kind, encoding, text = schema["title"], "jsonschema", "json", orjson.dumps(schema)
-            if name not in self._schemas:
-                self._schemas[name] = self._guarded(lambda: self._writer.register_schema(name, kind, text))
-            number = self._schemas[name]
+            if name is not None and name not in self._schemas:
+                text = ros_messages.definition(name).encode()
+                self._schemas[name] = self._guarded(lambda: self._writer.register_schema(name, "ros2msg", text))
+            number, encoding = (NO_SCHEMA, "json") if name is None else (self._schemas[name], "cdr")
             self._channels[topic] = self._guarded(lambda: self._writer.register_channel(topic, encoding, number))
         return self._channels[topic]
 

@@ -26,7 +26,7 @@ from hardware.arm.profile import ArmProfile
 from hardware.files.arm_file import arm_from_text, arm_text
 from hardware.files.dispenser_file import dispensers_from_text, outlets_from
 from hardware.files.folder_tables import check_polygon, checked_rows, trajectory_from_rows
-from hardware.files.images import IMAGE_ENCODING, check_size, decode, unpack_image
+from hardware.files.images import check_size, decode
 from hardware.files.path_file import path_from_text, path_text
 from hardware.files.session import SURFACE_SUFFIXES, FrameRef, PrintHeadLog, Session, head_from_row, pair_refs
 from hardware.files.session_folder import open_folder
@@ -35,14 +35,15 @@ from hardware.recording.mcap_file import (
     AttachedFile,
     ChunkMessages,
     Damage,
+    FileMetadata,
     StoredMessage,
+    began_of,
     chunk_messages,
     damage_words,
     parse,
     walk,
 )
-from hardware.recording.messages import Message
-from hardware.recording.schemas import image_topic
+from hardware.recording.messages import Message, image_topic
 from perception.frames import Image, OutlinedPicture, PrintHead, Roi
 from planning.command import Command
 from planning.material import Outlets
@@ -76,6 +77,7 @@ class RecordingContents:
     places: ImagePlaces = field(default_factory=dict)
     surface: AttachedFile | None = None
     damage: str = ""  # "" if none
+    began: int | None = None  # ns since 1970, UTC, at stamp 0
 
 
 def open_session(path: str | Path) -> Session:
@@ -108,7 +110,7 @@ def open_recording(path: Path) -> Session:
     rois = _checked_rois(path, contents, rig)
     truth, heads = _truth(path, contents), _heads(path, contents)
     surface, sets = _unpacked_surface(contents.surface, open_reader), pair_refs(frames, stamps, len(rig))
-    return Session(path, rig, rois, surface, truth, sets, open_reader, contents.damage, heads)
+    return Session(path, rig, rois, surface, truth, sets, open_reader, contents.damage, heads, contents.began)
 
 
 def _contents(path: Path) -> RecordingContents:
@@ -116,6 +118,8 @@ def _contents(path: Path) -> RecordingContents:
     for part in walk(path):
         if isinstance(part, Damage):
             damages.append(part)
+        elif isinstance(part, FileMetadata):
+            contents.began = began_of(part.table)
         elif isinstance(part, AttachedFile):
             if part.name in SURFACE_NAMES:
                 contents.surface = part
@@ -249,8 +253,10 @@ class RecordingReader:
         offset, index, encoding = self._places[topic, ref.number]
         data = self._chunk(offset)[index]
         try:
-            if encoding == IMAGE_ENCODING:
-                return unpack_image(data)
+            if encoding == "cdr":
+                from hardware.recording.ros_messages import image_from  # slow to load
+
+                return image_from(data)
             message = parse(self._path, StoredMessage(topic, ref.number, data))  # as recordings once held them
             return message["format"], messages.bytes_from_message(message)
         except (KeyError, TypeError, ValueError, OverflowError) as error:

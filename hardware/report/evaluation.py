@@ -22,6 +22,7 @@ from estimation.pose import TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.files.pose_file import PoseTable
 from hardware.files.session import damage_text
+from hardware.process.provenance import provenance
 
 MAX_TRACKING_ERROR_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
 NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
@@ -322,7 +323,8 @@ def finite(value: Any) -> Any:
 
 def write_summary(path: Path, result: Evaluation) -> None:
     """Write summary.json."""
-    path.write_text(json.dumps(as_dict(result), indent=2) + "\n", encoding="utf-8")
+    summary = as_dict(result) | {"provenance": provenance().table()}
+    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 def summary_text(result: Evaluation) -> str:

@@ -12,17 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
+from hardware.process.provenance import provenance
 
 
 def document(kind: str, title: str, lead: str, body: Sequence[str], footer: str) -> str:
-    """The whole page. kind: of report; lead: the verdict in words; body: parts as HTML; the rest is plain text."""
+    """The whole page. kind: of report; lead: the verdict in words; body: parts as HTML; the rest is plain text.
+
+    It ends with what made it: date, machine, version, inputs.
+    """
     style = (files("hardware.report") / "report.css").read_text(encoding="utf-8")
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(f"{title} · {kind}")}</title>'
         f'<meta name="viewport" content="width=device-width"><style>\n{style}</style></head><body><main>\n'
         f'<header><div class="kind">{escape(kind)}</div><h1>{escape(title)}</h1>'
         f'<p class="lead">{escape(lead)}</p></header>\n'
-        f"{chr(10).join(body)}\n<footer>{escape(footer)}</footer></main></body></html>\n"
+        f"{chr(10).join(body)}\n<footer>{escape(footer)}<br>{escape(provenance().sentence())}</footer></main></body></html>\n"
     )
 
 

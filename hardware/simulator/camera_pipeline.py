@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from logging import WARNING
 from typing import Protocol
 
 import cv2
@@ -22,7 +23,6 @@ from hardware.files.images import decode, encode
 from hardware.offline.track import FrameSetStep
 from hardware.process.clock import Clock
 from hardware.process.faults import Fault, FaultPart, WorkRates, fault_rng, faults_striking
-from hardware.recording.schemas import WARNING
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras, garble
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.appearance import Sensor

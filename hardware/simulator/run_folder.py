@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from html import escape
+from logging import INFO, WARNING
 from pathlib import Path
 from types import TracebackType
 
@@ -29,8 +30,8 @@ from hardware.files.folder_tables import SessionFolderWriter, rows_from_trajecto
 from hardware.files.pose_file import PoseWriter
 from hardware.files.session import row_from_head
 from hardware.offline.replay import CommandWriter
+from hardware.process.clock import utc_now
 from hardware.recording.recorder import Recorder
-from hardware.recording.schemas import INFO, WARNING
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.deposit import NozzleLog, PlannedLine
 from hardware.simulator.nozzle_error import nozzle_errors
@@ -165,6 +166,7 @@ def _quoted(reason: str) -> str:
     return ('"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\r') else text) + "\n"
 
 
+SHOWN_ROWS = 20  # of the nozzle's log, one of which is shown to viewers: 50 a second
 STAMP_DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
 TRUTH_DELAY = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
 
@@ -203,6 +205,7 @@ class RunFolder:
         self._written: list[Array] = []  # s, rising
         self._until = -np.inf  # s, the last of them
         self._headed = -np.inf  # s, the last frame set whose print head was written
+        self._posed = 0.0  # s, stamp of the last pose
         cameras = scenario.cameras
         self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
         shutil.copyfile(scenario.file, out / "scenario.toml")
@@ -214,10 +217,13 @@ class RunFolder:
             self._commands = opening.enter_context(CommandWriter(out))
             self._nozzle = opening.enter_context(NozzleWriter(out / "nozzle.csv", line))
             self._session: tuple[SessionFolderWriter, Recorder] | None = None
+            began = round(utc_now() * 1e9)  # the time of day at which virtual time begins
             if scenario.tracking.pictures:
                 self._session = (
-                    opening.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois)),
-                    opening.enter_context(Recorder(out / "session.mcap", scenario.known_rig, overwrite=True)),
+                    opening.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois, began)),
+                    opening.enter_context(
+                        Recorder(out / "session.mcap", scenario.known_rig, overwrite=True, began=began)
+                    ),
                 )
                 if scan is not None:
                     self._session[1].surface(scan)
@@ -246,6 +252,7 @@ class RunFolder:
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         """A pose was made of a frame set in `spent` s of real time."""
         self._poses.write(pose, len(frames.frames), report, spent)
+        self._posed = pose.stamp
         if pose.state is not self._state:
             self.event(pose.stamp, f"{pose.state.value}: {pose.reason}", INFO if pose.state.measured else WARNING)
             self._state = pose.state
@@ -263,6 +270,8 @@ class RunFolder:
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
         self._line_points = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
+        if self._session is not None:
+            self._session[1].show_path(self._posed, self._line_points, self._line.knots)
 
     def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
         """A command was sent, how far the print is by it, and what came from the arm since the last."""
@@ -273,6 +282,7 @@ class RunFolder:
             recorder.sent(command.stamp, frame)
             if received:
                 recorder.received(command.stamp, received)
+            recorder.progress(command.stamp, progress.place)
         reason = command.reason
         if reason and reason != self._reason:
             self.event(command.stamp, f"hold: {reason}", WARNING)
@@ -285,6 +295,10 @@ class RunFolder:
         """The next rows of the truth at the nozzle."""
         self.logs.append(log)
         self._nozzle.write(log)
+        if self._session is not None and log.extrude.any():
+            off = (log.base_from_nozzle - log.base_from_target)[:, :3, 3]
+            for k in np.flatnonzero(log.extrude)[::SHOWN_ROWS]:
+                self._session[1].error(float(log.stamps[k]), "nozzle", float(np.linalg.norm(off[k])))
         self._pending.append(log.stamps)
         self._write_truth(float(log.stamps[-1]) - self._latest)
 

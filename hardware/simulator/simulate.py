@@ -35,6 +35,7 @@ from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import Progress, prepare_out
+from hardware.process.provenance import provenance
 from hardware.report.evaluation import Evaluation, evaluate, write_summary
 from hardware.report.report import write_report
 from hardware.simulator.arm.ports import PtyLink
@@ -283,6 +284,7 @@ def _write_results(
     run = NozzleRun(scenario.title, log, path, scenario.bead, *judged, pictures, files)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
+    summary["provenance"] = provenance().table()
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     (out / "report.html").write_text(nozzle_page(result), encoding="utf-8")
     folder.watch.finish(summary["verdict"][0])
