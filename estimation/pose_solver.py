@@ -30,6 +30,7 @@ GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quart
 EFFICIENCY = 1.235
 INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
 DELAY_ERROR_PX = 0.05  # half the least sigma of a track
+MIN_KNOWN_SHARE = 1e-6  # of the information of the best known effect; less is rounding
 CLOCK_SIGMAS = 2.0  # of what is known of a clock: what lies farther off is something else
 CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
@@ -203,7 +204,8 @@ def delay_gain(solution: PoseFit, shared: SharedErrors, twist_variance: Array) -
 
     The best linear prediction (Henderson 1975) from how the cameras disagree, the pose free. Three things reduce it:
 
-    - Chance: many cameras are triggered together (James and Stein 1961, positive part).
+    - Chance, as many cameras are triggered together, and whatever makes them disagree in other ways, as lenses do
+      (James and Stein 1961, positive part).
     - Delays beyond what is known of the clocks: a surface that bends looks like late cameras, too.
     - What is not linear: a delay acts along the velocity, and where that errs too, the product of both errors must stay
       below DELAY_ERROR_PX. So what is waved by hand at 6 Hz stays as it is fitted.
@@ -218,17 +220,31 @@ def delay_gain(solution: PoseFit, shared: SharedErrors, twist_variance: Array) -
     known = np.diag(shared.delay)
     product = unknown * float(np.mean(known)) / DELAY_ERROR_PX**2
     far = float(np.max((gain @ seen.pull) ** 2 / np.maximum(known, 1e-12))) / CLOCK_SIGMAS**2
-    clear = max(0.0, 1 - 1 / max(_delay_chi2(seen, prior, count), 1e-9))
+    clear = max(0.0, 1 - 1 / max(_delay_clarity(seen, prior, count), 1e-9))
     return np.asarray(gain * (clear / ((1 + product**3) * (1 + far**3))))  # sharp, and yet without a jump of the pose
 
 
-def _delay_chi2(seen: SharedFit, prior: Array, count: int) -> float:
-    """Mean squared sigmas of the differences between `count` cameras' delays; one by chance. prior: (3C, 3C)."""
+def _delay_clarity(seen: SharedFit, prior: Array, count: int) -> float:
+    """What delays explain of the disagreement of `count` cameras, in parts of what they do not; of each a mean.
+
+    Both in squared sigmas for a degree of freedom, the latter one at least. prior: (3C, 3C).
+    """
     own, cross, rest = seen.information[:count], seen.information[:count, count:], seen.information[count:, count:]
     shifts = prior[count:, count:] @ np.linalg.inv(np.eye(2 * count) + rest @ prior[count:, count:])
     information = own[:, :count] - cross @ shifts @ cross.T
-    pull = seen.pull[:count] - cross @ shifts @ seen.pull[count:]
-    return float(pull @ np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ pull) / max(1, count - 1)
+    explained, freedom = _squared_sigmas(information, seen.pull[:count] - cross @ shifts @ seen.pull[count:])
+    whole, every = _squared_sigmas(seen.information, seen.pull)
+    other = max(1.0, (whole - explained) / max(1, every - freedom))
+    return explained / max(1, freedom) / other
+
+
+def _squared_sigmas(information: Array, pull: Array) -> tuple[float, int]:
+    """What the effects come to that pull (K,), and how many are known; information (K, K) may be singular."""
+    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    known, axes = np.linalg.eigh(information * size[:, None] * size)
+    sure = known > MIN_KNOWN_SHARE * max(float(known[-1]), 1e-300)
+    along = axes[:, sure].T @ (size * pull)
+    return float((along**2 / known[sure]).sum()), int(sure.sum())
 
 
 def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
