@@ -77,6 +77,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into .venv what stillbed needs: some minutes, once"
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@$(call apt,libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0,$(BIN)/python -c 'import open3d')
 	@touch $@
 
 # $(call apt,PACKAGES,CHECK): where CHECK fails, install PACKAGES if we may, else say the one line to run, and go on.

@@ -19,7 +19,7 @@ from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
-from hardware.files.ply_file import write_ply
+from hardware.files.mesh_file import write_ply
 from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois

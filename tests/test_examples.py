@@ -57,7 +57,7 @@ def test_a_folder_of_pictures_is_tracked(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_scanned_wound_is_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from hardware.files.ply_file import write_ply
+    from hardware.files.mesh_file import write_ply
     from hardware.plan.order import example_scan
 
     vertices, triangles = example_scan("forearm")

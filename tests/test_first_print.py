@@ -28,8 +28,8 @@ from estimation.synthetic.world import BASE_FROM_REST
 from hardware.arm.profile import placed
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.files.folder_tables import read_tum
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path
-from hardware.files.ply_file import write_ply
 from hardware.files.rig_file import read_rig, write_board
 from hardware.simulator.deposit import PlannedLine, planned_line
 from hardware.simulator.scene.scene import rois

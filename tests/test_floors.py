@@ -71,6 +71,7 @@ OWNERS = {  # library: the files that may import it
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
+    "open3d": ("estimation/scans/*.py", "hardware/files/mesh_reader.py"),
     "orjson": ("hardware/recording/recorder.py",),
     "packaging": ("hardware/cli/doctor.py",),
     "pycolmap": ("hardware/bench/smoothing.py",),
@@ -91,7 +92,6 @@ ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plug
 FREE = {"numpy", "scipy"}  # arrays are everywhere
 TOOLS = {
     "mypy",
-    "rerun_sdk",
     "ruff",
     "pytest_timeout",
     "pytest_xdist",
@@ -101,7 +101,7 @@ TOOLS = {
 ALLOWED = {*FLOORS, "tests", "data", "docs", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "Makefile"}
 ALLOWED |= {"CHANGELOG.md", "CITATION.cff"}
 LEFTOVERS = ("build", "dist", "demo", "out", "__pycache__", "*.egg-info")  # .gitignore names them
-MOTION_NEVER = {"gtsam", "numba", "cv2", "onnxruntime"}
+MOTION_NEVER = {"gtsam", "numba", "cv2", "onnxruntime", "open3d"}
 
 MAX_MODULES, MAX_ROOM, MAX_LINES = 300, 20, 400
 MIN_LONE_LINES = 60  # a module with a single importer has at least so many, or belongs into it
@@ -355,7 +355,8 @@ TESTS = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "docs" / "examples").glob("*.
 
 def _packages(requirements: list[str]) -> Set[str]:
     """The names under which requirements are imported."""
-    imports = {"foxglove-sdk": "foxglove", "opencv-python-headless": "cv2", "pyserial": "serial", "pyyaml": "yaml"}
+    imports = {"foxglove-sdk": "foxglove", "open3d-cpu": "open3d", "opencv-python-headless": "cv2"}
+    imports |= {"pyserial": "serial", "pyyaml": "yaml"}
     names = [re.split(r"[><=~\[ ]", line)[0] for line in requirements]
     return {imports.get(name, name.replace("-", "_")) for name in names}
 
@@ -381,6 +382,12 @@ def test_the_motion_process_loads_none_of_the_heavy_libraries() -> None:
     code = f"import sys, hardware.motion.step, hardware.process.clock, {', '.join(modules)}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "planning.command" in loaded.stdout.split() and MOTION_NEVER.isdisjoint(loaded.stdout.split())
+
+
+def test_tracking_and_planning_load_open3d_only_where_there_is_a_scan_to_be_placed() -> None:
+    code = "import sys, hardware.plan.run, hardware.live.tracking_process; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "perception.mapping.scan_map" in loaded.stdout.split() and "open3d" not in loaded.stdout.split()
 
 
 HOUSE = (ROOT / "docs" / "house.md").read_text(encoding="utf-8")

@@ -16,8 +16,18 @@ from estimation.errors import InputError
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, FrameStream, decode
 from hardware.bench.campaigns import fuzz
 from hardware.bench.campaigns import fuzz_process as fuzz_try
-from hardware.bench.campaigns.fuzz import PATH_TEXT, ReaderSum, fuzz_figures, readers
-from hardware.bench.campaigns.fuzz_process import Block, Reader, Task, fuzzed, mutated, read_log, run_tasks
+from hardware.bench.campaigns.fuzz import PATH_TEXT, readers
+from hardware.bench.campaigns.fuzz_process import (
+    Block,
+    Reader,
+    ReaderSum,
+    Task,
+    fuzz_figures,
+    fuzzed,
+    mutated,
+    read_log,
+    run_tasks,
+)
 from hardware.operator.broadcast import parse_message
 from hardware.process.checks import read_toml
 from hardware.process.faults import fault_from_text

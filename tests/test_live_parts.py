@@ -21,8 +21,8 @@ from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import ProgressWriter, read_progress, write_path, write_progress_durably
-from hardware.files.ply_file import write_ply
 from hardware.live.checklist import place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.motion_process import LAG_STEP, LiveMotion

@@ -10,8 +10,8 @@ import pytest
 
 from estimation import se3
 from estimation.se3 import Array
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path, write_path
-from hardware.files.ply_file import write_ply
 from hardware.live.prepared import RunFiles, read_placement
 from hardware.live.prerender import prerender
 from hardware.plan.run import register_in_session

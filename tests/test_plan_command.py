@@ -19,11 +19,19 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.cli.main import main
-from hardware.files.mesh_file import SCAN_UNITS, in_mm
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_contour, read_path
-from hardware.files.ply_file import write_ply
 from hardware.plan import run as planning_command
-from hardware.plan.order import SETTING_RANGES, PlanSettings, example_scan, order_of
+from hardware.plan.order import (
+    SCAN_UNITS,
+    SETTING_RANGES,
+    PlanRequest,
+    PlanSettings,
+    example_scan,
+    in_mm,
+    order_of,
+    subject_of,
+)
 from hardware.plan.run import MAX_MIDDLE_DISTANCE, WoundSighting, _sighting, placement_lines
 from perception.lens import Lenses
 from planning.command import Move
@@ -244,3 +252,15 @@ def test_every_file_that_a_plan_is_given_is_read_before_the_scan(
     assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "path.csv"), option, str(wrong)]) == 2
     told = capsys.readouterr().err
     assert f"stillbed: {wrong}: {words}" in told and "scan.ply" not in told and not (tmp_path / "path.csv").exists()
+
+
+def test_a_cloud_of_points_is_planned_as_the_mesh_is(tmp_path: Path) -> None:
+    vertices, triangles = scan_of()
+    write_ply(tmp_path / "mesh.ply", vertices, triangles)
+    order = np.random.default_rng(0).permutation(len(vertices))
+    np.savetxt(tmp_path / "cloud.xyz", vertices[order], "%.6f")
+    mesh, cloud = (
+        subject_of(PlanRequest(tmp_path / "x.csv", scan=tmp_path / name), False).wound.findings
+        for name in ("mesh.ply", "cloud.xyz")
+    )
+    assert cloud.area == pytest.approx(mesh.area, rel=0.02) and cloud.volume == pytest.approx(mesh.volume, rel=0.02)

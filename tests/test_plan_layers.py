@@ -15,7 +15,7 @@ from estimation.errors import InputError
 from estimation.scans.scan import face_normals
 from estimation.se3 import Array
 from hardware.cli.main import main
-from hardware.files.ply_file import write_ply
+from hardware.files.mesh_file import write_ply
 from planning.fill.bead import Pattern
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits, tilt_field, tool_rotations
 from planning.layers.grid import grid_over, unroll
@@ -346,3 +346,22 @@ def test_a_damaged_scan_gives_a_wound_or_one_clear_error(
         return
     assert wound.outline.is_valid and wound.outline.area > 0
     assert np.isfinite(wound.bed).all() and np.isfinite(wound.skin).all()
+
+
+def test_of_two_shells_the_upper_one_is_planned_with_a_note_and_back_to_back_they_are_refused() -> None:
+    vertices, triangles = scan_of()
+    both = np.concatenate([vertices, vertices - [0.0, 0.0, 3.0]])
+    alike = np.concatenate([triangles, triangles + len(vertices)])
+    alone = find_wound(repair_mesh(vertices, triangles, "scan")[0], 0.5, "scan").findings
+    doubled = find_wound(repair_mesh(both, alike, "scan")[0], 0.5, "scan").findings
+    assert doubled.area == pytest.approx(alone.area, rel=0.01) and any("overhangs" in note for note in doubled.notes)
+    back = np.concatenate([triangles, triangles[:, ::-1] + len(vertices)])
+    with pytest.raises(InputError, match="length of the mean normal"):
+        find_wound(repair_mesh(both, back, "scan")[0], 0.5, "scan")
+
+
+def test_a_heap_of_noise_is_one_error() -> None:
+    rng = np.random.default_rng(0)
+    corners = rng.uniform(0, 60, (20_000, 1, 3)) + rng.normal(0, 1, (20_000, 3, 3))
+    with pytest.raises(InputError, match="triangles that can be used of 20000"):
+        repair_mesh(corners.reshape(-1, 3), np.arange(60_000).reshape(-1, 3), "scan")

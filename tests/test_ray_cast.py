@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.rig import ideal_pixels
 from estimation.scans.registration import Registration
-from estimation.scans.scan import Scan, cast_rays, face_normals, open_edges, scan_from_triangles
+from estimation.scans.scan import Hits, Scan, cast_rays, face_normals, open_edges, scan_from_triangles
 from estimation.se3 import Array
 from estimation.surface_map import moved_map
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
@@ -38,6 +38,11 @@ seeds = st.integers(0, 2**32 - 1)
 DOWN = se3.make(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 400.0])  # surface_from_camera: straight above, looking down
 
 
+def cast(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits:
+    """Rays (N, 3) of a camera, in its own frame."""
+    return cast_rays(scan, surface_from_camera[:3, 3], directions @ surface_from_camera[:3, :3].T)
+
+
 def pixel_rays(rng: np.random.Generator, count: int, wide: float = 0.12) -> Array:
     return np.column_stack([rng.uniform(-wide, wide, (count, 2)), np.ones(count)]) * rng.uniform(0.5, 2, (count, 1))
 
@@ -53,7 +58,7 @@ def tilted(rng: np.random.Generator) -> Array:
 def test_a_plane_is_met_where_the_ray_crosses_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
     surface_from_camera, directions = tilted(rng), pixel_rays(rng, 200)
-    hits = cast_rays(scans.height_field(scans.plane, step=4.0), surface_from_camera, directions)
+    hits = cast(scans.height_field(scans.plane, step=4.0), surface_from_camera, directions)
     points, hit = hits.points, hits.hit
     origin, along = surface_from_camera[:3, 3], directions @ surface_from_camera[:3, :3].T
     wanted = origin - along * (origin[2] / along[:, 2])[:, None]
@@ -68,7 +73,7 @@ def test_a_plane_is_met_where_the_ray_crosses_it(seed: int) -> None:
 def test_a_ball_is_met_on_the_near_side(seed: int) -> None:
     rng = np.random.default_rng(seed)
     surface_from_camera, directions = tilted(rng), pixel_rays(rng, 150)
-    hits = cast_rays(scans.ball(30.0), surface_from_camera, directions)
+    hits = cast(scans.ball(30.0), surface_from_camera, directions)
     origin = surface_from_camera[:3, 3]
     along = directions @ surface_from_camera[:3, :3].T
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -103,7 +108,7 @@ def test_any_triangles_large_small_and_behind(seed: int) -> None:
     corners = rng.normal(size=(40, 1, 3)) * 150 + rng.normal(size=(40, 3, 3)) * sizes
     scan = scan_from_triangles(corners.reshape(-1, 3), np.arange(120).reshape(-1, 3))
     surface_from_camera, directions = tilted(rng), pixel_rays(rng, 25, wide=0.5)
-    hits = cast_rays(scan, surface_from_camera, directions)
+    hits = cast(scan, surface_from_camera, directions)
     points, hit = hits.points, hits.hit
     wanted = brute_force(scan, surface_from_camera, directions)
     assert (hit == np.isfinite(wanted[:, 0])).all()
@@ -113,7 +118,7 @@ def test_any_triangles_large_small_and_behind(seed: int) -> None:
 def test_no_ray_slips_through_between_triangles() -> None:
     scan = scans.height_field(scans.plane, step=5.0)
     targets = scan.vertices[(np.abs(scan.vertices[:, :2]) < [39, 29]).all(axis=1)]  # rays through inner vertices
-    hits = cast_rays(scan, DOWN, se3.transform_points(se3.inverse(DOWN), targets))
+    hits = cast(scan, DOWN, se3.transform_points(se3.inverse(DOWN), targets))
     points, hit = hits.points, hits.hit
     assert hit.all()
     np.testing.assert_allclose(points, targets, atol=1e-9)
@@ -121,11 +126,11 @@ def test_no_ray_slips_through_between_triangles() -> None:
 
 def test_no_rays_and_no_way_to_the_scan() -> None:
     scan = scans.height_field(scans.plane, step=5.0)
-    hits = cast_rays(scan, DOWN, np.zeros((0, 3)))
+    hits = cast(scan, DOWN, np.zeros((0, 3)))
     points, hit = hits.points, hits.hit
     assert points.shape == (0, 3) and hit.shape == (0,)
     away = se3.make(np.eye(3), [0.0, 0.0, 400.0])  # looks the other way
-    assert not cast_rays(scan, away, pixel_rays(np.random.default_rng(0), 20)).hit.any()
+    assert not cast(scan, away, pixel_rays(np.random.default_rng(0), 20)).hit.any()
 
 
 def test_a_scan_merges_equal_vertices_and_drops_empty_triangles() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.scans.registration import MIN_REGISTRATION_POINTS, Registration, register
-from estimation.scans.scan import Scan, ScanIndex, closest_weights
+from estimation.scans.scan import Scan, ScanIndex, scan_from_triangles
 from estimation.se3 import Array
 from tests import scans
 
@@ -144,17 +144,17 @@ def test_registration_is_deterministic() -> None:
     assert a.verdict == b.verdict
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(seeds)
-def test_no_other_point_of_a_triangle_is_nearer(seed: int) -> None:
+def test_no_other_point_of_a_scan_is_nearer(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    corners, points = rng.normal(size=(30, 3, 3)), 2 * rng.normal(size=(30, 3))
-    weights = closest_weights(points, corners)
-    assert (weights >= -1e-12).all()
-    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-9)
-    best = np.linalg.norm(np.einsum("nk,nki->ni", weights, corners) - points, axis=1)
-    for other in rng.dirichlet([0.5, 0.5, 0.5], 200):
-        assert (np.linalg.norm(np.einsum("k,nki->ni", other, corners) - points, axis=1) >= best - 1e-9).all()
+    scan = scan_from_triangles(rng.normal(size=(30, 3)), np.arange(30).reshape(-1, 3))
+    points = 2 * rng.normal(size=(30, 3))
+    near = ScanIndex(scan).closest(points)
+    best = np.linalg.norm(near.points - points, axis=1)
+    for _ in range(200):
+        others = np.einsum("tk,tki->ti", rng.dirichlet([0.5, 0.5, 0.5], len(scan.triangles)), scan.corners)
+        assert (np.linalg.norm(others[:, None] - points, axis=2) >= best - 1e-6).all()
 
 
 def test_nearest_points_of_a_ball_lie_towards_its_centre() -> None:
@@ -171,4 +171,4 @@ def test_nearest_points_of_a_ball_lie_towards_its_centre() -> None:
 def test_points_beside_a_scan_are_nearest_to_its_rim() -> None:
     near = ScanIndex(scans.height_field(scans.plane)).closest(np.array([[45.0, 3.3, 1.0], [12.2, 3.1, 1.0]]))
     assert near.rim.tolist() == [True, False]
-    np.testing.assert_allclose(near.points, [[40, 3.3, 0], [12.2, 3.1, 0]], atol=1e-9)
+    np.testing.assert_allclose(near.points, [[40, 3.3, 0], [12.2, 3.1, 0]], atol=1e-5)  # float32

@@ -316,6 +316,7 @@ def test_the_summary_is_plain_json_and_says_the_same_again(tmp_path: Path) -> No
     result = evaluate(*run(60, sigma=SIGMA), "monday")
     write_summary(tmp_path / "summary.json", result)
     loaded = json.loads((tmp_path / "summary.json").read_text(), parse_constant=pytest.fail)
+    assert set(loaded.pop("provenance")) >= {"started_utc", "stillbed", "commit", "host", "operator", "inputs_sha256"}
     assert loaded == as_dict(result) and loaded["states_since_s"] is None
     assert loaded["errors"]["start"]["translation_mm"]["max"] > 0
     assert text_of(loaded) == summary_text(result)

@@ -23,6 +23,7 @@ from hardware.cameras.sources import CameraDevice
 from hardware.cli import doctor
 from hardware.cli.doctor import REINSTALL, LoadFailure, library_checks, load_failures
 from hardware.cli.main import main
+from hardware.files.mesh_reader import SHARED_LIBRARIES
 from hardware.files.rig_file import read_rig, write_rig
 from hardware.operator.view import Check, CheckVerdict
 from hardware.process.clock import SimClock
@@ -184,6 +185,14 @@ def test_a_library_that_is_only_slow_is_no_failure() -> None:
 def test_a_library_that_is_not_installed_fails_with_a_remedy() -> None:
     (check,) = library_checks(["no-such-library"])
     assert check == Check("no-such-library", FAIL, "not installed", REINSTALL)
+
+
+def test_the_packages_that_open3d_lacks_are_named() -> None:
+    lacking = {"open3d": doctor.LoadFailure("libGL.so.1: cannot open shared object file", shared_object=True)}
+    check = doctor._library_check("numpy", "open3d", lacking)
+    assert check.verdict is FAIL and "apt-get install -y libegl1 libgl1" in check.remedy
+    makefile = (Path(__file__).parents[1] / "Makefile").read_text()
+    assert f"apt,{SHARED_LIBRARIES}," in makefile
 
 
 def system(root: Path, flags: str, free_kb: int) -> Path:

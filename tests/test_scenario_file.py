@@ -13,7 +13,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile
-from hardware.files.ply_file import write_ply
+from hardware.files.mesh_file import write_ply
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.process.faults import FaultKind
 from hardware.simulator.scenario import read_scenario

@@ -27,6 +27,9 @@ FINE_STARTS = 6  # and of these, those refined with exact nearest points
 FINAL_STARTS = 3  # and of these, those refined with all points: more than one, to see whether the best is alone
 COARSE_SAMPLES = 4000  # of the scan: enough to lay a part of it under the points
 
+# of what a full step costs: along what the shape leaves open, the last digits of float32 would else move by metres
+STEP_DAMPING = 1e-6
+
 FREE_STD = 0.3  # mm: a direction known no better is called free; three times the error that is wanted
 FREE_SLOPE = 0.012  # mm of distance per mm of motion (0.7 degrees): below, errors of the scan's own shape decide
 SLIDE_TURN_SHARE = 0.2  # of turning, below which a motion is called a slide
@@ -151,8 +154,9 @@ def _refine(
         jacobian = np.concatenate([np.cross(inner, pull), pull], axis=1)  # -d offset / d xi
         weighted = jacobian * weight[:, None]
         information = weighted.T @ jacobian
-        damped = information + 1e-6 * np.diag(np.diag(information)) + 1e-9 * np.eye(6)
-        step = np.linalg.solve(damped, weighted.T @ offset)
+        reach = float(np.einsum("ni,ni->", inner, inner)) + len(points)
+        damping = STEP_DAMPING * np.diag([reach] * 3 + [len(points)] * 3)
+        step = np.linalg.solve(information + damping, weighted.T @ offset)
         step = without_free(inner, pull, step) if held else step
         pose = pose @ se3.exp(step)
         spread = 1.4826 * float(np.median(np.abs(offset)))

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from estimation.se3 import Array, Index, Mask, inverse, transform_points
+from estimation.se3 import Array, Index, Mask
 
 MIN_INCIDENCE = 0.1  # cosine of ray and normal: no landmark is seen more from the side
-_EDGE_SLACK = 1e-9  # barycentric, so that no ray slips through between two triangles
 SAMPLE_COUNT = 15_000  # about so many spread over the scan; a 100 x 100 mm scan gets one every 0.8 mm
-CANDIDATE_SAMPLES = 8  # whose triangles may hold the nearest point
+RIM_WEIGHT = 1e-6  # barycentric, below which a nearest point lies on the opposite side: a digit over those of float32
 _MAX_DIVISIONS = 24  # of a triangle's side
 
 
@@ -87,6 +87,38 @@ def _vertex_normals(points: Array, faces: Index) -> Array:
     return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
 
 
+class _Scene:
+    """open3d's ray casting scene of a scan. It is in float32 and tells the triangle; places follow in float64.
+
+    Which triangle does not depend on other queries: the same input gives the same result, whatever the threads.
+    """
+
+    def __init__(self, scan: Scan) -> None:
+        import open3d as o3d  # most of a second and 100 MB, which processes without a scan need not spend
+
+        self.scan, self._tensor = scan, o3d.core.Tensor
+        self._middle = scan.vertices.mean(axis=0)  # float32 has 7 digits: they are spent on the scan, not on its place
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(self._single(scan.vertices - self._middle), self._single(scan.triangles, np.uint32))
+        self._miss = self._scene.INVALID_ID
+
+    def _single(self, values: Array | Index, kind: type = np.float32) -> Any:
+        return self._tensor(np.ascontiguousarray(values, kind))
+
+    def first_hits(self, origins: Array, directions: Array) -> tuple[Index, Index]:
+        """Rays (M,) that meet the scan, and the triangle (M,) that each meets first."""
+        rays = np.concatenate([origins - self._middle, directions], axis=1)
+        triangle = self._scene.cast_rays(self._single(rays))["primitive_ids"].numpy()
+        ray = np.flatnonzero(triangle != self._miss)
+        return ray, triangle[ray].astype(np.int64)
+
+    def closest(self, points: Array) -> tuple[Index, Array]:
+        """The triangle (N,) nearest to each point (N, 3), and the barycentric weights (N, 3) of its nearest point."""
+        near = self._scene.compute_closest_points(self._single(points - self._middle))
+        uv = near["primitive_uvs"].numpy().astype(np.float64)
+        return near["primitive_ids"].numpy().astype(np.int64), np.column_stack([1 - uv.sum(axis=1), uv])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
     """Where N rays first meet the scan."""
@@ -96,26 +128,19 @@ class Hits:
     hit: Mask  # (N,)
 
 
-def cast_rays(scan: Scan, surface_from_camera: Array, directions: Array) -> Hits:
-    """Where rays (N, 3), camera frame, first meet the scan, on either side; all within 80 degrees of their mean.
+def cast_rays(scan: Scan, origins: ArrayLike, directions: Array) -> Hits:
+    """Where rays from `origins` (N, 3) or (3,) along `directions` (N, 3), surface frame, first meet it, on either side.
 
-    Only triangles whose picture on a plane across the mean ray covers the ray's are tried (Moeller and Trumbore 1997).
-    They are looked up by their circles, octave by octave, so that a few large triangles do not slow the small ones.
+    open3d finds the triangle; where the ray meets its plane is worked out in float64.
     """
-    miss = np.full((len(directions), 3), np.nan)
+    points, normals = np.full((2, len(directions), 3), np.nan)
     if not len(directions) or not len(scan.triangles):
-        return Hits(miss, miss.copy(), np.zeros(len(directions), bool))
-    corners = transform_points(inverse(surface_from_camera), scan.vertices)[scan.triangles]  # (T, 3, 3) camera frame
-    ray, triangle = _candidates(corners, directions)
-    depth, weights = _meet(corners[triangle], directions[ray])
-    keep = np.flatnonzero(np.isfinite(depth))
-    keep = keep[np.argsort(depth[keep], kind="stable")]
-    first_ray, first = np.unique(ray[keep], return_index=True)
-    chosen = keep[first]
-    points, normals = miss, miss.copy()
-    hits = depth[chosen, None] * directions[first_ray]
-    points[first_ray] = transform_points(surface_from_camera, hits)
-    normals[first_ray] = normals_at(scan, triangle[chosen], weights[chosen])
+        return Hits(points, normals, np.zeros(len(directions), bool))
+    origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
+    ray, triangle = _Scene(scan).first_hits(origins, directions)
+    weights, depth = _meet(scan.corners[triangle] - origins[ray, None], directions[ray])
+    points[ray] = origins[ray] + depth[:, None] * directions[ray]
+    normals[ray] = normals_at(scan, triangle, weights)
     return Hits(points, normals, np.isfinite(points[:, 0]))
 
 
@@ -131,50 +156,14 @@ def foot_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:
 
 
 def _meet(corners: Array, directions: Array) -> tuple[Array, Array]:
-    """Distances (M,) to triangles (M, 3, 3), in lengths of `directions` (M, 3), NaN for a miss; barycentric weights."""
-    # Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997
+    """Barycentric weights (M, 3) of where rays (M, 3) from the origin meet the planes of triangles (M, 3, 3), and how
+    far away that is, in lengths of `directions` (Moeller and Trumbore 1997)."""
     a = corners[:, 0]
     ab, ac = corners[:, 1] - a, corners[:, 2] - a
     p, q = np.cross(directions, ac), np.cross(-a, ab)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / np.einsum("mi,mi->m", ab, p)
-        u = np.einsum("mi,mi->m", -a, p) * scale
-        v = np.einsum("mi,mi->m", directions, q) * scale
-        t = np.einsum("mi,mi->m", ac, q) * scale
-        inside = (u >= -_EDGE_SLACK) & (v >= -_EDGE_SLACK) & (u + v <= 1 + _EDGE_SLACK) & (t > 0)
-    return np.where(inside, t, np.nan), np.column_stack([1 - u - v, u, v])
-
-
-def _candidates(corners: Array, directions: Array) -> tuple[Index, Index]:
-    """Pairs (M,) of ray and triangle (T, 3, 3), camera frame, that may meet."""
-    across = _across(directions)
-    flat = directions @ across[:, :2] / (directions @ across[:, 2:])  # (N, 2) on a plane one unit away
-    turned = corners @ across
-    front = turned[..., 2] > 1e-6 * np.abs(turned).max()
-    whole = np.flatnonzero(front.all(1))  # the others reach behind the camera: tried against every ray
-    odd = np.flatnonzero(front.any(1) & ~front.all(1))
-    pictures = turned[whole, :, :2] / turned[whole, :, 2:]  # (W, 3, 2)
-    low, high = pictures.min(1), pictures.max(1)
-    centres, radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
-    rays = [np.repeat(np.arange(len(flat)), len(odd))]
-    triangles = [np.tile(odd, len(flat))]
-    tree = cKDTree(flat)
-    for octave in np.unique(np.frexp(radii)[1]):
-        some = np.flatnonzero(np.frexp(radii)[1] == octave)
-        near = tree.query_ball_tree(cKDTree(centres[some]), float(np.ldexp(1.0, octave)) * (1 + 1e-9))
-        rays.append(np.repeat(np.arange(len(flat)), [len(f) for f in near]))
-        triangles.append(whole[some[np.array([t for f in near for t in f], np.int64)]])
-    return np.concatenate(rays), np.concatenate(triangles)
-
-
-def _across(directions: Array) -> Array:
-    """Rotation (3, 3) whose last column is the mean ray."""
-    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    z = unit.mean(0) / np.linalg.norm(unit.mean(0))
-    assert (unit @ z).min() > 0.17, "rays of one camera stand within 80 degrees of their mean"
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
+    scale = 1 / np.einsum("mi,mi->m", ab, p)
+    u, v = -np.einsum("mi,mi->m", a, p) * scale, np.einsum("mi,mi->m", directions, q) * scale
+    return np.column_stack([1 - u - v, u, v]), np.einsum("mi,mi->m", ac, q) * scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +179,7 @@ class ScanIndex:
     """A scan made ready for many queries, by samples spread over its triangles, at least one on each."""
 
     def __init__(self, scan: Scan) -> None:
-        self.scan, self._corners, areas = scan, scan.corners, face_areas(scan)
+        self.scan, self._scene, self._corners, areas = scan, _Scene(scan), scan.corners, face_areas(scan)
         spacing = float(np.sqrt(areas.sum() / SAMPLE_COUNT))
         self.spacing = max(spacing, float(np.sqrt(np.quantile(areas, 0.9))))  # mm, about the largest between samples
         self.triangle, weights = _spread(scan, spacing)  # (S,) that each sample lies on
@@ -201,47 +190,15 @@ class ScanIndex:
         sides = np.sort(scan.triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
         edges, count = open_edges(scan), len(scan.vertices)
         self._open = np.isin(sides[..., 0] * count + sides[..., 1], edges[:, 0] * count + edges[:, 1])
+        self._rim = np.isin(scan.triangles, edges)  # (T, 3) whether each corner is
 
     def closest(self, points: Array) -> ClosestPoints:
-        """Nearest points of the scan to points (N, 3), on the triangles of the nearest samples."""
-        count = min(CANDIDATE_SAMPLES, len(self.samples))
-        _, near = self.tree.query(points, k=count)
-        triangle = self.triangle[near.reshape(len(points), count)]  # (N, K)
-        corners = self._corners[triangle.ravel()]
-        weights = closest_weights(np.repeat(points, count, axis=0), corners)
-        nearest = np.einsum("mk,mki->mi", weights, corners).reshape(len(points), count, 3)
-        best = np.argmin(np.linalg.norm(nearest - points[:, None], axis=2), axis=1)
-        row = np.arange(len(points))
-        chosen, weight = triangle[row, best], weights.reshape(len(points), count, 3)[row, best]
-        rim = ((weight < 1e-9) & self._open[chosen]).any(axis=1)
-        return ClosestPoints(nearest[row, best], normals_at(self.scan, chosen, weight), rim)
-
-
-def closest_weights(points: Array, corners: Array) -> Array:
-    """Barycentric weights (M, 3) of the point of each triangle (M, 3, 3) nearest to its point (M, 3).
-
-    Inside where the foot of the perpendicular falls inside, else on the nearest of the three sides (Ericson, Real-Time
-    Collision Detection, 2005, 5.1.5, without its shortcuts).
-    """
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    area = np.einsum("mi,mi->m", normal, normal)
-    u = np.einsum("mi,mi->m", np.cross(c - b, points - b), normal) / area
-    v = np.einsum("mi,mi->m", np.cross(a - c, points - c), normal) / area
-    inner = np.column_stack([u, v, 1 - u - v])
-    best, nearest = inner.copy(), np.full(len(points), np.inf)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        side = corners[:, j] - corners[:, i]
-        along = np.einsum("mi,mi->m", points - corners[:, i], side) / np.einsum("mi,mi->m", side, side)
-        along = np.clip(along, 0, 1)
-        distance = np.linalg.norm(corners[:, i] + along[:, None] * side - points, axis=1)
-        weights = np.zeros_like(inner)
-        weights[:, i], weights[:, j] = 1 - along, along
-        better = distance < nearest
-        best[better], nearest[better] = weights[better], distance[better]
-    inside = (inner >= 0).all(axis=1)
-    best[inside] = inner[inside]
-    return best
+        """Nearest points of the scan to points (N, 3)."""
+        triangle, weights = self._scene.closest(points)
+        nearest = np.einsum("nk,nki->ni", weights, self._corners[triangle])
+        beside = (weights < RIM_WEIGHT) & self._open[triangle]
+        rim = np.any(beside | ((weights > 1 - RIM_WEIGHT) & self._rim[triangle]), axis=1)
+        return ClosestPoints(nearest, normals_at(self.scan, triangle, weights), rim)
 
 
 def _spread(scan: Scan, spacing: float) -> tuple[Index, Array]:

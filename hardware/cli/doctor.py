@@ -21,6 +21,7 @@ from packaging.requirements import Requirement
 
 from estimation.errors import StillbedError
 from hardware.bench.figures import this_machine
+from hardware.files.mesh_reader import SHARED_LIBRARIES
 from hardware.operator.view import Check, CheckVerdict
 from hardware.process.clock import Clock
 from hardware.process.system import NO_PRIORITY
@@ -55,6 +56,7 @@ for name in sys.argv[1:]:
 REINSTALL = "make a new environment and `pip install .` there again, with constraints.txt"
 SLOW_REMEDY = "ask again while less runs on this machine"
 SYSTEM_REMEDY = "install the system's package that has this file: `apt-file search` with its name tells which"
+OPEN3D_REMEDY = f"on Debian: sudo apt-get install -y {SHARED_LIBRARIES}"
 
 
 def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) -> list[Check]:
@@ -261,7 +263,8 @@ def _library_check(name: str, module: str, failed: dict[str, LoadFailure]) -> Ch
     trouble = failed[module]
     if trouble.slow:
         return Check(name, CheckVerdict.WARN, f"{have}: {trouble.reason}", SLOW_REMEDY)
-    remedy = SYSTEM_REMEDY if trouble.shared_object else REINSTALL
+    by_system = OPEN3D_REMEDY if module == "open3d" else SYSTEM_REMEDY
+    remedy = by_system if trouble.shared_object else REINSTALL
     return Check(name, CheckVerdict.FAIL, f"{have}: {trouble.reason}", remedy)
 
 

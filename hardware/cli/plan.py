@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from perception.wound.segmentation import Segmenter
 
 PLAN_TEXT = """\
-Plan the print of a wound. SCAN is a mesh (.ply, .stl, .obj) of the wound with skin around it, or a flat contour
-(.csv with x_mm,y_mm): one layer. The mesh is repaired, the wound found as the depression in the skin, the healthy
-skin interpolated over it, the volume between cut into layers, each filled with beads, and the tool led over them.
+Plan the print of a wound. SCAN is a mesh (.ply, .stl, .obj, .off, .gltf, .glb) or a cloud of points (.ply, .pcd,
+.xyz) of the wound with skin around it, or a flat contour (.csv with x_mm,y_mm): one layer. The mesh is repaired, the
+wound found as the depression in the skin, the healthy skin interpolated over it, the volume between cut into layers,
+each filled with beads, and the tool led over them.
 
 Writes PATH.csv, whole or not at all, and beside it PATH_layers.csv and PATH.json (coverage, lengths, times, volumes),
 PATH_scan.ply (the scan as repaired), PATH_layers/ (a picture of each layer) and PATH.html (a report with a view in
@@ -40,7 +41,7 @@ def add_plan(commands: Commands) -> None:
     summary = "plan the print of a scanned wound: layers, beads, checkpoints"
     command = commands.add("plan", _run_plan, summary, PLAN_TEXT, *PLAN_EXAMPLES)
     add = command.add_argument
-    add("scan", type=Path, nargs="?", metavar="SCAN", help="mesh of the wound, or contour")
+    add("scan", type=Path, nargs="?", metavar="SCAN", help="mesh or points of the wound, or contour")
     add("-o", "--out", type=Path, required=True, metavar="PATH.csv", help="path to write")
     add("--example", choices=("forearm", "chest", "foot"), help="a built-in scan instead of SCAN; also written")
     add("--gcode", type=Path, metavar="FILE", help="also write the path as plain G-code text")

@@ -1,120 +1,257 @@
-"""Scans from PLY, STL and OBJ files, read strictly: whatever is wrong, missing or unknown in the file is an error.
+"""Scans from meshes and point clouds: read by open3d apart (`mesh_reader`), counted against the file, and checked.
 
-An arm moves along the scan, and the libraries for these files read damaged ones in part and without an error (trimesh
-5.2: text that ends early, vertex 0 of an OBJ file), or end the process (open3d 0.20).
+An arm moves along the scan, and the libraries for these files read damaged ones in part and without an error. So the
+header, or the lines of a format without one, tells what must come; whatever is wrong, missing or too much is an error.
 """
 
 from __future__ import annotations
 
-from array import array
-from dataclasses import dataclass
+import json
+import re
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.scans.scan import Scan, open_edges, scan_from_triangles
 from estimation.se3 import Array
-from hardware.files.ply_file import RawMesh, check_rows, fans, read_ply, text_rows, wrong_line
-
-STL_HEADER_BYTES = 84  # bytes: eighty of anything, and the number of triangles
-STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-STL_FACET = (b"facet", b"outer", b"vertex", b"vertex", b"vertex", b"endloop", b"endfacet")  # a triangle, line by line
-STL_FACET_REST = {b"facet": " or endsolid", b"vertex": " and three numbers"}  # what may follow, or stand there instead
-
-
-def read_stl(path: Path) -> RawMesh:
-    """The mesh in an STL file, three vertices of its own for each triangle. InputError says where it is none."""
-    with path.open("rb") as file:
-        size, head = path.stat().st_size, file.read(STL_HEADER_BYTES)
-        count = int.from_bytes(head[80:], "little")
-        if len(head) == STL_HEADER_BYTES and size == STL_HEADER_BYTES + STL_TRIANGLE.itemsize * count:
-            check_rows(path, "triangles", count)
-            corners = np.fromfile(file, STL_TRIANGLE)["corners"].astype(np.float64).reshape(-1, 3)
-        elif head.lstrip()[:5].lower() == b"solid":
-            file.seek(0)
-            corners = np.array(_text_corners(file, path), np.float64).reshape(-1, 3)
-        else:
-            got = f"{size} bytes" + (f", {count} triangles by its header" if len(head) == STL_HEADER_BYTES else "")
-            sizes = f"{STL_HEADER_BYTES} bytes and {STL_TRIANGLE.itemsize} for each triangle"
-            raise InputError(path, "scan", got, f"{sizes} (is it cut short?), or text")
-    return RawMesh(corners, np.arange(len(corners)).reshape(-1, 3))
-
-
-def _text_corners(file: BinaryIO, path: Path) -> array[float]:
-    """Nine numbers for each triangle of a text STL file, of all its solids."""
-    corners, step, solid = array("d"), 0, False
-    for number, words in text_rows(file, path):
-        word, expected = words[0].lower(), STL_FACET[step]
-        if step == 0 and word == (b"endsolid" if solid else b"solid"):
-            solid = not solid
-            continue
-        try:
-            if not solid or word != expected:
-                raise ValueError
-            if word == b"vertex":
-                x, y, z = words[1:]
-                corners.extend((float(x), float(y), float(z)))
-                check_rows(path, "triangles", len(corners) // 9)
-        except ValueError:
-            allowed = expected.decode() + STL_FACET_REST.get(expected, "") if solid else "solid"
-            raise wrong_line(path, number, words, allowed) from None
-        step = (step + 1) % len(STL_FACET)
-    if solid:
-        raise InputError(path, "scan", "ends within a solid", "endsolid as its last line (is it cut short?)")
-    return corners
-
-
-OBJ_VERTEX, OBJ_FACE = "v and the three numbers of a place", "f and three or more numbers of vertices, counted from 1"
-IGNORED_OBJ_WORDS = frozenset(
-    b"vt vn vp g o s mg l p usemtl mtllib usemap maplib bevel c_interp d_interp lod shadow_obj trace_obj".split()
+from hardware.files.mesh_reader import (
+    PLAIN_READERS,
+    MeshReader,
+    MeshReaderError,
+    RawMesh,
+    check_rows,
+    text_rows,
+    wrong_line,
 )
 
 
-def read_obj(path: Path) -> RawMesh:
-    """The mesh in an OBJ file, polygons as fans of triangles. InputError names the line that is no line of one."""
-    places, counts, corners = array("d"), array("q"), array("q")
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """What a file says it holds."""
+
+    vertices: int | None = None  # None: it does not say
+    faces: int | None = None  # 0: a cloud
+    triangles: int | None = None  # where it says how many corners faces have
+    check: Callable[[int], None] = lambda triangles: None  # of the file's length, once the triangles are known
+
+
+PLY_TYPES = {  # bytes of each
+    **{b"char": 1, b"uchar": 1, b"short": 2, b"ushort": 2, b"int": 4, b"uint": 4, b"float": 4, b"double": 8},
+    **{b"int8": 1, b"uint8": 1, b"int16": 2, b"uint16": 2, b"int32": 4, b"uint32": 4, b"float32": 4, b"float64": 8},
+}
+BROKEN_NUMBERS = (b"float", b"float32", b"double", b"float64")  # types that count and name nothing
+PLY_FORMATS = (b"ascii", b"binary_little_endian", b"binary_big_endian")
+FACE_LIST_NAMES = (b"vertex_indices", b"vertex_index")  # what programs call the list of a face's vertices
+MAX_COUNT_DIGITS = 18  # of a count: fits 64 bits
+PLY_HEADER_LINES = "comment ..., element NAME COUNT, property TYPE NAME, property list TYPE TYPE NAME, or end_header"
+
+
+@dataclass(slots=True)
+class PlyElement:
+    """A table of a PLY file."""
+
+    rows: int  # by the header
+    names: list[bytes] = field(default_factory=list)  # of its properties
+    row_bytes: int = 0  # of a row without lists
+    lists: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # bytes of a count and of an entry, by name
+
+    def whole(self, words: list[bytes]) -> bool:
+        """Whether the words of a line are a number for each property, and a face has three corners or more."""
+        at = 0
+        for name in self.names:
+            count = words[at] if name in self.lists and at < len(words) else b"0"
+            if not count.isdigit() or len(count) > MAX_COUNT_DIGITS or (name in FACE_LIST_NAMES and int(count) < 3):
+                return False
+            at += 1 + int(count)
+        return at == len(words)
+
+
+def announced_by_ply(path: Path) -> Announcement:
+    """What the header of a PLY file says; InputError names the line that is wrong or missing."""
+    with path.open("rb") as file:
+        kind, elements, lines = _ply_header(file, path)
+        begin = file.tell()
+    vertex, face = elements.get(b"vertex", PlyElement(0)), elements.get(b"face", PlyElement(0))
+    for name, element in elements.items():
+        check_rows(path, f"rows of {name.decode('utf-8', 'replace')}", element.rows)
+    if [name for name in vertex.names if name in (b"x", b"y", b"z") and name not in vertex.lists] != [b"x", b"y", b"z"]:
+        allowed = "x, y and z among them in this order, a number each"
+        raise InputError(path, "properties of vertex", _joined(vertex.names), allowed)
+    corners = [name for name in face.lists if name in FACE_LIST_NAMES]
+    if face.rows and not corners:
+        allowed = f"{FACE_LIST_NAMES[0].decode()} among them, a list of whole numbers"
+        raise InputError(path, "properties of face", _joined(face.names), allowed)
+    if kind == b"ascii":
+        _check_lines(path, lines, elements)
+    other = sum(len(element.lists) for element in elements.values()) > 1 or len(corners) < len(face.lists)
+
+    def check(triangles: int) -> None:
+        if other or kind == b"ascii":  # lists of any length: that of the file follows from nothing
+            return
+        count = triangles + 2 * face.rows  # of corners: a polygon of n has n - 2 triangles
+        size = sum(e.rows * (e.row_bytes + sum(counted for counted, _ in e.lists.values())) for e in elements.values())
+        size += count * face.lists[corners[0]][1] if corners else 0
+        with path.open("rb") as file:
+            file.seek(begin + size)
+            rest = file.read(2)
+        if rest.strip() or path.stat().st_size < begin + size:
+            _check_length(path, "bytes behind the header", path.stat().st_size - begin, size)
+
+    return Announcement(vertex.rows, face.rows, check=check)
+
+
+def _joined(names: list[bytes]) -> str:
+    return b", ".join(names).decode("utf-8", "replace")
+
+
+def _check_length(path: Path, what: str, got: int, wanted: int) -> None:
+    if got != wanted:
+        raise InputError(path, what, got, f"{wanted}, as it tells (is it cut short, or was more appended?)")
+
+
+def _check_lines(path: Path, header_lines: int, elements: dict[bytes, PlyElement]) -> None:
+    """InputError where rows of text are not whole: rply, which reads them, takes whatever words come next."""
+    owners = (element for element in elements.values() for _ in range(element.rows))
     with path.open("rb") as file:
         for number, words in text_rows(file, path):
-            word = words[0]
-            if word not in (b"v", b"f"):
-                if word in IGNORED_OBJ_WORDS or word.startswith(b"#"):
-                    continue
-                raise wrong_line(path, number, words, f"{OBJ_VERTEX}, or {OBJ_FACE}")
-            try:
-                if word == b"v":
-                    x, y, z = words[1:4]
-                    places.extend((float(x), float(y), float(z)))
-                    check_rows(path, "vertices", len(places) // 3)
-                else:
-                    face = _face(words[1:], len(places) // 3)
-                    counts.append(len(face))
-                    corners.extend(face)
-                    check_rows(path, "faces", len(counts))
-            except (ValueError, OverflowError):
-                raise wrong_line(path, number, words, OBJ_VERTEX if word == b"v" else OBJ_FACE) from None
-    triangles = fans(np.array(counts, np.int64), np.array(corners, np.int64))
-    return RawMesh(np.array(places, np.float64).reshape(-1, 3), triangles)
+            if number <= header_lines:
+                continue
+            owner = next(owners, None)
+            if owner is None:
+                raise wrong_line(path, number, words, "nothing behind the rows that the header tells of")
+            if not owner.whole(words):
+                names = b" ".join(b"COUNT " + n + b"..." if n in owner.lists else n for n in owner.names)
+                raise wrong_line(path, number, words, f"{names.decode('utf-8', 'replace')}, in numbers")
+    if missing := sum(1 for _ in owners):
+        raise InputError(path, "rows that are missing", missing, "none (is the file cut short?)")
 
 
-def _face(words: list[bytes], vertices: int) -> list[int]:
-    """Numbers, from 0, of the corners that the words i, i/t, i//n or i/t/n name. vertices: how many have come so far.
+def _ply_header(file: BinaryIO, path: Path) -> tuple[bytes, dict[bytes, PlyElement], int]:
+    """Format, elements and number of lines of a PLY file's header, behind which the file is left."""
+    rows = text_rows(file, path)
+    number, words = next(rows, (1, []))
+    if words != [b"ply"]:
+        raise wrong_line(path, number, words, "ply")
+    kind, elements, last = None, dict[bytes, PlyElement](), None
+    for number, words in rows:
+        match words:
+            case [b"comment" | b"obj_info", *_]:
+                continue
+            case [b"format", form, b"1.0"] if kind is None and form in PLY_FORMATS:
+                kind = form
+            case _ if kind is None:
+                formats = ", ".join(map(bytes.decode, PLY_FORMATS))
+                raise wrong_line(path, number, words, f"format, one of {formats}, 1.0")
+            case [b"element", name, count] if (
+                count.isdigit() and len(count) <= MAX_COUNT_DIGITS and name not in elements
+            ):
+                elements[name] = last = PlyElement(int(count))
+            case [b"property", b"list", count, each, name] if last and _countable(count) and each in PLY_TYPES:
+                whole = name not in FACE_LIST_NAMES or _countable(each)
+                if not whole or name in last.names:
+                    raise wrong_line(path, number, words, "a list of whole numbers, no name twice")
+                last.names.append(name)
+                last.lists[name] = PLY_TYPES[count], PLY_TYPES[each]
+            case [b"property", each, name] if last and each in PLY_TYPES and name not in last.names:
+                last.names.append(name)
+                last.row_bytes += PLY_TYPES[each]
+            case [b"end_header"] if all(element.names for element in elements.values()):
+                return kind, elements, number
+            case _:
+                raise wrong_line(path, number, words, f"{PLY_HEADER_LINES}; no name twice, no element without any")
+    raise wrong_line(path, number + 1, [], "end_header somewhere (is the file cut short?)")
 
-    ValueError: they are no face.
-    """
-    if b"#" in words:
-        words = words[: words.index(b"#")]
-    corners = [int(word.partition(b"/")[0]) for word in words]
-    if len(corners) < 3 or 0 in corners or min(corners) < -vertices:
-        raise ValueError
-    return [one - 1 if one > 0 else vertices + one for one in corners]
+
+def _countable(kind: bytes) -> bool:
+    return kind in PLY_TYPES and kind not in BROKEN_NUMBERS
 
 
-MESH_READERS = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj}
+def announced_by_off(path: Path) -> Announcement:
+    """The first numbers of an OFF file."""
+    with path.open("rb") as file:
+        rows = ((n, words) for n, words in text_rows(file, path) if not words[0].startswith(b"#"))
+        number, words = next(rows, (1, []))
+        if not words or not words[0].endswith(b"OFF"):
+            raise wrong_line(path, number, words, "OFF")
+        if len(words) == 1:
+            number, words = next(rows, (number + 1, []))
+    counts = words[-3:]
+    if len(counts) < 3 or not all(count.isdigit() and len(count) <= MAX_COUNT_DIGITS for count in counts):
+        raise wrong_line(path, number, words, "the numbers of vertices, faces and edges")
+    for what, count in zip(("vertices", "faces"), counts, strict=False):
+        check_rows(path, what, int(count))
+    return Announcement(int(counts[0]), int(counts[1]))
+
+
+def announced_by_pcd(path: Path) -> Announcement:
+    """The points that the header of a PCD file tells of."""
+    with path.open("rb") as file:
+        for _, words in text_rows(file, path):
+            if words[0] == b"POINTS" and len(words) == 2 and words[1].isdigit() and len(words[1]) <= MAX_COUNT_DIGITS:
+                check_rows(path, "points", int(words[1]))
+                return Announcement(int(words[1]), 0)
+            if words[0] == b"DATA":
+                break
+    raise InputError(path, "header", "no line POINTS before DATA", "POINTS and how many there are")
+
+
+# open3d takes what begins like a number for one
+NUMBER = rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)"
+THREE_NUMBERS = rb"(?: " + NUMBER + rb"){3}"
+XYZ_LINE = re.compile(THREE_NUMBERS + rb"(?: " + NUMBER + rb")*", re.IGNORECASE)
+
+
+def announced_by_xyz(path: Path) -> Announcement:
+    """The lines of an XYZ file, a point each."""
+    count = 0
+    with path.open("rb") as file:
+        for number, words in text_rows(file, path):
+            if words[0].startswith(b"#"):
+                continue
+            if not XYZ_LINE.fullmatch(b" " + b" ".join(words)):
+                raise wrong_line(path, number, words, "three numbers, or more")
+            count += 1
+            check_rows(path, "points", count)
+    return Announcement(count, 0)
+
+
+GLB_HEADER = 20  # bytes before the JSON of a GLB file
+
+
+def announced_by_gltf(path: Path) -> Announcement:
+    """The triangles that the primitives of a glTF or GLB file tell of."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(GLB_HEADER)
+            if head[:4] == b"glTF":
+                told = int.from_bytes(head[8:12], "little")
+                _check_length(path, "bytes", path.stat().st_size, told)
+                tree = json.loads(file.read(int.from_bytes(head[12:16], "little")))
+            else:
+                tree = json.loads(head + file.read())
+        pieces = [piece for mesh in tree["meshes"] for piece in mesh["primitives"]]
+        accessor = [piece.get("indices", piece["attributes"]["POSITION"]) for piece in pieces]
+        count = sum(tree["accessors"][each]["count"] // 3 for each in accessor)
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise InputError(path, "scan", f"{type(error).__name__} in its JSON", "a glTF file with meshes") from None
+    check_rows(path, "triangles", count)
+    return Announcement(faces=count, triangles=count)
+
+
+ANNOUNCED: dict[str, Callable[[Path], Announcement]] = {  # formats that are read apart
+    **{".ply": announced_by_ply, ".off": announced_by_off, ".gltf": announced_by_gltf, ".glb": announced_by_gltf},
+    **{".pcd": announced_by_pcd, ".xyz": announced_by_xyz},
+}
+MESH_FORMATS = (".ply", *PLAIN_READERS, *(suffix for suffix in ANNOUNCED if suffix != ".ply"))
 MAX_MESH_FILE_BYTES = 1 << 30  # bytes: a million triangles take 50 MB as binary, and up to 300 MB as an STL file's text
 MIN_SCAN_SIZE, MAX_SCAN_SIZE = 1.0, 2000.0  # mm, longest side: a hand in metres is 0.2, a leg in micrometres 1e6
-WHOLE_MESH = "a whole PLY, STL or OBJ file with triangles"
+WHOLE_MESH = "a whole file of a mesh with triangles, or of a cloud of points"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,28 +262,57 @@ class MeshFile:
     open_edges: int  # edges with one triangle only, of the rim and of holes; 0 if closed
 
 
-def read_raw_mesh(path: str | Path) -> RawMesh:
-    """The mesh in a PLY, STL or OBJ file, checked only for being whole; InputError where it cannot be read."""
+def read_raw_mesh(path: str | Path, reader: MeshReader | None = None) -> RawMesh:
+    """The mesh in a file, or the surface through its points, checked only for being whole.
+
+    reader: a process that is kept, for many files. InputError where it cannot be read, or not as a whole.
+    """
     path = Path(path)
-    if path.suffix.lower() not in MESH_READERS:
-        raise InputError(path, "scan", path.suffix or "no suffix", f"a file {', '.join(MESH_READERS)}")
+    formats = ", ".join(MESH_FORMATS)
+    if path.suffix.lower() not in MESH_FORMATS:
+        raise InputError(path, "scan", path.suffix or "no suffix", f"a file {formats}")
     if not path.is_file():
-        raise InputError(path, "scan", "no such file", f"a file {', '.join(MESH_READERS)}")
-    size = path.stat().st_size
-    if size > MAX_MESH_FILE_BYTES:
-        raise InputError(path, "size of the file", f"{size} bytes", f"{MAX_MESH_FILE_BYTES} or fewer")
-    mesh = MESH_READERS[path.suffix.lower()](path)
-    if not len(mesh.vertices):
-        raise InputError(path, "scan", f"{size} bytes, no vertex in them", WHOLE_MESH)
-    if not len(mesh.triangles):
-        raise InputError(path, "scan", f"{len(mesh.vertices)} points and no triangles", WHOLE_MESH)
+        raise InputError(path, "scan", "no such file", f"a file {formats}")
+    before = path.stat()
+    if before.st_size > MAX_MESH_FILE_BYTES:
+        raise InputError(path, "size of the file", f"{before.st_size} bytes", f"{MAX_MESH_FILE_BYTES} or fewer")
+    suffix = path.suffix.lower()
+    plain = PLAIN_READERS.get(suffix)
+    mesh = _read_apart(path, ANNOUNCED[suffix](path), reader) if plain is None else plain(path)
+    after = path.stat()
+    if (after.st_size, after.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
+        raise InputError(path, "scan", "a file that changed while it was read", "one that is finished")
+    if not len(mesh.triangles) or not len(mesh.vertices):
+        got = f"{before.st_size} bytes, {len(mesh.vertices)} points, {len(mesh.triangles)} triangles"
+        raise InputError(path, "scan", got, WHOLE_MESH)
     return mesh
 
 
-def read_mesh(path: str | Path) -> MeshFile:
-    """Read and check a scan, mm; InputError says what is wrong with the file."""
+def _read_apart(path: Path, told: Announcement, kept: MeshReader | None) -> RawMesh:
+    """What another process reads of a file, InputError where that is not what the file tells of."""
+    if not told.faces and not told.vertices:
+        raise InputError(path, "scan", f"{path.stat().st_size} bytes, no vertex in them", WHOLE_MESH)
+    try:
+        with nullcontext(kept) if kept is not None else MeshReader() as reader:
+            read = reader.read(path, not told.faces)
+    except MeshReaderError as error:
+        raise InputError(path, "scan", str(error), WHOLE_MESH) from None
+    vertices, triangles = int(read["count"]), len(read["triangles"])
+    cut = "as the file itself says (is it cut short, or damaged?)"
+    if told.vertices is not None and vertices != told.vertices:
+        raise InputError(path, "vertices that could be read", vertices, f"{told.vertices}, {cut}")
+    if told.triangles is not None and triangles != told.triangles:
+        raise InputError(path, "triangles that could be read", triangles, f"{told.triangles}, {cut}")
+    if told.faces and triangles < told.faces:
+        raise InputError(path, "faces that could be read", triangles, f"{told.faces}, {cut}")
+    told.check(triangles if told.faces else 0)
+    return RawMesh(read["vertices"], read["triangles"])
+
+
+def read_mesh(path: str | Path, reader: MeshReader | None = None) -> MeshFile:
+    """Read and check a scan, mm; InputError says what is wrong with the file. reader: see `read_raw_mesh`."""
     path = Path(path)
-    raw = read_raw_mesh(path)
+    raw = read_raw_mesh(path, reader)
     vertices, triangles = raw.vertices, raw.triangles
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
@@ -171,29 +337,10 @@ def _check_size(path: Path, vertices: Array) -> None:
     raise InputError(path, "size of the scan", got, f"{MIN_SCAN_SIZE:g} to {MAX_SCAN_SIZE:g} mm{hint}")
 
 
-SCAN_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}  # mm of each
-MAX_COORDINATE = 1e6  # mm: a kilometre; beyond it a scan has lost the hundredth of a millimetre, and sums overflow
-MIN_SCAN_WITH_SKIN, MAX_SCAN_WITH_SKIN = 20.0, 1000.0  # mm, longest side: from a finger to a leg
-
-
-def in_mm(vertices: Array, triangles: Array, unit: str, where: object) -> Array:
-    """Vertices (V, 3) in mm; InputError where the scan is too small or too large, with the units that would fit."""
-    used = vertices[np.unique(np.clip(triangles, 0, len(vertices) - 1))]
-    used = used[np.isfinite(used).all(axis=1)]
-    if not len(used):
-        raise InputError(where, "vertices", "none that is finite", "a scan with finite coordinates")
-    away = (np.abs(vertices) > MAX_COORDINATE / SCAN_UNITS[unit]).any(axis=1) & np.isfinite(vertices).all(axis=1)
-    far = np.flatnonzero(away)
-    if len(far):
-        allowed = f"coordinates within {MAX_COORDINATE:g} mm, or not finite ones, which are left out"
-        raise InputError(where, f"vertex {far[0]}", vertices[far[0]].tolist(), allowed)
-    low, high = np.percentile(used, [1, 99], axis=0)  # without stray vertices
-    longest = float((high - low).max())
-    size = longest * SCAN_UNITS[unit]
-    if MIN_SCAN_WITH_SKIN <= size <= MAX_SCAN_WITH_SKIN:
-        return np.asarray(vertices * SCAN_UNITS[unit])
-    fitting = [name for name, mm in SCAN_UNITS.items() if MIN_SCAN_WITH_SKIN <= longest * mm <= MAX_SCAN_WITH_SKIN]
-    units = " or ".join(f"--unit {name} ({longest * SCAN_UNITS[name]:.0f} mm)" for name in fitting)
-    hint = f"; its numbers look like another unit: say {units}" if units else ""
-    allowed = f"{MIN_SCAN_WITH_SKIN:g} to {MAX_SCAN_WITH_SKIN:g} mm{hint}"
-    raise InputError(where, "size of the scan", f"{size:.4g} mm along its longest side, read as {unit}", allowed)
+def write_ply(path: Path, vertices: Array, triangles: NDArray[np.int64]) -> None:
+    """Write vertices (V, 3) mm and triangles (T, 3) as a PLY file, in text."""
+    head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
+    head += [f"property double {axis}" for axis in "xyz"]
+    head += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
+    body = [" ".join(repr(float(v)) for v in p) for p in vertices] + [f"3 {a} {b} {c}" for a, b, c in triangles]
+    path.write_text("\n".join(head + body) + "\n", encoding="ascii")

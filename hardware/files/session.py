@@ -16,7 +16,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from perception.frames import Frame, FrameSet, Image, PrintHead, Roi, frame_period, frame_set, pair, pairing_tolerance
 
-SURFACE_SUFFIXES = (".ply", ".stl", ".obj")
+SURFACE_SUFFIXES = (".ply", ".stl", ".obj")  # of a scan in a session folder; other formats are for planning
 HEAD_STAMP_TOLERANCE = 0.002  # s from a row to its frame set: the rounding of stamps, far below a frame's period
 
 

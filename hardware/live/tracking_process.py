@@ -165,8 +165,7 @@ class _TrackingLoop:
         stack.callback(self._source.close)
         session, placement = self._session, prepared.placement
         self._rig, self._truth = rig, None if session is None else session.truth
-        own = None if session is None else session.surface
-        self._surface = agreed_scan(prepared.scan, own, prepared.session)
+        self._surface = agreed_scan(prepared.scan, None if session is None else session.surface, prepared.session)
         self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
         self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
@@ -177,9 +176,10 @@ class _TrackingLoop:
         if self._earlier is None and region.by is not None:
             rois = region.rois(rig, self.report.stamp)
         sender.put(rig)
-        if self._surface is not None:
+        self._scan = None if self._surface is None else read_mesh(self._surface).scan
+        if self._surface is not None and self._scan is not None:
             sender.put(ScanEntry(self._surface))
-            channels.link.scan.put(scan_drawing(read_mesh(self._surface).scan))
+            channels.link.scan.put(scan_drawing(self._scan))
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
         self._rois, self._drawn = rois, region.drawn and not rois
@@ -202,7 +202,7 @@ class _TrackingLoop:
         timed = outlined or tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, since, strict=True))
         self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
         find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
-        given = self._surface, self._clock.now, self._prepared.task.profile.tool
+        given = self._scan, self._clock.now, self._prepared.task.profile.tool
         self._step = self._steps.enter_context(tracker(self._rig, timed, *given, model=settings.model, find=find))
         if placement is not None and self._earlier is not None:
             new_from_old = _restore_map(self._step, placement, self._earlier, shift)

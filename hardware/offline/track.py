@@ -20,6 +20,7 @@ from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
 if TYPE_CHECKING:
     from estimation.pose import SurfacePose
     from estimation.rig import Rig
+    from estimation.scans.scan import Scan
     from estimation.se3 import Array
     from hardware.files.pose_file import PoseWriter
     from hardware.files.region_table import RegionSettings
@@ -84,7 +85,7 @@ def step_by(
 def tracker(
     rig: Rig,
     roi: Sequence[Roi],
-    surface: Path | None = None,
+    surface: Path | Scan | None = None,
     now: Callable[[], float] = lambda: 0.0,
     tool: Array | None = None,
     prefilter: str = "none",
@@ -95,8 +96,8 @@ def tracker(
 
     roi: where the surface is at the start; without one `find`, given one thread, makes what finds it, by default the
     search of the wound by a network. model: the network, an ONNX file; None: the one that comes along. surface: the
-    scan's file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm, profile
-    of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+    scan, or its file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm,
+    profile of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
@@ -104,7 +105,7 @@ def tracker(
     from perception.tracking.step import TrackingStep
     from perception.tracking.wound_step import RegionTrackingStep
 
-    scan = None if surface is None else read_mesh(surface).scan
+    scan = read_mesh(surface).scan if isinstance(surface, Path) else surface
     with ProcessPoolExecutor(1, SPAWN, _start_map_process) as executor:
         with blocked_sigint():
             first = executor.submit(int)

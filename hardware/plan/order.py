@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.files.mesh_file import in_mm, read_raw_mesh
+from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import read_contour
 from hardware.process.progress import ProgressReport, no_progress
 from planning.fill import PatternKind
@@ -199,6 +199,34 @@ def _number(text: str, word: str, low: float, high: float) -> float:
     if not low <= value <= high:
         raise InputError(COMMAND_LINE, f"--tissue {text}: {word}", word, f"{low:g} to {high:g}; {TISSUE_SYNTAX}")
     return value
+
+
+SCAN_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}  # mm of each
+MAX_COORDINATE = 1e6  # mm: a kilometre; beyond it a scan has lost the hundredth of a millimetre, and sums overflow
+MIN_SCAN_WITH_SKIN, MAX_SCAN_WITH_SKIN = 20.0, 1000.0  # mm, longest side: from a finger to a leg
+
+
+def in_mm(vertices: Array, triangles: Index, unit: str, where: object) -> Array:
+    """Vertices (V, 3) in mm; InputError where the scan is too small or too large, with the units that would fit."""
+    used = vertices[np.unique(np.clip(triangles, 0, len(vertices) - 1))]
+    used = used[np.isfinite(used).all(axis=1)]
+    if not len(used):
+        raise InputError(where, "vertices", "none that is finite", "a scan with finite coordinates")
+    away = (np.abs(vertices) > MAX_COORDINATE / SCAN_UNITS[unit]).any(axis=1) & np.isfinite(vertices).all(axis=1)
+    far = np.flatnonzero(away)
+    if len(far):
+        allowed = f"coordinates within {MAX_COORDINATE:g} mm, or not finite ones, which are left out"
+        raise InputError(where, f"vertex {far[0]}", vertices[far[0]].tolist(), allowed)
+    low, high = np.percentile(used, [1, 99], axis=0)  # without stray vertices
+    longest = float((high - low).max())
+    size = longest * SCAN_UNITS[unit]
+    if MIN_SCAN_WITH_SKIN <= size <= MAX_SCAN_WITH_SKIN:
+        return np.asarray(vertices * SCAN_UNITS[unit])
+    fitting = [name for name, mm in SCAN_UNITS.items() if MIN_SCAN_WITH_SKIN <= longest * mm <= MAX_SCAN_WITH_SKIN]
+    units = " or ".join(f"--unit {name} ({longest * SCAN_UNITS[name]:.0f} mm)" for name in fitting)
+    hint = f"; its numbers look like another unit: say {units}" if units else ""
+    allowed = f"{MIN_SCAN_WITH_SKIN:g} to {MAX_SCAN_WITH_SKIN:g} mm{hint}"
+    raise InputError(where, "size of the scan", f"{size:.4g} mm along its longest side, read as {unit}", allowed)
 
 
 SCAN_STEPS = 3  # a mesh is read, repaired, and its wound found

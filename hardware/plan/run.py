@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import gcode_text, write_path
-from hardware.files.ply_file import write_ply
 from hardware.offline.reach import read_jointed_arm, with_feasible
 from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, order_of, subject_of
 from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text

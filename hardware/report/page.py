@@ -26,7 +26,7 @@ def document(kind: str, title: str, lead: str, body: Sequence[str], footer: str)
         f'<meta name="viewport" content="width=device-width"><style>\n{style}</style></head><body><main>\n'
         f'<header><div class="kind">{escape(kind)}</div><h1>{escape(title)}</h1>'
         f'<p class="lead">{escape(lead)}</p></header>\n'
-        f"{chr(10).join(body)}\n<footer>{escape(footer)}<br>{escape(provenance().sentence())}</footer></main></body></html>\n"
+        f"{chr(10).join(body)}\n<footer><div>{escape(footer)}</div><div>{escape(provenance().sentence())}</div></footer></main></body></html>\n"
     )
 
 

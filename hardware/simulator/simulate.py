@@ -28,8 +28,8 @@ from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import Follower
 from estimation.synthetic.world import project_landmarks, undistorting
 from estimation.triangulation import TriangulatedMap
+from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path
-from hardware.files.ply_file import write_ply
 from hardware.files.pose_file import read_poses
 from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
 from hardware.process.clock import WallClock

@@ -263,7 +263,6 @@ MATCH_SIGMA_MM = 0.03  # mm, of points matched on the scan itself
 MATCH_SPACING_NODES = 6  # nodes between points taken: half a matched patch, so neighbours share half their error,
 SHARED_ERROR_FACTOR = 2.5  # and their errors another part, as measured: each is worth a sixth of an independent one
 REFINEMENT_ROUNDS = 4  # of matching and settling: the third was measured to move by 0.01 mm, the fourth by 0.002
-APEX_DISTANCE_MM = 1e5  # mm: rays from there are parallel to 1e-3 rad over a body
 SCAN_MARGIN_MM = 2.0  # mm around the part that was seen
 # mm rms on the scan: 0.04 on the right one, 0.19 on another; the lower limit where the relief did not fit at first
 MAX_FIT_RMS_MM, EXACT_FIT_RMS_MM = 0.15, 0.06
@@ -339,9 +338,10 @@ class ScanPlacing:
         low, high = flat.min(0) - SCAN_MARGIN_MM, flat.max(0) + SCAN_MARGIN_MM
         lines = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
         lattice = np.stack(np.meshgrid(*lines), -1)
-        down = np.concatenate([lattice / APEX_DISTANCE_MM, -np.ones((*lattice.shape[:2], 1))], -1).reshape(-1, 3)
-        apex = surface_from_plane @ se3.make(np.eye(3), [0.0, 0.0, APEX_DISTANCE_MM])
-        return cast_rays(self.scan, apex, down).points.reshape(*lattice.shape[:2], 3)
+        size = float(np.ptp(self.scan.vertices, axis=0).max())
+        above = np.concatenate([lattice, np.full((*lattice.shape[:2], 1), size)], -1).reshape(-1, 3)
+        above = se3.transform_points(surface_from_plane, above)
+        return cast_rays(self.scan, above, np.broadcast_to(-z, above.shape)).points.reshape(*lattice.shape[:2], 3)
 
 
 def as_at_one_instant(rig: Rig, pose: Array, single: dict[int, Array]) -> Rig:
@@ -378,7 +378,7 @@ def landmarks_on_scan(
         lens = lenses.rig.cameras[c]
         surface_from_camera = se3.inverse(place.base_from_surface) @ lens.base_from_camera
         inner = se3.transform_points(se3.inverse(surface_from_camera), points[mine])
-        hits = cast_rays(scan, surface_from_camera, inner)
+        hits = cast_rays(scan, surface_from_camera[:3, 3], inner @ surface_from_camera[:3, :3].T)
         off = np.einsum("ni,ni->n", hits.points - points[mine], hits.normals)
         own = np.einsum("ni,nij,nj->n", hits.normals, blocks[mine], hits.normals)
         on = hits.hit & (np.abs(off) < MAX_SCAN_DISTANCE_SIGMAS * np.sqrt(own + across**2))

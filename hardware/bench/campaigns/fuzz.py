@@ -14,7 +14,7 @@ import hashlib
 import re
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +28,25 @@ from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm import protocol
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream, Reply, ReplyKind
-from hardware.bench.campaigns.fuzz_process import Block, Reader, Task, append_log, read_log, run_tasks
-from hardware.bench.figures import Figure, at_most, require_positive
+from hardware.bench.campaigns.fuzz_process import (
+    Reader,
+    ReaderSum,
+    Task,
+    append_log,
+    fuzz_figures,
+    print_failure,
+    read_log,
+    run_tasks,
+)
+from hardware.bench.figures import Figure, require_positive
 from hardware.calibration.corners import read_corners, write_corners
 from hardware.calibration.rig_formats import FORMATS
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.files.folder_tables import read_heads, read_rows, write_heads
 from hardware.files.images import encode
-from hardware.files.mesh_file import STL_TRIANGLE, in_mm, read_mesh, read_raw_mesh
+from hardware.files.mesh_file import read_mesh, read_raw_mesh, write_ply
+from hardware.files.mesh_reader import STL_TRIANGLE, MeshReader
 from hardware.files.path_file import read_contour, read_path, read_progress, write_progress_durably
-from hardware.files.ply_file import write_ply
 from hardware.files.pose_file import PoseWriter, read_poses
 from hardware.files.rig_file import ImageSource, read_board, read_rig, write_board, write_rig
 from hardware.files.session import PrintHeadLog
@@ -45,6 +54,7 @@ from hardware.live.prepared import SurfacePlacement, read_placement, write_place
 from hardware.live.settings import read_settings, settings_text
 from hardware.offline.trajectory_files import read_pose_series, write_instants
 from hardware.operator.broadcast import parse_message
+from hardware.plan.order import in_mm
 from hardware.process.clock import WallClock
 from hardware.process.faults import fault_from_text
 from hardware.process.progress import Progress
@@ -95,6 +105,15 @@ BINARY_PLY_HEADER = (
     "ply\nformat binary_big_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
     "property uchar red\nelement face 5\nproperty list uchar uint vertex_indices\nend_header\n"
 )
+PCD_HEADER = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA binary\n"
+OFF_TEXT = "OFF\n4 2 0\n0 0 0\n20 0 0\n0 20 0\n20 20 1\n3 0 1 2\n3 1 3 2\n"
+GLTF_TEXT = """{"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}], "accessors": [
+{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0], "max": [20, 20, 0]},
+{"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"}],
+"bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 6}],
+"buffers": [{"byteLength": 44, "uri":
+"data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACgQQAAAAAAAAAAAAAAAAAAoEEAAAAAAAABAAIAAAA="}]}"""
 SCAN_VERTICES = np.array([[0.0, 0, 0], [20, 0, 1], [20, 20, 0], [0, 20, 2], [10, 10, 3]])
 SCAN_TRIANGLES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
 SKIN_NODES = 6  # a side of the scan that is planned on, so that it has the triangles that repair asks for
@@ -102,6 +121,7 @@ SMALL_SIZE, VIDEO_RATE, FRAME_COUNT = (48, 32), 30, 3  # px, Hz
 CORNERS_KEY = "0123456789abcdef" * 4  # of the recording that the corners belong to
 HAS_INDEX, KEY_FRAME = 0x10, 0x10  # flags of an AVI
 FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}
+XYZ_TEXT = "".join(f"{k % 9} {k // 9} {k % 7 / 10}\n" for k in range(81))
 
 
 def _small_picture(number: int) -> Image:
@@ -238,9 +258,26 @@ def _make_skin(folder: Path) -> None:
     write_ply(folder / "x.ply", np.column_stack([x, y, 3 + x * y / 1000]), np.concatenate([low, high]))
 
 
+@cache
+def _kept_reader() -> MeshReader:
+    """The process that reads all meshes of this one, and ends with it."""
+    return MeshReader()
+
+
+def _read_mesh(path: Path) -> object:
+    return read_mesh(path, _kept_reader())
+
+
+def _make_cloud(folder: Path) -> None:
+    """A curved square of points in a binary PCD file."""
+    x, y = (each.ravel() for each in np.meshgrid(*2 * [np.linspace(0, 30, SKIN_NODES + 2)]))
+    points = np.column_stack([x, y, x * y / 100]).astype("<f4")
+    (folder / "x.pcd").write_bytes(PCD_HEADER.format(len(points)).encode() + points.tobytes())
+
+
 def _read_skin(path: Path) -> object:
     """A scan as `stillbed plan` reads it: its unit checked, and repaired."""
-    raw = read_raw_mesh(path)
+    raw = read_raw_mesh(path, _kept_reader())
     return repair_mesh(in_mm(raw.vertices, raw.triangles, "mm", path), raw.triangles, path)
 
 
@@ -305,11 +342,15 @@ def readers() -> dict[str, Reader]:
         "region": Reader("roi.toml", _make_session, lambda p: open_session(p.parent)),
         "picture": Reader("cam_0/1.png", _make_session, lambda p: _read_session(p.parent.parent)),
         "recording": Reader("x.mcap", _make_recording, _read_session),
-        "PLY": Reader("x.ply", lambda f: write_ply(f / "x.ply", SCAN_VERTICES, SCAN_TRIANGLES), read_mesh),
-        "binary PLY": Reader("x.ply", _make_binary_ply, read_mesh),
+        "PLY": Reader("x.ply", lambda f: write_ply(f / "x.ply", SCAN_VERTICES, SCAN_TRIANGLES), _read_mesh),
+        "binary PLY": Reader("x.ply", _make_binary_ply, _read_mesh),
         "STL": _plain("x.stl", solid, read_mesh),
         "binary STL": Reader("x.stl", _make_binary_stl, read_mesh),
         "OBJ": _plain("x.obj", OBJ_TEXT, read_mesh),
+        "OFF": _plain("x.off", OFF_TEXT, _read_mesh),
+        "glTF": _plain("x.gltf", GLTF_TEXT, _read_mesh),
+        "cloud": Reader("x.pcd", _make_cloud, _read_mesh),
+        "text of a cloud": _plain("x.xyz", XYZ_TEXT, _read_mesh),
         "scan to plan on": Reader("x.ply", _make_skin, _read_skin),
         "settings of a network": Reader("wound.toml", _make_model, _read_model),
         "network": Reader("wound.onnx", _make_model, _read_model),
@@ -326,23 +367,6 @@ def readers() -> dict[str, Reader]:
 MAX_SAVED_INPUTS = 5  # of each reader; the others can be made again from their seed and number
 
 
-@dataclass(slots=True)
-class ReaderSum:
-    """What one reader did so far."""
-
-    count: int = 0  # inputs
-    refused: int = 0  # with one of our own errors
-    seconds: float = 0.0  # of processor time
-    wrong: int = 0  # inputs that failed
-
-    def add(self, block: Block) -> None:
-        """Count a block."""
-        self.count += block.count
-        self.refused += block.refused
-        self.seconds += block.seconds
-        self.wrong += bool(block.wrong)
-
-
 def run_fuzz(options: argparse.Namespace) -> list[Figure]:
     """Fuzz the readers, in processes of their own; print, save and log each failure as it happens."""
     names = list(readers())
@@ -354,7 +378,7 @@ def run_fuzz(options: argparse.Namespace) -> list[Figure]:
         for block in read_log(options.log, options.seed):
             if block.name in sums:
                 sums[block.name].add(block)
-                _print_failure(block)
+                print_failure(block)
     share = -(-options.count // len(sums))
     tasks = [Task(name, range(done.count, share)) for name, done in sums.items() if done.count < share]
     count, total = 0, sum(len(task.numbers) for task in tasks)
@@ -366,33 +390,10 @@ def run_fuzz(options: argparse.Namespace) -> list[Figure]:
             if block.wrong:
                 progress.close()
                 save = options.out is not None and sums[block.name].wrong <= MAX_SAVED_INPUTS
-                _print_failure(block, options.out if save else None)
+                print_failure(block, options.out if save else None)
             count += block.count
             progress(count, total)
     for name, done in sums.items():
         each = 1e6 * done.seconds / max(done.count, 1)
         print(f"{name:<24}{done.count:>9}  refused {done.refused:>9}  wrong {done.wrong:>3}  {each:>7.0f} us each")
     return fuzz_figures(list(sums.values()))
-
-
-def _print_failure(block: Block, out: Path | None = None) -> None:
-    """Print what failed, if anything. out: the folder in which the input is saved, too."""
-    text = ""
-    if out is not None:
-        file = out / f"{block.name.replace(' ', '_')}_{block.number}.bin"
-        file.write_bytes(block.case)
-        text = f"; kept as {file}"
-    if block.wrong:
-        print(f"{block.name}, input {block.number}: {block.wrong}{text}", flush=True)
-
-
-def fuzz_figures(sums: Sequence[ReaderSum]) -> list[Figure]:
-    """The figures of all readers."""
-    count, refused = sum(each.count for each in sums), sum(each.refused for each in sums)
-    seconds, least = sum(each.seconds for each in sums), min(each.count for each in sums)
-    note = f"of {len(sums)} readers, {least} or more each; {refused} refused with one error"
-    return [
-        Figure("inputs", count, "", None, "", note),
-        Figure("inputs that went wrong", sum(each.wrong for each in sums), "", at_most(0)),
-        Figure("processor time of an input", 1e6 * seconds / max(count, 1), "us"),
-    ]

@@ -11,7 +11,7 @@ import re
 import resource
 import signal
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -24,7 +24,7 @@ from types import FrameType
 import numpy as np
 
 from estimation.errors import InputError, StillbedError
-from hardware.bench.figures import append_rows, log_rows
+from hardware.bench.figures import Figure, append_rows, at_most, log_rows
 from hardware.process.clock import ProcessorClock
 
 NUMBER_TEXT = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
@@ -111,6 +111,46 @@ class Block:
     wrong: str = ""  # how the reader failed on the last of them
     number: int = 0  # of that one
     case: bytes = b""  # that one
+
+
+@dataclass(slots=True)
+class ReaderSum:
+    """What one reader did so far."""
+
+    count: int = 0  # inputs
+    refused: int = 0  # with one of our own errors
+    seconds: float = 0.0  # of processor time
+    wrong: int = 0  # inputs that failed
+
+    def add(self, block: Block) -> None:
+        """Count a block."""
+        self.count += block.count
+        self.refused += block.refused
+        self.seconds += block.seconds
+        self.wrong += bool(block.wrong)
+
+
+def print_failure(block: Block, out: Path | None = None) -> None:
+    """Print what failed, if anything. out: the folder in which the input is saved, too."""
+    text = ""
+    if out is not None:
+        file = out / f"{block.name.replace(' ', '_')}_{block.number}.bin"
+        file.write_bytes(block.case)
+        text = f"; kept as {file}"
+    if block.wrong:
+        print(f"{block.name}, input {block.number}: {block.wrong}{text}", flush=True)
+
+
+def fuzz_figures(sums: Sequence[ReaderSum]) -> list[Figure]:
+    """The figures of all readers."""
+    count, refused = sum(each.count for each in sums), sum(each.refused for each in sums)
+    seconds, least = sum(each.seconds for each in sums), min(each.count for each in sums)
+    note = f"of {len(sums)} readers, {least} or more each; {refused} refused with one error"
+    return [
+        Figure("inputs", count, "", None, "", note),
+        Figure("inputs that went wrong", sum(each.wrong for each in sums), "", at_most(0)),
+        Figure("processor time of an input", 1e6 * seconds / max(count, 1), "us"),
+    ]
 
 
 def fuzzed(name: str, reader: Reader, numbers: range, seed: int, folder: Path) -> Iterator[Block]:

@@ -18,7 +18,7 @@ from hardware.simulator.scene.fields import smooth_noise
 
 NODE_STEP = 0.25  # mm between nodes: a wound's rim rises over 2 mm
 MIN_FACING = 0.1  # mean of a scan's normals by area: a closed body's is 0, and no plane is its mean plane
-CAST_HEIGHT = 1e7  # mm: rays from there are parallel to 1e-5 rad over a body, 0.1 um across a scan
+CAST_HEIGHT = 1.0  # mm over the highest point, from where rays are cast down
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,10 +136,9 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = NOD
     columns, rows = (int(np.ceil(2 * h / step - 1e-9)) + 1 for h in half)
     x, y = (np.arange(n) * step - (n - 1) * step / 2 for n in (columns, rows))
     nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    apex = np.array([0.0, 0.0, CAST_HEIGHT])
-    directions = np.column_stack([nodes, np.zeros(len(nodes))]) - apex
+    above = np.column_stack([nodes, np.full(len(nodes), vertices_grid[:, 2].max() + CAST_HEIGHT)])
     scan_grid = Scan(vertices_grid, scan.triangles, scan.normals)
-    hits = cast_rays(scan_grid, se3.make(np.eye(3), apex), directions / CAST_HEIGHT)
+    hits = cast_rays(scan_grid, above, np.broadcast_to([0.0, 0.0, -1.0], above.shape))
     heights, valid = hits.points[:, 2].reshape(rows, columns), hits.hit.reshape(rows, columns)
     nearest = distance_transform_edt(~valid, return_distances=False, return_indices=True)
     return Shape(step, heights[tuple(nearest)], surface_from_grid, valid=valid)
