@@ -355,7 +355,12 @@ TESTS = [*(ROOT / "tests").rglob("*.py"), *(ROOT / "docs" / "examples").glob("*.
 
 def _packages(requirements: list[str]) -> Set[str]:
     """The names under which requirements are imported."""
-    imports = {"foxglove-sdk": "foxglove", "open3d-cpu": "open3d", "opencv-python-headless": "cv2"}
+    imports = {
+        "foxglove-sdk": "foxglove",
+        "rerun-sdk": "rerun",
+        "open3d-cpu": "open3d",
+        "opencv-python-headless": "cv2",
+    }
     imports |= {"pyserial": "serial", "pyyaml": "yaml"}
     names = [re.split(r"[><=~\[ ]", line)[0] for line in requirements]
     return {imports.get(name, name.replace("-", "_")) for name in names}
