@@ -6,7 +6,8 @@ the tracks stuck to a static drape, the error was 0.107 mm with Huber's loss and
 Some errors are shared by all tracks of a camera and do not average out: a late exposure, or a lens that shifts its
 image. `SharedErrors` holds their expected size. They are solved for beside the pose (linear mixed-effects model;
 Henderson 1975), so that they are not mistaken for outliers and can be learned. They do not change the weights between
-cameras: that moved poses farther from the reference of the webcams' recordings.
+cameras: that moved poses farther from the reference of the webcams' recordings. What delays do to the pose is taken out
+of it afterwards, as far as the cameras' disagreement shows them (`delay_gain`).
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quart
 # (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89
 EFFICIENCY = 1.235
 INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
+DELAY_ERROR_PX = 0.05  # half the least sigma of a track
+MIN_KNOWN_SHARE = 1e-6  # of the information of the best known effect; less is rounding
+CLOCK_SIGMAS = 2.0  # of what is known of a clock: what lies farther off is something else
 CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
 
@@ -195,6 +199,54 @@ class _SharedErrorSolver:
         return self._fit
 
 
+def delay_gain(solution: PoseFit, shared: SharedErrors, twist_variance: Array) -> Array:
+    """(C, 3C), s: the cameras' delays in one frame set, from the pull of `solution.shared` (3C,).
+
+    The best linear prediction (Henderson 1975) from how the cameras disagree, the pose free. Three things reduce it:
+
+    - Chance, as many cameras are triggered together, and whatever makes them disagree in other ways, as lenses do
+      (James and Stein 1961, positive part).
+    - Delays beyond what is known of the clocks: a surface that bends looks like late cameras, too.
+    - What is not linear: a delay acts along the velocity, and where that errs too, the product of both errors must stay
+      below DELAY_ERROR_PX. So what is waved by hand at 6 Hz stays as it is fitted.
+    """
+    count, seen, unknown = len(shared.shift), solution.shared, 0.0
+    assert seen is not None
+    prior = shared.covariance()
+    gain = (prior @ np.linalg.inv(np.eye(3 * count) + seen.information @ prior))[:count]
+    if solution.weights.any():
+        squares = (solution.jacobians**2 @ twist_variance).sum(1)  # (N,) px^2/s^2
+        unknown = float(solution.weights @ squares / solution.weights.sum())
+    known = np.diag(shared.delay)
+    product = unknown * float(np.mean(known)) / DELAY_ERROR_PX**2
+    far = float(np.max((gain @ seen.pull) ** 2 / np.maximum(known, 1e-12))) / CLOCK_SIGMAS**2
+    clear = max(0.0, 1 - 1 / max(_delay_clarity(seen, prior, count), 1e-9))
+    return np.asarray(gain * (clear / ((1 + product**3) * (1 + far**3))))  # sharp, and yet without a jump of the pose
+
+
+def _delay_clarity(seen: SharedFit, prior: Array, count: int) -> float:
+    """What delays explain of the disagreement of `count` cameras, in parts of what they do not; of each a mean.
+
+    Both in squared sigmas for a degree of freedom, the latter one at least. prior: (3C, 3C).
+    """
+    own, cross, rest = seen.information[:count], seen.information[:count, count:], seen.information[count:, count:]
+    shifts = prior[count:, count:] @ np.linalg.inv(np.eye(2 * count) + rest @ prior[count:, count:])
+    information = own[:, :count] - cross @ shifts @ cross.T
+    explained, freedom = _squared_sigmas(information, seen.pull[:count] - cross @ shifts @ seen.pull[count:])
+    whole, every = _squared_sigmas(seen.information, seen.pull)
+    other = max(1.0, (whole - explained) / max(1, every - freedom))
+    return explained / max(1, freedom) / other
+
+
+def _squared_sigmas(information: Array, pull: Array) -> tuple[float, int]:
+    """What the effects come to that pull (K,), and how many are known; information (K, K) may be singular."""
+    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    known, axes = np.linalg.eigh(information * size[:, None] * size)
+    sure = known > MIN_KNOWN_SHARE * max(float(known[-1]), 1e-300)
+    along = axes[:, sure].T @ (size * pull)
+    return float((along**2 / known[sure]).sum()), int(sure.sum())
+
+
 def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
     """Residuals (N, 2) px that are left when each camera has a pose of its own, to first order.
 
@@ -269,6 +321,29 @@ def gram_by_camera(cameras: int, camera: Index, jacobian: Array, residual: Array
             for b in range(a):
                 grams[c, a, b] = grams[c, b, a]
     return grams
+
+
+@compiled("Tuple((f8[:,:,::1], f8[:,:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1])")
+def pose_pulls(
+    cameras: int, landmarks: int, camera: Index, landmark: Index, jacobian: Array, weight: Array, twist: Array
+) -> tuple[Array, Array]:
+    """How each landmark (6, L, 3), px^-2 per mm, and each camera's delay and shifts (6, 3, C) pull at the pose.
+
+    The pose gives way by its covariance times that. landmark: (N,) below L. The rest as in `gram_by_camera`.
+    """
+    by_landmark, by_camera = np.zeros((6, landmarks, 3)), np.zeros((6, 3, cameras))
+    for i in range(len(camera)):
+        for k in range(2):
+            row, along = jacobian[i, k], 0.0
+            for a in range(6):
+                along += row[a] * twist[a]
+            for a in range(6):
+                weighted = weight[i] * row[a]
+                by_camera[a, 0, camera[i]] += weighted * along
+                by_camera[a, 1 + k, camera[i]] += weighted
+                for b in range(3):
+                    by_landmark[a, landmark[i], b] += weighted * row[3 + b]
+    return by_landmark, by_camera
 
 
 @compiled("f8[:,::1](i8[::1], f8[:,:,::1], f8[::1], f8[:,::1])")

@@ -18,6 +18,7 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "PATH.csv": "path.csv",
     "B.toml": "board.toml",
     "X.mcap": "run.mcap",
+    "X.dot": "window.dot",
     "FOLDER": "sessions/monday",
     "/dev/ttyUSB0": "./serving",
     "DEVICE": "./serving",

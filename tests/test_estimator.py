@@ -19,6 +19,7 @@ from estimation.synthetic.movements import patch
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
 from tests.slowly import slowly
 from tests.synthetic import Motion, breathing
+from tests.test_smoother import broken
 
 RIG = arc_rig()
 LANDMARKS = patch(60, np.random.default_rng(3)).points
@@ -139,6 +140,16 @@ def test_a_clear_view_is_tracking_without_a_reason() -> None:
     poses = follow(begun(breathing), breathing, 1.0)
     assert all(p.state is TrackState.TRACKING and p.reason == "" for p in poses)
     assert max(error(p, breathing) for p in poses) < 0.15
+
+
+def test_a_window_that_is_rebuilt_is_told_for_as_long_as_a_fault_is() -> None:
+    estimator = begun(breathing)
+    follow(estimator, breathing, 1.0)
+    broken(estimator._smoother)
+    told, after, *_, later = follow(estimator, breathing, 0.3, first=1.0 + 1 / RATE)
+    assert told.state is TrackState.DEGRADED and told.reason == "the window of poses failed and was rebuilt, 1 so far"
+    assert after.state is TrackState.DEGRADED and "seen well again" in after.reason
+    assert later.state is TrackState.TRACKING and error(told, breathing) < 0.15
 
 
 def test_no_state_but_tracking_is_without_a_reason() -> None:

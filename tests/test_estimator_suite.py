@@ -16,6 +16,7 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
+from estimation.online import fit
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.synthetic.follow import Follower, FollowResult, Mapping, first_map, follow
@@ -142,6 +143,25 @@ def test_a_surface_that_comes_back_is_found_where_it_was() -> None:
 def test_a_part_that_comes_into_view_moves_nothing() -> None:
     found = pool_errors([follow(world("breathing", reveal=(0.8, 1.6)))])
     assert found.error_mm < 1.8 * found.bound_mm and found.nees < 1.4
+
+
+OUT_OF_STEP: list[dict[str, Any]] = [{"offsets": OFFSETS}, {"jitter": 0.005}]
+
+
+@pytest.mark.parametrize("instants", OUT_OF_STEP, ids=["late", "unsteady"])
+def test_cameras_out_of_step_are_followed_better_than_by_their_plain_mean(
+    monkeypatch: pytest.MonkeyPatch, instants: dict[str, Any]
+) -> None:
+    """Pose and twist, beside the same estimator that leaves each frame set's delays in its pose."""
+    apart = world("breathing", seconds=4.0, **instants)
+    ours = follow(apart)
+    monkeypatch.setattr(fit, "delay_gain", lambda solution, shared, twist_variance: np.zeros((3, 9)))
+    plain = follow(apart)
+    pose, twist = (
+        float(np.sqrt((a[:, 3:] ** 2).sum() / (b[:, 3:] ** 2).sum()))
+        for a, b in ((ours.errors, plain.errors), (ours.twist_errors, plain.twist_errors))
+    )
+    assert (pose if "offsets" in instants else twist) < 0.95 and max(pose, twist) < 1.03
 
 
 @pytest.mark.parametrize("mapping", ["told", "seen"])

@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.pose_solver import EFFICIENCY, PointTracks, PoseFit, project, solve_pose
+from estimation.pose_solver import (
+    EFFICIENCY,
+    PointTracks,
+    PoseFit,
+    SharedErrors,
+    delay_gain,
+    pose_pulls,
+    project,
+    solve_pose,
+)
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.synthetic.movements import patch
@@ -182,3 +191,76 @@ def test_a_prior_holds_what_the_tracks_leave_open() -> None:
     fitted = fit(two, start, prior=np.diag([1 / 0.02**2] * 3 + [1 / 5.0**2] * 3))
     assert np.abs(fitted.residuals).max() < 0.1
     assert np.linalg.norm(away(fitted, start)[3:]) < 10
+
+
+TWIST = np.array([0.05, -0.03, 0.08, 30.0, -12.0, 15.0])  # rad/s and mm/s
+
+
+def late(seed: int, delays: Array, noise: float = 0.1) -> tuple[PoseFit, SharedErrors, Observations]:
+    """The fit to cameras that expose `delays` (C,) s late, what was expected of their errors, and their tracks."""
+    parts = [seen(BASE_FROM_REST @ se3.exp(s * TWIST), seed + 1000 * c, noise) for c, s in enumerate(delays)]
+    o = joined(0.0, [part.only(part.camera == c) for c, part in enumerate(parts)])
+    expected = SharedErrors(TWIST, 0.01**2 * (np.eye(3) - 1 / 3), np.full(3, 0.005**2))
+    tracks = PointTracks.of(o, LANDMARKS[o.track])
+    return solve_pose(RIG, tracks, BASE_FROM_REST, scales=(4.0, 1.0), shared=expected), expected, o
+
+
+def without_delays(fitted: PoseFit, expected: SharedErrors, o: Observations, unknown: float = 0.0) -> Array:
+    """(6,) from the fitted pose to the one without the delays. unknown: of TWIST, one sigma in parts of it."""
+    weight = EFFICIENCY * fitted.weights / (o.sigma * fitted.scale) ** 2
+    pulls = pose_pulls(3, 1, o.camera, np.zeros(len(o), np.int64), fitted.jacobians, weight, TWIST)[1]
+    assert fitted.shared is not None
+    delays = delay_gain(fitted, expected, (unknown * TWIST) ** 2) @ fitted.shared.pull
+    return -np.linalg.solve(fitted.information, pulls[:, 0]) @ delays
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_the_pose_without_delays_is_that_of_one_least_squares_over_pose_delays_and_shifts(seed: int) -> None:
+    fitted, expected, o = late(seed, np.random.default_rng(seed).normal(size=3) * 0.004)
+    weight = EFFICIENCY * fitted.weights / (o.sigma * fitted.scale) ** 2
+    own = (o.camera[:, None] == np.arange(3))[:, None, :] * np.ones((1, 2, 1))
+    shifts = (own[:, :, None, :] * np.eye(2)[None, :, :, None]).reshape(len(o), 2, 6)
+    rows = np.concatenate([fitted.jacobians, own * (fitted.jacobians @ TWIST)[..., None], shifts], axis=2)
+    residual = project(RIG, o.camera, fitted.base_from_surface, LANDMARKS[o.track])[0] - o.pixels
+    root = np.sqrt(weight)[:, None]
+    known = np.linalg.pinv(expected.covariance()[:3, :3] + 1e-6**2 * np.eye(3), hermitian=True)
+    prior = np.zeros((15, 15))
+    prior[6:9, 6:9], prior[9:, 9:] = known, np.eye(6) / 0.005**2
+    tall, right = (rows * root[..., None]).reshape(-1, 15), (residual * root).ravel()
+    solved = -np.linalg.solve(tall.T @ tall + prior, tall.T @ right)
+    found, whole = without_delays(fitted, expected, o), solved[:6]
+    taken = found @ whole / (whole @ whole)  # what chance may have made is left in the pose
+    assert 0 <= taken < 1 and np.linalg.norm(found - taken * whole) < 0.02 * np.linalg.norm(whole)
+
+
+def test_cameras_at_different_instants_are_brought_together_as_far_as_the_velocity_is_known() -> None:
+    errors = []
+    for seed in range(12):
+        delays = np.random.default_rng(seed).normal(size=3) * 0.006
+        fitted, expected, o = late(seed, delays - delays.mean())
+        left = [fitted.base_from_surface @ se3.exp(without_delays(fitted, expected, o, u)) for u in (0.0, 0.03, 1.0)]
+        errors.append(
+            [np.linalg.norm(pose[:3, 3] - BASE_FROM_REST[:3, 3]) for pose in [fitted.base_from_surface, *left]]
+        )
+    plain, known, nearly, unknown = np.mean(errors, axis=0)
+    assert plain > 0.04 and known < 0.5 * plain and nearly < 0.6 * plain and abs(unknown / plain - 1) < 0.02
+
+
+def test_a_camera_later_than_clocks_are_is_left_to_those_who_find_odd_cameras() -> None:
+    for seed in range(6):
+        fitted, expected, o = late(seed, np.array([0.06, -0.03, -0.03]))
+        still = without_delays(fitted, expected, o)
+        assert np.linalg.norm(still[3:]) < 0.02 * np.linalg.norm(
+            fitted.base_from_surface[:3, 3] - BASE_FROM_REST[:3, 3]
+        )
+
+
+def test_cameras_in_step_lose_next_to_nothing() -> None:
+    errors = []
+    for seed in range(60):
+        fitted, expected, o = late(seed, np.zeros(3), noise=0.3)
+        both = fitted.base_from_surface, fitted.base_from_surface @ se3.exp(without_delays(fitted, expected, o))
+        errors.append([np.linalg.norm(pose[:3, 3] - BASE_FROM_REST[:3, 3]) for pose in both])
+    plain, corrected = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert corrected < 1.02 * plain

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -111,7 +112,7 @@ def test_what_is_not_finite_never_reaches_the_window(wrong: float) -> None:
     for pose, covariance in [(BASE_FROM_REST + wrong, COVARIANCE), (BASE_FROM_REST, COVARIANCE + wrong)]:
         with pytest.raises(AssertionError):
             smoother.add(MeasuredPose(1.0, pose, covariance))
-    assert smoother.newest is first and smoother.restarts == 0
+    assert smoother.newest is first and smoother.rebuilds == 0
     assert smoother.add(measure(breathing, np.array([6 / 30]), 1)[0]).stamp == 6 / 30
 
 
@@ -125,13 +126,37 @@ def test_a_covariance_that_is_none_does_not_break_what_comes_after(value: float)
     assert 0.5 < nees(windows, breathing, skip=0) < 2.0
 
 
+def broken(smoother: Smoother) -> None:
+    """Let GTSAM throw: its smoother cannot be used any more."""
+    graph, nowhere = gtsam.NonlinearFactorGraph(), gtsam.Pose3(np.full((4, 4), np.nan))
+    one = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)
+    graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", smoother._key - 1), nowhere, one))
+    with pytest.raises(RuntimeError):
+        smoother._window.update(graph, gtsam.Values(), {})
+
+
+def test_a_window_that_has_thrown_is_rebuilt_where_it_was_and_counted() -> None:
+    measured = measure(breathing, np.arange(40) / 30, 1)
+    smoother, whole = Smoother(), run(measured)
+    run(measured[:20], smoother)
+    broken(smoother)
+    after = run(measured[20:], smoother)
+    assert smoother.rebuilds == 1
+    assert np.abs(after[0].twist - whole[20].twist).max() < 0.7  # mm/s; it is 2.2
+    assert np.diag(after[0].covariance).max() < 1.1 * np.diag(whole[20].covariance).max()
+    assert np.abs(after[-1].pose - whole[-1].pose).max() < 5e-3
+    broken(smoother)
+    smoother.add(measure(breathing, np.array([41 / 30]), 1)[0])
+    assert smoother.rebuilds == 2
+
+
 def test_a_gap_longer_than_the_window_begins_a_new_one() -> None:
     smoother = Smoother()
     run(measure(breathing, np.arange(20) / 30, 1), smoother)
     after = measure(breathing, 19 / 30 + WINDOW_LAG_S + 0.5 + np.arange(20) / 30, 2)
     windows = run(after, smoother)
     alone = run(after)
-    assert smoother.restarts == 0
+    assert smoother.rebuilds == 0
     assert np.allclose(windows[0].pose, after[0].pose, atol=1e-9)
     assert np.allclose(windows[0].covariance, COVARIANCE, rtol=1e-3)
     assert np.abs(windows[-1].pose - alone[-1].pose).max() < 0.02
@@ -167,7 +192,7 @@ def test_the_window_holds_as_much_after_a_minute_as_after_a_second() -> None:
     factors, keys = np.array(sizes).T
     assert factors[60:].max() <= factors[30:60].max() and keys[60:].max() <= keys[30:60].max()
     assert keys.max() <= 2 * (WINDOW_LAG_S * 30 + 2)
-    assert smoother.restarts == 0
+    assert smoother.rebuilds == 0
 
 
 DT = 1 / 30

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -57,9 +58,10 @@ def film(folder: Path, name: str) -> None:
 
 @pytest.fixture(scope="module")
 def tracked(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `stillbed track --record` made of it."""
+    """What `stillbed track --record --graph` made of it."""
     out = tmp_path_factory.mktemp("tracked") / "out"
-    assert main(["track", str(session), "-o", str(out), "--record", str(out.parent / "run.mcap")]) == 0
+    also = ["--record", str(out.parent / "run.mcap"), "--graph", str(out.parent / "window.dot")]
+    assert main(["track", str(session), "-o", str(out), *also]) == 0
     return out
 
 
@@ -105,6 +107,23 @@ def test_the_simulated_surface_is_followed(tracked: Path) -> None:
 def test_the_recording_of_the_run_tracks_to_the_same_poses(tracked: Path, tmp_path: Path) -> None:
     assert main(["track", str(tracked.parent / "run.mcap"), "-o", str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "poses.tum").read_bytes() == (tracked / "poses.tum").read_bytes()
+
+
+def test_the_graph_holds_the_newest_pose_and_joins_what_it_names(tracked: Path) -> None:
+    text, stamps = (tracked.parent / "window.dot").read_text(encoding="utf-8"), read_poses(tracked / "poses.csv").stamps
+    assert f"pose\\n{stamps[-1]:.3f} s" in text and text.count("pose\\n") == text.count("twist\\n") > 1
+    named, joined = (set(re.findall(pattern, text)) for pattern in (r"  ([xv]\d+) \[label", r"-- ([xv]\d+);"))
+    assert named == joined
+    assert text.count("white noise on acceleration") == text.count("pose\\n") - 1
+
+
+@pytest.mark.parametrize("options", [["--method", "thesis"], []])
+def test_a_graph_that_cannot_be_written_is_refused_before_anything_is_tracked(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    folder = tmp_path if not options else tmp_path / "new.dot"
+    assert main(["track", str(session), "-o", str(tmp_path / "out"), "--graph", str(folder), *options]) == 2
+    assert "--graph" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_an_early_end_costs_only_the_rest(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

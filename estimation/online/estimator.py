@@ -32,7 +32,7 @@ from estimation.online.surface_state import (
     PoseStateMachine,
     Region,
 )
-from estimation.online.window import MeasuredPose, Smoother
+from estimation.online.window import MeasuredPose, Smoother, WindowEstimate
 from estimation.pose import SurfacePose, TrackState, position_sigma
 from estimation.pose_solver import INLIER_WEIGHT, project
 from estimation.rig import Rig
@@ -80,6 +80,11 @@ class Estimator:
     def pose(self) -> SurfacePose | None:
         """The last pose given, or None before there is a map."""
         return None if self._mapped is None else self._mapped.reported_pose
+
+    @property
+    def window_graph(self) -> str:
+        """The window's factors and variables as `Smoother.graph`."""
+        return self._smoother.graph
 
     @property
     def confirmed(self) -> bool:
@@ -132,7 +137,7 @@ class Estimator:
         solution, outliers, offsets = self.health.solve(tracks, start, scales, allowed, expected)
         inlier = solution.weights > INLIER_WEIGHT
         used = np.bincount(seen.camera[inlier], minlength=len(self.rig))
-        parts = fit_covariance(seen, solution, shared, surface.map_error, surface.warp)
+        parts = fit_covariance(seen, solution, shared, surface.map_error, surface.warp, twist_variance)
         # is it a measurement?
         count, whole = int((~np.isin(seen.camera, list(outliers))).sum()), parts.noise + parts.smear + parts.lasting
         reason = self._rejection(count, used, whole, tracks.incoherent_residual(solution, inlier))
@@ -212,8 +217,8 @@ class Estimator:
         self._smoother.reset()
         self.health.begin(surface_map.points)
         covariance = np.diag([1e-4**2] * 3 + [1e-3**2] * 3)  # exact by definition: the frame is what is seen here
-        zero = np.zeros((6, 6))
-        return self._enter(stamp, base_from_surface, covariance, zero, zero, *self._states.begin(stamp))
+        zero, window = np.zeros((6, 6)), self._smoother.add(MeasuredPose(stamp, base_from_surface, covariance))
+        return self._enter(window, zero, zero, *self._states.begin(stamp))
 
     def may_learn(self, fit: FrameFit) -> bool:
         """Whether map, warp and clocks may learn from a fit: what blurred or bumped cameras show would bend them."""
@@ -295,6 +300,9 @@ class Estimator:
         surface.local(observations, fit, sigma, surface.map, self._smear(fit))
         surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map))
         lasting = fit.parts.lasting + surface.calibration.covariance(fit, self.cameras)
+        rebuilds = self._smoother.rebuilds
+        place = fit.solution.base_from_surface @ se3.exp(fit.parts.step)
+        window = self._smoother.add(MeasuredPose(fit.stamp, place, fit.parts.noise))
         late = self.cameras.delays.sigma
         unsteady = f"the cameras expose {late:.3f} s apart, now more, now less" if late > MAX_DELAY_SIGMA_S else ""
         quality = Measurement(
@@ -309,12 +317,10 @@ class Estimator:
             or surface.caveat
             or unsteady,
             deformation=0.0 if surface.warp.warp is None else surface.warp.warp.deformation,
+            rebuilds=self._smoother.rebuilds if self._smoother.rebuilds > rebuilds else 0,
         )
-        place, parts, state = fit.solution.base_from_surface, fit.parts, self._states.measured(fit.stamp, quality)
-        pose = self._enter(fit.stamp, place, parts.noise, parts.smear, lasting, *state)
-        assert self._smoother.newest is not None
-        averaged = self._smoother.newest.covariance
-        given = surface.reported.measured(pose, fit, self.cameras, surface.first, averaged)
+        pose = self._enter(window, fit.parts.smear, lasting, *self._states.measured(fit.stamp, quality))
+        given = surface.reported.measured(pose, fit, self.cameras, surface.first, window.covariance)
         given = widened(given, alias_covariance(aliases)) if len(aliases) else given
         given = widened(given, displaced.covariance) if displaced.whole else given
         if self.health.rivals.doubted or unsteady:
@@ -330,15 +336,15 @@ class Estimator:
         self.health.update(fit.stamp, used, self._min_camera_tracks(), fit.offsets, fit.allowed, outliers)
 
     def _enter(
-        self, stamp: float, pose: Array, noise: Array, smear: Array, lasting: Array, state: TrackState, reason: str
+        self, window: WindowEstimate, smear: Array, lasting: Array, state: TrackState, reason: str
     ) -> SurfacePose:
-        """Average a pose's noise in the window; its covariance is the window's marginal + smear + lasting errors.
+        """The pose that the window gives; its covariance is the window's marginal + smear + lasting errors.
 
         The smear (late exposures) is not averaged: its size is learned slowly, and it errs along the motion. As part of
         the noise it made the window believe its prior: a third farther off a waved board than the fit alone.
         """
-        surface, step = self._surface, max(1e-3, stamp - self._measured_stamp)
-        window = self._smoother.add(MeasuredPose(stamp, pose, noise))
+        surface, stamp = self._surface, window.stamp
+        step = max(1e-3, stamp - self._measured_stamp)
         self._measured_stamp, surface.psd = stamp, window.acceleration_psd
         if surface.first is not None:
             lasting = lasting + surface.first

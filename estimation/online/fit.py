@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from estimation import se3
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter
 from estimation.pose import SurfacePose
-from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, project
+from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, delay_gain, pose_pulls, project
 from estimation.rig import Rig
 from estimation.runtime import compiled, median
 from estimation.se3 import Array, Index, Mask
@@ -33,6 +33,7 @@ class FitCovariance:
     tracks: Array  # (6, 6), the tracks' part of `noise`, by their stated sigmas
     by_delay: Array  # (6, C), change of the pose by a second's delay of each camera
     by_shift: Array  # (6, 2C), change of the pose by a pixel's shift of each image: right and down of camera 0, 1, ...
+    step: Array = field(default_factory=lambda: np.zeros(6))  # (6,) from the fitted pose to the one that all this is of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,9 +188,18 @@ def residual_scatter(observations: Observations, solution: PoseFit) -> float:
 
 
 def fit_covariance(
-    observations: Observations, solution: PoseFit, shared: SharedErrors, map_error: MapError, warp: WarpFilter
+    observations: Observations,
+    solution: PoseFit,
+    shared: SharedErrors,
+    map_error: MapError,
+    warp: WarpFilter,
+    twist_variance: Array,
 ) -> FitCovariance:
-    """The covariance of a pose that was fitted to what was `seen`, by its parts."""
+    """The covariance of a pose that was fitted to what was `seen`, by its parts.
+
+    The pose is the fitted one without what the cameras' delays in this frame set did to it, as far as their tracks show
+    these delays (`delay_gain`). twist_variance: (6,) of `shared.twist`.
+    """
     information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
     noise = np.linalg.pinv(information, hermitian=True)
     weight = EFFICIENCY * solution.weights / (observations.sigma * solution.scale) ** 2
@@ -199,34 +209,17 @@ def fit_covariance(
     by_landmark, by_camera = pose_pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
     weighted = solution.jacobians * weight[:, None, None]
     lasting = map_error.reaching_pose(rows, by_landmark)
-    lasting = lasting + warp.pull(observations.track, weighted, solution.jacobians[:, :, 3:])
-    by_delay, by_shift = noise @ by_camera[:, 0], noise @ by_camera[:, 1:].swapaxes(1, 2).reshape(6, -1)
-    new = noise + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
+    lasting = noise @ (lasting + warp.pull(observations.track, weighted, solution.jacobians[:, :, 3:])) @ noise
+    # the pose by each delay, shift right and shift down; what a correction by the seen delays leaves of that, and adds
+    effects, seen = noise @ by_camera.reshape(6, -1), solution.shared
+    assert seen is not None
+    gain = effects[:, :cameras] @ delay_gain(solution, shared, twist_variance)
+    effects, tracks = effects - gain @ seen.information, noise + gain @ seen.information @ gain.T
+    by_delay = effects[:, :cameras]
+    by_shift = effects[:, cameras:].reshape(6, 2, -1).swapaxes(1, 2).reshape(6, -1)
+    new = tracks + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
     smear, scatter = by_delay @ shared.delay @ by_delay.T, residual_scatter(observations, solution)
-    return FitCovariance(new, smear, noise @ lasting @ noise, scatter, noise, by_delay, by_shift)
-
-
-@compiled("Tuple((f8[:,:,::1], f8[:,:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1])")
-def pose_pulls(
-    cameras: int, landmarks: int, camera: Index, landmark: Index, jacobian: Array, weight: Array, twist: Array
-) -> tuple[Array, Array]:
-    """How each landmark (6, L, 3), px^-2 per mm, and each camera's delay and shifts (6, 3, C) pull at the pose.
-
-    The pose gives way by its covariance times that. landmark: (N,) below L. The rest as in `gram_by_camera`.
-    """
-    by_landmark, by_camera = np.zeros((6, landmarks, 3)), np.zeros((6, 3, cameras))
-    for i in range(len(camera)):
-        for k in range(2):
-            row, along = jacobian[i, k], 0.0
-            for a in range(6):
-                along += row[a] * twist[a]
-            for a in range(6):
-                weighted = weight[i] * row[a]
-                by_camera[a, 0, camera[i]] += weighted * along
-                by_camera[a, 1 + k, camera[i]] += weighted
-                for b in range(3):
-                    by_landmark[a, landmark[i], b] += weighted * row[3 + b]
-    return by_landmark, by_camera
+    return FitCovariance(new, smear, lasting, scatter, tracks, by_delay, by_shift, -gain @ seen.pull)
 
 
 @compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")

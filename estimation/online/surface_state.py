@@ -263,6 +263,7 @@ class Measurement:
     trouble: str = ""  # cameras that are missed, and why
     caveat: str = ""  # any other reservation
     deformation: float = 0.0  # mm, of the surface
+    rebuilds: int = 0  # of the window after an exception of GTSAM, so far; 0: not now
 
 
 class PoseStateMachine:
@@ -283,7 +284,8 @@ class PoseStateMachine:
 
     def measured(self, stamp: float, basis: Measurement) -> tuple[TrackState, str]:
         """State and reason of a measured pose."""
-        fault = self._fault(basis)
+        rebuilt = f"the window of poses failed and was rebuilt, {basis.rebuilds} so far" if basis.rebuilds else ""
+        fault = "; ".join(filter(None, (self._fault(basis), rebuilt)))
         if fault:
             self._bad_stamp = stamp
         elif stamp - self._bad_stamp < self.settings.settle:

@@ -9,6 +9,7 @@ surface's velocity about its own origin, and the prior does not couple rotations
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -19,6 +20,7 @@ from estimation.runtime import compiled
 from estimation.se3 import Array
 
 WINDOW_LAG_S = 0.6  # longer changed the newest pose by nothing (0.5, 1 s, windows of 5 to 20 agree to 1e-4 mm)
+GTSAM_ERRORS = RuntimeError, IndexError, ValueError  # what its smoother was seen to throw
 MAX_PRIOR_CHI2 = 4.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
 
 GRID_RATIO = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second
@@ -114,7 +116,7 @@ class Smoother:
         self._last: MeasuredPose | None = None
         self._motion = AccelerationPsd()
         self._psd = self._motion.psd
-        self.restarts = 0
+        self.rebuilds = 0  # after an exception of GTSAM, since the start
         self._clear()
 
     def _clear(self) -> None:
@@ -144,11 +146,39 @@ class Smoother:
         self._last, self._psd = measured, self._motion.psd
         try:
             self.newest = self._extend(measured)
-        except (RuntimeError, IndexError, ValueError):  # GTSAM's smoother cannot be used after it has thrown
-            self.restarts += 1
-            self._clear()
-            self.newest = self._extend(measured)
+        except GTSAM_ERRORS:
+            self.newest = self._rebuild(measured)
         return self.newest
+
+    def _rebuild(self, measured: MeasuredPose) -> WindowEstimate:
+        """The estimate by a new window, as GTSAM's smoother cannot be used after it has thrown.
+
+        It begins at the last estimate; where that is what cannot be used, at the measurement, without a velocity.
+        """
+        self.rebuilds += 1
+        last = self.newest
+        self._clear()
+        if last is not None:
+            try:
+                self._begin_at(last)
+                return self._extend(measured)
+            except GTSAM_ERRORS:
+                self._clear()
+        return self._extend(measured)
+
+    def _begin_at(self, last: WindowEstimate) -> None:
+        """Take an estimate as the first pose and twist of an empty window; their correlation is left out."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
+        known = gtsam.noiseModel.Gaussian.Covariance(last.covariance)
+        graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(last.pose), known))
+        known = gtsam.noiseModel.Gaussian.Covariance(last.twist_covariance)
+        graph.add(gtsam.PriorFactorVector(twist, last.twist, known))
+        values.insert(pose, gtsam.Pose3(last.pose))
+        values.insert(twist, last.twist)
+        self._window.update(graph, values, {pose: last.stamp, twist: last.stamp})
+        self._key += 1
+        self.newest = last
 
     def _density(self, measured: MeasuredPose) -> Array:
         """Density (6,) of the acceleration since the last pose: the recent motion's, or that of a sudden jerk."""
@@ -195,6 +225,37 @@ class Smoother:
         if not all(np.isfinite(part).all() for part in parts):
             raise ValueError("the window's estimate is not finite")
         return window
+
+    @property
+    def graph(self) -> str:
+        """The factors and variables that the window holds, in Graphviz's language (DOT)."""
+        return dot(self._window.getFactors(), dict(self._window.timestamps()))
+
+
+VARIABLE_NAMES = {"x": "pose", "v": "twist"}
+FACTOR_NAMES = {
+    "PriorFactorPose3": "tracks of a frame set",
+    "WnoaMotionFactorPose3": "white noise on acceleration",
+    "PriorFactorVector": "twist before it is seen",
+    "LinearContainerFactor": "what has left the window",
+}
+
+
+def dot(factors: gtsam.NonlinearFactorGraph, stamps: Mapping[int, float]) -> str:
+    """A factor graph in Graphviz's language: variables as ellipses, factors as boxes. stamps: s, of the variables."""
+    lines = ["graph window {"]
+    for key, stamp in sorted(stamps.items(), key=lambda each: (each[1], each[0])):
+        symbol = gtsam.Symbol(key)
+        name = VARIABLE_NAMES[chr(symbol.chr())]
+        lines.append(f'  {chr(symbol.chr())}{symbol.index()} [label="{name}\\n{stamp:.3f} s"];')
+    for number in range(factors.size()):
+        factor = factors.at(number)
+        if factor is None:  # an unused slot
+            continue
+        lines.append(f'  f{number} [shape=box, label="{FACTOR_NAMES[type(factor).__name__]}"];')
+        symbols = map(gtsam.Symbol, list(factor.keys()))
+        lines += [f"  f{number} -- {chr(symbol.chr())}{symbol.index()};" for symbol in symbols]
+    return "\n".join([*lines, "}", ""])
 
 
 def _symmetric(matrix: Array) -> Array:

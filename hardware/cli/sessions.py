@@ -31,6 +31,7 @@ def add_track(commands: Commands) -> None:
     add("--wound", action="store_true", help="also segment the wound beside it, into wound.csv")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
+    add("--graph", type=Path, metavar="X.dot", help="also write the factor graph of the last poses, for Graphviz")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
 
@@ -89,8 +90,11 @@ def _track(a: argparse.Namespace) -> int:
     from hardware.files.arm_file import read_arm
     from hardware.offline.track import run_track
 
+    if a.graph is not None and a.method != MAP_METHOD:
+        raise wrong_option("--graph", "given", f"with --method {MAP_METHOD}: no other method has a graph")
     tool = None if a.arm is None else read_arm(a.arm).tool
-    text, damage = run_track(a.session, a.out, a.record, a.force, a.method, tool, a.prefilter, a.wound, a.model)
+    paths = a.session, a.out, a.record
+    text, damage = run_track(*paths, a.force, a.method, tool, a.prefilter, a.wound, a.model, a.graph)
     print(text)
     return FAILED if damage else 0
 

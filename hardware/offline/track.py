@@ -12,7 +12,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 from hardware.process.progress import Progress, ProgressReport, prepare_out
 from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
@@ -192,11 +192,12 @@ def run_track(
     prefilter: str = "none",
     wound: bool = False,
     model: Path | None = None,
+    graph: Path | None = None,
 ) -> tuple[str, str]:
     """Track the session at `path` into the folder `out`; returns the summary, and what was lost of the file, as texts.
 
     method, tool, prefilter, model: as `step_by` takes them. wound: whether it is segmented as well,
-    into wound.csv.
+    into wound.csv. graph: the file that the factor graph is written into as it is at the end, by `MAP_METHOD` only.
     An early end, by an error of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
     """
     from hardware.files.pose_file import PoseWriter, WoundFile
@@ -208,8 +209,9 @@ def run_track(
     session = open_session(path)
     if model is not None:
         _network_segmenter(model)  # what is wrong with it is told before anything is written
-    if record is not None:
-        _check_record(record, force)
+    for option, file in (("--record", record), ("--graph", graph)):
+        if file is not None:
+            _check_file(option, file, force)
     prepare_out(out, force)
     clock = WallClock()
     complete = False
@@ -225,19 +227,21 @@ def run_track(
             follow(session.frame_sets(), step, writer, clock.now, progress, len(session), sinks)
             complete = True
         finally:
+            if graph is not None:
+                graph.write_text(cast("TrackingStep", step).window_graph, encoding="utf-8")
             text = _write_report(out, session, complete, method)
     return f"{text}\nreport: {out / 'report.html'}", session.damage
 
 
-def _check_record(record: Path, force: bool) -> None:
-    """InputError where the recording cannot be written, before a tracker is started."""
+def _check_file(option: str, file: Path, force: bool) -> None:
+    """InputError where the option's file cannot be written, before a tracker is started."""
     from estimation.errors import InputError
 
-    if record.is_dir() or (record.exists() and not force):
-        got = "a folder" if record.is_dir() else "a file that exists"
-        raise InputError(record, "--record", got, "a new file, or --force")
-    if not record.parent.is_dir():
-        raise InputError(record, "--record", "no such folder", "a file in a folder that exists")
+    if file.is_dir() or (file.exists() and not force):
+        got = "a folder" if file.is_dir() else "a file that exists"
+        raise InputError(file, option, got, "a new file, or --force")
+    if not file.parent.is_dir():
+        raise InputError(file, option, "no such folder", "a file in a folder that exists")
 
 
 def follow(

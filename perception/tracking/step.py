@@ -158,6 +158,11 @@ class TrackingStep:
         return self._estimator.map
 
     @property
+    def window_graph(self) -> str:
+        """The factor graph of the last poses in Graphviz's language."""
+        return self._estimator.window_graph
+
+    @property
     def registration(self) -> Registration | None:
         """Where the scan lies, as of the pictures that confirmed the first map; None before, and without a scan."""
         return self._mapping.registration

@@ -217,6 +217,11 @@ class RegionTrackingStep:
         return None if self._step is None else self._step.map
 
     @property
+    def window_graph(self) -> str:
+        """The factor graph of the last poses in Graphviz's language; '' before the region is known."""
+        return "" if self._step is None else self._step.window_graph
+
+    @property
     def registration(self) -> Registration | None:
         """Where the scan lies, as of the pictures that confirmed the first map; None before, and without a scan."""
         return None if self._step is None else self._step.registration
