@@ -546,6 +546,7 @@ def test_on_and_off_pass_a_pty_and_a_replugged_device_is_off_and_must_be_prepare
             assert driver.on(1.0, clock.now()) == ""
             until(driver, DispenserState.ON)
             driver.off(clock.now())
+            until(driver, DispenserState.READY)  # else what was on before is taken for what comes now
         assert driver.on(1.0, clock.now()) == ""
         until(driver, DispenserState.ON)
     assert [flow for _, flow in models[0].switches] == [1.0, 0.0] * 3 + [1.0]

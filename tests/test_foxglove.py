@@ -186,8 +186,8 @@ def test_a_live_run_is_seen_while_it_prints_and_says_who_made_it_of_what(tmp_pat
         ):
             wanted = ["/surface", "/path", "/tf", "/landmarks"]
             channels, seen = await subscribed(window, wanted), set[str]()
+            await window.send_bytes(b"\x01\x01\0\0\0" + b"stop")  # into a channel that it had no leave to open
             while seen != set(wanted):
-                await window.send_bytes(b"\x01\x01\0\0\0" + b"stop")  # into a channel that it had no leave to open
                 message = await told(window)
                 if isinstance(message, bytes) and message[0] == DATA:
                     seen.add(channels[int.from_bytes(message[1:5], "little")]["topic"])
