@@ -546,9 +546,11 @@ def test_on_and_off_pass_a_pty_and_a_replugged_device_is_off_and_must_be_prepare
             assert driver.on(1.0, clock.now()) == ""
             until(driver, DispenserState.ON)
             driver.off(clock.now())
-            until(driver, DispenserState.READY)  # else what was on before is taken for what comes now
         assert driver.on(1.0, clock.now()) == ""
         until(driver, DispenserState.ON)
+        for _ in range(20):  # until the device has read what was sent
+            driver.poll(clock.now())
+            clock.wait_until(clock.now() + POLL)
     assert [flow for _, flow in models[0].switches] == [1.0, 0.0] * 3 + [1.0]
     until(driver, DispenserState.FAILED)
     assert "on" not in driver.on(1.0, clock.now())[:2]
