@@ -275,6 +275,7 @@ def _summed(values: Array, axis: int) -> Array:
 MAX_NODES = 400_000  # of a grid: 3 MB a layer
 SMOOTHING_PER_NOISE = 8.0  # mm for each mm of noise: leaves a tenth of it on a scan of 0.5 mm between points
 MAX_SMOOTHING = 1.0  # mm: more would round the wound's rim away
+WALL_SIGMAS = 2.0  # deviations of the noise: heights that scatter by more are a wall and no noise
 MIN_NOISE = 0.01  # mm: noise below is not worth smoothing
 CLOSING_RADII = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # nodes: how far each round of closing holes looks
 
@@ -311,8 +312,18 @@ def height_map(scan: Scan, surface_from_plane: Array, step: float, box: Array | 
     heights = _closed(np.where(scanned, top, 0.0), scanned, closed)
     noise = _noise(grid, heights, scanned)
     radius = min(SMOOTHING_PER_NOISE * noise, MAX_SMOOTHING) if noise > MIN_NOISE else 0.0
-    heights = smoothed(grid, heights, radius, scanned | closed)
+    heights = _averaged(grid, heights, radius, scanned | closed, noise)
     return HeightMap(surface_from_plane, grid, heights, scanned, closed, noise, radius)
+
+
+def _averaged(grid: Grid, heights: Array, radius: float, known: Mask, noise: float) -> Array:
+    """Heights (H, W) averaged over `radius` mm where they scatter by no more than the noise (Lee 1980): walls stay."""
+    if radius <= 0:
+        return heights
+    mean = smoothed(grid, heights, radius, known)
+    scatter = smoothed(grid, (heights - mean) ** 2, radius, known)
+    kept = np.clip(1 - (WALL_SIGMAS * noise) ** 2 / np.maximum(scatter, 1e-12), 0, 1)
+    return np.asarray(mean + kept * (heights - mean))
 
 
 def _closed(heights: Array, scanned: Mask, holes: Mask) -> Array:

@@ -247,7 +247,8 @@ def flat_wound(contour: Array, thickness: float, where: object) -> WoundVolume:
     bed = np.zeros(grid.shape)
     area = float(shapely.area(outline))
     findings = WoundFindings(
-        given=True, area=area, volume=area * thickness, depth=thickness, level=0.0, noise=0.0, smoothing=0.0,
+        given=True, area=area, volume=area * thickness, volume_sigma=0.0, depth=thickness, skin_sigma=0.0, margin=0.0,
+        level=0.0, noise=0.0, smoothing=0.0,
         scatter=0.0, closed=0.0, hidden=0.0, cut=0.0, others=0, notes=(),
     )  # fmt: skip
-    return WoundVolume(np.eye(4), grid, bed, bed + thickness, outline, findings)
+    return WoundVolume(np.eye(4), grid, bed, bed + thickness, np.zeros(grid.shape), outline, findings)

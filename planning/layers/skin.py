@@ -1,0 +1,224 @@
+"""Healthy skin restored over a wound, from the skin around it: a curvature-continuous surface with its deviation.
+
+The skin is a base bent like the body there, and a departure from it along the base's normal: a quadric and a Gaussian
+process over places on the base (universal kriging, Matheron 1969). So a limb may turn away by any angle that is seen.
+With Matern's covariance of order 5/2 the surface has continuous curvature; of order 3/2 and long reach it is nearly a
+thin plate. Kernel, reach and smoothing are chosen by cross-validation: discs of skin as large as the gap, as far as
+there are such, are predicted from the rest (Rasmussen and Williams 2006, 5.4.2), and the deviation is scaled by how far
+those predictions were off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import cKDTree
+
+from estimation.se3 import Array, Index
+from planning.layers.grid import Grid
+
+MAX_CELLS = 320  # that the surface is held by: means of the points in squares
+MIN_CELL = 2.0  # mm, side of such a square: skin bends over centimetres
+MIN_CELLS = 12  # of skin, of which a quadric can be told
+REACHES = (12.0, 25.0, 50.0, 100.0)  # mm over which a departure from the quadric fades
+MIDDLE_NOISE = 3e-3  # variance of a cell by itself over that of the departures, while the reach is chosen
+NOISE_SHARES = (1e-4, 3e-4, 1e-3, 1e-2, 3e-2, 0.2)  # those that are tried then
+MAX_BLOCK = 16.0  # mm, radius of the discs left out: larger ones leave too little around them
+BLOCKS = 24  # discs left out in turn
+BASE_ROUNDS = 3  # of bending the base: each takes what the last has left
+MAX_CURVATURE = 1 / 15.0  # 1/mm, of the base: a finger
+FLAT_CURVATURE = 1e-5  # 1/mm: a plane is a ball of 100 m
+HEIGHT_ROUNDS = 12  # of Newton's method from the plane to the skin
+MIN_FACING = 0.25  # cosine: where the skin turns further from the plane it has no height over it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BentBase:
+    """A torus patch through the plane's origin: its principal curvatures there are those of the skin."""
+
+    turn: Array  # (2, 2) plane's x and y from principal directions
+    curvature: Array  # (2,) 1/mm along them, positive where the body is convex
+
+    def places(self, points: Array) -> tuple[Array, Array]:
+        """Arc lengths (N, 2) along the principal directions, and heights (N,) over the base, of points (N, 3), mm."""
+        flat = points[:, :2] @ self.turn
+        near, far = (1 / k for k in self.curvature)
+        v, z = _unbent(flat[:, 1], points[:, 2], far)
+        u, height = _unbent(flat[:, 0], z, near)
+        return np.column_stack([u, v]), height
+
+
+def _unbent(x: Array, z: Array, radius: float) -> tuple[Array, Array]:
+    """Arc length along a circle that touches z = 0 at 0 from below (radius > 0) or above, and height over it."""
+    side = np.sign(radius)
+    up = side * (z + radius)
+    return radius * np.arctan2(x, up) * side, side * np.hypot(x, up) - radius
+
+
+def bent_base(points: Array) -> BentBase:
+    """The base that points (N, 3) of skin, mm, in a plane that nearly touches it at the origin, are bent like."""
+    base = BentBase(np.eye(2), np.full(2, FLAT_CURVATURE))
+    bend = np.zeros((2, 2))
+    for _ in range(BASE_ROUNDS):
+        places, height = base.places(points)
+        flat = places @ base.turn.T
+        fit = np.linalg.lstsq(_quadric(flat, 1.0), height, rcond=None)[0]
+        bend = bend - np.array([[2 * fit[3], fit[4]], [fit[4], 2 * fit[5]]])
+        values, axes = np.linalg.eigh(bend)
+        values = np.clip(values, -MAX_CURVATURE, MAX_CURVATURE)
+        values = np.where(np.abs(values) < FLAT_CURVATURE, FLAT_CURVATURE, values)
+        base = BentBase(axes, values)
+    return base
+
+
+def _quadric(places: Array, size: float) -> Array:
+    """The six terms (N, 6) of a quadric at places (N, 2), scaled by `size` mm."""
+    x, y = places.T / size
+    return np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
+
+
+def _matern(far: Array, reach: float, smooth: bool) -> Array:
+    """Matern's correlation at distances `far`, mm: of order 5/2 where smooth, else 3/2."""
+    t = far * (np.sqrt(5.0 if smooth else 3.0) / reach)
+    return np.asarray(((1 + t + t * t / 3) if smooth else (1 + t)) * np.exp(-t))
+
+
+@dataclass(frozen=True, slots=True)
+class SkinKernel:
+    """What skin departs from its quadric like."""
+
+    smooth: bool  # Matern 5/2, else 3/2
+    reach: float  # mm
+    noise: float  # variance of a cell by itself, over `variance`
+    variance: float  # mm^2, of the departures, as cross-validation scales them
+    left_out: float  # mm, rms error of skin that was left out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestoredSkin:
+    """The skin over a wound, in the plane's frame."""
+
+    base: BentBase
+    kernel: SkinKernel
+    cells: Array  # (N, 2) mm, on the base
+    size: float  # mm, by which places are scaled
+    factor: tuple[Array, bool]  # of the cells' correlation
+    drift: Array  # (6,) of the quadric
+    weights: Array  # (N,) of the cells
+    bound: Array  # (6, 6) covariance of the drift, over the variance
+    solved: Array  # (N, 6) correlation's inverse times the quadric's terms
+
+    def at(self, places: Array) -> Array:
+        """Heights (M,) over the base at places (M, 2) on it, mm."""
+        return np.asarray(self._correlation(places) @ self.weights + _quadric(places, self.size) @ self.drift)
+
+    def covariance(self, places: Array) -> Array:
+        """Covariance (M, M), mm^2, of the heights at places (M, 2)."""
+        near, terms = self._correlation(places), _quadric(places, self.size)
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        lacking = terms - near @ self.solved
+        whole = _matern(apart, self.kernel.reach, self.kernel.smooth) - near @ cho_solve(self.factor, near.T)
+        return np.asarray(self.kernel.variance * (whole + lacking @ self.bound @ lacking.T))
+
+    def deviation(self, places: Array) -> Array:
+        """Standard deviation (M,), mm, of the heights at places (M, 2)."""
+        near, terms = self._correlation(places), _quadric(places, self.size)
+        lacking = terms - near @ self.solved
+        own = 1 - np.einsum("mn,nm->m", near, cho_solve(self.factor, near.T))
+        return np.sqrt(self.kernel.variance * np.maximum(own + np.einsum("mi,ij,mj->m", lacking, self.bound, lacking), 0))
+
+    def over(self, grid: Grid) -> tuple[Array, Array]:
+        """Places (H, W, 2) on the base and heights (H, W) over the plane of the skin at the nodes of a grid.
+
+        Heights are NaN where the skin has turned away from the plane.
+        """
+        flat = grid.nodes.reshape(-1, 2)
+        z, places = np.zeros(len(flat)), flat
+        facing = np.ones(len(flat))
+        for _ in range(HEIGHT_ROUNDS):
+            places, height = self.base.places(np.column_stack([flat, z]))
+            _, raised = self.base.places(np.column_stack([flat, z + 1e-3]))
+            facing = (raised - height) / 1e-3
+            z = z + (self.at(places) - height) / np.maximum(facing, MIN_FACING)
+        off = np.abs(self.at(places) - height)
+        z = np.where((facing > MIN_FACING) & (off < 0.05), z, np.nan)
+        return places.reshape(*grid.shape, 2), z.reshape(grid.shape)
+
+    def _correlation(self, places: Array) -> Array:
+        far = np.sqrt(np.maximum(((places[:, None] - self.cells[None]) ** 2).sum(axis=2), 0))
+        return _matern(far, self.kernel.reach, self.kernel.smooth)
+
+
+def restored_skin(base: BentBase, points: Array, gap: float, like: RestoredSkin | None = None) -> RestoredSkin:
+    """The surface through points (P, 3) of skin, mm, plane frame, over a gap of about `gap` mm radius.
+
+    like: a surface whose kernel, reach, smoothing and variance are taken, in place of cross-validation.
+    """
+    places, heights = base.places(points)
+    cells, values, weights = _cells(places, heights)
+    size = float(np.ptp(cells, axis=0).max())
+    apart, terms = np.linalg.norm(cells[:, None] - cells[None], axis=2), _quadric(cells, size)
+    kernel = _validated(apart, terms, values, weights, _blocks(cells, gap)) if like is None else like.kernel
+    whole = _matern(apart, kernel.reach, kernel.smooth) + np.diag(kernel.noise / weights)
+    factor = cho_factor(whole, lower=True)
+    solved = cho_solve(factor, terms)
+    bound = np.linalg.inv(terms.T @ solved)
+    drift = bound @ (solved.T @ values)
+    return RestoredSkin(base, kernel, cells, size, factor, drift, cho_solve(factor, values - terms @ drift), bound, solved)
+
+
+def _validated(apart: Array, terms: Array, values: Array, weights: Array, blocks: list[Index]) -> SkinKernel:
+    """The kernel by which blocks of cells that are left out are predicted best: first its shape, then its noise."""
+    tried = dict[tuple[bool, float, float], tuple[float, float]]()
+
+    def best(choices: list[tuple[bool, float, float]]) -> tuple[bool, float, float]:
+        for smooth, reach, noise in choices:
+            whole = _matern(apart, reach, smooth) + np.diag(noise / weights)
+            tried[smooth, reach, noise] = _left_out(whole, terms, values, blocks)
+        return min(tried, key=lambda choice: tried[choice][0])
+
+    smooth, reach, _ = best([(smooth, reach, MIDDLE_NOISE) for smooth in (True, False) for reach in REACHES])
+    chosen = best([(smooth, reach, noise) for noise in NOISE_SHARES])
+    return SkinKernel(*chosen, tried[chosen][1], tried[chosen][0])
+
+
+def _cells(places: Array, heights: Array) -> tuple[Array, Array, Array]:
+    """Means (N, 2) and (N,) of the points in squares, as small as leave MAX_CELLS, and their weights (N,)."""
+    side = MIN_CELL
+    while True:
+        _, number, count = np.unique(np.floor(places / side), axis=0, return_inverse=True, return_counts=True)
+        if len(count) <= MAX_CELLS:
+            break
+        side *= max(1.05, np.sqrt(len(count) / MAX_CELLS))
+    number = number.reshape(-1)
+    means = [np.bincount(number, values) / count for values in (*places.T, heights)]
+    return np.column_stack(means[:2]), means[2], count / count.mean()
+
+
+def _blocks(cells: Array, radius: float) -> list[Index]:
+    """Numbers of the cells within `radius` of middles that are spread over all."""
+    chosen = [int(np.argmin(np.linalg.norm(cells - cells.mean(axis=0), axis=1)))]
+    far = np.linalg.norm(cells - cells[chosen[0]], axis=1)
+    while len(chosen) < min(BLOCKS, len(cells)):
+        chosen.append(int(np.argmax(far)))
+        far = np.minimum(far, np.linalg.norm(cells - cells[chosen[-1]], axis=1))
+    lists = cKDTree(cells).query_ball_point(cells[chosen], min(radius, MAX_BLOCK))
+    return [np.array(each) for each in lists if len(each) < len(cells) / 3]
+
+
+def _left_out(whole: Array, terms: Array, values: Array, blocks: list[Index]) -> tuple[float, float]:
+    """Rms error of the blocks predicted from the rest, and its square over the variance predicted for 1."""
+    inverse = cho_solve(cho_factor(whole, lower=True), np.eye(len(whole)))
+    solved = inverse @ terms
+    inverse = inverse - solved @ np.linalg.solve(terms.T @ solved, solved.T)
+    pulled = inverse @ values
+    squares, ratios, count = 0.0, 0.0, 0
+    for block in blocks:
+        own = inverse[np.ix_(block, block)]
+        off = np.linalg.solve(own, pulled[block])
+        squares += float(off @ off)
+        ratios += float(off @ own @ off)  # whitened by the block's predicted covariance
+        count += len(block)
+    return float(np.sqrt(squares / max(count, 1))), ratios / max(count, 1)
