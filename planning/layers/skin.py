@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
-from estimation.se3 import Array, Index
+from estimation.se3 import Array, Index, Mask
 from planning.layers.grid import Grid
 
-MAX_CELLS = 320  # that the surface is held by: means of the points in squares
+MAX_CELLS = 260  # that the surface is held by: means of the points in squares
 MIN_CELL = 2.0  # mm, side of such a square: skin bends over centimetres
 MIN_CELLS = 12  # of skin, of which a quadric can be told
 REACHES = (12.0, 25.0, 50.0, 100.0)  # mm over which a departure from the quadric fades
@@ -30,7 +31,8 @@ BLOCKS = 24  # discs left out in turn
 BASE_ROUNDS = 3  # of bending the base: each takes what the last has left
 MAX_CURVATURE = 1 / 15.0  # 1/mm, of the base: a finger
 FLAT_CURVATURE = 1e-5  # 1/mm: a plane is a ball of 100 m
-HEIGHT_ROUNDS = 12  # of Newton's method from the plane to the skin
+HEIGHT_ROUNDS, HEIGHT_TOLERANCE = 10, 1e-3  # of Newton's method from the plane to a surface over the base; mm
+SKIN_HEIGHT_ROUNDS = 2  # of reading the skin's height over the base: it changes little where the place moves
 MIN_FACING = 0.25  # cosine: where the skin turns further from the plane it has no height over it
 
 
@@ -48,6 +50,23 @@ class BentBase:
         v, z = _unbent(flat[:, 1], points[:, 2], far)
         u, height = _unbent(flat[:, 0], z, near)
         return np.column_stack([u, v]), height
+
+
+    def heights_over(self, flat: Array, z: Array, wanted: Array) -> tuple[Array, Array, Mask]:
+        """Heights (N,) over the plane at places (N, 2) of it whose points are `wanted` (N,) mm over the base.
+
+        z: (N,) to begin with. Also the points' places (N, 2) on the base, and whether there is such a point at all.
+        """
+        places, seen = flat, np.ones(len(flat), bool)
+        for _ in range(HEIGHT_ROUNDS):
+            places, height = self.places(np.column_stack([flat, z]))
+            facing = (self.places(np.column_stack([flat, z + 1e-3]))[1] - height) / 1e-3
+            off = wanted - height
+            z = z + off / np.maximum(facing, MIN_FACING)
+            seen = (facing > MIN_FACING) & (np.abs(off) < 10 * HEIGHT_TOLERANCE)
+            if np.percentile(np.abs(off), 95) < HEIGHT_TOLERANCE:  # the others have turned away
+                break
+        return z, places, seen
 
 
 def _unbent(x: Array, z: Array, radius: float) -> tuple[Array, Array]:
@@ -82,7 +101,8 @@ def _quadric(places: Array, size: float) -> Array:
 def _matern(far: Array, reach: float, smooth: bool) -> Array:
     """Matern's correlation at distances `far`, mm: of order 5/2 where smooth, else 3/2."""
     t = far * (np.sqrt(5.0 if smooth else 3.0) / reach)
-    return np.asarray(((1 + t + t * t / 3) if smooth else (1 + t)) * np.exp(-t))
+    fading = np.exp(-t)
+    return np.asarray((1 + t * (1 + t / 3)) * fading if smooth else (1 + t) * fading)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +116,16 @@ class SkinKernel:
     left_out: float  # mm, rms error of skin that was left out
 
 
+USUAL_KERNEL = SkinKernel(True, 25.0, MIDDLE_NOISE, 0.5, 0.1)  # of most bodies: enough while a wound is looked for
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RestoredSkin:
     """The skin over a wound, in the plane's frame."""
 
     base: BentBase
     kernel: SkinKernel
-    cells: Array  # (N, 2) mm, on the base
+    cells: Array  # (N, 2) mm, places on the base
     size: float  # mm, by which places are scaled
     factor: tuple[Array, bool]  # of the cells' correlation
     drift: Array  # (6,) of the quadric
@@ -117,9 +140,8 @@ class RestoredSkin:
     def covariance(self, places: Array) -> Array:
         """Covariance (M, M), mm^2, of the heights at places (M, 2)."""
         near, terms = self._correlation(places), _quadric(places, self.size)
-        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
         lacking = terms - near @ self.solved
-        whole = _matern(apart, self.kernel.reach, self.kernel.smooth) - near @ cho_solve(self.factor, near.T)
+        whole = _matern(cdist(places, places), self.kernel.reach, self.kernel.smooth) - near @ cho_solve(self.factor, near.T)
         return np.asarray(self.kernel.variance * (whole + lacking @ self.bound @ lacking.T))
 
     def deviation(self, places: Array) -> Array:
@@ -135,38 +157,45 @@ class RestoredSkin:
         Heights are NaN where the skin has turned away from the plane.
         """
         flat = grid.nodes.reshape(-1, 2)
-        z, places = np.zeros(len(flat)), flat
-        facing = np.ones(len(flat))
-        for _ in range(HEIGHT_ROUNDS):
-            places, height = self.base.places(np.column_stack([flat, z]))
-            _, raised = self.base.places(np.column_stack([flat, z + 1e-3]))
-            facing = (raised - height) / 1e-3
-            z = z + (self.at(places) - height) / np.maximum(facing, MIN_FACING)
-        off = np.abs(self.at(places) - height)
-        z = np.where((facing > MIN_FACING) & (off < 0.05), z, np.nan)
+        z, wanted, places, seen = np.zeros(len(flat)), np.zeros(len(flat)), flat, np.ones(len(flat), bool)
+        for _ in range(SKIN_HEIGHT_ROUNDS):
+            z, places, seen = self.base.heights_over(flat, z, wanted)
+            wanted = self.at(places)
+        z, places, seen = self.base.heights_over(flat, z, wanted)
+        z = np.where(seen, z, np.nan)
         return places.reshape(*grid.shape, 2), z.reshape(grid.shape)
 
     def _correlation(self, places: Array) -> Array:
-        far = np.sqrt(np.maximum(((places[:, None] - self.cells[None]) ** 2).sum(axis=2), 0))
-        return _matern(far, self.kernel.reach, self.kernel.smooth)
+        return _matern(cdist(places, self.cells), self.kernel.reach, self.kernel.smooth)
 
 
-def restored_skin(base: BentBase, points: Array, gap: float, like: RestoredSkin | None = None) -> RestoredSkin:
-    """The surface through points (P, 3) of skin, mm, plane frame, over a gap of about `gap` mm radius.
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinCells:
+    """Points of skin on a base, averaged in squares."""
 
-    like: a surface whose kernel, reach, smoothing and variance are taken, in place of cross-validation.
+    base: BentBase
+    places: Array  # (N, 2) mm, on the base
+    heights: Array  # (N,) mm over it
+    weights: Array  # (N,) how many points, about 1
+
+
+def restored_skin(cells: SkinCells, gap: float, kernel: SkinKernel | None = None) -> RestoredSkin:
+    """The surface through cells of skin, over a gap of about `gap` mm radius.
+
+    kernel: what skin departs like, in place of what cross-validation finds.
     """
-    places, heights = base.places(points)
-    cells, values, weights = _cells(places, heights)
-    size = float(np.ptp(cells, axis=0).max())
-    apart, terms = np.linalg.norm(cells[:, None] - cells[None], axis=2), _quadric(cells, size)
-    kernel = _validated(apart, terms, values, weights, _blocks(cells, gap)) if like is None else like.kernel
+    places, values, weights = cells.places, cells.heights, cells.weights
+    size = float(np.ptp(places, axis=0).max())
+    apart, terms = cdist(places, places), _quadric(places, size)
+    if kernel is None:
+        kernel = _validated(apart, terms, values, weights, _blocks(places, gap))
     whole = _matern(apart, kernel.reach, kernel.smooth) + np.diag(kernel.noise / weights)
     factor = cho_factor(whole, lower=True)
     solved = cho_solve(factor, terms)
     bound = np.linalg.inv(terms.T @ solved)
     drift = bound @ (solved.T @ values)
-    return RestoredSkin(base, kernel, cells, size, factor, drift, cho_solve(factor, values - terms @ drift), bound, solved)
+    mixed = cho_solve(factor, values - terms @ drift)
+    return RestoredSkin(cells.base, kernel, places, size, factor, drift, mixed, bound, solved)
 
 
 def _validated(apart: Array, terms: Array, values: Array, weights: Array, blocks: list[Index]) -> SkinKernel:
@@ -184,17 +213,20 @@ def _validated(apart: Array, terms: Array, values: Array, weights: Array, blocks
     return SkinKernel(*chosen, tried[chosen][1], tried[chosen][0])
 
 
-def _cells(places: Array, heights: Array) -> tuple[Array, Array, Array]:
-    """Means (N, 2) and (N,) of the points in squares, as small as leave MAX_CELLS, and their weights (N,)."""
+def skin_cells(base: BentBase, points: Array) -> SkinCells:
+    """Points (P, 3) mm, plane frame, averaged in squares as small as leave MAX_CELLS of them."""
+    places, heights = base.places(points)
     side = MIN_CELL
     while True:
-        _, number, count = np.unique(np.floor(places / side), axis=0, return_inverse=True, return_counts=True)
+        square = np.floor(places / side).astype(np.int64)
+        square -= square.min(axis=0)
+        key = square[:, 0] * (int(square[:, 1].max()) + 1) + square[:, 1]
+        _, number, count = np.unique(key, return_inverse=True, return_counts=True)
         if len(count) <= MAX_CELLS:
             break
         side *= max(1.05, np.sqrt(len(count) / MAX_CELLS))
-    number = number.reshape(-1)
     means = [np.bincount(number, values) / count for values in (*places.T, heights)]
-    return np.column_stack(means[:2]), means[2], count / count.mean()
+    return SkinCells(base, np.column_stack(means[:2]), means[2], count / count.mean())
 
 
 def _blocks(cells: Array, radius: float) -> list[Index]:

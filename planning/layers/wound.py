@@ -23,13 +23,13 @@ from estimation.se3 import Array, Index
 from planning.layers.depressions import Depression, depressions
 from planning.layers.grid import Grid, HeightMap, Mask, as_multi, filled, height_map, interpolate, positive_region
 from planning.layers.repair import mean_normal
-from planning.layers.skin import MIN_CELLS, BentBase, RestoredSkin, bent_base, restored_skin
+from planning.layers.skin import MIN_CELLS, USUAL_KERNEL, RestoredSkin, SkinCells, SkinKernel, bent_base, restored_skin, skin_cells
 
 SEARCH_STEP = 0.75  # mm between nodes while the wound is looked for
-SKIN_STEP = 2.0  # mm between nodes where the skin is worked out; it bends over centimetres
+SKIN_STEP = 3.0  # mm between nodes where the skin is worked out; it bends over centimetres
 SURROUND_WIDTH = 30.0  # mm of skin around the wound that is looked at
 # mm of skin along the rim that is not trusted at first, as it may be swollen or rolled in; and the least that is left out
-RIM_MARGIN, MIN_RIM_MARGIN = 5.0, 1.5
+RIM_MARGIN, MIN_RIM_MARGIN = 7.0, 1.5
 MARGIN_STEP = 1.0  # mm of that skin judged at once
 MAX_SWELLING = 0.1  # mm, mean of such a strip off the skin restored without it, beside its deviation
 SKIN_SIGMAS, MIN_SKIN_BAND = 4.0, 0.3  # skin lies within so many deviations, and mm, of the restored
@@ -41,13 +41,14 @@ OUTLINE_TOLERANCE = 0.02  # mm: an outline is moved less by being made simple; a
 MIN_NODES = 150  # of the map that are surface: of fewer no skin can be told
 MIN_PIECE = 1.0  # mm^2: of an outline, and of an island of skin inside it
 OPENING_RADIUS = 0.5  # mm: creases narrower than twice that are not part of a wound
-OUTLINE_ROUNDS = 3  # of outline and restored skin: each is found by the other
+OUTLINE_ROUNDS, SAME_SHARE = 4, 0.99  # of outline and restored skin: each is found by the other; and when it is
 MAX_CUT_SHARE = 0.25  # share of the outline that may lie along the scan's rim, where no skin holds the restored surface
 MIN_UPWARD = 0.1  # upward part of a triangle's normal: below, it is an overhang's
 MAX_PLACES = 6  # depressions that are outlined and judged
 RIM_INSIDE, RIM_OUTSIDE = 2.0, 1.0  # mm from the outline, between which a wound's wall falls
 MAX_VOLUME_NODES = 400  # of the skin, of which the volume's deviation is summed
-MIN_SCORE, SURE_SCORE, RIVAL_SHARE = 1.0, 2.0, 0.5
+RIVAL_CLARITY = 0.15  # of the clearest depression's: less clear ones are not looked at
+MIN_SCORE, SURE_SCORE, RIVAL_SHARE = 4.5, 6.0, 0.4
 INSIDE_OUT_CLARITY = 3.0  # of a bulge that would be a wound from the other side
 SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 
@@ -181,12 +182,12 @@ def find_wound(
     shape = as_multi(shapely.make_valid(shapely.transform(place.outline, lambda xy: _moved(xy, coarse, turn))))
     fine = height_map(scan, surface_from_plane, step, _box(shape))
     if outline is None:
-        found = _outlined(scan, fine, shape, OUTLINE_ROUNDS, place.restored)
+        found = _outlined(scan, fine, shape)
         if found is None:
             raise _refusal(coarse, place.depth, where, flipped)
     else:
         shape = _given(outline, surface_from_plane, where)
-        found = _with_skin(scan, fine, shape, place.restored)
+        found = _with_skin(scan, fine, shape)
     return _checked_wound(scan, found, outline is not None, others, where)
 
 
@@ -213,7 +214,7 @@ def _places(scan: Scan, first: HeightMap, colour: ScanColour | None) -> list[tup
     found = depressions(first.grid, first.heights, first.known, MAX_PLACES)
     judged = []
     for each in found:
-        if each.clarity > 0.1 * found[0].clarity and each.depth > MIN_DEPTH / 4:
+        if each.clarity > RIVAL_CLARITY * found[0].clarity and each.depth > MIN_DEPTH / 4:
             place = _outlined_depression(scan, first, each)
             if place is not None:
                 judged.append((_judged(place, colour), place))
@@ -235,7 +236,7 @@ def _outlined_depression(scan: Scan, first: HeightMap, hollow: Depression) -> _O
     plane = se3.make(_axes(rotation @ z / np.linalg.norm(z), np.eye(3)[0]), middle)
     disc = as_multi(shapely.Point(0.0, 0.0).buffer(1.2 * hollow.radius))
     fine = height_map(scan, plane, SEARCH_STEP, _box(disc))
-    return _outlined(scan, fine, disc, OUTLINE_ROUNDS + 1) if fine.known.sum() > MIN_NODES else None
+    return _outlined(scan, fine, disc, USUAL_KERNEL) if fine.known.sum() > MIN_NODES else None
 
 
 def _judged(place: _Outlined, colour: ScanColour | None) -> WoundPlace:
@@ -247,7 +248,7 @@ def _judged(place: _Outlined, colour: ScanColour | None) -> WoundPlace:
     rims = [_around(outline, away) for away in (-RIM_INSIDE, RIM_OUTSIDE)]
     if len(rims[0]):
         falls = [float(np.median(interpolate(fine.grid, depth, rim))) for rim in rims]
-        steepness = (falls[0] - falls[1]) / max(deep, 1e-6)
+        steepness = min((falls[0] - max(falls[1], 0.0)) / max(deep, 1e-6), 1.0)
     else:
         steepness = 1.0  # narrower than that: all of it is rim
     points = _on(fine, shapely.get_coordinates(outline.geoms[0].exterior))
@@ -383,28 +384,32 @@ def _skin_points(scan: Scan, fine: HeightMap) -> Array:
     return np.asarray(points[under < max(1.0, SKIN_SIGMAS * fine.noise)])
 
 
-def _restored(points: Array, outline: MultiPolygon, margin: float, like: RestoredSkin | None) -> tuple[RestoredSkin, float]:
+def _restored(
+    points: Array, outline: MultiPolygon, margin: float, kernel: SkinKernel | None = None
+) -> tuple[RestoredSkin, float]:
     """The skin over an outline, from points (P, 3) of the scan beyond `margin` mm, and their scatter about it."""
     beside = ~shapely.contains_xy(shapely.buffer(outline, margin), points[:, 0], points[:, 1])
     if beside.sum() < MIN_CELLS:
         beside = ~shapely.contains_xy(outline, points[:, 0], points[:, 1])
     around = points[beside] if beside.sum() >= MIN_CELLS else points
-    base: BentBase = bent_base(around) if like is None else like.base
+    cells = skin_cells(bent_base(around), around)
     gap = float(np.sqrt(outline.area / np.pi)) + margin
-    skin, held, scatter = restored_skin(base, around, gap, like), around, 0.0
-    places, heights = base.places(around)
+    skin, held, scatter = restored_skin(cells, gap, kernel), len(cells.heights), 0.0
     for _ in range(SKIN_ROUNDS):
-        off = np.abs(heights - skin.at(places))
+        off = np.abs(cells.heights - skin.at(cells.places))
         scatter = 1.4826 * float(np.median(off))
-        good = around[off < max(SKIN_SIGMAS * scatter, MIN_SKIN_BAND)]  # no second wound, fold or hair
-        if len(good) == len(held) or len(good) < MIN_CELLS:
+        good = off < max(SKIN_SIGMAS * scatter, MIN_SKIN_BAND)  # no second wound, fold or hair
+        if good.sum() == held or good.sum() < MIN_CELLS:
             break
-        skin, held = restored_skin(base, good, gap, skin), good
+        kept = SkinCells(cells.base, cells.places[good], cells.heights[good], cells.weights[good])
+        skin, held = restored_skin(kept, gap, skin.kernel), int(good.sum())
     return skin, scatter
 
 
 def _trusted_margin(points: Array, outline: MultiPolygon, skin: RestoredSkin) -> float:
     """How near to the rim, mm, the scan's skin agrees with that restored from beyond RIM_MARGIN."""
+    near = shapely.contains_xy(shapely.buffer(outline, RIM_MARGIN + MARGIN_STEP), *points[:, :2].T)
+    points = points[near]
     places, heights = skin.base.places(points)
     edges = np.arange(MIN_RIM_MARGIN, RIM_MARGIN, MARGIN_STEP)
     for low in edges[::-1]:
@@ -414,16 +419,16 @@ def _trusted_margin(points: Array, outline: MultiPolygon, skin: RestoredSkin) ->
             continue
         off = float(np.mean(heights[strip] - skin.at(places[strip])))
         if abs(off) > MAX_SWELLING + float(np.median(skin.deviation(places[strip]))):
-            return float(low + MARGIN_STEP)
+            return RIM_MARGIN
     return MIN_RIM_MARGIN
 
 
-def _with_skin(scan: Scan, fine: HeightMap, outline: MultiPolygon, like: RestoredSkin | None = None) -> _Outlined:
+def _with_skin(scan: Scan, fine: HeightMap, outline: MultiPolygon) -> _Outlined:
     """An outline with the skin over it, held as near to the rim as the skin there is sound."""
     points = _skin_points(scan, fine)
-    far, _ = _restored(points, outline, RIM_MARGIN, None)
+    far, _ = _restored(points, outline, RIM_MARGIN)
     margin = _trusted_margin(points, outline, far)
-    restored, scatter = _restored(points, outline, margin, None)
+    restored, scatter = _restored(points, outline, margin)
     return _Outlined(fine, outline, restored, _heights_over(restored, fine.grid), margin, scatter, 0.0)
 
 
@@ -435,26 +440,30 @@ def _heights_over(restored: RestoredSkin, grid: Grid) -> Array:
     return upsampled(grid, coarse, filled(np.where(known, heights, 0.0), known) if known.any() else np.zeros(coarse.shape))
 
 
-def _outlined(
-    scan: Scan, fine: HeightMap, outline: MultiPolygon, rounds: int, like: RestoredSkin | None = None
-) -> _Outlined | None:
-    """Outline and restored skin, each found by the other, from a first outline; None where nothing lies deep there."""
+def _outlined(scan: Scan, fine: HeightMap, outline: MultiPolygon, kernel: SkinKernel | None = None) -> _Outlined | None:
+    """Outline and restored skin, each found by the other, from a first outline; None where nothing lies deep there.
+
+    kernel: of the skin; by cross-validation without.
+    """
     points = _skin_points(scan, fine)
     if len(points) < MIN_CELLS:
         return None
-    margin, restored = RIM_MARGIN, like
-    for turn in range(rounds):
-        restored, scatter = _restored(points, outline, margin, None)
+    margin, known = RIM_MARGIN, kernel
+    for turn in range(OUTLINE_ROUNDS):
+        restored, scatter = _restored(points, outline, margin, known)
         skin = _heights_over(restored, fine.grid)
-        level, outline_now = _rim_of(fine, np.where(fine.known, skin - fine.heights, -1.0), outline)
-        if outline_now.is_empty:
+        level, now = _rim_of(fine, np.where(fine.known, skin - fine.heights, -1.0), outline)
+        if now.is_empty:
             return None
-        before, outline = outline, outline_now
-        same = shapely.intersection(before, outline).area > 0.99 * shapely.union(before, outline).area
-        if turn == rounds - 2 or same:
-            if margin < RIM_MARGIN:
+        before, outline, known = outline, now, restored.kernel
+        same = shapely.intersection(before, outline).area > SAME_SHARE * shapely.union(before, outline).area
+        if turn and margin < RIM_MARGIN and same:
+            break
+        if same or turn == OUTLINE_ROUNDS - 2:
+            closer = _trusted_margin(points, outline, restored)
+            if closer == margin and same:
                 break
-            margin = _trusted_margin(points, outline, restored)
+            margin, known = closer, kernel
     return _Outlined(fine, outline, restored, skin, margin, scatter, level)
 
 
