@@ -20,14 +20,14 @@ from scipy.spatial import cKDTree
 from estimation import se3
 from estimation.errors import StillbedError
 from estimation.scans.scan import Scan, scan_from_triangles
-from estimation.se3 import Array, Index, Mask
-from hardware.bench.figures import Figure, at_least, at_most, with_progress
-from hardware.bench.figures import Target
+from estimation.se3 import Array, Index
+from hardware.bench.figures import Figure, Target, at_least, at_most, with_progress
 from hardware.files.mesh_file import read_raw_mesh
 from planning.layers.checkpoints import ToolLimits, tilt_field, tool_rotations
 from planning.layers.grid import as_multi, interpolate
+from planning.layers.outline import nodes_within
 from planning.layers.repair import repair_mesh
-from planning.layers.wound import WoundVolume, find_wound, nodes_within
+from planning.layers.wound import WoundVolume, find_wound
 
 Rng = np.random.Generator
 WOUND_SIZES, WOUND_DEPTHS = (10.0, 50.0), (3.0, 7.0)  # mm
@@ -87,7 +87,9 @@ def _figures(
     carved: list[CarvedWound], found: list[WoundScore], given: list[WoundScore], reasons: list[str]
 ) -> list[Figure]:
     iou = np.array([s.iou for s in found])
-    skin, volume, tilt, inside = (np.array([getattr(s, k) for s in given]) for k in ("skin", "volume", "tilt", "inside"))
+    skin, volume, tilt, inside = (
+        np.array([getattr(s, k) for s in given]) for k in ("skin", "volume", "tilt", "inside")
+    )
     plate = np.array([c.plate for c in carved])
     note = f"{len(carved)} wounds; asked or refused: {len(reasons)}"
     return [
@@ -127,7 +129,9 @@ def _score(true: CarvedWound, found: WoundVolume) -> WoundScore:
     tilts = interpolate(found.grid, tilt_field(found.grid, found.skin, inside, ToolLimits()).values, points[:, :2])
     axes = tool_rotations(tilts, 0.0)[:, :, 2]
     tilt = float(np.median(np.arccos(np.clip(np.einsum("ni,ni->n", axes, normals), -1, 1))))
-    sigma = interpolate(found.grid, found.sigma, points[:, :2]) if hasattr(found, "sigma") else np.full(len(off), np.nan)
+    sigma = (
+        interpolate(found.grid, found.sigma, points[:, :2]) if hasattr(found, "sigma") else np.full(len(off), np.nan)
+    )
     within = float(np.mean(np.abs(off) < 2 * sigma)) if np.isfinite(sigma).all() else float("nan")
     return WoundScore(iou, float(np.sqrt(np.mean(off**2))), found.findings.volume / true.volume, tilt, within)
 
@@ -157,7 +161,9 @@ def carve(body: Scan, rng: Rng) -> CarvedWound:
         kept &= far > rng.uniform(*HOLE_RADII)
     pose = se3.make(se3.exp_rotation(rng.normal(0, 1.5, 3)), rng.uniform(-300, 300, 3))
     moved = [se3.transform_points(pose, each) for each in (scanned, rim, skin[0])]
-    return CarvedWound(moved[0], triangles[kept], moved[1], moved[2], skin[1] @ pose[:3, :3].T, volume, size, plate, undercut)
+    return CarvedWound(
+        moved[0], triangles[kept], moved[1], moved[2], skin[1] @ pose[:3, :3].T, volume, size, plate, undercut
+    )
 
 
 def scan_normals(vertices: Array, triangles: Index) -> Array:
@@ -290,7 +296,9 @@ def _mesh_body(path: Path) -> Scan:
 def _tube(radius: Callable[[Array, Array], Array], length: float) -> Scan:
     """The outside of a body of `radius` (angle, height along it), mm, `length` mm long, open at both ends."""
     rows, columns = round(length / 3.0), 360
-    height, angle = np.meshgrid(np.linspace(0, length, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij")
+    height, angle = np.meshgrid(
+        np.linspace(0, length, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
+    )
     r = radius(angle, height)
     points = np.stack([r * np.cos(angle), r * np.sin(angle), height], axis=-1).reshape(-1, 3)
     number = np.arange(rows * columns).reshape(rows, columns)

@@ -27,8 +27,9 @@ from planning.layers.checkpoints import (
     tilt_field,
 )
 from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, unroll
+from planning.layers.outline import nodes_within
 from planning.layers.slicing import BumpPassing, Layer, LayerMode, LayerStack, Tissue, layer_stack
-from planning.layers.wound import WoundFindings, WoundVolume, nodes_within
+from planning.layers.wound import WoundFindings, WoundVolume
 from planning.path import Path
 
 Report = Callable[[int, int], None]  # (layers done, layers)

@@ -51,7 +51,6 @@ class BentBase:
         u, height = _unbent(flat[:, 0], z, near)
         return np.column_stack([u, v]), height
 
-
     def heights_over(self, flat: Array, z: Array, wanted: Array) -> tuple[Array, Array, Mask]:
         """Heights (N,) over the plane at places (N, 2) of it whose points are `wanted` (N,) mm over the base.
 
@@ -141,7 +140,9 @@ class RestoredSkin:
         """Covariance (M, M), mm^2, of the heights at places (M, 2)."""
         near, terms = self._correlation(places), _quadric(places, self.size)
         lacking = terms - near @ self.solved
-        whole = _matern(cdist(places, places), self.kernel.reach, self.kernel.smooth) - near @ cho_solve(self.factor, near.T)
+        whole = _matern(cdist(places, places), self.kernel.reach, self.kernel.smooth) - near @ cho_solve(
+            self.factor, near.T
+        )
         return np.asarray(self.kernel.variance * (whole + lacking @ self.bound @ lacking.T))
 
     def deviation(self, places: Array) -> Array:
@@ -149,7 +150,9 @@ class RestoredSkin:
         near, terms = self._correlation(places), _quadric(places, self.size)
         lacking = terms - near @ self.solved
         own = 1 - np.einsum("mn,nm->m", near, cho_solve(self.factor, near.T))
-        return np.sqrt(self.kernel.variance * np.maximum(own + np.einsum("mi,ij,mj->m", lacking, self.bound, lacking), 0))
+        return np.sqrt(
+            self.kernel.variance * np.maximum(own + np.einsum("mi,ij,mj->m", lacking, self.bound, lacking), 0)
+        )
 
     def over(self, grid: Grid) -> tuple[Array, Array]:
         """Places (H, W, 2) on the base and heights (H, W) over the plane of the skin at the nodes of a grid.

@@ -26,7 +26,8 @@ from estimation.errors import InputError
 from estimation.se3 import Array, Index
 from planning.fill.region import without_bumps
 from planning.layers.grid import Grid, Mask, as_multi, interpolate, positive_region, smoothed
-from planning.layers.wound import OUTLINE_TOLERANCE, WoundVolume, nodes_within
+from planning.layers.outline import OUTLINE_TOLERANCE, nodes_within
+from planning.layers.wound import WoundVolume
 
 EIGHT_NEIGHBOURS = np.ones((3, 3), int)  # nodes joined across corners too, so that no outline runs between them
 # of a layer's height that a bump may stand over its top: the layer over it keeps three tenths of its own there,
