@@ -251,6 +251,11 @@ _SUBJECTS = (
         _number("--minutes", 10.0, "M", "that are stood for; default 10"),
         _number("--pictures", 240, "N", "evenly over them; default 240"),
     ),
+    _subject("wounds", "wounds", "wounds carved into bodies: found, the skin restored, its volume and its normal")(
+        _option("bodies", nargs="*", type=Path, metavar="MESH", help="of persons or limbs, mm; five own without"),
+        _number("--count", 40, "N", "wounds; default 40"),
+        SEED,
+    ),
     _subject("views", "pictures", "skin that deforms, grazing views with glare, a cube's edges")(
         _number("--seconds", 8.0, "S", "of each sequence; default 8")
     ),

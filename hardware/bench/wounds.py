@@ -1,7 +1,7 @@
 """Subject `wounds`: wounds carved into bodies, the skin before carving being the truth of what is found and restored.
 
 Bodies are synthetic limbs and trunks, or meshes that are given: whole persons too, as the wound is carved anywhere on
-them and a patch about it is cut out. Each scan has noise, holes, and any pose; a part of the wounds has an undercut rim.
+them and a patch about it is cut out. Each scan has noise, holes, and any pose; some of the wounds have undercut rims.
 """
 
 from __future__ import annotations
@@ -122,17 +122,13 @@ def _score(true: CarvedWound, found: WoundVolume) -> WoundScore:
     points = se3.transform_points(plane_from_scan, true.skin)
     normals = true.normals @ plane_from_scan[:3, :3].T
     off = (interpolate(found.grid, found.skin, points[:, :2]) - points[:, 2]) * normals[:, 2]
-    rims = [shapely.make_valid(shapely.Polygon(se3.transform_points(plane_from_scan, r)[:, :2])) for r in (true.rim,)]
-    shape = as_multi(rims[0])
+    shape = as_multi(shapely.make_valid(shapely.Polygon(se3.transform_points(plane_from_scan, true.rim)[:, :2])))
     iou = shapely.intersection(shape, found.outline).area / shapely.union(shape, found.outline).area
     inside = nodes_within(found.grid, found.outline)
     tilts = interpolate(found.grid, tilt_field(found.grid, found.skin, inside, ToolLimits()).values, points[:, :2])
     axes = tool_rotations(tilts, 0.0)[:, :, 2]
     tilt = float(np.median(np.arccos(np.clip(np.einsum("ni,ni->n", axes, normals), -1, 1))))
-    sigma = (
-        interpolate(found.grid, found.sigma, points[:, :2]) if hasattr(found, "sigma") else np.full(len(off), np.nan)
-    )
-    within = float(np.mean(np.abs(off) < 2 * sigma)) if np.isfinite(sigma).all() else float("nan")
+    within = float(np.mean(np.abs(off) < 2 * interpolate(found.grid, found.sigma, points[:, :2])))
     return WoundScore(iou, float(np.sqrt(np.mean(off**2))), found.findings.volume / true.volume, tilt, within)
 
 
@@ -176,7 +172,7 @@ def scan_normals(vertices: Array, triangles: Index) -> Array:
 
 
 def _patch(body: Scan, radius: float, rng: Rng) -> tuple[Array, Index, Array, Array]:
-    """Vertices, triangles, middle (3,) and normal (3,) of a patch seen from one side, its edges SCAN_SPACING at most."""
+    """Vertices, triangles, middle (3,) and normal (3,) of a patch seen from one side, its edges about SCAN_SPACING."""
     for _ in range(PLACE_TRIES):
         at = int(rng.integers(len(body.vertices)))
         middle, normal = body.vertices[at], body.normals[at]
@@ -241,7 +237,7 @@ def _inside(chart: Array, edge: Callable[[Array], Array]) -> Array:
     line = np.column_stack([np.cos(angle), np.sin(angle)]) * edge(angle)[:, None]
     far, _ = cKDTree(line).query(chart)
     within = np.hypot(*chart.T) < edge(np.arctan2(chart[:, 1], chart[:, 0]))
-    return np.where(within, far, -far)
+    return np.asarray(np.where(within, far, -far))
 
 
 def _carved(
@@ -314,33 +310,33 @@ def _swell(angle: Array, height: Array, at: tuple[float, float], wide: tuple[flo
     return np.asarray(np.exp(-((turned / wide[0]) ** 2) - ((height - at[1]) / wide[1]) ** 2))
 
 
+def _calf(a: Array, h: Array) -> Array:
+    return 38 + 0.05 * h + 11 * _swell(a, h, (1.2, 190), (0.9, 75)) + 8 * _swell(a, h, (2.2, 170), (0.8, 70))
+
+
+def _thigh(a: Array, h: Array) -> Array:
+    return np.asarray(62 + 0.08 * h + 7 * np.cos(2 * a + 0.4) + 6 * _swell(a, h, (0.0, 150), (0.9, 90)))
+
+
+def _belly(a: Array, h: Array) -> Array:
+    navel = 9 * _swell(a, h, (1.57, 150), (0.09, 9))
+    return 130 + 34 * np.cos(2 * a) + 28 * _swell(a, h, (1.57, 180), (0.9, 110)) - navel
+
+
+def _back(a: Array, h: Array) -> Array:
+    spine, blades = 9 * _swell(a, h, (1.57, 200), (0.14, 400)), ((1.05, 290), (2.09, 290))
+    return 130 + 36 * np.cos(2 * a) - spine + 10 * sum(_swell(a, h, at, (0.25, 55)) for at in blades)
+
+
+def _chest(a: Array, h: Array) -> Array:
+    ribs, breasts = np.sin(2 * np.pi * (h + 18 * np.cos(a)) / 33), ((1.1, 260), (2.04, 260))
+    return np.asarray(128 + 30 * np.cos(2 * a) + ribs + 14 * sum(_swell(a, h, at, (0.33, 55)) for at in breasts))
+
+
 LIMBS: dict[str, tuple[Callable[[Array, Array], Array], float]] = {
-    "calf": (
-        lambda a, h: 38 + 0.05 * h + 11 * _swell(a, h, (1.2, 190), (0.9, 75)) + 8 * _swell(a, h, (2.2, 170), (0.8, 70)),
-        300.0,
-    ),
-    "thigh": (lambda a, h: 62 + 0.08 * h + 7 * np.cos(2 * a + 0.4) + 6 * _swell(a, h, (0.0, 150), (0.9, 90)), 320.0),
-    "belly": (
-        lambda a, h: (
-            130 + 34 * np.cos(2 * a) + 28 * _swell(a, h, (1.57, 180), (0.9, 110)) - 9 * _swell(a, h, (1.57, 150), (0.09, 9))
-        ),
-        360.0,
-    ),
-    "back": (
-        lambda a, h: (
-            130 + 36 * np.cos(2 * a) - 9 * _swell(a, h, (1.57, 200), (0.14, 400))
-            + 10 * _swell(a, h, (1.05, 290), (0.25, 55)) + 10 * _swell(a, h, (2.09, 290), (0.25, 55))
-        ),
-        400.0,
-    ),
-    "chest": (
-        lambda a, h: (
-            128 + 30 * np.cos(2 * a) + 14 * _swell(a, h, (1.1, 260), (0.33, 55)) + 14 * _swell(a, h, (2.04, 260), (0.33, 55))
-            + 1.0 * np.sin(2 * np.pi * (h + 18 * np.cos(a)) / 33)
-        ),
-        360.0,
-    ),
-}  # fmt: skip  # radius (mm) by angle and height, and length, of each
+    **{"calf": (_calf, 300.0), "thigh": (_thigh, 320.0), "belly": (_belly, 360.0)},
+    **{"back": (_back, 400.0), "chest": (_chest, 360.0)},
+}  # radius (mm) by angle and height, and length, of each
 
 
 @cache

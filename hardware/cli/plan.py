@@ -68,6 +68,9 @@ def _add_scan(command: argparse.ArgumentParser) -> None:
     add("--flip", action="store_true", help="turn SCAN over, whose normals point inwards")
     outline = "outline of the wound, x_mm,y_mm[,z_mm] in SCAN's frame, mm; default: found"
     add("--outline", type=Path, metavar="CSV", help=outline)
+    clicks = "three places or more on the wound's rim, in SCAN's frame, mm, instead of an outline"
+    add("--clicks", metavar="X,Y,Z/X,Y,Z/X,Y,Z", help=clicks)
+    add("--wound", type=int, metavar="N", help="which of the places, where a plan was refused with PATH_question.html")
 
 
 def _add_layers(command: argparse.ArgumentParser) -> None:
@@ -138,7 +141,8 @@ def _run_plan(a: argparse.Namespace) -> int:
     values = {f.name: getattr(a, f.name) for f in fields(PlanSettings) if f.name != "tissues"}
     settings = PlanSettings(tissues=tuple(a.tissue), **values)
     source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
-    text, damage = run_plan(PlanRequest(*source, not a.no_pictures, a.force, a.arm, settings))
+    order = PlanRequest(*source, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, settings=settings)
+    text, damage = run_plan(order)
     print(text)
     return damage_code(damage)
 

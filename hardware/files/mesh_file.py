@@ -306,7 +306,7 @@ def _read_apart(path: Path, told: Announcement, kept: MeshReader | None) -> RawM
     if told.faces and triangles < told.faces:
         raise InputError(path, "faces that could be read", triangles, f"{told.faces}, {cut}")
     told.check(triangles if told.faces else 0)
-    return RawMesh(read["vertices"], read["triangles"])
+    return RawMesh(read["vertices"], read["triangles"], read.get("colours"))
 
 
 def read_mesh(path: str | Path, reader: MeshReader | None = None) -> MeshFile:

@@ -59,6 +59,7 @@ class RawMesh:
 
     vertices: Array  # (V, 3), in the file's unit
     triangles: NDArray[np.int64]  # (T, 3) numbers of vertices
+    colours: NDArray[np.uint8] | None = None  # (V, 3) red, green and blue; None where the file has none
 
 
 class MeshReaderError(StillbedError):
@@ -79,6 +80,8 @@ class MeshReader:
 
     def read(self, path: Path, cloud: bool) -> Arrays:
         """What a file holds: `vertices` (V, 3), `triangles` (T, 3), and `count` of the vertices in the file.
+
+        Where it has colours also `colours` (V, 3), red, green and blue.
 
         cloud: points without triangles, through which a surface is laid. MeshReaderError where that was not to be.
         """
@@ -202,11 +205,18 @@ def _mesh_of(path: str) -> Arrays:
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Warning)
     if path.lower().endswith((".ply", ".off")):  # in float64; the others' reader does without quadrangles
         mesh = o3d.io.read_triangle_mesh(path)
-        vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        vertices, triangles, colours = np.asarray(mesh.vertices), np.asarray(mesh.triangles), _colours_of(mesh)
     else:
         tensors = o3d.t.io.read_triangle_mesh(path)
-        vertices, triangles = tensors.vertex.positions.numpy(), tensors.triangle.indices.numpy()
-    return {"vertices": vertices.astype(np.float64), "triangles": triangles.astype(np.int64), "count": len(vertices)}
+        vertices, triangles, colours = tensors.vertex.positions.numpy(), tensors.triangle.indices.numpy(), {}
+    arrays = {"vertices": vertices.astype(np.float64), "triangles": triangles.astype(np.int64)}
+    return {**arrays, "count": len(vertices), **colours}
+
+
+def _colours_of(mesh: Any) -> Arrays:
+    """The colours of a mesh of open3d, if it has any."""
+    shares = np.asarray(mesh.vertex_colors)
+    return {"colours": np.rint(255 * shares).astype(np.uint8)} if len(shares) == len(mesh.vertices) > 0 else {}
 
 
 def _points_of(path: str) -> Any:
@@ -242,7 +252,8 @@ def surface_through(cloud: Any) -> Arrays:
     cloud.normalize_normals()
     radii = o3d.utility.DoubleVector([apart * radius for radius in BALL_RADII])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
-    return {"vertices": np.asarray(mesh.vertices), "triangles": np.asarray(mesh.triangles, np.int64), "count": count}
+    arrays = {"vertices": np.asarray(mesh.vertices), "triangles": np.asarray(mesh.triangles, np.int64)}
+    return {**arrays, "count": count, **_colours_of(mesh)}
 
 
 def _thinned(cloud: Any) -> Any:

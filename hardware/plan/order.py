@@ -15,10 +15,12 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import read_contour
+from hardware.plan.question import clicks_of, scan_colour, write_question
 from hardware.process.progress import ProgressReport, no_progress
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits
+from planning.layers.places import WoundQuestionError
 from planning.layers.plan import PlanOrder, flat_wound
 from planning.layers.repair import Repairs, repair_mesh
 from planning.layers.slicing import BumpPassing, LayerMode, Tissue
@@ -107,6 +109,8 @@ class PlanRequest:
     pictures: bool = True
     force: bool = False
     arm: Path | None = None  # whose reach of each checkpoint is written
+    clicks: str | None = None  # places on the wound's rim, mm, as the command line has them
+    wound: int | None = None  # of the places that a question has shown, from 1
     settings: PlanSettings = field(default_factory=PlanSettings)
 
 
@@ -260,14 +264,27 @@ def subject_of(request: PlanRequest, flat: bool, progress: ProgressReport = no_p
         if contour.shape[1] != 2:
             raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
         return PlanSubject(request.scan.name, flat_wound(contour, height, request.scan), None)
+    ways = [request.outline, request.clicks, request.wound]
+    if sum(way is not None for way in ways) > 1:
+        raise InputError(COMMAND_LINE, "--outline, --clicks, --wound", "more than one", "one that says where it is")
     drawn = None if request.outline is None else read_contour(request.outline)
+    clicks = None if request.clicks is None else clicks_of(request.clicks, "--clicks")
     raw = read_raw_mesh(request.scan)
     progress(1, SCAN_STEPS)
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
     scan, repairs = repair_mesh(vertices, raw.triangles, request.scan, request.flip)
     progress(2, SCAN_STEPS)
     outline = None if drawn is None else _outline(drawn, scan.vertices)
-    wound = find_wound(scan, step, request.scan, outline, request.flip)
+    colour = scan_colour(scan, vertices, raw.colours, request.scan) if outline is None and clicks is None else None
+    try:
+        wound = find_wound(
+            scan, step, request.scan, outline, request.flip, clicks=clicks, number=request.wound, colour=colour
+        )
+    except WoundQuestionError as question:
+        page = request.out.with_name(f"{request.out.stem}_question.html")
+        write_question(page, scan, vertices, raw.colours, question)
+        allowed = f"{question.allowed}: pictures of them are in {page}"
+        raise InputError(question.where, question.what, question.got, allowed) from None
     progress(SCAN_STEPS, SCAN_STEPS)
     return PlanSubject(request.scan.name, wound, repairs)
 

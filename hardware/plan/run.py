@@ -30,7 +30,7 @@ from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text
 from hardware.process.provenance import provenance
 from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
-from planning.layers.wound import WoundVolume
+from planning.layers.wound import WoundFindings, WoundVolume
 from planning.path import check_path
 from planning.placement import PathPlacement, placement_by_scan
 
@@ -49,6 +49,7 @@ LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
+SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
@@ -177,7 +178,7 @@ def _pictures(
 def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path, written: Sequence[str]) -> str:
     f = plan.wound.findings
     lines = [
-        f"wound: {f.area:.0f} mm^2, up to {f.depth:.2f} mm deep, {f.volume:.0f} mm^3"
+        f"wound: {f.area:.0f} mm^2, up to {f.depth:.2f} mm deep, {volume_text(f)}"
         + ("" if f.given else f"; outline found where the scan is {f.level:.2f} mm deep"),
         f"path: {count_text(sum(bool(layer.beads) for layer in plan.layers), 'layer')}, {len(plan.path)} checkpoints, "
         f"{len_text(total.printed)} of bead, {len_text(total.travelled)} of travel, {duration_text(total.seconds)}",
@@ -205,7 +206,7 @@ def findings_rows(plan: Plan) -> list[tuple[str, str]]:
         ("outline", "given" if f.given else f"found: where the scan is {f.level:.2f} mm deep"),
         ("area over which it is open", f"{f.area:.1f} mm²"),
         ("greatest depth under the restored skin", f"{f.depth:.2f} mm"),
-        ("volume up to the restored skin", f"{f.volume:.0f} mm³"),
+        ("volume up to the restored skin", volume_text(f)),
         ("volume of the beads", f"{plan.points.volume.sum():.0f} mm³"),
     ]
     rows += [("bumps of the bed", bumps_text(plan))] if layers_with_bumps(plan) else []
@@ -214,10 +215,19 @@ def findings_rows(plan: Plan) -> list[tuple[str, str]]:
     return rows + [
         ("noise of the scan", f"{f.noise:.3f} mm, smoothed over {f.smoothing:.2f} mm"),
         ("skin around off the restored surface", f"{f.scatter:.3f} mm"),
+        ("restored skin's standard deviation, at most", f"{f.skin_sigma:.2f} mm"),
+        ("skin left out along the rim", f"{f.margin:.1f} mm"),
         ("guessed in holes of the scan", f"{f.closed:.1f} mm²"),
         ("hidden under overhangs", f"{f.hidden:.1f} mm²"),
         ("tool off the normal, at worst, first and last layer", f"{low_tilt:.1f}°, {high_tilt:.1f}°"),
     ]
+
+
+def volume_text(findings: WoundFindings) -> str:
+    """The volume, and its 95 % interval where the skin's place leaves it open."""
+    spread = SIGMA_95 * findings.volume_sigma
+    interval = f" (95 %: {max(findings.volume - spread, 0):.0f} to {findings.volume + spread:.0f})" if spread else ""
+    return f"{findings.volume:.0f} mm^3{interval}"
 
 
 def notes_of(plan: Plan) -> list[str]:

@@ -219,4 +219,4 @@ def _largest(chosen: Mask, inside: Mask) -> Mask:
     """The piece (H, W) of the nodes chosen that has most nodes inside; none where it has none."""
     pieces, _ = label(chosen)
     share = np.bincount(pieces[inside], minlength=2)[1:]
-    return (pieces == int(np.argmax(share)) + 1) & bool(share.any())
+    return np.asarray((pieces == int(np.argmax(share)) + 1) & bool(share.any()))

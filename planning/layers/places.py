@@ -158,6 +158,10 @@ class WoundQuestionError(InputError):
         super().__init__(where, "wound", got, allowed)
         self.places = tuple(places)
 
+    def __reduce__(self) -> tuple[type[WoundQuestionError], tuple[str, tuple[WoundPlace, ...]]]:  # type: ignore[override]
+        """Pickled by its parts."""
+        return type(self), (self.where, self.places)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanColour:

@@ -150,9 +150,8 @@ class RestoredSkin:
         near, terms = self._correlation(places), _quadric(places, self.size)
         lacking = terms - near @ self.solved
         own = 1 - np.einsum("mn,nm->m", near, cho_solve(self.factor, near.T))
-        return np.sqrt(
-            self.kernel.variance * np.maximum(own + np.einsum("mi,ij,mj->m", lacking, self.bound, lacking), 0)
-        )
+        squares = own + np.einsum("mi,ij,mj->m", lacking, self.bound, lacking)
+        return np.asarray(np.sqrt(self.kernel.variance * np.maximum(squares, 0)))
 
     def over(self, grid: Grid) -> tuple[Array, Array]:
         """Places (H, W, 2) on the base and heights (H, W) over the plane of the skin at the nodes of a grid.

@@ -17,7 +17,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
-from planning.layers.grid import Grid, HeightMap, as_multi, filled, height_map, interpolate
+from planning.layers.grid import Grid, HeightMap, as_multi, filled, gradient, height_map, interpolate
 from planning.layers.outline import (
     MIN_DEPTH,
     MIN_NODES,
@@ -144,9 +144,8 @@ def _moved(xy: Array, first: HeightMap, turn: Array) -> Array:
 def _plane_over(place: OutlinedWound) -> Array:
     """The plane across the skin over an outline: origin on it over the outline's middle, z its mean normal there."""
     grid = place.fine.grid
-    steep_y, steep_x = np.gradient(place.skin, grid.step)
-    inside = nodes_within(grid, place.outline)
-    z = np.array([-steep_x[inside].mean(), -steep_y[inside].mean(), 1.0])
+    slopes = gradient(grid, place.skin)[nodes_within(grid, place.outline)].mean(axis=0)
+    z = np.array([-slopes[0], -slopes[1], 1.0])
     rotation = place.fine.surface_from_plane[:3, :3]
     middle = np.array(place.outline.centroid.coords[0])
     origin = np.array([[*middle, float(interpolate(grid, place.skin, middle[None])[0])]])
