@@ -16,18 +16,24 @@ from estimation.errors import InputError
 from hardware.bench.fill import random_wound
 from planning.fill.bead import (
     PATTERN_KINDS,
+    ROUNDING_GRID,
     SHARP_TURN,
     Bead,
     Pattern,
     PatternKind,
     PrintPace,
+    Region,
     even_bead,
+    fill_coverage,
     print_cost,
+    region_of,
+    roughness,
     travel_length,
     turn_angles,
+    union_of,
+    without_bumps,
 )
 from planning.fill.fill import fill, settle_angle, smooth_corners
-from planning.fill.region import ROUNDING_GRID, Region, fill_coverage, region_of, roughness, union_of, without_bumps
 from planning.fill.spiral import order_runs
 
 PACE = PrintPace()

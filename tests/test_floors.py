@@ -79,7 +79,10 @@ OWNERS = {  # library: the files that may import it
     "rosbags": ("hardware/recording/ros_messages.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
-    "shapely": ("hardware/bench/fill.py", "hardware/plan/page.py", "planning/fill/*.py", "planning/layers/*.py"),
+    "shapely": (
+        *("hardware/bench/fill.py", "hardware/bench/wounds.py", "hardware/plan/page.py"),
+        *("planning/fill/*.py", "planning/layers/*.py"),
+    ),
     "time": ("hardware/process/clock.py",),
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),

@@ -18,8 +18,7 @@ from estimation.se3 import Array
 from hardware.files.path_file import gcode_text, read_path, write_path
 from hardware.simulator.scene.shape import Wound as Carved
 from hardware.simulator.scene.shape import body
-from planning.fill.bead import Bead, Pattern, even_bead
-from planning.fill.region import fill_coverage
+from planning.fill.bead import Bead, Pattern, even_bead, fill_coverage
 from planning.layers.checkpoints import CheckpointSettings, bead_points, spacing_over, with_spacing
 from planning.layers.grid import Grid, grid_over, interpolate, positive_region, topmost
 from planning.layers.plan import Plan, PlanOrder, figures_of, flat_wound, make_plan, seconds_to, total_of

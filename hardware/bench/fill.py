@@ -29,9 +29,19 @@ from estimation.se3 import Array
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress
 from hardware.process.clock import CpuClock, ProcessorClock
 from planning.fill import PATTERN_KINDS, PatternKind
-from planning.fill.bead import Bead, Pattern, PrintPace, print_cost
+from planning.fill.bead import (
+    Bead,
+    FillCoverage,
+    Pattern,
+    PrintPace,
+    Region,
+    areas,
+    fill_coverage,
+    only_areas,
+    print_cost,
+    region_of,
+)
 from planning.fill.fill import fill
-from planning.fill.region import FillCoverage, Region, areas, fill_coverage, only_areas, region_of
 
 Rng = np.random.Generator
 MAX_ROUGHNESS = 0.2  # mm: noise of the points of a contour, as segmentation leaves it

@@ -320,12 +320,12 @@ def _thigh(a: Array, h: Array) -> Array:
 
 def _belly(a: Array, h: Array) -> Array:
     navel = 9 * _swell(a, h, (1.57, 150), (0.09, 9))
-    return 130 + 34 * np.cos(2 * a) + 28 * _swell(a, h, (1.57, 180), (0.9, 110)) - navel
+    return np.asarray(130 + 34 * np.cos(2 * a) + 28 * _swell(a, h, (1.57, 180), (0.9, 110)) - navel)
 
 
 def _back(a: Array, h: Array) -> Array:
     spine, blades = 9 * _swell(a, h, (1.57, 200), (0.14, 400)), ((1.05, 290), (2.09, 290))
-    return 130 + 36 * np.cos(2 * a) - spine + 10 * sum(_swell(a, h, at, (0.25, 55)) for at in blades)
+    return np.asarray(130 + 36 * np.cos(2 * a) - spine + 10 * sum(_swell(a, h, at, (0.25, 55)) for at in blades))
 
 
 def _chest(a: Array, h: Array) -> Array:

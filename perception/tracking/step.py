@@ -25,7 +25,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import DuplicateFilter, FrameSet, Image, Roi, of_whole_pictures, parallel_map
 from perception.lens import Lenses, unfiltered
-from perception.mapping.colours import Colours
+from perception.mapping.aliases import Colours
 from perception.mapping.features import Relocaliser, grey
 from perception.mapping.mapping import Mapping, TrackedSet
 from perception.mapping.masks import Tool, TrackingMasks

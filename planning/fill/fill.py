@@ -19,13 +19,16 @@ from planning.fill.bead import (
     Bead,
     Pattern,
     PrintPace,
+    Region,
     bead_fit,
+    check_region,
+    covered_area,
     even_bead,
     print_cost,
+    roughness,
     travel_length,
     turn_angles,
 )
-from planning.fill.region import Region, check_region, covered_area, roughness
 from planning.fill.rings import ring_levels
 from planning.fill.spiral import BeadRun, fill_gaps, nest_rings, order_runs, separate_rings, spiral_runs
 

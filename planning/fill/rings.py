@@ -20,8 +20,7 @@ from scipy.spatial import QhullError, Voronoi, cKDTree
 from shapely.geometry.base import BaseGeometry
 
 from estimation.se3 import Array
-from planning.fill.bead import Bead, BeadFit, even_bead
-from planning.fill.region import Region, covered_area, difference, union_of
+from planning.fill.bead import Bead, BeadFit, Region, covered_area, difference, even_bead, union_of
 from planning.fill.spiral import dot_beads, widen_ring
 
 MAX_RADIUS_SLOPE = 0.38  # mm per mm, of the radius along the axis: cos 67.5 degrees, as Kuipers et al. 2020

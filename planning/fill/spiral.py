@@ -20,8 +20,7 @@ from scipy.ndimage import convolve1d
 from shapely.geometry.base import BaseGeometry
 
 from estimation.se3 import Array
-from planning.fill.bead import POINT_TOLERANCE, Bead, BeadFit, even_bead
-from planning.fill.region import Region, covered_area, difference
+from planning.fill.bead import POINT_TOLERANCE, Bead, BeadFit, Region, covered_area, difference, even_bead
 
 BeadRun = list[Bead]  # beads that follow one another
 MAX_IMPROVEMENTS = 300  # improvements: a bound on time, reached by no layer that a wound was seen to need

@@ -13,9 +13,8 @@ from shapely import MultiPolygon
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from planning.fill.bead import SHARP_TURN, Bead, Pattern, PrintPace
+from planning.fill.bead import SHARP_TURN, Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
 from planning.fill.fill import fill, settle_angle
-from planning.fill.region import FillCoverage, fill_coverage, region_of
 from planning.layers.checkpoints import (
     Checkpoints,
     CheckpointSettings,

@@ -24,7 +24,7 @@ from shapely import MultiPolygon
 
 from estimation.errors import InputError
 from estimation.se3 import Array, Index
-from planning.fill.region import without_bumps
+from planning.fill.bead import without_bumps
 from planning.layers.grid import Grid, Mask, as_multi, interpolate, positive_region, smoothed
 from planning.layers.outline import OUTLINE_TOLERANCE, nodes_within
 from planning.layers.wound import WoundVolume
