@@ -289,7 +289,7 @@ def _mesh_body(path: Path) -> Scan:
     return scan_from_triangles(mesh.vertices, mesh.triangles)
 
 
-def _tube(radius: Callable[[Array, Array], Array], length: float) -> Scan:
+def tube(radius: Callable[[Array, Array], Array], length: float) -> Scan:
     """The outside of a body of `radius` (angle, height along it), mm, `length` mm long, open at both ends."""
     rows, columns = round(length / 3.0), 360
     height, angle = np.meshgrid(
@@ -341,4 +341,4 @@ LIMBS: dict[str, tuple[Callable[[Array, Array], Array], float]] = {
 
 @cache
 def _limb(kind: str) -> Scan:
-    return _tube(*LIMBS[kind])
+    return tube(*LIMBS[kind])

@@ -129,7 +129,7 @@ def _mirrored(weight: Array) -> Array:
 
 MAX_PLACES = 6  # depressions that are outlined and judged
 RIM_INSIDE, RIM_OUTSIDE = 2.0, 1.0  # mm from the outline, between which a wound's wall falls
-RIVAL_CLARITY = 0.15  # of the clearest depression's: less clear ones are not looked at
+RIVAL_CLARITY = 0.2  # of the clearest depression's: less clear ones are not looked at
 # on bodies without a wound the best place had 4.2 of 24, beside one 13; carved wounds 33 or more, the simulator's 11
 MIN_SCORE, SURE_SCORE, RIVAL_SHARE = 4.5, 6.0, 0.4  # of a place; of one that is planned; and of another as likely
 INSIDE_OUT_CLARITY = 2.0  # of a bulge that may be a wound from the other side
