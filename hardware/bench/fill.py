@@ -1,9 +1,8 @@
 """Subjects `fill` and `plan`: beads in contours and random wounds, and a whole plan of a large wound.
 
 `fill`: coverage and time of contours, beside other planners', and of random wounds; a picture of all patterns.
-`plan`: from a damaged mesh in memory to the path: time, memory, fit. Each plan is made in a process of its own, to have
-its own peak memory. The time is of the processor, from the mesh's arrays to the path: without making the scan and
-writing files; the time of imports is given beside it.
+`plan`: from a damaged mesh in memory to the path: time, memory, fit. Each plan has a process of its own. The time is of
+the processor, from the mesh's arrays to the path, without imports.
 """
 
 from __future__ import annotations
@@ -157,8 +156,7 @@ REGION_GENERATORS: dict[str, Callable[[Rng], Region]] = {
 
 PX_PER_MM, DRAWING_MARGIN, CAPTION_HEIGHT = 9.0, 12.0, 34.0  # px around each drawing; px for two lines under it
 DRAWING_COLUMNS = 3
-DRAWN_WIDTH = 0.8  # mm, of the beads drawn
-WIDTH_STEP = 0.05  # mm, to which widths are rounded
+DRAWN_WIDTH, WIDTH_STEP = 0.8, 0.05  # mm, of the beads drawn, and to which widths are rounded
 
 
 def picture() -> str:
