@@ -34,7 +34,7 @@ BASE_FRAME, SURFACE_FRAME, NOZZLE_FRAME = "base", "surface", "nozzle"
 M_PER_MM = 1e-3
 MAX_TIME_SECOND = 2**31 - 1  # that ROS's Time holds: in 2038
 
-OVERLAY_PERIOD = 0.19  # s between two drawings over the pictures: each costs as much as five poses
+OVERLAY_PERIOD = 0.19  # s between two drawings over the pictures, each as dear as five poses, and two claims
 PATH_PERIOD = 1.0  # s between two clouds of the path, which differ by what is printed
 NOZZLE_PERIOD = 0.039  # s between two places of the nozzle: every second tick of 20 ms
 MAX_OVERLAY_POINTS = 100  # of a line over a picture
@@ -354,8 +354,6 @@ class ViewerChannels:
         moved = odometry(lies, pose.covariance, pose.twist, pose.twist_covariance, instant)
         yield RosMessage("/surface", ODOMETRY, moved)
         middle = self._path.mean(axis=0) if len(self._path) else np.zeros(3)
-        if np.isfinite(pose.covariance).all():
-            yield self.error("claimed", float(pose.error_at(middle[None])[0]))
         if self._truth is not None and self._truth[0] == pose.stamp:
             if self._true_from_own is None and pose.state is TrackState.TRACKING:
                 self._true_from_own = se3.inverse(self._truth[1]) @ lies
@@ -365,6 +363,8 @@ class ViewerChannels:
                 yield self.error("tracking", float(np.linalg.norm(off)))
         if pose.stamp - self._drawn >= OVERLAY_PERIOD:
             self._drawn = pose.stamp
+            if np.isfinite(pose.covariance).all():
+                yield self.error("claimed", float(pose.error_at(middle[None])[0]))
             yield from self._overlays(pose, instant)
 
     def _overlays(self, pose: SurfacePose, instant: int) -> Iterator[RosMessage]:
