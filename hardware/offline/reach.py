@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.files.arm_file import far_limits_text, read_arm
 from hardware.files.path_file import read_path, write_path
-from hardware.process.progress import prepare_out
+from hardware.process.progress import duration_text, prepare_out
 from hardware.report.page import (
     MAX_LINE_POINTS,
     Plot,
@@ -28,6 +28,7 @@ from hardware.report.page import (
     spanning,
 )
 from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
+from planning.motion.retime import run_times
 from planning.path import REACH_REASONS, Path, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
 
 PAGE_WIDTH_PX = 900
@@ -115,8 +116,10 @@ def run_reach(
     if out is not None:
         prepare_out(out, force)
     model, motion, reach = _evaluated(checkpoints, arm, question)
-    text = reach_text(model, reach, best_posture(model, _arm_from_surface(question), checkpoints, motion), question)
-    text = "\n".join(filter(None, [text, far_limits_text(read_arm(arm).limits)]))
+    best, profile = best_posture(model, _arm_from_surface(question), checkpoints, motion), read_arm(arm)
+    seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
+    text = reach_text(model, reach, best, question, seconds)
+    text = "\n".join(filter(None, [text, far_limits_text(profile.limits)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
@@ -153,8 +156,11 @@ def with_feasible_column(path: Path, reach: Reach) -> Path:
     return replace(path, surface_from_nozzle=spin_path(path, reach.spin), extra={**path.extra, "feasible": column})
 
 
-def reach_text(model: JointModel, reach: Reach, best: tuple[int, int], question: ReachQuestion) -> str:
-    """The answer as a table of text. best: posture by its row of POSTURES, and its number of printable checkpoints."""
+def reach_text(model: JointModel, reach: Reach, best: tuple[int, int], question: ReachQuestion, seconds: float) -> str:
+    """The answer as a table of text.
+
+    best: posture by its row of POSTURES, and its number of printable checkpoints. seconds: that a run takes.
+    """
     count, good = len(reach.reason), int(reach.feasible.sum())
     speed = reach.speed[np.isfinite(reach.speed)]
     swing = f"{question.amplitude_mm:g} mm and {question.turn_deg:g} degrees at {question.rate_hz:g} Hz"
@@ -169,6 +175,7 @@ def reach_text(model: JointModel, reach: Reach, best: tuple[int, int], question:
         ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
         ("wrist to the first axis", f"{_smallest(reach.shoulder)} mm"),
         ("most of a joint's speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
+        ("a run over a surface at rest", f"{duration_text(seconds)} once it is at the first checkpoint"),
         ("spin of the tool", f"{np.rad2deg(reach.spin.min()):.0f} to {np.rad2deg(reach.spin.max()):.0f} degrees"),
     ]
     if best[1] > good:
