@@ -253,14 +253,12 @@ def _slicers_rule(name: str, beads: Sequence[Bead], region: Region, width: float
     """Coverage and time as other planners' are taken: lines of one width, and turns at the ends of travels as well."""
     way = np.concatenate([bead.points for bead in beads])
     way = way[np.r_[True, np.linalg.norm(np.diff(way, axis=0), axis=1) > 1e-9]]
-    turns, cost, pace = int((turn_angles(way) > SHARP_TURN).sum()), print_cost(beads, PrintPace()), PrintPace()
+    more = int((turn_angles(way) > SHARP_TURN).sum()) - (cost := print_cost(beads, PrintPace())).turns
     lines = [Bead(bead.points, np.full(len(bead.points), width)) for bead in beads]
-    covered, peers = 100 * fill_coverage(lines, region).covered, REFERENCE_PLANNERS.get(name, "")
+    covered, seconds = 100 * fill_coverage(lines, region).covered, cost.seconds + more * PrintPace().turn
     return [
-        Figure(f"{name}: covered by lines of nominal width", covered, "%", None, peers),
-        Figure(
-            f"{name}: time with turns at travels", cost.seconds + (turns - cost.turns) * pace.turn, "s", None, peers
-        ),
+        Figure(f"{name}: covered by lines of nominal width", covered, "%"),
+        Figure(f"{name}: time with turns at travels", seconds, "s"),
     ]
 
 
