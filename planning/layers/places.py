@@ -128,6 +128,7 @@ def _mirrored(weight: Array) -> Array:
 
 
 MAX_PLACES = 6  # depressions that are outlined and judged
+NEAR_BONUS = 1.1  # of a rim's steepness, for skin that is held near it: a swollen rim costs a third of it
 RIM_INSIDE, RIM_OUTSIDE = 2.0, 1.0  # mm from the outline, between which a wound's wall falls
 RIVAL_CLARITY = 0.2  # of the clearest depression's: less clear ones are not looked at
 # on bodies without a wound the best place had 4.2 of 24, beside one 13; carved wounds 33 or more, the simulator's 11
@@ -143,7 +144,7 @@ class WoundPlace:
     area: float  # mm^2
     depth: float  # mm
     steepness: float  # how much of the depth is reached within RIM_INSIDE + RIM_OUTSIDE mm across its rim
-    clarity: float  # of its depression
+    clarity: float  # of the scan's clearest depression
     colour: float  # share of it that is coloured as a wound; nan without colours
     score: float  # by which places are compared
 
@@ -178,7 +179,7 @@ def wound_places(scan: Scan, first: HeightMap, colour: ScanColour | None) -> lis
         place
         for each in found
         if each.clarity > RIVAL_CLARITY * found[0].clarity and each.depth > MIN_DEPTH / 4
-        for place in _judged_depression(scan, first, each, colour)
+        for place in _judged_depression(scan, first, each, colour, found[0].clarity)
     ]
     judged.sort(key=lambda pair: -pair[0].score)
     kept = list[tuple[WoundPlace, OutlinedWound]]()
@@ -191,12 +192,12 @@ def wound_places(scan: Scan, first: HeightMap, colour: ScanColour | None) -> lis
 
 
 def _judged_depression(
-    scan: Scan, first: HeightMap, hollow: Depression, colour: ScanColour | None
+    scan: Scan, first: HeightMap, hollow: Depression, colour: ScanColour | None, clarity: float
 ) -> Sequence[tuple[WoundPlace, OutlinedWound]]:
     """The wound at a depression of the first map, in a plane of its own; none where there is none.
 
     Where the skin at the rim is not as the skin further out lets expect, either the rim is swollen or the body bends
-    too much to tell: of both the one counts by which the rim is steeper.
+    too much to tell: of both the one counts by which the rim is steeper, and in doubt the nearer skin.
     """
     z = np.array([-hollow.slope[0], -hollow.slope[1], 1.0])
     rotation = first.surface_from_plane[:3, :3]
@@ -210,8 +211,10 @@ def _judged_depression(
     ways = [far]
     if far is None or far.margin == RIM_MARGIN:
         ways.append(outlined(scan, fine, disc if far is None else far.outline, True, USUAL_KERNEL))
-    judged = [(_judged(place, hollow.clarity, colour), place) for place in ways if place is not None]
-    return sorted(judged, key=lambda pair: -pair[0].steepness)[:1]
+    judged = [(_judged(place, clarity, colour), place) for place in ways if place is not None]
+    return sorted(judged, key=lambda pair: -pair[0].steepness * (NEAR_BONUS if pair[1].margin < RIM_MARGIN else 1.0))[
+        :1
+    ]
 
 
 def _judged(place: OutlinedWound, clarity: float, colour: ScanColour | None) -> WoundPlace:
