@@ -101,6 +101,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench faults --count 5663 --seed 1": (FAULTS, LONG),
     "stillbed bench faults --count 10000 --jobs 2 --log faults.csv": (FAULTS, LONG),
     "stillbed bench fill CSV ...": ("stillbed bench fill contour.csv --count 2", LONG),
+    "stillbed bench wounds": ("stillbed bench wounds --count 1", LONG),
     "stillbed bench fuzz --count 1000000": ("stillbed bench fuzz --count 50", LONG),
     "stillbed bench fuzz --count 20000": ("stillbed bench fuzz --count 50", LONG),
     "stillbed bench latency": ("stillbed bench latency sessions/monday", LONG),

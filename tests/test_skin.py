@@ -179,3 +179,17 @@ def test_where_the_scan_lies_does_not_matter() -> None:
         scan, _ = repair_mesh(vertices, wound.triangles, "scan")
         areas.append(find_wound(scan, 0.5, "scan").findings.area)
     assert areas[0] == pytest.approx(areas[1], rel=0.02)
+
+
+@pytest.mark.parametrize("apart", [0.6, 2.0])
+def test_a_second_shell_under_the_first_changes_nothing(apart: float) -> None:
+    vertices, triangles = two_pits((3.0, 0.0))
+    alone = find_wound(repair_mesh(vertices, triangles, "scan")[0], 0.5, "scan").findings
+    both = (
+        np.concatenate([vertices, vertices - [0.0, 0.0, apart]]),
+        np.concatenate([triangles, triangles + len(vertices)]),
+    )
+    doubled = find_wound(repair_mesh(*both, "scan")[0], 0.5, "scan").findings
+    assert doubled.area == pytest.approx(alone.area, rel=0.02)
+    assert doubled.volume == pytest.approx(alone.volume, rel=0.03)
+    assert any("overhang" in note for note in doubled.notes) == (apart > 1)

@@ -34,6 +34,7 @@ MIN_PIECE = 1.0  # mm^2: of an outline, and of an island of skin inside it
 CORE_SHARE, MIN_WALL_REACH = 0.35, 4.0
 OPENING_RADIUS = 0.5  # mm: creases narrower than twice that are not part of a wound
 OUTLINE_ROUNDS, SAME_SHARE = 4, 0.99  # of outline and restored skin: each is found by the other; and when it is
+MAX_UNDER = 0.3  # mm under the topmost heights: further down it is another shell, or under an overhang
 MIN_UPWARD = 0.1  # upward part of a triangle's normal: below, it is an overhang's
 
 
@@ -101,7 +102,7 @@ def visible_points(scan: Scan, fine: HeightMap) -> Array:
     near = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1) & (upward > MIN_UPWARD)
     points, upward = points[near], upward[near]
     under = (interpolate(fine.grid, fine.heights, points[:, :2]) - points[:, 2]) * upward
-    return np.asarray(points[under < max(1.0, SKIN_SIGMAS * fine.noise)])
+    return np.asarray(points[under < max(MAX_UNDER, SKIN_SIGMAS * fine.noise)])
 
 
 def skin_around(
