@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from scipy.ndimage import distance_transform_edt, label, map_coordinates
+from scipy.ndimage import binary_erosion, distance_transform_edt, label, map_coordinates
 from shapely import MultiPolygon
 
 from estimation import se3
@@ -221,3 +221,10 @@ def _largest(chosen: Mask, inside: Mask) -> Mask:
     pieces, _ = label(chosen)
     share = np.bincount(pieces[inside], minlength=2)[1:]
     return np.asarray((pieces == int(np.argmax(share)) + 1) & bool(share.any()))
+
+
+def share_cut(fine: HeightMap, shape: MultiPolygon) -> float:
+    """Share of an outline that lies along the scan's own rim."""
+    rim = shapely.get_coordinates(shapely.segmentize(shape.boundary, fine.grid.step))
+    inner = binary_erosion(fine.known, iterations=max(2, round(1.0 / fine.grid.step)))
+    return float(np.mean(interpolate(fine.grid, inner.astype(float), rim) < 0.5))

@@ -34,6 +34,7 @@ from planning.layers.outline import (
     nodes_within,
     outlined,
     points_on,
+    share_cut,
     surround_box,
 )
 from planning.layers.skin import USUAL_KERNEL
@@ -233,7 +234,9 @@ def _judged(place: OutlinedWound, clarity: float, colour: ScanColour | None) -> 
     share = float("nan")
     if colour is not None:
         share = _coloured(colour, points_on(fine, fine.grid.nodes[inside]))
-    score = np.sqrt(outline.area) * deep * max(steepness, 0.02) ** 2 * (1.0 if np.isnan(share) else 0.1 + share)
+    whole = 1 - share_cut(fine, outline)  # what the scan's own rim cuts off is hardly the wound that was scanned
+    likeness = 1.0 if np.isnan(share) else 0.1 + share
+    score = np.sqrt(outline.area) * deep * max(steepness, 0.02) ** 2 * likeness * whole**2
     return WoundPlace(points, float(outline.area), deep, steepness, clarity, share, float(score))
 
 

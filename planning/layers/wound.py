@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from scipy.ndimage import binary_erosion
 from shapely import MultiPolygon
 
 from estimation import se3
@@ -30,6 +29,7 @@ from planning.layers.outline import (
     axes_along,
     nodes_within,
     outlined,
+    share_cut,
     surround_box,
     upsampled,
     with_skin,
@@ -183,9 +183,7 @@ def _checked_wound(scan: Scan, found: OutlinedWound, given: bool, others: int, w
         share = f"{known.sum() / inside.sum():.0%} of the outline"
         raise InputError(where, "scanned part of the wound", share, "half of it or more: scan it again, or the outline")
     cell, depth = fine.grid.step**2, np.where(fine.known, skin - fine.heights, 0.0)
-    rim = shapely.get_coordinates(shapely.segmentize(shape.boundary, fine.grid.step))
-    inner = binary_erosion(fine.known, iterations=max(2, round(1.0 / fine.grid.step)))
-    cut = float(np.mean(interpolate(fine.grid, inner.astype(float), rim) < 0.5))
+    cut = share_cut(fine, shape)
     if cut > MAX_CUT_SHARE:
         allowed = f"{MAX_CUT_SHARE:.0%} or less: scan 20 mm of skin around the wound"
         raise InputError(where, "share of the outline at the scan's own rim", f"{cut:.0%}", allowed)
