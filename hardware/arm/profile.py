@@ -19,6 +19,7 @@ from planning.motion.follow import LOOKAHEAD
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
+MAX_FLIGHT = 0.5  # s: what is under way cannot be called back by an arm without a stop of its own
 AXIS_LETTERS = "XYZABC"
 DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
 ARM_FROM_BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
@@ -37,17 +38,24 @@ class ArmProfile:
     baud: int = 115_200  # bits/s, 8N1; thesis 6.2; one public driver uses 9600, at which a frame takes 50 ms
     tick: float = 0.02  # s, 50 commands a second: faster than any camera here, a fifth of what the wire carries
     lag: float = 0.024  # s, 4 ms of wire, and 20 ms that a hobby servo is taken to follow behind until it is measured
+    dead_time: float | None = None  # s that a command takes to the arm; None: what a frame takes at `baud`
+    flight: float | None = None  # s of motion that may be under way; None: the link's own limit
     tool: Array = field(default_factory=SYRINGE.copy)  # (K, 2) mm, of what hangs on it: height above the tip, radius
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
             raise InputError("arm profile", "baud", self.baud, "> 0 bits/s")
+        if self.dead_time is not None and not 0 <= self.dead_time <= MAX_LAG:
+            raise InputError("arm profile", "dead_time", self.dead_time, f"0 to {MAX_LAG} s")
         wire = self.frame_time
         if not wire <= self.tick <= LOOKAHEAD / 2:
             allowed = f"{wire:.5f} s, one frame on the wire, to {LOOKAHEAD / 2} s"
             raise InputError("arm profile", "tick", self.tick, allowed)
         if not 0 <= self.lag <= MAX_LAG:
             raise InputError("arm profile", "lag", self.lag, f"0 to {MAX_LAG} s")
+        if self.flight is not None and not self.tick <= self.flight <= MAX_FLIGHT:
+            allowed = f"{self.tick} s, a tick, to {MAX_FLIGHT} s"
+            raise InputError("arm profile", "flight", self.flight, allowed)
         check_profile("arm profile", "tool", self.tool)
         arm, limits = self.arm, self.limits
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
@@ -63,7 +71,9 @@ class ArmProfile:
 
     @property
     def frame_time(self) -> float:
-        """Seconds that one frame takes on the wire: 4.17 ms at 115200 bits/s."""
+        """Seconds that one command takes to the arm: the dead time, or a frame on the wire, 4.17 ms at 115200 bits/s."""
+        if self.dead_time is not None:
+            return self.dead_time
         return FRAME_LENGTH * BITS_PER_BYTE / self.baud
 
 
