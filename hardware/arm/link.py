@@ -118,7 +118,7 @@ class Arm(ArmDevice):
         return DONE
 
     def home(self, now: float) -> Reason:
-        """Go home by the arm's own way, where it has one, or in slow steps; by default X202.5 Y225 Z113 (thesis 6.3)."""
+        """Go home by the arm's own way where it has one, or in slow steps; by default X202.5 Y225 Z113, thesis 6.3."""
         if self.state is ArmState.ARMED and not self.travels and self.driver.home(now):
             self.busy = True
             return DONE

@@ -71,7 +71,7 @@ class ArmProfile:
 
     @property
     def frame_time(self) -> float:
-        """Seconds that one command takes to the arm: the dead time, or a frame on the wire, 4.17 ms at 115200 bits/s."""
+        """Seconds that a command takes to the arm: the dead time, or a frame on the wire, 4.17 ms at 115200 bits/s."""
         if self.dead_time is not None:
             return self.dead_time
         return FRAME_LENGTH * BITS_PER_BYTE / self.baud

@@ -163,7 +163,7 @@ class FlowControl:
 
     @property
     def flight(self) -> float:
-        """Seconds that may be under way, wire included: the arm's or the settings' flight, or on a slow line one frame and its move.
+        """Seconds that may be under way, wire included: the flight, or on a slow line one frame and its move.
 
         Either way a tick, of 50 ms at most, is all that is added to what the arm's queue holds.
         """
