@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm.driver import ArmDriver, Reply, open_arm
+from hardware.arm.driver import ArmDriver, Reply
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
 from hardware.arm.s6h4d import S6H4D
 from hardware.process.clock import Clock, SimClock, WallClock, WatchedClock
 from hardware.simulator.arm.controller import VirtualArm

@@ -15,10 +15,10 @@ from estimation.errors import InputError
 from hardware.arm import port as arm_port
 from hardware.arm import s6h4d
 from hardware.arm.device import ArmState
-from hardware.arm.driver import Pause, UnpluggedError, emergency_stop, open_arm
+from hardware.arm.driver import Pause, UnpluggedError
 from hardware.arm.link import Arm
 from hardware.arm.port import PortOpener, SerialPort
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, emergency_stop, open_arm
 from hardware.arm.protocol import FRAME_LENGTH, encode
 from hardware.process.clock import WallClock
 from hardware.simulator.arm.ports import open_pty

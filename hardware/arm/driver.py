@@ -1,4 +1,4 @@
-"""The seam between stillbed and an arm: what a driver must do, its vocabulary, and which driver an address has.
+"""The seam between stillbed and an arm: what a driver must do, and its vocabulary.
 
 Above it stand guard, flow control, own moves, retries of a stop and the recovery of an arm that does not follow
 (`hardware/arm/link.py`), the same for any arm. Below it stands what one make of arm needs: its bytes, its library, its
@@ -10,20 +10,15 @@ Axes are X Y Z A B C of the arm's frame, mm and rad. Instants are s of our clock
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
-
-if TYPE_CHECKING:
-    from hardware.arm.profile import ArmProfile
 
 
 class UnpluggedError(StillbedError):
@@ -161,54 +156,3 @@ class ArmDriver(Protocol):
 
 
 ByteListener = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
-
-
-@dataclass(frozen=True, slots=True)
-class DriverKind:
-    """One make of arm, by the addresses that lead to it.
-
-    Its module has `open_arm(address, profile, listener) -> ArmDriver`, `emergency_stop(address, profile) ->
-    (s, reason)` and `find_arms() -> [(address, description)]`, and is imported where it is used only.
-    """
-
-    name: str
-    schemes: tuple[str, ...]  # what stands before :// in an address; () : all addresses that no other has
-    module: str
-    example: str  # an address
-    extra: str = ""  # of stillbed, that brings what it imports; "": it needs none
-    needs: str = ""  # what it imports, by which its extra is known to be there
-
-    @property
-    def installed(self) -> bool:
-        """Whether what it imports is there."""
-        return not self.needs or find_spec(self.needs) is not None
-
-
-DRIVERS = (DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0"),)
-
-
-def driver_kind(address: str) -> DriverKind:
-    """The driver of an address; InputError where its extra is not installed."""
-    scheme = address.partition("://")[0] if "://" in address else ""
-    kind = next((kind for kind in DRIVERS if scheme in kind.schemes), DRIVERS[0])
-    if not kind.installed:
-        raise InputError("arm", "address", address, f"stillbed with its extra: pip install 'stillbed[{kind.extra}]'")
-    return kind
-
-
-def open_arm(address: str, profile: ArmProfile, listener: ByteListener | None = None) -> ArmDriver:
-    """The driver of the arm at an address, not connected yet. listener: is told the bytes that pass, both ways."""
-    driver: ArmDriver = importlib.import_module(driver_kind(address).module).open_arm(address, profile, listener)
-    return driver
-
-
-def emergency_stop(address: str, profile: ArmProfile) -> tuple[float, str]:
-    """Stop an arm whose motion process is gone: when the stop was out, s, and why it could not be, "" if it was."""
-    answer: tuple[float, str] = importlib.import_module(driver_kind(address).module).emergency_stop(address, profile)
-    return answer
-
-
-def find_arms(kind: DriverKind) -> list[tuple[str, str]]:
-    """The arms that a driver finds now, as (address, description)."""
-    found: list[tuple[str, str]] = importlib.import_module(kind.module).find_arms()
-    return found

@@ -26,9 +26,8 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.triangulation import triangulate
-from hardware.arm.driver import open_arm
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, open_arm
 from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, MoveOptions, move_arm, read_commanded
 from hardware.calibration.arm_report import MAX_TIP_ERROR, ArmTruth, arm_page, arm_text, judge_arm

@@ -323,8 +323,7 @@ def _virtual(a: argparse.Namespace) -> ArmCalibrationResult:
 
 def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     from hardware.arm.console import axes_from_text
-    from hardware.arm.driver import open_arm
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
     from hardware.calibration.arm_record import record_live
     from hardware.calibration.arm_run import check_out, check_record, copy_rig_json
     from hardware.cameras.live import LiveCameras

@@ -336,8 +336,7 @@ def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: L
 
 def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
     from hardware.arm.console import axes_from_text
-    from hardware.arm.driver import open_arm
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
     from hardware.calibration.dispenser_record import record_live
     from hardware.cameras.live import LiveCameras
     from hardware.cameras.sources import read_live_rig

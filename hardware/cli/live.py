@@ -232,8 +232,7 @@ def _serve_virtual_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
 def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
     from hardware.arm.console import ArmRequest, axes_from_text, jog_from_text, origin_from_text, run_arm
     from hardware.arm.device import ArmState
-    from hardware.arm.driver import open_arm
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
 
     request = ArmRequest(
         seconds=float("inf") if a.watch else a.seconds,

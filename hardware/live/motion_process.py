@@ -18,9 +18,8 @@ from estimation.errors import StillbedError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
-from hardware.arm.driver import open_arm
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag
+from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag, open_arm
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared

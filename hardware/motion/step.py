@@ -17,9 +17,8 @@ from types import FrameType
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
-from hardware.arm.driver import open_arm
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import WallClock
 from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
