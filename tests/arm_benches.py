@@ -57,6 +57,10 @@ class ArmBench:
     def plug(self) -> None:
         """It is back."""
 
+    def end(self) -> None:
+        """Let go of what it was tried on."""
+        return
+
     def run(self, seconds: float, each: Callable[[float], None] = lambda now: None) -> None:
         """Let time pass; `each` is called once a tick."""
         end, due = self.clock.now() + seconds, self.clock.now()
@@ -158,6 +162,9 @@ class PtyBench(ArmBench):
     def plug(self) -> None:
         self._serve(self.profile)
 
+    def end(self) -> None:
+        self.unplug()
+
 
 def _silence(driver: ArmDriver) -> None:
     """Have what the arm answers come to nobody."""
@@ -179,5 +186,4 @@ def closing_bench(bench: ArmBench) -> Iterator[ArmBench]:
     finally:
         bench.arm.close()
         bench.arm.driver.release()
-        if isinstance(bench, PtyBench):
-            bench.unplug()
+        bench.end()

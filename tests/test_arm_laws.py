@@ -15,10 +15,14 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
 from planning.command import Hold, Move
 from tests.arm_benches import ArmBench, PtyBench, VirtualTimeBench, closing_bench
+from tests.franka_bench import MISSING, FrankaBench, installed
 
 BENCHES = [
     pytest.param(lambda folder: VirtualTimeBench(), id="s6h4d"),
     pytest.param(lambda folder: PtyBench(folder / "arm"), id="s6h4d-on-a-pty"),
+    pytest.param(
+        FrankaBench, id="franka", marks=[pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
+    ),
 ]
 LEGS = np.array([[0, 0, 0], [6, 0, 0], [6, 6, 0], [0, 6, 3], [0, 0, 0]], float)  # mm from where it stands
 SPEED = 12.0  # mm/s along the legs
