@@ -45,11 +45,13 @@ from pathlib import Path
 
 import numpy as np
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import AXIS_LETTERS, ArmProfile, at_baud
+from hardware.arm.profile import ARM_FROM_BENCH, AXIS_LETTERS, ArmProfile, at_baud, driver_kind, placed
 from hardware.arm.protocol import Dialect
 from hardware.process import checks
+from perception import shipped_file
 from perception.frames import check_profile
 from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
@@ -189,6 +191,22 @@ FILE_KEYS = {
 def read_arm(path: str | Path) -> ArmProfile:
     """The profile in an arm file; InputError names the key that makes no sense."""
     return _profile(Path(path), checks.read_toml(Path(path)))
+
+
+def arm_for(address: str) -> ArmProfile:
+    """The profile that stands in for the arm at an address where no arm file is given."""
+    file = driver_kind(address).file
+    return read_arm(shipped_file("arms", file)) if file else ArmProfile()
+
+
+def arm_over(known: ArmProfile, address: str) -> ArmProfile:
+    """That profile, put so that the surface below the home of a `known` arm is below this one's; or the known one."""
+    if not driver_kind(address).file:
+        return known
+    profile = arm_for(address)
+    base_from_surface = se3.inverse(known.arm.arm_from_base) @ ARM_FROM_BENCH
+    moved = profile.arm.home[:3] - ArmProfile().arm.home[:3]
+    return placed(profile, base_from_surface, se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + moved))
 
 
 def arm_from_text(text: str, where: str | Path) -> ArmProfile:
