@@ -23,6 +23,7 @@ from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile, open_arm
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import WallClock
+from hardware.process.system import ask_for_real_time
 from tests.arm_benches import ArmBench
 
 ROOT = Path(__file__).parents[1]
@@ -44,6 +45,7 @@ def serve(log: Path) -> None:
 
     rows: list[tuple[float, ...]] = []
     clock = WallClock()
+    ask_for_real_time()  # a real controller shares no core with us
 
     class Logged(MujocoSimulator):  # type: ignore[misc]
         def _step(self) -> None:

@@ -45,7 +45,7 @@ CONTROL_PERIOD = 0.01  # s between velocities: twice a tick, and ten of libfrank
 REPORT_PERIOD = 0.02  # s between reported places
 SILENT_TIME = 0.06  # s without a new state of the robot: sixty of libfranka's
 GONE_TIME = 0.5  # s likewise, after which the connection is given up and made anew
-VELOCITY_TIME_MS = 60  # ms that a velocity is good for: three ticks
+VELOCITY_TIME = 0.06  # s that a velocity is good for: three ticks
 LOOK_BACK = 0.02  # s by which the commands are followed later: a tick, so that the next one is known
 GAIN = 20.0  # 1/s of what is missing: settles in 0.05 s, five control periods
 DYNAMICS = 0.5  # of franky's limits, which are libfranka's: 6.5 m/s^2 and 3250 m/s^3
@@ -285,18 +285,20 @@ class Follower:
         turn = clipped(turn + GAIN * se3.log_rotation(arm_from_begin @ arm_from_now.T), MAX_TURN_RATE)
         way = (end - begin)[:3] / CONTROL_PERIOD + GAIN * (begin - axes)[:3]
         way = clipped(way, self._most) + np.cross(turn, ee - axes[:3])  # of the end effector, not of the nozzle
+        self._ask(way, turn, VELOCITY_TIME)
+
+    def _ask(self, way: Array, turn: Array, seconds: float) -> None:
+        """Ask for a velocity of the end effector, mm/s and rad/s, for so long; after that it brakes."""
         franky = self._franky
-        twist = franky.Twist(
-            np.round(way / VELOCITY_STEP) * VELOCITY_STEP / 1000, np.round(turn / TURN_STEP) * TURN_STEP
-        )
-        time = franky.Duration(VELOCITY_TIME_MS)
-        self._robot.move(franky.CartesianVelocityMotion(twist, time), asynchronous=True)
+        way, turn = (np.round(v / step) * step for v, step in ((way, VELOCITY_STEP), (turn, TURN_STEP)))
+        time = franky.Duration(round(1000 * seconds))
+        self._robot.move(franky.CartesianVelocityMotion(franky.Twist(way / 1000, turn), time), asynchronous=True)
 
     def _brake(self) -> None:
-        """Slow down as fast as the limits of acceleration and jerk let it."""
+        """Slow down as fast as the limits of acceleration and jerk let it, and leave the robot to itself."""
         with suppress(Exception):  # of a motion that has just ended
             if self._robot.is_in_control:
-                self._robot.move(self._franky.CartesianVelocityStopMotion(), asynchronous=True)
+                self._ask(np.zeros(3), np.zeros(3), CONTROL_PERIOD)
 
     def _end(self, clock: WallClock) -> None:
         """Come to rest."""
