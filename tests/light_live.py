@@ -119,7 +119,11 @@ def main(folder: Path, record: Path, *flags: str) -> int:
     else:
         rig, path, profile = (folder / name for name in ("rig.toml", "path.csv", "arm.toml"))
         device = next((flag for flag in flags if not flag.startswith("--")), "virtual")
-        more = {"unattended": "--yes" in flags, "page": "--page" in flags, "stands_home": True}
+        more = {
+            "unattended": "--yes" in flags,
+            "page": "--page" in flags,
+            "stands_home": not device.startswith("franka"),
+        }
         ports = [int(flag.partition("=")[2]) for flag in flags if flag.startswith("--foxglove=")]
         more |= {"foxglove_port": sum(ports), "operator": "Ada" if ports else ""}
         given = LiveSettings(rig=rig, path=path, arm=device, profile=profile, record=record, **more)

@@ -34,7 +34,7 @@ class Live:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.runs = folder, list[Running]()
-        prepare_files(folder, lines=40, speed=5.0)
+        prepare_files(folder, lines=12, speed=5.0)
         profile = arm_over(ArmProfile(), ADDRESS)
         home = profile.arm.home.copy()
         home[2] += HOME - ArmProfile().arm.home[2]
