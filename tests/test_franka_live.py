@@ -20,8 +20,9 @@ from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.path import PrintPhase
 from tests.franka_bench import HOST, MISSING, FrankaServer, installed
 from tests.light_live import HOME, TILT, prepare_files
-from tests.live_runs import Running
+from tests.live_runs import CLOCK, Running, messages
 from tests.moving import breathing
+from tests.test_live_run import confirmed
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
 ADDRESS = f"franka://{HOST}"
@@ -111,3 +112,34 @@ def test_a_breathing_surface_is_printed_and_the_true_flange_says_how_well(live: 
     ticks: list[ReplayedTick] = list(replay_run(record))
     assert len(ticks) > 200 and all(tick.frame == tick.recorded for tick in ticks)
     assert p95 <= 0.5 and most <= 1.0 and duty >= 0.8, words
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
+def test_a_robot_that_is_gone_is_held_in_time_and_printing_goes_on_where_it_was(
+    live: Live, number: signal.Signals
+) -> None:
+    record = live.folder / "run.mcap"
+    run = live.start(record, "--until-printed")
+    at = confirmed(run)
+    CLOCK.wait_until(CLOCK.now() + 4.0)
+    assert live.server.process is not None
+    gone = CLOCK.now()
+    live.server.process.send_signal(number)
+    at = run.wait_for("stopped: the arm is unplugged", at)
+    live.server.end(signal.SIGKILL)
+    live.server.start()
+    at = run.wait_for("the arm is back", at)
+    run.press("h")
+    at = run.wait_for("stopped: at home", at)
+    run.press("r")
+    at = run.wait_for(r"\nprint\n", at)
+    run.wait_for("done", at)
+    assert run.end() == 0, run.said
+    moves = sorted(float(str(m["stamp"])) for m in messages(record, "/move"))
+    last = max(stamp for stamp in moves if stamp < gone + 1.0)
+    print(f"last move {1000 * (last - gone):.0f} ms after it was {number.name}, load {os.getloadavg()[0]:.1f}")
+    assert last - gone <= 0.1
+    extruding = {m["stamp"]: m["extrude"] for m in messages(record, "/move")}
+    ticks = sorted(messages(record, "/tick"), key=lambda tick: float(str(tick["stamp"])))
+    places = [float(str(tick["fraction"])) for tick in ticks if extruding.get(tick["stamp"])]
+    assert len(places) > 100 and (np.diff(places) >= -1e-9).all()  # no checkpoint is printed twice

@@ -43,10 +43,8 @@ FIRST_CONNECT_TIME = (
     20.0  # s of the first connection, while nothing moves: libraries are loaded, and a host may be slow
 )
 CLOSE_TIME = 1.5  # s for the process to bring the robot to rest and end
-CONTROL_PERIOD = 0.01  # s between velocities: twice a tick, and ten of libfranka's
-REPORT_PERIOD = 0.02  # s between reported places
-SILENT_TIME = 0.06  # s without a new state of the robot: sixty of libfranka's
-GONE_TIME = 0.5  # s likewise, after which the connection is given up and made anew
+CONTROL_PERIOD = 0.01  # s between velocities, and between reported places: twice a tick, and ten of libfranka's
+GONE_TIME = 0.5  # s without a new state, after which the connection is given up and made anew
 VELOCITY_TIME = 0.06  # s that a velocity is good for: three ticks
 LOOK_BACK = 0.02  # s by which the commands are followed later: a tick, so that the next one is known
 GAIN = 20.0  # 1/s of what is missing: settles in 0.05 s, five control periods
@@ -84,11 +82,14 @@ class Franka(ArmDriver):
             raise InputError("arm file", "flange_from_nozzle", "missing", allowed)
         self._host, self._profile, self._listener = host, profile, listener
         self._process: Any = None
+        self._former: tuple[Any, float] | None = None  # the process before, and when it was closed, s
         self._last: FrankaState | None = None
         self._patience = FIRST_CONNECT_TIME
 
     def connect(self, now: float) -> None:
         """Start the process, and see whether it has the robot; only the first call waits for that."""
+        if self._former is not None:
+            self._reap(now)
         if self._process is None:
             self._states: SharedLatest[FrankaState] = SharedLatest(1 << 16)
             theirs, self._orders = SPAWN.Pipe(duplex=False)
@@ -137,14 +138,27 @@ class Franka(ArmDriver):
         return ""
 
     def close(self) -> None:
-        """Let the process bring the robot to rest and end."""
+        """Let the process bring the robot to rest and end; nobody waits for that here."""
         if self._process is not None:
             self._orders.close()
-            self._process.join(CLOSE_TIME)
-            if self._process.is_alive():
-                self._process.kill()
-                self._process.join()
-        self._process = None
+            self._former, self._process = (self._process, WallClock().now()), None
+
+    def release(self) -> None:
+        """Wait until the process has ended."""
+        if self._former is not None:
+            self._former[0].join(CLOSE_TIME)
+            with suppress(UnpluggedError):
+                self._reap(math.inf)
+
+    def _reap(self, now: float) -> None:
+        """Do away with the process that was closed, in a while; UnpluggedError until then."""
+        assert self._former is not None
+        process, closed = self._former
+        if process.is_alive() and now < closed + CLOSE_TIME:
+            raise UnpluggedError(f"{SCHEME}{self._host}: its former connection is ended")
+        process.kill()
+        process.join()
+        self._former = None
 
     def _hand(self, order: tuple[object, float]) -> None:
         try:
@@ -215,7 +229,8 @@ class Follower:
 
     def run(self, orders: Connection, states: SharedLatest[FrankaState], clock: WallClock) -> None:
         """Follow `orders`, and put what the robot says; until they end, or the robot says nothing for GONE_TIME."""
-        due = reported = self._heard = clock.now()
+        due = self._heard = clock.now()
+        reported = 0.0  # s, the stamp of the last place
         while True:
             messages, closed = take_messages(orders)
             now = clock.now()
@@ -229,9 +244,9 @@ class Follower:
             if now - self._heard > GONE_TIME:
                 states.put(FrankaState(now, gone=f"the robot said nothing for {GONE_TIME:g} s"))
                 return
-            if now - self._heard <= SILENT_TIME and (now >= reported + REPORT_PERIOD - CONTROL_PERIOD / 2):
-                reported = now
-                states.put(FrankaState(now, axes, self._fault))
+            if self._heard > reported:  # an old place is no answer
+                reported = self._heard
+                states.put(FrankaState(reported, axes, self._fault))
             if self._queue is not None and not self._fault:
                 self._follow(self._queue, axes, ee, now)
             due = max(due + CONTROL_PERIOD, clock.now())
