@@ -18,7 +18,6 @@ import socket
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -198,12 +197,13 @@ def serve(host: str, profile: ArmProfile, orders: Connection, states: SharedLate
     ask_for_real_time()
     clock = WallClock()
     try:
-        franky = import_module("franky")
+        import franky
+
         kernel = Path("/sys/kernel/realtime").exists()
         how = franky.RealtimeConfig.Enforce if kernel else franky.RealtimeConfig.Ignore
         robot = franky.Robot(host, realtime_config=how)
         robot.relative_dynamics_factor = DYNAMICS
-        follower = Follower(franky, robot, profile)
+        follower = FrankaFollower(franky, robot, profile)
         follower.run(orders, states, clock)
     except Exception as error:  # whatever libfranka throws ends the connection, and is told
         states.put(FrankaState(clock.now(), gone=one_line(error)))
@@ -214,7 +214,7 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-class Follower:
+class FrankaFollower:
     """One robot following commands."""
 
     def __init__(self, franky: Any, robot: Any, profile: ArmProfile) -> None:

@@ -168,6 +168,11 @@ class DriverKind:
         """Whether what it imports is there."""
         return not self.needs or find_spec(self.needs) is not None
 
+    @property
+    def remedy(self) -> str:
+        """How to install what it imports."""
+        return f"pip install 'stillbed[{self.extra}]'"
+
 
 DRIVERS = (
     DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0"),
@@ -183,7 +188,7 @@ def driver_kind(address: str) -> DriverKind:
     scheme = address.partition("://")[0] if "://" in address else ""
     kind = next((kind for kind in DRIVERS if scheme in kind.schemes), DRIVERS[0])
     if not kind.installed:
-        raise InputError("arm", "address", address, f"stillbed with its extra: pip install 'stillbed[{kind.extra}]'")
+        raise InputError("arm", "address", address, f"stillbed with its extra: {kind.remedy}")
     return kind
 
 
