@@ -14,12 +14,13 @@ import pytest
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
 from planning.command import Hold, Move
-from tests.arm_benches import ArmBench, PtyBench, VirtualTimeBench, closing_bench
+from tests.arm_benches import ArmBench, ExampleBench, PtyBench, VirtualTimeBench, closing_bench
 from tests.franka_bench import MISSING, FrankaBench, installed
 
 BENCHES = [
     pytest.param(lambda folder: VirtualTimeBench(), id="s6h4d"),
     pytest.param(lambda folder: PtyBench(folder / "arm"), id="s6h4d-on-a-pty"),
+    pytest.param(lambda folder: ExampleBench(), id="the-example"),
     pytest.param(
         FrankaBench, id="franka", marks=[pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
     ),
