@@ -23,7 +23,7 @@ slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # Machines that others wrote: what can be installed is, what is missing is skipped, with what to install.
-COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py
+COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py
 
 counterparts: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[counterparts]'
