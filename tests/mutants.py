@@ -243,7 +243,7 @@ MUTANTS = (
     ),
     Mutant(
         "a stop waits for the frames before it",
-        "hardware/arm/port.py",
+        "hardware/arm/s6h4d.py",
         "> (1 if self._done else 0)",
         "> 9",
         ("test_arm_link.py::test_a_frame_of_which_no_byte_is_gone_goes_out_no_more_once_the_arm_is_to_rest",),
@@ -268,6 +268,20 @@ MUTANTS = (
         "elif self._feedback.off > self.settings.lost",
         "elif self._feedback.off > 1e9",
         ("test_arm_link.py::test_an_arm_that_runs_away_is_stopped_at_once",),
+    ),
+    Mutant(
+        "an arm that has stopped by itself is sent more",
+        "hardware/arm/link.py",
+        "if self.fault and self.state is ArmState.ARMED",
+        "if False",
+        ("test_arm_laws.py::test_an_arm_that_has_stopped_by_itself_is_stopped_and_says_why",),
+    ),
+    Mutant(
+        "an arm that is away is thought to stand where it was",
+        "hardware/arm/device.py",
+        "self._online, self._queue = False, None",
+        "self._online = False",
+        ("test_arm_laws.py::test_unplugged_it_is_known_nowhere_and_back_it_waits_for_the_operator",),
     ),
     Mutant(
         "a frame with wrong reserved bytes is taken",
