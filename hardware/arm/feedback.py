@@ -129,6 +129,12 @@ class ArmFeedback:
             return None
         return np.concatenate([place.values, turn.values])
 
+    @property
+    def last(self) -> Array | None:
+        """The last answered axes (6,), however old; None without."""
+        place, turn = self._place.values, self._turn.values
+        return None if place is None or turn is None else np.concatenate([place, turn])
+
     def stands(self, known: Array | None, now: float) -> Array | None:
         """Where an arm at rest is (6,), by its answers: where it is `known` to be (6,) as far as rounding allows.
 

@@ -240,7 +240,7 @@ class Arm(ArmDevice):
     def _unplugged(self, reason: str, now: float) -> None:
         """The device is gone, and what was under way with it."""
         self._own.drop()
-        self._recovery.break_off()
+        self._recovery.break_off(self._feedback.last)
         super()._unplugged(reason, now)
 
     def _enable(self, now: float) -> str:
