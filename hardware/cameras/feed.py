@@ -12,8 +12,9 @@ from enum import Enum
 
 import numpy as np
 
-from hardware.cameras.capture import Capture, CaptureOpener, Control, locked_exposure, open_capture
-from hardware.cameras.sources import CameraSource
+from estimation.errors import StillbedError
+from hardware.cameras.capture import Capture, CaptureOpener, Control, Transport, locked_exposure, open_by_opencv
+from hardware.cameras.sources import CameraSource, SourceKind
 from hardware.cameras.stamping import FrameStamp, FrameStamper
 from hardware.process.clock import Clock
 from perception.frames import DuplicateFilter, Frame, Image, StampedBy
@@ -30,6 +31,7 @@ MAX_DAMAGED_FRAMES = 30  # in a row, after which a camera is opened again
 class FrameFault(Enum):
     """Why a frame is left out; the text follows a camera's name."""
 
+    INCOMPLETE = "sends pictures with packets missing"
     DAMAGED = "sends pictures that cannot be decoded"
     WRONG_SIZE = "sends pictures of another size"
     DUPLICATED = "sends the same stamp again"
@@ -98,6 +100,7 @@ class CameraState:
     controls: tuple[Control, ...]
     newest: Image | None  # its last picture, faulty or not
     error: str = ""  # the last one that its driver raised
+    transport: Transport | None = None  # what was lost on the way; None where nothing is known of it
 
     @property
     def trouble(self) -> str:
@@ -150,6 +153,15 @@ class CameraPlace:
     offset: float = 0.0  # s, added to its stamps
 
 
+def open_capture(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> Capture | None:
+    """Open a camera for pictures of `size` (W, H) px by the driver of its kind; None where that is not possible now."""
+    if source.identity.kind is SourceKind.GENICAM:
+        from hardware.cameras.genicam import open_genicam
+
+        return open_genicam(source, size)
+    return open_by_opencv(source, size, clock)
+
+
 class Feed:
     """Delivers one camera's good frames: in its own thread by `run`, or in virtual time by calls of `step`."""
 
@@ -177,6 +189,7 @@ class Feed:
         self._stamped: FrameStamp | None = None
         self._newest: Image | None = None
         self._error = ""
+        self._transport: Transport | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -216,8 +229,7 @@ class Feed:
     def _open(self) -> None:
         capture = self._opener(self.source, self.place.size, self._clock)
         if capture is None:
-            self._wait(self._back_off)
-            self._back_off = min(2 * self._back_off, MAX_BACK_OFF)
+            self._pause()
             return
         self._begin()
         self._capture, self._broken = capture, 0
@@ -230,12 +242,17 @@ class Feed:
         if self._watch.repeats(position):
             self._leave_out(FrameFault.DUPLICATED)
             return
+        if capture.incomplete and math.isnan(position):  # its begin was lost: an arrival instead would move the beat
+            self._leave_out(FrameFault.INCOMPLETE)
+            return
         missed = self._stamping.pll.missed
         stamped = self._stamping(now, position, capture.clocked)
         image = capture.retrieve()
         fault = self._watch.fault(image) or (None if stamped.fresh else FrameFault.BACKLOG)
+        fault = FrameFault.INCOMPLETE if capture.incomplete else fault
         with self._lock:
             self._missed += max(0, self._stamping.pll.missed - missed)
+            self._transport = capture.transport
             self._stamped = stamped
             self._newest = self._newest if image is None else image
         if fault is not None or image is None:
@@ -264,7 +281,7 @@ class Feed:
         with self._lock:
             self._faults[fault] += 1
             self._fault = fault
-        self._broken = self._broken + 1 if fault is FrameFault.DAMAGED else 0
+        self._broken = self._broken + 1 if fault in (FrameFault.DAMAGED, FrameFault.INCOMPLETE) else 0
         if self._broken >= MAX_DAMAGED_FRAMES:
             self._release()
             self._enter(CameraPhase.GONE)
@@ -274,9 +291,9 @@ class Feed:
             self._release()
         self._capture = None
         with self._lock:
-            self._error = f"{type(error).__name__}: {error}"
+            self._error = str(error) if isinstance(error, StillbedError) else f"{type(error).__name__}: {error}"
         self._enter(CameraPhase.GONE)
-        self._wait(self._back_off)
+        self._pause()
 
     def _enter(self, phase: CameraPhase) -> None:
         with self._lock:
@@ -287,6 +304,10 @@ class Feed:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+    def _pause(self) -> None:
+        self._wait(self._back_off)
+        self._back_off = min(2 * self._back_off, MAX_BACK_OFF)
 
     def _wait(self, seconds: float) -> None:
         end = self._clock.now() + seconds
@@ -316,4 +337,5 @@ class Feed:
                 controls=self._controls,
                 newest=self._newest,
                 error=self._error,
+                transport=self._transport,
             )
