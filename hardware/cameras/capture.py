@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -153,6 +153,9 @@ class CameraError(StillbedError):
     """Why a camera cannot be opened, or was lost: one line."""
 
 
+TRANSPORT_COUNTS = ("received", "lost", "resent", "frames_lost")
+
+
 @dataclass(frozen=True, slots=True)
 class Transport:
     """What a camera on a network or bus lost on the way, and how its clock runs."""
@@ -163,6 +166,13 @@ class Transport:
     frames_lost: int  # of which no packet came, by the numbers that the camera gives its frames
     drift: float  # by how much our clock is faster than the camera's, of 1; nan before it is known
     doubt: float  # s, of the offset between both clocks; nan where the camera's clock cannot be read
+
+    def after(self, earlier: Transport | None) -> Transport:
+        """The same with what was counted before the camera was opened again."""
+        if earlier is None:
+            return self
+        counts = {name: getattr(self, name) + getattr(earlier, name) for name in TRANSPORT_COUNTS}
+        return replace(self, **counts)
 
 
 class Capture(Protocol):
@@ -179,8 +189,8 @@ class Capture(Protocol):
     def transport(self) -> Transport | None:
         """What was lost so far; None where nothing is known of it."""
 
-    def grab(self) -> bool:
-        """Wait for the next frame; False if the camera is gone or has ended."""
+    def grab(self) -> bool | None:
+        """Wait for the next frame; None where none came yet, False if the camera is gone or has ended."""
 
     def position(self) -> float:
         """The source's own time stamp of the grabbed frame, s; nan without one."""

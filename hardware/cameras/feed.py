@@ -158,7 +158,7 @@ def open_capture(source: CameraSource, size: tuple[int, int] | None, clock: Cloc
     if source.identity.kind is SourceKind.GENICAM:
         from hardware.cameras.genicam import open_genicam
 
-        return open_genicam(source, size)
+        return open_genicam(source, size, clock)
     return open_by_opencv(source, size, clock)
 
 
@@ -190,12 +190,13 @@ class Feed:
         self._newest: Image | None = None
         self._error = ""
         self._transport: Transport | None = None
+        self._earlier: Transport | None = None  # before the camera was opened last
         self._begin()
 
     def _begin(self) -> None:
         """Reset the state of the last connection."""
         self._stamping, self._watch = FrameStamper(self._period), FrameWatch(self.place.size)
-        self._grabbed = 0
+        self._grabbed, self._earlier = 0, self._transport
 
     def run(self) -> None:
         """Step until closed, or the file has ended."""
@@ -219,9 +220,9 @@ class Feed:
         """Grab a frame and deliver it if it is good; or try to open the camera, and wait if that fails."""
         if self._capture is None:
             self._open()
-        elif self._capture.grab():
+        elif grabbed := self._capture.grab():
             self._take(self._capture)
-        else:
+        elif grabbed is not None:
             ended = self._capture.ends and self._grabbed > 0
             self._release()
             self._enter(CameraPhase.ENDED if ended else CameraPhase.GONE)
@@ -235,7 +236,9 @@ class Feed:
         self._capture, self._broken = capture, 0
 
     def _take(self, capture: Capture) -> None:
-        now, position = self._clock.now(), capture.position()
+        now, position, transport = self._clock.now(), capture.position(), capture.transport
+        with self._lock:
+            self._transport = self._earlier if transport is None else transport.after(self._earlier)
         if self._grabbed == 0:  # accepted controls show only once pictures flow
             self._first(capture)
         self._grabbed += 1
@@ -252,7 +255,6 @@ class Feed:
         fault = FrameFault.INCOMPLETE if capture.incomplete else fault
         with self._lock:
             self._missed += max(0, self._stamping.pll.missed - missed)
-            self._transport = capture.transport
             self._stamped = stamped
             self._newest = self._newest if image is None else image
         if fault is not None or image is None:

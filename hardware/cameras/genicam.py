@@ -23,6 +23,7 @@ from estimation.errors import InputError
 from hardware.cameras.capture import READ_TIMEOUT, CameraError, Control, Transport, image_from_pixels
 from hardware.cameras.sources import GENICAM_PREFIX, PIXEL_FORMATS, SOFTWARE_TRIGGER, CameraSource
 from hardware.cameras.stamping import DeviceClock
+from hardware.process.clock import Clock
 from perception.frames import Image
 
 SYSTEM_PYTHON = "/usr/bin/python3"  # which Debian installs bindings for
@@ -79,12 +80,12 @@ def list_industrial() -> tuple[IndustrialCamera, ...] | None:
     return tuple(IndustrialCamera(*(one[key] for key in keys)) for one in found)
 
 
-def open_genicam(source: CameraSource, size: tuple[int, int] | None) -> GenicamCapture:
+def open_genicam(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> GenicamCapture:
     """Open a camera and let pictures flow; CameraError says why that is not possible."""
     python = aravis_python()
     if python is None:
         raise CameraError(f"Aravis is not installed; {INSTALL}")
-    return GenicamCapture(python, source, size)
+    return GenicamCapture(python, source, size, clock)
 
 
 class GenicamCapture:
@@ -92,9 +93,10 @@ class GenicamCapture:
 
     ends, clocked = False, True
 
-    def __init__(self, python: str, source: CameraSource, size: tuple[int, int] | None) -> None:
+    def __init__(self, python: str, source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> None:
         """CameraError where it cannot be opened. size: (W, H) px; None: as the camera is set."""
-        self._source, self._clock, self._frame = source, DeviceClock(), dict[str, Any]()
+        self._source, self._now, self._frame = source, clock.now, dict[str, Any]()
+        self._clock = DeviceClock()
         self.transport: Transport | None = None
         memory = os.memfd_create("stillbed camera")
         try:
@@ -111,6 +113,7 @@ class GenicamCapture:
                 raise
         finally:
             os.close(memory)
+        self._heard = self._framed = clock.now()  # s, when the process said anything, and when a frame came
 
     def _open(self, memory: int, size: tuple[int, int] | None) -> dict[str, Any]:
         source = self._source
@@ -139,22 +142,25 @@ class GenicamCapture:
         """Whether packets of the grabbed frame are missing."""
         return bool(self._frame) and self._frame["status"] != "success"
 
-    def grab(self) -> bool:
-        """Wait for the next frame, whole or not; False where none came for READ_TIMEOUT, unless a line triggers it."""
+    def grab(self) -> bool | None:
+        """Wait for the next frame, whole or not; None where none came yet, False if the camera is gone.
+
+        It is gone where none came for READ_TIMEOUT; a camera that waits for its line must give signs of life only.
+        """
         self._give_back()
-        waited = 0.0
-        while True:
-            line = self._line(POLL_PERIOD)
-            if line is not None and "frame" in line:
-                self._take(line["frame"])
-                return True
-            if line is not None and "latch" in line:
+        line = self._line(POLL_PERIOD)
+        now = self._now()
+        if line is not None:
+            self._heard = now
+            if "latch" in line:
                 sent, received, device = line["latch"]
                 self._clock.latched(device, sent, received)
-            if line is None:
-                waited += POLL_PERIOD
-                if waited >= READ_TIMEOUT and self._source.trigger in (None, SOFTWARE_TRIGGER):
-                    return False
+            if "frame" in line:
+                self._framed = now
+                self._take(line["frame"])
+                return True
+        waits = self._source.trigger not in (None, SOFTWARE_TRIGGER)
+        return False if now - (self._heard if waits else self._framed) > READ_TIMEOUT else None
 
     def _take(self, frame: dict[str, Any]) -> None:
         self._frame = frame
@@ -254,7 +260,8 @@ class GenicamCapture:
             self._process.wait()
 
 
-def require_aravis(where: object, name: str, source: CameraSource) -> None:
-    """InputError where a camera needs Aravis and there is none."""
+def require_aravis(name: str, source: CameraSource) -> None:
+    """InputError where there is no Aravis for a camera, by its name in the rig."""
     if aravis_python() is None:
-        raise InputError(where, f"camera {name!r}: source", source.identity.shown, INSTALL)
+        key, allowed = f"camera {name!r}: source", f"once Aravis is there; {INSTALL}"
+        raise InputError("live cameras", key, source.identity.shown, allowed)
