@@ -39,6 +39,8 @@ PTP_STATES = ("PtpStatus", "GevIEEE1588Status")
 UDP_OVERHEAD = 36  # bytes of IP, UDP and GVSP in each packet of the size that is set
 ENVELOPE_PACKETS = 2  # leader and trailer of each frame
 MAX_SHORT_ID = 65535  # after which a GigE Vision 1 frame number begins again at 1
+REORDERED = 8  # frames after which one that is missing will not come any more
+MAX_GAP = 10_000  # frames: a larger step is no loss, the camera has begun to count anew
 _writing = threading.Lock()
 
 
@@ -158,12 +160,13 @@ class Counters:
     """What was lost on the way, exactly: packets by those that should have come, frames by their numbers."""
 
     def __init__(self, camera: Any, stream: Any, payload: int) -> None:
-        self._stream, self._ended, self._last, self._short = stream, 0, 0, False
-        self._per_frame = 0
+        self._stream, self._per_frame = stream, 0
         if camera.is_gv_device():
             data = camera.gv_get_packet_size() - UDP_OVERHEAD
             self._per_frame = -(-payload // data) + ENVELOPE_PACKETS
         self._infos = {stream.get_info_name(i): i for i in range(stream.get_n_infos())}
+        self._ended = self._last = self._turns = 0
+        self._skipped: set[int] = set()  # numbers that may still come: an incomplete frame comes after whole ones
         self.lost, self.frames_lost = 0, 0
 
     def _info(self, name: str) -> int:
@@ -174,23 +177,26 @@ class Counters:
 
         Packets of a frame under way only lower what seems lost, so the largest value that was seen is the right one.
         """
-        gap = 0
-        if self._last and number:
-            gap = number - self._last - 1
-            if gap < 0:  # from 65535 to 1; a camera that starts anew is opened anew as well
-                gap += MAX_SHORT_ID
-        self._last = number or self._last
-        if 0 < gap < MAX_SHORT_ID // 2:
-            self.frames_lost += gap
-        self._ended += 1 + max(0, gap if gap < MAX_SHORT_ID // 2 else 0)
+        self._ended += 1
+        if number:
+            self._follow(number)
         received = self._info("n_received_packets") - self._info("n_duplicated_packets")
-        self.lost = max(self.lost, self._ended * self._per_frame - received)
-        return {
-            "received": received,
-            "lost": self.lost,
-            "resent": self._info("n_resent_packets"),
-            "frames_lost": self.frames_lost,
-        }
+        self.lost = max(self.lost, (self._ended + self.frames_lost) * self._per_frame - received)
+        resent = self._info("n_resent_packets")
+        return {"received": received, "lost": self.lost, "resent": resent, "frames_lost": self.frames_lost}
+
+    def _follow(self, number: int) -> None:
+        """Take a frame's number, which begins at 1 again after MAX_SHORT_ID."""
+        own = number + self._turns * MAX_SHORT_ID
+        if self._last - own > MAX_SHORT_ID // 2:
+            self._turns, own = self._turns + 1, own + MAX_SHORT_ID
+        if self._last and 0 < own - self._last <= MAX_GAP:
+            self._skipped.update(range(self._last + 1, own))
+        self._skipped.discard(own)
+        self._last = max(self._last, own)
+        gone = {one for one in self._skipped if one < self._last - REORDERED}
+        self._skipped -= gone
+        self.frames_lost += len(gone)
 
 
 class Memory:
