@@ -277,3 +277,19 @@ def test_three_fake_cameras_are_a_rig_one_dies_and_packets_are_lost(monkeypatch:
     assert wrong_sets(sets, stamps, period / 2) == []
     assert max(map(abs, errors)) < 1e-3
     assert sum(len(one.frames) == 3 for one in first) > 0.7 * 18 / period
+
+
+@pytest.mark.slow
+def test_a_camera_whose_clock_is_far_off_and_runs_wrong_is_stamped_by_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten days ahead and 150 ppm too fast: 4.5 ms in the half minute."""
+    need_fakes(several=True)
+    stamps, camera, rate = watch_stamps(monkeypatch), FakeCamera(0, clock="+10d x1.00015"), 1.5e-4
+    with own_network(1), running(camera), LiveCameras(rig_of(1), [camera.source(fps=20.0)], CLOCK) as live:
+        sets = sets_until(live, CLOCK.now() + 40)
+        transport = live.health().cameras[0].transport
+    assert transport is not None and transport.drift == pytest.approx(-rate, abs=2e-5)
+    ours = np.array([one.frames[0].stamp for one in sets])
+    theirs = np.array([(stamps[stamp] - stamps[ours[0]]) / 1e9 for stamp in ours])
+    off = ours - ours[0] - theirs / (1 + rate)
+    print(f"drift {1e6 * transport.drift:.1f} ppm; stamps {1e3 * np.ptp(off[100:]):.2f} ms apart from a steady clock")
+    assert len(sets) > 600 and np.ptp(off[100:]) < 1e-3
