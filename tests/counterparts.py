@@ -23,7 +23,9 @@ import pytest
 from hardware.cameras import genicam
 from hardware.cameras.capture import locked_exposure
 from hardware.cameras.genicam import INSTALL, SYSTEM_PYTHON, GenicamCapture, aravis_python
+from hardware.cameras.live import LiveCameras
 from hardware.cameras.sources import GENICAM_PREFIX, CameraSource, Identity, SourceKind
+from perception.frames import FrameSet
 from tests.streams import CLOCK
 
 FAKE = "arv-fake-gv-camera-0.8"
@@ -173,6 +175,14 @@ def watch_stamps(monkeypatch: pytest.MonkeyPatch) -> dict[float, int]:
 def instant_of(stamp: int) -> float:
     """Our instant, s, of a stamp by the machine's time of day, ns."""
     return CLOCK.now() - (time.time_ns() - stamp) / 1e9
+
+
+def sets_until(live: LiveCameras, end: float) -> list[FrameSet]:
+    """All sets until an instant, s."""
+    sets = []
+    while (one := live.next_set(end)) is not None:
+        sets.append(one)
+    return sets
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """GStreamer's RTSP server with one camera, run by the system's Python: rtsp://127.0.0.1:PORT/camera.
 
-Each picture, 320x240, shows the instant at which it was taken, by the machine's monotonic clock in ms, as 32 bars, white
-for 1, the highest bit first. It prints "ready" once it listens; a line "stall" on its input stops the pictures.
+Each picture, 320x240, shows the instant at which it was taken, by the machine's monotonic clock in ms, as 32 bars,
+white for 1, the highest bit first. It prints "ready" once it listens.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ SIZE, FPS = (320, 240), 25
 PIPELINE = (
     "( appsrc name=source is-live=true do-timestamp=true format=time "
     f"caps=video/x-raw,format=GRAY8,width={SIZE[0]},height={SIZE[1]},framerate={FPS}/1 "
-    "! videoconvert ! video/x-raw,format=I420 ! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=25 bitrate=2000 "
+    "! videoconvert ! video/x-raw,format=I420 "
+    "! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=25 bitrate=2000 "
     "! rtph264pay name=pay0 pt=96 )"
 )
-stalled = threading.Event()
 
 
 def picture(instant: int) -> bytes:
@@ -39,22 +39,15 @@ def feed(source: Gst.Element) -> None:
     while True:
         due += 1 / FPS
         time.sleep(max(0.0, due - time.monotonic()))
-        if not stalled.is_set():
-            shown = Gst.Buffer.new_wrapped(picture(round(1000 * time.monotonic())))
-            if source.emit("push-buffer", shown) != Gst.FlowReturn.OK:
-                return
+        shown = Gst.Buffer.new_wrapped(picture(round(1000 * time.monotonic())))
+        if source.emit("push-buffer", shown) != Gst.FlowReturn.OK:
+            return
 
 
 def configure(_: object, media: GstRtspServer.RTSPMedia) -> None:
     """Feed the camera of a connection."""
     source = media.get_element().get_child_by_name("source")
     threading.Thread(target=feed, args=(source,), daemon=True).start()
-
-
-def listen() -> None:
-    """Stall when told to."""
-    for _ in sys.stdin:
-        stalled.set()
 
 
 def main() -> None:
@@ -71,7 +64,6 @@ def main() -> None:
     server.get_mount_points().add_factory("/camera", factory)
     if server.attach(None) == 0:
         sys.exit("the port is taken")
-    threading.Thread(target=listen, daemon=True).start()
     print("ready", flush=True)
     GLib.MainLoop().run()
 

@@ -26,7 +26,16 @@ from hardware.cli.main import main
 from hardware.operator.view import CheckVerdict
 from hardware.process.clock import SimClock
 from perception.frames import FrameSet
-from tests.counterparts import FakeCamera, PacketLoss, instant_of, need_fakes, own_network, running, watch_stamps
+from tests.counterparts import (
+    FakeCamera,
+    PacketLoss,
+    instant_of,
+    need_fakes,
+    own_network,
+    running,
+    sets_until,
+    watch_stamps,
+)
 from tests.streams import CLOCK, ListedCapture, Shot, picture
 from tests.test_camera_names import rig_file
 
@@ -235,13 +244,6 @@ def test_what_a_camera_does_not_have_is_told() -> None:
 
 def rig_of(count: int) -> list[CameraPlace]:
     return [CameraPlace(i, f"c{i}", SIZE) for i in range(count)]
-
-
-def sets_until(live: LiveCameras, end: float) -> list[FrameSet]:
-    out = []
-    while (one := live.next_set(end)) is not None:
-        out.append(one)
-    return out
 
 
 def wrong_sets(sets: list[FrameSet], stamps: dict[float, int], limit: float) -> list[FrameSet]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,9 @@ from perception.frames import Image
 
 READ_TIMEOUT = 2  # s: a camera or stream that sends nothing for longer is opened again
 OPEN_TIMEOUT = 3  # s for a stream to answer
+CATCH_UP = 0.75  # of the time between two stamps: RTSP pictures that come faster had been waiting
+CATCH_UP_FRAMES = 5  # over which that is judged: FFmpeg reads a socket in pieces
+MAX_BACKLOG = 300  # pictures that FFmpeg may have read before it gives the first: five seconds at 60 Hz
 FILE_FPS = 30.0  # Hz, where neither the container nor rig.toml has a rate
 EXPOSURE_UNIT = 1e-4  # s: V4L2 counts an absolute exposure in 100 us
 MANUAL_EXPOSURE, AUTOMATIC_OFF = 1.0, 0.0  # V4L2_EXPOSURE_MANUAL; the other automatics are switches
@@ -245,15 +249,32 @@ class _OpenCapture:
         rate = capture.get(cv2.CAP_PROP_FPS)
         self._period = 1 / (source.fps or (rate if rate > 0 else FILE_FPS))
         self._next = clock.now()
+        self._behind = source.identity.text.startswith(("rtsp://", "rtsps://"))  # FFmpeg looks at these for a second
 
     def grab(self) -> bool:
         if self.ends:
             self._clock.wait_until(self._next)
             self._next = max(self._next, self._clock.now() - self._period) + self._period
+        begun = self._clock.now()
         try:
-            return bool(self._capture.grab())
+            grabbed = self._catch_up() if self._behind else bool(self._capture.grab())
         except cv2.error:
             return False
+        # at the time's end a decoder gives the picture that it still holds, which is as old as that
+        return grabbed and (self.ends or self._clock.now() - begun < READ_TIMEOUT)
+
+    def _catch_up(self) -> bool:
+        """Grab the first picture that was not read before: the others come faster than they were taken."""
+        seen = deque[tuple[float, float]](maxlen=CATCH_UP_FRAMES)
+        for _ in range(MAX_BACKLOG):
+            if not self._capture.grab():
+                return False
+            now, position = self._clock.now(), self.position()
+            seen.append((now, position))
+            if len(seen) == CATCH_UP_FRAMES and now - seen[0][0] >= CATCH_UP * (position - seen[0][1]):
+                break
+        self._behind = False
+        return True
 
     def position(self) -> float:
         position = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
