@@ -10,7 +10,7 @@ from estimation.calibration.lens_model import matrix_of
 from estimation.rig import Camera, Rig
 from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
-from hardware.simulator.scene.ground_truth_views import BoardView
+from hardware.simulator.scene.render import BoardView
 from perception.boards.board import Board
 from tests.boards import motion, places
 

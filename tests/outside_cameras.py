@@ -27,8 +27,7 @@ from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.scene.appearance import Sensor
-from hardware.simulator.scene.ground_truth_views import BoardView
-from hardware.simulator.scene.render import render
+from hardware.simulator.scene.render import BoardView, render
 from hardware.simulator.scene.scene import Scene, WorldState
 from perception.frames import Image
 from tests.board_session import BOARD, RATE, small_rig

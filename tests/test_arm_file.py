@@ -55,6 +55,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
         draw.uniform(0.01, 0.04),
         draw.uniform(0, 0.5),
         np.stack([np.cumsum(draw.uniform(0.1, 30, 3 + seed % 4)), draw.uniform(0, 9, 3 + seed % 4)], axis=-1),
+        *(None if seed % 3 else draw.uniform(0, 0.009), None if seed % 2 else draw.uniform(0.05, 0.5)),
     )
     file = tmp_path_factory.mktemp("arm") / "arm.toml"
     write_arm(file, profile, "made up\nfor a test")

@@ -22,7 +22,7 @@ from hardware.calibration.run import CalibrationOptions, CalibrationResult, run_
 from hardware.cli.main import main
 from hardware.files.rig_file import read_board, read_rig, write_board
 from hardware.process.progress import no_progress
-from hardware.simulator.scene.ground_truth_views import BoardView
+from hardware.simulator.scene.render import BoardView
 from perception.boards.board import (
     Board,
     CornerFinder,

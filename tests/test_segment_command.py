@@ -25,7 +25,7 @@ from hardware.files.pose_file import WOUND_FILE_NAME, WoundFile
 from hardware.live.prepared import prepare
 from hardware.live.settings import LiveSettings
 from hardware.offline.segment import OVERLAY_FOLDER, WOUND_TABLE, SegmentOptions, input_files, run_segment
-from hardware.simulator.scene.ground_truth_views import WoundView, mask_from_outlines, wound_view
+from hardware.simulator.scene.render import WoundView, mask_from_outlines, wound_view
 from perception.frames import Frame, FrameSet
 from perception.tracking.step import report_without_offsets
 from perception.training.dataset import Labelled, read_dataset

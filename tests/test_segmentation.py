@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.simulator.scene.ground_truth_views import mask_from_outlines
+from hardware.simulator.scene.render import mask_from_outlines
 from perception.frames import Frame, FrameSet
 from perception.tracking.wound_step import MAX_MISSED_LOOKS, AsyncSegmentation, WoundFilter, overlap
 from perception.wound.network import Looks, Settings, window, wound_logits

@@ -21,7 +21,7 @@ from hardware.cli.main import main
 from hardware.files.images import encode
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.offline.segment import AREA_TABLE, NO_BAND, UNCALIBRATED, area_text, input_files
-from hardware.simulator.scene.ground_truth_views import WoundSet, wound_set
+from hardware.simulator.scene.render import WoundSet, wound_set
 from perception.tracking.wound_area import (
     ELSEWHERE,
     FEW_POINTS,

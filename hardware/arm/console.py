@@ -10,8 +10,8 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, ArmStatus
+from hardware.arm.driver import ArmDriver
 from hardware.arm.link import Arm, shut_down
-from hardware.arm.port import Opener
 from hardware.arm.profile import AXIS_LETTERS, DISPLAY_UNITS, ArmProfile, LinkSettings
 from hardware.process import checks
 from hardware.process.clock import Clock
@@ -39,7 +39,7 @@ class ArmRequest:
 
 
 def run_arm(
-    opener: Opener,
+    driver: ArmDriver,
     profile: ArmProfile,
     request: ArmRequest,
     clock: Clock,
@@ -55,7 +55,7 @@ def run_arm(
     if request.moves and not request.confirmed:
         raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
     start, settings = clock.now(), LinkSettings() if settings is None else settings
-    arm = Arm(opener, profile, start, settings)
+    arm = Arm(driver, profile, start, settings)
     if arm.state is ArmState.UNPLUGGED and (request.moves or np.isfinite(request.seconds)):
         raise InputError("arm", "port", arm.reason, "a device that is there, or --watch to wait for it")
     console = _Console(arm, clock, say, start)

@@ -19,8 +19,8 @@ from itertools import chain
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.arm.driver import G1, Pause
 from hardware.arm.feedback import REST_TOLERANCE, ArmFeedback, near
-from hardware.arm.protocol import G1, Pause
 
 POSITION, ANGLES = slice(0, 3), slice(3, 6)  # of axes (6,)
 

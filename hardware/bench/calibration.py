@@ -27,7 +27,7 @@ from hardware.calibration.arm_solve import kinematics_of, solve_folder
 from hardware.calibration.report import held_out_residual, median_residual
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, no_progress
-from hardware.simulator.scene.ground_truth_views import BoardView
+from hardware.simulator.scene.render import BoardView
 from hardware.simulator.watched_arm import watched_arm
 from perception.boards.board import Board, CornerFinder, CornerTable, empty_table, usable_views
 

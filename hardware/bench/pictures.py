@@ -33,8 +33,7 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.scene.appearance import Sensor, unlit_texture
 from hardware.simulator.scene.fields import smooth_noise
-from hardware.simulator.scene.ground_truth_views import wound_set, wound_view
-from hardware.simulator.scene.render import render
+from hardware.simulator.scene.render import render, wound_set, wound_view
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import shape_from_function
 from hardware.simulator.truth import Truth

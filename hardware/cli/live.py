@@ -234,8 +234,7 @@ def _serve_virtual_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
 def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
     from hardware.arm.console import ArmRequest, axes_from_text, jog_from_text, origin_from_text, run_arm
     from hardware.arm.device import ArmState
-    from hardware.arm.port import PortOpener
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
 
     request = ArmRequest(
         seconds=float("inf") if a.watch else a.seconds,
@@ -246,11 +245,11 @@ def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
         confirmed=a.yes,
     )
     settings = LinkSettings(pause_frame=not a.no_pause_frame)
-    device = PortOpener(a.device, profile.baud)
+    driver = open_arm(a.device, profile)
     try:
-        status = run_arm(device, profile, request, WallClock(), settings=settings)
+        status = run_arm(driver, profile, request, WallClock(), settings=settings)
     finally:
-        device.release()
+        driver.release()
     return 0 if status.state is ArmState.DISARMED else 1
 
 

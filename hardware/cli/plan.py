@@ -302,6 +302,6 @@ def _segmenter(a: argparse.Namespace) -> Segmenter:
 
 def _run_train(arguments: argparse.Namespace) -> None:
     from hardware.offline.train import run_train
-    from hardware.simulator.scene.ground_truth_views import wound_view
+    from hardware.simulator.scene.render import wound_view
 
     print(run_train(arguments, wound_view))

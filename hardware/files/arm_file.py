@@ -11,6 +11,8 @@ pwm = 0                                       # bytes 27 to 30 of a G1 frame: 0,
 pwm_on = 1500                                 # optional, in its place while material is to flow: switches a dispenser
 baud = 115200                                 # or 9600, at which a frame takes 50 ms
 tick_s = 0.02                                 # at least a frame's time on the wire, which is the default where longer
+dead_time_s = 0.0                             # optional, that a command takes to an arm without such a line
+flight_s = 0.05                               # optional, motion that may be under way at once
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
@@ -167,12 +169,14 @@ _ANGLES = ("turn", "surface_turn")  # single numbers in rad
 _ARRAYS = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)}  # shapes
 ARM_KEYS = (
     *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
+    *("dead_time_s", "flight_s"),
     *("limits", "no_go", "kinematics"),
 )
 # of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
 PART_PREFIXES = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}
 FILE_KEYS = {
     **{"home": "home_mm_deg", "tool_offset": "tool_offset_mm", "tick": "tick_s", "lag": "lag_s", "tool": "tool_mm"},
+    **{"dead_time": "dead_time_s", "flight": "flight_s"},
     "kinematics.dh": "kinematics.dh_mm_deg",
     **{f"kinematics.{name}": f"kinematics.{key}" for key, name in JOINT_KEYS.items()},
 }
@@ -206,6 +210,8 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             baud=default.baud,
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
+            dead_time=checks.number(path, "dead_time_s", table["dead_time_s"]) if "dead_time_s" in table else None,
+            flight=checks.number(path, "flight_s", table["flight_s"]) if "flight_s" in table else None,
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
         )
     except InputError as error:
@@ -235,6 +241,8 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         f"baud = {profile.baud}",
         f"tick_s = {checks.toml_number(profile.tick)}",
         f"lag_s = {checks.toml_number(profile.lag)}",
+        *([] if profile.dead_time is None else [f"dead_time_s = {checks.toml_number(profile.dead_time)}"]),
+        *([] if profile.flight is None else [f"flight_s = {checks.toml_number(profile.flight)}"]),
         f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",

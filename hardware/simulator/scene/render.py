@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,11 +12,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.rig import Camera, pixels_from_points
+from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.scene.appearance import Sensor, expose
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.simulator.scene.appearance import Appearance, Sensor, expose
 from hardware.simulator.scene.fields import Field, upsample
-from hardware.simulator.scene.rays import ImageBox, RenderView
+from hardware.simulator.scene.rays import ImageBox, RenderView, rays_at
 from hardware.simulator.scene.scene import (
     NOZZLE_PARTS,
     XYZ,
@@ -29,6 +30,7 @@ from hardware.simulator.scene.scene import (
     rotate_rays,
     scene_state,
 )
+from hardware.simulator.scene.shape import BODIES, Shape, Wound, body
 from hardware.simulator.scene.surface_picture import (
     DRAPE_LATTICE_PX,
     DrapePicture,
@@ -36,6 +38,7 @@ from hardware.simulator.scene.surface_picture import (
     drape_picture,
     surface_picture,
 )
+from perception.boards.board import Board, ink_cells
 from perception.frames import Image
 
 MIN_PART_DEPTH = 30.0  # mm before the lens: nearer, a part is not drawn
@@ -192,3 +195,170 @@ def _behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> 
         near = skin.depth[skin.box.samples(both)]
         np.copyto(depth[box.samples(both)], near, where=np.isfinite(near))
     return depth
+
+
+VIEW_TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own
+MASK_SAMPLES = 4  # samples a pixel and axis of the true mask
+FINER_OUTLINES = 3  # of pictures by which areas are judged: at 4 and 0.25 mm the outline is off by 1 % of a small wound
+IMAGE_SIZES = ((1280, 720), (640, 480), (768, 576))  # px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WoundView:
+    """One picture with its ground truth."""
+
+    image: Image  # (H, W, 3) BGR
+    wound: NDArray[np.bool_]  # (H, W), all False where the skin is healthy
+    camera: Camera
+    base_from_surface: Array  # (4, 4) mm
+    area: float  # mm^2 of the wound on the surface
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WoundSet:
+    """Pictures of one wound by the cameras of a rig at one instant, with their ground truth."""
+
+    images: tuple[Image, ...]  # (H, W, 3) BGR, by camera
+    wounds: tuple[NDArray[np.bool_], ...]  # (H, W), by camera
+    rig: Rig
+    base_from_surface: Array  # (4, 4) mm
+    area: float  # mm^2 inside the wound's edge of the skin as it would go on over the wound
+
+
+def wound_view(seed: int, wounded: bool = True) -> WoundView:
+    """The picture of a seed: body, wound, tone, wetness, drape, lamps and camera are drawn from it."""
+    rng = np.random.default_rng([seed, 41])
+    scene, _ = _random_scene(rng, seed, wounded)
+    size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
+    focal = size[0] * rng.uniform(0.7, 1.1)
+    camera = arc_rig((rng.uniform(0, 75),), rng.uniform(220, 480), focal, size).cameras[0]
+    image, pose = _random_pictures(rng, scene, Rig((camera,)))
+    inside, area = scene.shape.inside, 0.0
+    if inside is not None:
+        area = float((inside > 0).sum()) * scene.shape.step**2
+    return WoundView(image[0], _true_mask(scene.shape, camera, pose), camera, pose, area)
+
+
+def wound_set(seed: int) -> WoundSet:
+    """The pictures of a seed by the thesis's three cameras: drawn as in `wound_view`, and how far away they stand."""
+    rng = np.random.default_rng([seed, 43])
+    scene, bare = _random_scene(rng, seed, True)
+    size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
+    rig = arc_rig(distance=rng.uniform(260, 480), focal=size[0] * rng.uniform(0.7, 1.1), size=size)
+    images, pose = _random_pictures(rng, scene, rig)
+    inside, step = scene.shape.inside, scene.shape.step
+    assert inside is not None
+    along, across = np.gradient(bare.heights, step)
+    area = float(np.sqrt(1 + along**2 + across**2)[inside > 0].sum()) * step**2
+    wounds = tuple(_true_mask(scene.shape, camera, pose, FINER_OUTLINES) for camera in rig.cameras)
+    return WoundSet(tuple(images), wounds, rig, pose, area)
+
+
+def _random_scene(rng: np.random.Generator, seed: int, wounded: bool) -> tuple[Scene, Shape]:
+    """A scene, and the shape of its skin as it would be without the wound."""
+    wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
+    kind = rng.choice(list(BODIES))
+    return Scene(body(kind, wound, seed), _random_appearance(rng), seed=seed), body(kind, None, seed)
+
+
+def _random_pictures(rng: np.random.Generator, scene: Scene, rig: Rig) -> tuple[list[Image], Array]:
+    """A picture (H, W, 3) BGR of each camera, and base_from_surface (4, 4)."""
+    pose = BASE_FROM_REST @ se3.make(se3.exp_rotation(rng.normal(0, [0.15, 0.15, 1.5])), rng.normal(0, [12, 12, 6]))
+    instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
+    sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
+    draws = [rng] if len(rig) == 1 else rng.spawn(len(rig))
+    return render(scene, rig.cameras, [instant] * len(rig), sensor, draws, threads=1), pose
+
+
+def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: int = 1) -> NDArray[np.bool_]:
+    """(H, W) what a camera sees of the wound; all False without one.
+
+    finer: times that the outline is drawn finer; by 1 it runs through the outermost nodes, half a node too far in.
+    """
+    outlines = []
+    if shape.inside is not None:
+        inside = cv2.resize(shape.inside, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
+        contours, _ = cv2.findContours((inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
+        for each in contours:
+            nodes = (each.reshape(-1, 2) + 0.5) / finer - 0.5
+            points = shape.points((nodes - middle) * shape.step)
+            outlines.append(pixels_from_points(camera, se3.transform_points(base_from_surface, points))[0])
+    return mask_from_outlines(outlines, camera.size, finer * MASK_SAMPLES)
+
+
+def mask_from_outlines(
+    outlines: Sequence[Array], size: tuple[int, int], samples: int = MASK_SAMPLES
+) -> NDArray[np.bool_]:
+    """(H, W) pixels that lie for the most part inside closed outlines (N, 2) px, in an image of `size` (W, H).
+
+    Drawn finer, by `samples` a pixel and axis, and shrunk: OpenCV fills the outline's own pixels too, which would add
+    half a pixel all round.
+    """
+    fine = np.zeros((size[1] * samples, size[0] * samples), np.uint8)
+    for outline in outlines:
+        cv2.fillPoly(fine, [np.round((outline + 0.5) * samples - 0.5).astype(np.int32)], 255)
+    return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA) > 127)
+
+
+def _random_appearance(rng: np.random.Generator) -> Appearance:
+    ambient, key, fill = rng.uniform(0.2, 0.5), rng.uniform(0.35, 0.8), rng.uniform(0.05, 0.4)
+    tone, wetness, hair = rng.uniform(0, 0.9), rng.uniform(0.1, 1), rng.uniform(0, 1.2)
+    drape = bool(rng.random() < 0.6)
+    return Appearance(VIEW_TEXEL, tone, wetness, hair, drape, ambient=ambient, key=key, fill=fill)
+
+
+BOARD_SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel
+PAPER_MARGIN = 0.5  # of a square, white around the print
+PAPER_GREY, INK_GREY, WALL_GREY = 205.0, 38.0, 120.0  # grey levels of paper, ink and what is behind
+DRAWING_SCALE = 8  # parts of a cell along its edge; light between two is interpolated, so that edges do not step
+BOX_MARGIN_PX = 12  # px around the board that are drawn
+
+
+class BoardView:
+    """One camera before one board."""
+
+    def __init__(self, camera: Camera, board: Board) -> None:
+        self.camera, self._board = camera, board
+        ink, cell = ink_cells(board)
+        rim = round(PAPER_MARGIN * board.square / cell * DRAWING_SCALE)
+        drawn = np.kron(np.where(ink, INK_GREY, PAPER_GREY), np.ones((DRAWING_SCALE, DRAWING_SCALE)))
+        paper = INK_GREY if board.inverted else PAPER_GREY
+        self._drawing = np.pad(drawn, rim, constant_values=paper).astype(np.float32)
+        scale, shift = DRAWING_SCALE / cell, rim - 0.5  # cells' middles are whole numbers
+        self._drawing_from_board = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
+
+    def picture(self, base_from_board: Array, blur: float, noise: float, rng: np.random.Generator) -> Image:
+        """The image (H, W) grey of the board at a pose (4, 4); blur: px, noise: grey levels, one sigma each."""
+        w, h = self.camera.size
+        light = np.full((h, w), WALL_GREY, np.float32)
+        box = self._box(base_from_board)
+        if box is not None:
+            x0, y0, x1, y1 = box
+            light[y0:y1, x0:x1] = self._patch(base_from_board, box)
+        if blur:
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), blur), np.float32)
+        grain = rng.standard_normal((h, w), np.float32)
+        return np.clip(np.round(light + noise * grain), 0, 255).astype(np.uint8)
+
+    def _box(self, base_from_board: Array) -> tuple[int, int, int, int] | None:
+        rim = PAPER_MARGIN * self._board.square
+        w, h = self._board.size
+        x, y = np.meshgrid(np.linspace(-rim, w + rim, 5), np.linspace(-rim, h + rim, 5))
+        outline = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+        pixels, depth = pixels_from_points(self.camera, se3.transform_points(base_from_board, outline))
+        if (depth < 1).any():
+            return None
+        low = np.maximum(np.floor(pixels.min(0)).astype(int) - BOX_MARGIN_PX // 2, 0)
+        high = np.minimum(np.ceil(pixels.max(0)).astype(int) + BOX_MARGIN_PX // 2, self.camera.size)
+        return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (high > low).all() else None
+
+    def _patch(self, base_from_board: Array, box: tuple[int, int, int, int]) -> Field:
+        x0, y0, x1, y1 = box
+        x, y = ((np.arange((b - a) * BOARD_SAMPLES) + 0.5) / BOARD_SAMPLES - 0.5 + a for a, b in ((x0, x1), (y0, y1)))
+        u, v = rays_at(self.camera, x, y)
+        camera_from_board = se3.inverse(self.camera.base_from_camera) @ base_from_board
+        drawing_from_ray = self._drawing_from_board @ np.linalg.inv(camera_from_board[:3, [0, 1, 3]])
+        across, down, depth = (a * u + b * v + c for a, b, c in drawing_from_ray.astype(np.float32))
+        light = cv2.remap(self._drawing, across / depth, down / depth, cv2.INTER_LINEAR, borderValue=WALL_GREY)
+        return np.asarray(cv2.resize(light, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA), np.float32)
