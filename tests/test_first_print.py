@@ -42,6 +42,7 @@ from tests.outside_cameras import WOUND_FPS, outside, wound_rig, wound_scene
 SCAN_FROM_TRUE = se3.make(se3.exp_rotation([0.1, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame
 SMALL = "--tissue gel=rest:1:20 --layer-height 1.2 --bead 1.6 --speed 5 --travel 15"  # 47 mm of bead in 10 s
 LIFT = 20.0  # mm
+RISE = 2.0  # mm by which the skin comes nearer to a nozzle that is held: `outside_cameras.breath_at`
 DELAYS = (0.08, 0.04, 0.08, 0.04)  # s
 PROGRAM = (sys.executable, "-u", "-m", "hardware.cli.main")
 STOPPED_AT = 45.0  # checkpoints of some 140
@@ -393,7 +394,7 @@ def test_dry_run(watched: Table) -> None:
     far = nearest(truth.tip, line.points + LIFT * up)
     low = line.distance(truth.tip).min()
     print(f"above each checkpoint {np.percentile(far, 95):.3f} mm (95 %), {far.max():.3f}; at {low:.2f} mm or more")
-    assert low > LIFT - 1.0 and np.percentile(far, 95) < 0.6
+    assert low > LIFT - RISE - 0.3 and np.percentile(far, 95) < 0.6
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from scipy.spatial import cKDTree
 
 from estimation.errors import InputError
 from hardware.live.prepared import RunFiles
@@ -22,9 +24,10 @@ from hardware.process.provenance import file_hash
 from hardware.recording import ros_messages
 from hardware.recording.mcap_file import FileMetadata, walk
 from hardware.recording.recorder import PublishedMessage, Recorder
+from hardware.recording.session_reader import open_session
 from tests.live_runs import light_runs, messages
 from tests.session_files import rig
-from tests.test_viewers import surface_at
+from tests.test_viewers import placed, read, surface_at
 
 CLOCK = WallClock()
 PROTOCOL = "foxglove.sdk.v1"
@@ -35,6 +38,27 @@ DATA = 1  # kind of a binary message that holds another, behind it its subscript
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return int(listener.getsockname()[1])
+
+
+def nozzle_from_path(record: Path) -> np.ndarray:
+    """(N,) mm from the path to the nozzle while material is laid, all as viewers are shown them."""
+    frames: dict[str, list[tuple[int, np.ndarray]]] = {"surface": [], "nozzle": []}
+    for each in (each for message in read(record, "/tf") for each in message.transforms):
+        stamp = each.header.stamp.sec * 1_000_000_000 + each.header.stamp.nanosec
+        frames[each.child_frame_id].append((stamp, placed(each.transform)))
+    rows = np.frombuffer(read(record, "/path")[-1].data.tobytes(), [("at", "<f4", 3), ("colour", "<u4")])
+    at = np.linspace(0, len(rows) - 1, 100 * len(rows))
+    line = np.stack([np.interp(at, np.arange(len(rows)), 1000 * axis) for axis in rows["at"].T], axis=1)
+    path = cKDTree(line)
+    began = open_session(record).began
+    laid = [began + round(1e9 * float(str(m["stamp"]))) for m in messages(record, "/move") if m["extrude"]]
+    times, poses = zip(*frames["surface"], strict=True)
+    off = []
+    for stamp, nozzle in frames["nozzle"]:
+        if laid[0] < stamp < laid[-1]:
+            pose = poses[min(int(np.searchsorted(times, stamp)), len(poses) - 1)]
+            off.append(path.query((np.linalg.inv(pose) @ nozzle)[:3, 3])[0])
+    return np.array(off)
 
 
 async def told(window: aiohttp.ClientWebSocketResponse) -> dict[str, Any] | bytes:
@@ -210,3 +234,5 @@ def test_a_live_run_is_seen_while_it_prints_and_says_who_made_it_of_what(tmp_pat
     with AnyReader([record]) as reader:
         assert began - 1 < reader.start_time / 1e9 < reader.end_time / 1e9 < utc_now() + 1
         assert reader.topics["/surface"].msgcount > 100
+    off = nozzle_from_path(record)
+    assert len(off) > 50 and np.percentile(off, 90) < 1.0, np.percentile(off, [0, 50, 90, 100])

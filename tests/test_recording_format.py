@@ -87,6 +87,23 @@ def test_the_summary_points_at_what_is_there(whole: Path) -> None:
     assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 4
 
 
+def test_no_bit_of_what_a_file_says_of_itself_flips_unseen(whole: Path, tmp_path: Path) -> None:
+    """Else a flipped digit would move the time of day of everything."""
+    data, told = bytearray(whole.read_bytes()), 0
+    began = open_session(whole).began
+    with open(whole, "rb") as file:
+        (index,) = SeekingReader(file).get_summary().metadata_indexes
+    for offset in range(index.offset + 9, index.offset + index.length, 3):
+        data[offset] ^= 1
+        flipped = tmp_path / "flipped.mcap"
+        flipped.write_bytes(data)
+        data[offset] ^= 1
+        session = open_session(flipped)
+        assert session.damage or session.began == began, offset
+        told += bool(session.damage)
+    assert told > 0.8 * index.length / 3  # unseen is only what changes nothing: the table's name, the checksum's
+
+
 CHANNELS_PAGE = Path(__file__).parent.parent / "docs" / "recordings.md"
 
 

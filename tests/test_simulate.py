@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.online.surface_state import StateSettings
+from estimation.rig import pixels_from_points
 from estimation.synthetic.world import BASE_FROM_REST
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
@@ -23,6 +25,7 @@ from hardware.recording.session_reader import open_session
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.simulate import SimulationOptions, run_simulation
 from tests.nozzle_logs import read_nozzle
+from tests.test_viewers import placed, read
 from tests.worlds import IDEAL, SMALL, write_path, write_scenario
 
 BREATHING = {"kind": "breathing", "amplitude_mm": 2.0, "rate_hz": 0.4}
@@ -112,6 +115,20 @@ def test_the_truth_holds_every_exposure_and_each_pose_is_near_it(recorded: Path)
     assert np.abs(truth.stamps[:, None] - exposed).min(axis=0).max() < 1e-8
     session = open_session(out / "session")
     assert session.truth is not None and len(session.truth.stamps) == len(truth.stamps)
+
+
+def test_viewers_see_the_landmarks_in_the_wounds_region(recorded: Path) -> None:
+    """In the pictures, where the simulator says that the region is."""
+    file = recorded / "one" / "session.mcap"
+    session = open_session(file)
+    cloud = read(file, "/landmarks")[-1]
+    lies = placed(read(file, "/tf")[-1].transforms[0].transform)
+    points = 1000 * np.frombuffer(cloud.data.tobytes(), "<f4").reshape(-1, 3)
+    assert len(points) > 30 and cloud.header.frame_id == "surface"
+    for roi in session.roi:
+        pixels, depth = pixels_from_points(session.rig.cameras[roi.camera], se3.transform_points(lies, points))
+        low, high = roi.polygon.min(axis=0) - 5, roi.polygon.max(axis=0) + 5
+        assert ((pixels > low) & (pixels < high)).all(axis=1).mean() > 0.95 and (depth > 0).all()
 
 
 def test_folder_and_mcap_hold_the_same_session(recorded: Path) -> None:

@@ -186,7 +186,11 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
     set_up_process("recorder", settings.cores_recorder, RECORDER_NICENESS, outlives=True)
     state_inputs(used_files(settings), settings.operator)
     retain_freed_pages(FREE_PAGES_BYTES)
-    writer = _EntryWriter(settings, reports)
+    try:
+        writer = _EntryWriter(settings, reports)
+    except StillbedError as error:
+        reports.put(RecorderReport(0, 0.0, str(error)))
+        return
     try:
         writer.run([RecorderReceiver(sender) for sender in senders])
     except StillbedError as error:
@@ -209,14 +213,17 @@ class FoxgloveServer:
         import foxglove  # the extra [foxglove]
 
         self._library, self._context = foxglove, foxglove.Context()
-        self._server = foxglove.start_server(
-            name="stillbed",
-            host=LOOPBACK,
-            port=port,
-            capabilities=[],  # what a client wants to publish, set or call is refused
-            context=self._context,
-            message_backlog_size=FOXGLOVE_BACKLOG,
-        )
+        try:
+            self._server = foxglove.start_server(
+                name="stillbed",
+                host=LOOPBACK,
+                port=port,
+                capabilities=[],  # what a client wants to publish, set or call is refused
+                context=self._context,
+                message_backlog_size=FOXGLOVE_BACKLOG,
+            )
+        except Exception as error:  # the library's own, of a port that was taken since it was looked at
+            raise StillbedError(f"record.foxglove_port: {port} cannot be used: {error}; another port, or 0") from error
         self._channels: dict[str, foxglove.Channel] = {}
         self._seldom: dict[str, PublishedMessage] = {}
         self._clock, self._repeated = WallClock(), 0.0
@@ -306,7 +313,7 @@ class _EntryWriter:
             self._recorder = self._opened(rig=entry)
             early, self._early = self._early, []
             for each in early:
-                _write_entry(self._recorder, each)
+                self._write(each)
         elif self._recorder is None:
             self._early.append(entry)
         else:
@@ -359,11 +366,14 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
 
 
 def _write_used(recorder: Recorder, entry: UsedEntry) -> None:
-    """Keep the file; the path, which is now in the tracker's surface frame, is shown as well."""
+    """Keep the file; the path, which is now in the tracker's surface frame, and the arm's nozzle are shown as well."""
+    from hardware.files.arm_file import arm_from_text
     from hardware.files.path_file import path_from_text
-    from hardware.recording.session_reader import PATH_ATTACHMENT
+    from hardware.recording.session_reader import ARM_ATTACHMENT, PATH_ATTACHMENT
 
     recorder.attach(entry.name, entry.text.encode())
+    if entry.name == ARM_ATTACHMENT:
+        recorder.show_arm(arm_from_text(entry.text, ARM_ATTACHMENT))
     if entry.name == PATH_ATTACHMENT:
         points = path_from_text(entry.text, PATH_ATTACHMENT).surface_from_nozzle[:, :3, 3]
         recorder.show_path(WallClock().now(), points, np.arange(len(points), dtype=float))
@@ -378,6 +388,6 @@ def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:
         known = Trajectory(np.array([stamp]), entry.truth[None], exact=True)
         recorder.truth_row(rows_from_trajectory(known)[0], exact=True)
     if entry.head is not None:
-        recorder.head_row(row_from_head(stamp, entry.head), entry.head.extruding)
+        recorder.head_row(row_from_head(stamp, entry.head), entry.head.extruding, shown=False)
     recorder.write(entry.observations)
     recorder.write(entry.pose)

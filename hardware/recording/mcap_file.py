@@ -42,6 +42,7 @@ _SHAPE_BYTES = 512  # of a record, in which its inner lengths stand
 _RECORD_START = re.compile(rb"(?s)(?=[\x02\x06\x09\x0c\x0f].{5}\0\0\0)")  # kinds to go on at, of less than 2**40 bytes
 SCAN_BYTES = 2**22  # read at once in search of a whole record
 MAX_TOLD_DAMAGES = 5  # in one text
+CHECKSUM_KEY = "crc32"  # in metadata
 NO_SCHEMA = 0  # of a channel of JSON: readers of ROS refuse a file with any schema but ROS's
 
 
@@ -163,6 +164,18 @@ def profile_of(path: Path) -> str:
     return ""
 
 
+def sealed(table: Mapping[str, str]) -> dict[str, str]:
+    """A table of metadata with a checksum of it: MCAP has none there."""
+    text = json.dumps(sorted(table.items()), ensure_ascii=False)
+    return {**table, CHECKSUM_KEY: f"{zlib.crc32(text.encode()):08x}"}
+
+
+def _is_sound(table: Mapping[str, str]) -> bool:
+    """Whether its checksum is right; older recordings have none."""
+    own = {key: text for key, text in table.items() if key != CHECKSUM_KEY}
+    return CHECKSUM_KEY not in table or sealed(own) == table
+
+
 def epoch_of(metadata: Mapping[str, str]) -> int | None:
     """By how many ns log times are ahead of stamps, by a recording's metadata; None where they do not say."""
     now, before = (metadata.get(key, "") for key in ("epoch_ns", "epoch_s"))  # whole s in older recordings
@@ -264,7 +277,7 @@ class _RecordWalk:
         try:
             if opcode == Opcode.METADATA:
                 metadata = Metadata.read(stream)
-                return (metadata,) if stream.count == len(data) else None
+                return (metadata,) if stream.count == len(data) and _is_sound(metadata.metadata) else None
             if opcode == Opcode.ATTACHMENT:
                 (crc,) = struct.unpack("<I", data[-4:])
                 return (Attachment.read(stream),) if crc in (0, zlib.crc32(data[:-4])) else None

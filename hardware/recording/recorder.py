@@ -20,6 +20,7 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile
 from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.images import check_size, encode
 from hardware.files.session import SURFACE_SUFFIXES, head_from_row
@@ -28,7 +29,7 @@ from hardware.motion.material import DispenserRecord
 from hardware.process.checks import read_bytes
 from hardware.process.provenance import provenance
 from hardware.recording import messages, ros_messages
-from hardware.recording.mcap_file import NO_SCHEMA, UTC_LOG_TIMES, ChunkMessages, walk
+from hardware.recording.mcap_file import NO_SCHEMA, UTC_LOG_TIMES, ChunkMessages, sealed, walk
 from hardware.recording.mcap_writer import McapWriter
 from hardware.recording.messages import Message, camera_frame, image_topic
 from hardware.recording.ros_messages import RosMessage
@@ -144,7 +145,7 @@ class Recorder:
         if isinstance(record, Observations):
             self._viewers.take_tracks(record)
         elif isinstance(record, RecordedTick):
-            self.progress(record.stamp, record.fraction)
+            self._publish(self._viewers.tick(record, self._log_time(record.stamp)), record.stamp)
 
     def frame(self, frame: Frame, camera_stamp: float | None = None) -> None:
         """Write an image; camera_stamp: s on the camera's own clock, by default the frame's less the clock offset."""
@@ -176,13 +177,24 @@ class Recorder:
         self._message("/truth", float(row[0]), messages.message_from_truth(row, exact))
         self._viewers.take_truth(float(row[0]), head_from_row(row, False).base_from_nozzle)
 
-    def head_row(self, row: Array, extruding: bool) -> None:
-        """Write where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm, base_from_nozzle."""
+    def head_row(self, row: Array, extruding: bool, shown: bool = True) -> None:
+        """Write where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm, base_from_nozzle.
+
+        shown: whether viewers are shown it as well.
+        """
         self._check_rising("stamp of the print head", float(row[0]))
         stamp = float(row[0])
         self._message("/head", stamp, messages.message_from_head(row, extruding))
-        nozzle = head_from_row(row, extruding).base_from_nozzle
-        self._publish(self._viewers.head(nozzle, self._log_time(stamp)), stamp)
+        if shown:
+            self.show_nozzle(stamp, head_from_row(row, extruding).base_from_nozzle)
+
+    def show_arm(self, profile: ArmProfile) -> None:
+        """Show viewers the nozzle of this arm by the ticks from now on."""
+        self._viewers.arm(profile)
+
+    def show_nozzle(self, stamp: float, base_from_nozzle: Array) -> None:
+        """Show viewers where the nozzle is, (4, 4) mm."""
+        self._publish(self._viewers.nozzle(base_from_nozzle, self._log_time(stamp)), stamp)
 
     def show_path(self, stamp: float, points: Array, places: Array) -> None:
         """Show viewers the path: points (N, 3), mm, surface frame, and how far along it each is (N,), rising."""
@@ -284,7 +296,7 @@ class Recorder:
         self._epoch = LOG_EPOCH * 1_000_000_000 if known is None else known
         table = {"epoch_ns": str(self._epoch), "log_times": UTC_LOG_TIMES if known is not None else NO_LOG_TIMES}
         table |= {"units": "own channels: mm, s, rad, px; ROS's: m, s, rad, px", **provenance().texts()}
-        self._guarded(lambda: self._writer.add_metadata("stillbed", table))
+        self._guarded(lambda: self._writer.add_metadata("stillbed", sealed(table)))
         self._define(stamp)
 
     def _define(self, stamp: float) -> None:

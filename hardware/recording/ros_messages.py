@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,14 +26,17 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Camera, Rig, distort, pixels_from_points
 from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile
+from hardware.motion.loop import CommandedPose, RecordedTick
 from hardware.recording.messages import camera_frame
 
 BASE_FRAME, SURFACE_FRAME, NOZZLE_FRAME = "base", "surface", "nozzle"
 M_PER_MM = 1e-3
 MAX_TIME_SECOND = 2**31 - 1  # that ROS's Time holds: in 2038
 
-OVERLAY_PERIOD = 0.1  # s between two drawings over the pictures: each costs as much as five poses
+OVERLAY_PERIOD = 0.19  # s between two drawings over the pictures, each as dear as five poses, and two claims
 PATH_PERIOD = 1.0  # s between two clouds of the path, which differ by what is printed
+NOZZLE_PERIOD = 0.039  # s between two places of the nozzle: every second tick of 20 ms
 MAX_OVERLAY_POINTS = 100  # of a line over a picture
 TRACK_COLOUR, PATH_COLOUR, OUTLINE_COLOUR = (0.2, 0.9, 1.0), (1.0, 0.75, 0.1), (1.0, 0.35, 0.6)
 PRINTED_RGB, PLANNED_RGB = (60, 200, 90), (160, 160, 160)
@@ -270,10 +274,13 @@ class ViewerChannels:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._path, self._places = np.empty((0, 3)), np.empty(0)  # mm, surface frame; and how far along each is
-        self._outlines: Sequence[Array] = ()  # (K, 3) mm each, surface frame
+        self._outlines: list[Array] = []  # (K, 3) mm each, surface frame, as drawn over pictures
+        self._drawn_path = np.empty((0, 3))  # the path likewise
         self._tracks: Observations | None = None
         self._truth: tuple[float, Array] | None = None  # s and (4, 4) mm, the newest
         self._true_from_own: Array | None = None  # (4, 4) mm, between the surface frames of truth and tracker
+        self._commanded: CommandedPose | None = None
+        self._placed = -np.inf  # s, when the nozzle was last shown
         self._drawn = self._coloured = -np.inf  # s, of the last drawing over the pictures, and of the last cloud
 
     def start(self, instant: int) -> Iterator[RosMessage]:
@@ -293,12 +300,12 @@ class ViewerChannels:
 
     def path(self, points: Array, places: Array, instant: int) -> Iterator[RosMessage]:
         """The path from now on: points (N, 3), mm, surface frame, and how far along it each is (N,), rising."""
-        self._path, self._places = points, places
+        self._path, self._places, self._drawn_path = points, places, _thinned(points)
         yield from self._cloud(0.0, instant)
 
     def surface(self, landmarks: Array, outlines: Sequence[Array], instant: int) -> Iterator[RosMessage]:
         """Landmarks (N, 3) and outlines (K, 3), mm, surface frame, from now on."""
-        self._outlines = outlines
+        self._outlines = [_thinned(each) for each in outlines if len(each)]
         yield RosMessage("/landmarks", CLOUD, cloud(landmarks, SURFACE_FRAME, instant))
 
     def scan(self, points: Array, instant: int) -> Iterator[RosMessage]:
@@ -315,7 +322,22 @@ class ViewerChannels:
         colours = np.where((self._places <= place)[:, None], PRINTED_RGB, PLANNED_RGB)
         yield RosMessage("/path", CLOUD, cloud(self._path, SURFACE_FRAME, instant, colours))
 
-    def head(self, base_from_nozzle: Array, instant: int) -> Iterator[RosMessage]:
+    def arm(self, profile: ArmProfile) -> None:
+        """The arm whose nozzle is shown by the ticks from now on."""
+        self._commanded = CommandedPose(profile)
+
+    def tick(self, tick: RecordedTick, instant: int) -> Iterator[RosMessage]:
+        """How far the print is, and where the arm is by the commands so far."""
+        yield from self.progress(tick.stamp, tick.fraction, instant)
+        if self._commanded is None:
+            return
+        self._commanded.add(tick.command, tick.stamp)
+        head = self._commanded.at(tick.stamp) if tick.stamp >= self._placed + NOZZLE_PERIOD else None
+        if head is not None:
+            self._placed = tick.stamp
+            yield from self.nozzle(head.base_from_nozzle, instant)
+
+    def nozzle(self, base_from_nozzle: Array, instant: int) -> Iterator[RosMessage]:
         """Where the nozzle is, (4, 4) mm."""
         yield RosMessage("/tf", TRANSFORMS, transforms(BASE_FRAME, {NOZZLE_FRAME: base_from_nozzle}, instant))
 
@@ -332,8 +354,6 @@ class ViewerChannels:
         moved = odometry(lies, pose.covariance, pose.twist, pose.twist_covariance, instant)
         yield RosMessage("/surface", ODOMETRY, moved)
         middle = self._path.mean(axis=0) if len(self._path) else np.zeros(3)
-        if np.isfinite(pose.covariance).all():
-            yield self.error("claimed", float(pose.error_at(middle[None])[0]))
         if self._truth is not None and self._truth[0] == pose.stamp:
             if self._true_from_own is None and pose.state is TrackState.TRACKING:
                 self._true_from_own = se3.inverse(self._truth[1]) @ lies
@@ -343,21 +363,30 @@ class ViewerChannels:
                 yield self.error("tracking", float(np.linalg.norm(off)))
         if pose.stamp - self._drawn >= OVERLAY_PERIOD:
             self._drawn = pose.stamp
+            if np.isfinite(pose.covariance).all():
+                yield self.error("claimed", float(pose.error_at(middle[None])[0]))
             yield from self._overlays(pose, instant)
 
     def _overlays(self, pose: SurfacePose, instant: int) -> Iterator[RosMessage]:
         """Tracks, path and outlines in the picture of each camera."""
-        tracks = self._tracks
+        path = [self._drawn_path] if len(self._drawn_path) else []
+        lines = [*path, *self._outlines] if pose.state.measured else []
+        ends = np.cumsum([len(each) for each in lines]).tolist()
+        points = np.concatenate([np.empty((0, 3)), *lines])
         for number_, camera in enumerate(self._rig.cameras):
             drawn = []
-            if tracks is not None and tracks.stamp == pose.stamp:
+            if (tracks := self._tracks) is not None and tracks.stamp == pose.stamp:
                 seen = distort(camera, tracks.pixels[tracks.camera == number_])
                 drawn.append(Drawing(seen, TRACK_COLOUR, line=False, thickness=4.0))
-            lines = [(self._path, PATH_COLOUR, False)] if pose.state.measured and len(self._path) else []
-            lines += [(each, OUTLINE_COLOUR, True) for each in self._outlines] if pose.state.measured else []
-            for points, colour, closed in lines:
-                thinned = points[np.unique(np.linspace(0, len(points) - 1, MAX_OVERLAY_POINTS).astype(int))]
-                pixels, depth = pixels_from_points(camera, se3.transform_points(pose.base_from_surface, thinned))
-                if (depth > 0).all():
-                    drawn.append(Drawing(pixels, colour, closed=closed))
+            pixels, depth = pixels_from_points(camera, se3.transform_points(pose.base_from_surface, points))
+            for k, (begin, end) in enumerate(pairwise([0, *ends])):
+                if (depth[begin:end] > 0).all():
+                    closed = k >= len(path)
+                    colour = OUTLINE_COLOUR if closed else PATH_COLOUR
+                    drawn.append(Drawing(pixels[begin:end], colour, closed=closed))
             yield RosMessage(f"/camera/{camera.name}/annotations", ANNOTATIONS, image_annotations(drawn, instant))
+
+
+def _thinned(points: Array) -> Array:
+    """At most MAX_OVERLAY_POINTS of points (N, 3), the first and the last among them."""
+    return points[np.unique(np.linspace(0, len(points) - 1, MAX_OVERLAY_POINTS).astype(int))] if len(points) else points

@@ -37,7 +37,7 @@ from hardware.simulator.deposit import NozzleLog, PlannedLine
 from hardware.simulator.nozzle_error import nozzle_errors
 from hardware.simulator.scenario import Scenario
 from perception.frames import FrameSet, Image, PrintHead, Roi
-from perception.tracking.step import STAGES, StepReport
+from perception.tracking.step import STAGES, StepReport, TrackingStep
 from planning.command import Command, Move
 from planning.path import PrintProgress
 
@@ -172,6 +172,7 @@ def _quoted(reason: str) -> str:
 
 
 SHOWN_ROWS = 20  # of the nozzle's log, one of which is shown to viewers: 50 a second
+LANDMARKS_PERIOD = 2.0  # s between two clouds of the landmarks
 STAMP_DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
 TRUTH_DELAY = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
 
@@ -211,6 +212,8 @@ class RunFolder:
         self._until = -np.inf  # s, the last of them
         self._headed = -np.inf  # s, the last frame set whose print head was written
         self._posed = 0.0  # s, stamp of the last pose
+        self._tracker: TrackingStep | None = None
+        self._mapped = -np.inf  # s, when viewers were last shown its landmarks
         cameras = scenario.cameras
         self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
         shutil.copyfile(scenario.file, out / "scenario.toml")
@@ -254,6 +257,10 @@ class RunFolder:
             for container in self._session:
                 container.head_row(row_from_head(stamp, head), head.extruding)
 
+    def follow(self, tracker: TrackingStep) -> None:
+        """Viewers are shown the landmarks of this tracker."""
+        self._tracker = tracker
+
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         """A pose was made of a frame set in `spent` s of real time."""
         self._poses.write(pose, len(frames.frames), report, spent)
@@ -264,6 +271,7 @@ class RunFolder:
         if self._session is not None:
             self._session[1].write(report.observations)
             self._session[1].write(pose)
+            self._show_landmarks(pose.stamp)
             error, log = "not printing", self.logs[-1] if self.logs else None
             if log is not None and log.extrude.any():
                 off = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
@@ -271,6 +279,14 @@ class RunFolder:
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
             facts = [("time", time), ("arm", self._activity), ("error at the nozzle", error)]
             self.watch.show(frames, pose, self._line_points, facts)
+
+    def _show_landmarks(self, stamp: float) -> None:
+        """Now and then, as the map grows."""
+        if self._session is None or self._tracker is None or stamp < self._mapped + LANDMARKS_PERIOD:
+            return
+        if (surface_map := self._tracker.map) is not None:
+            self._mapped = stamp
+            self._session[1].show_surface(stamp, surface_map.points)
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""

@@ -52,7 +52,7 @@ from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_deformation
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, Roi
-from perception.tracking.step import STAGES, StepReport, report_without_offsets
+from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
 from planning.path import Path as Checkpoints
 
 LANDMARK_COUNT, LANDMARK_AREA = 90, (56.0, 42.0)  # landmarks, and mm of the surface round the wound that they lie in
@@ -221,6 +221,8 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
             step = stack.enter_context(_tracking(scenario, truth, scene.shape, wound_rois, scan, exposures))
+            if isinstance(step, TrackingStep):
+                folder.follow(step)
             line = stack.enter_context(closing(PtyLink())).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             folder.watch.begin()
