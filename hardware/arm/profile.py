@@ -17,7 +17,7 @@ from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
 from perception.frames import SYRINGE, check_profile
 from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
-from planning.motion.follow import LOOKAHEAD
+from planning.motion.curve import LOOKAHEAD
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's

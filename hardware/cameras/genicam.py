@@ -35,7 +35,7 @@ BUFFERS = 8  # pictures in shared memory: a quarter of a second at 30 Hz, as a b
 LIST_TIMEOUT = 20.0  # s; a network is searched for one
 OPEN_TIMEOUT = 15.0  # s: a camera that is found by name takes one, one that does not answer five
 END_TIMEOUT = 1.0  # s for the process to stop the camera, after which it is ended
-POLL_PERIOD = 0.1  # s
+GRAB_PERIOD = 0.1  # s
 GOOD_PTP = ("Slave", "Master")  # states in which the clocks of a network agree
 
 
@@ -148,7 +148,7 @@ class GenicamCapture:
         It is gone where none came for READ_TIMEOUT; a camera that waits for its line must give signs of life only.
         """
         self._give_back()
-        line = self._line(POLL_PERIOD)
+        line = self._line(GRAB_PERIOD)
         now = self._now()
         if line is not None:
             self._heard = now

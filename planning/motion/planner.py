@@ -27,6 +27,8 @@ from planning.material import FlowCommands, FlowOrder, Outlets, RestsAhead, mate
 from planning.motion.curve import (
     CORNER_SPEED_CHANGE,
     CORNER_TOLERANCE,
+    LOOKAHEAD,
+    AxisFollower,
     Gridpoints,
     PathCurve,
     curve_through,
@@ -36,7 +38,6 @@ from planning.motion.curve import (
     point_above,
     straight_curve,
 )
-from planning.motion.follow import LOOKAHEAD, AxisFollower
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import Path, PrintPhase, PrintProgress, check_path, check_start
 
