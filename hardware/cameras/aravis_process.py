@@ -27,9 +27,13 @@ import gi
 gi.require_version("Aravis", "0.8")
 from gi.repository import Aravis, GLib  # noqa: E402  (the version must be named before)
 
+SOCKET_PICTURES = 4  # that a socket is to hold: the kernel counts twice what a packet carries
+MAX_SOCKET_BUFFER = 2**30  # bytes; the kernel takes less where net.core.rmem_max is less
 PAGE_BYTES = mmap.PAGESIZE  # each buffer begins on a page
 POP_TIMEOUT_US = 100_000  # us between looks whether anybody still listens
 ALIVE_PERIOD = 0.5  # s between signs of life of a camera that sends nothing, as one that waits for its trigger
+CLOCK_TRIES, CLOCK_APART = 5, 2e-5  # s between two readings, from which another process ran in between
+MAX_TRIGGER_DELAY = 5e-3  # s: as long as a usual exposure
 LATCH_PERIOD = 1.0  # s between looks at the device's clock
 SOFTWARE = "Software"  # a trigger source's name in the standard (SFNC)
 LATCHES = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
@@ -96,6 +100,8 @@ def set_up(camera: Any, order: dict[str, Any]) -> dict[str, Any]:
             attempt("gain", camera.set_gain_auto, Aravis.Auto.OFF)
         attempt("gain", camera.set_gain, order["gain"])
     if order["trigger"] is not None:
+        if bounds := got(camera.get_frame_rate_bounds):  # or the camera's own beat holds triggers back
+            got(camera.set_frame_rate, bounds[-1])
         attempt("trigger", camera.set_trigger, order["trigger"])
     elif order["fps"] is not None:
         attempt("fps", camera.set_frame_rate, order["fps"])
@@ -167,7 +173,7 @@ class Counters:
         self._infos = {stream.get_info_name(i): i for i in range(stream.get_n_infos())}
         self._ended = self._last = self._turns = 0
         self._skipped: set[int] = set()  # numbers that may still come: an incomplete frame comes after whole ones
-        self.lost, self.frames_lost = 0, 0
+        self._missing = self.frames_lost = 0
 
     def _info(self, name: str) -> int:
         return int(self._stream.get_info_uint64(self._infos[name])) if name in self._infos else 0
@@ -175,15 +181,21 @@ class Counters:
     def add(self, number: int) -> dict[str, int]:
         """Count a frame that has ended, by its number (0: none); all counts so far.
 
-        Packets of a frame under way only lower what seems lost, so the largest value that was seen is the right one.
+        Packets of a frame under way only lower what seems to be missing, so the largest value that was seen is the
+        right one. What comes after its frame has ended was not lost.
         """
         self._ended += 1
         if number:
             self._follow(number)
-        received = self._info("n_received_packets") - self._info("n_duplicated_packets")
-        self.lost = max(self.lost, (self._ended + self.frames_lost) * self._per_frame - received)
-        resent = self._info("n_resent_packets")
-        return {"received": received, "lost": self.lost, "resent": resent, "frames_lost": self.frames_lost}
+        late, received = self._info("n_ignored_packets"), self._info("n_received_packets")
+        in_time = received - late - self._info("n_duplicated_packets")
+        self._missing = max(self._missing, (self._ended + self.frames_lost) * self._per_frame - in_time)
+        return {
+            "received": received,
+            "lost": max(0, self._missing - late),
+            "resent": self._info("n_resent_packets"),
+            "frames_lost": self.frames_lost,
+        }
 
     def _follow(self, number: int) -> None:
         """Take a frame's number, which begins at 1 again after MAX_SHORT_ID."""
@@ -221,8 +233,9 @@ def capture(order: dict[str, Any], lines: Any) -> None:
         stream, payload = camera.create_stream(None, None), camera.get_payload()
     except GLib.Error as error:
         raise ValueError(f"it does not stream, another program may hold it: {reason(error)}") from None
-    if camera.is_gv_device():  # room for a whole picture, as a camera may send it at once
-        stream.set_property("socket-buffer", Aravis.GvStreamSocketBuffer.AUTO)
+    if camera.is_gv_device():  # room for pictures that come while this process does not get to run; net.core.rmem_max
+        stream.set_property("socket-buffer", Aravis.GvStreamSocketBuffer.FIXED)
+        stream.set_property("socket-buffer-size", min(SOCKET_PICTURES * payload, MAX_SOCKET_BUFFER))
     memory = Memory(order["memory"], payload, order["buffers"])
     for buffer in memory.buffers:
         stream.push_buffer(buffer)
@@ -254,12 +267,16 @@ def refill(lines: Any, stream: Any, memory: Memory, ended: threading.Event) -> N
 
 
 def fire(camera: Any, period: float, ended: threading.Event) -> None:
-    """Trigger at every multiple of the period of the machine's clock: all cameras of a rig at the same instants."""
+    """Trigger at every multiple of the period of the machine's clock: all cameras of a rig at the same instants.
+
+    Where this process gets to it too late, the camera misses that picture rather than to show another instant.
+    """
     while not ended.is_set():
         now = time.monotonic()
-        time.sleep((now // period + 1) * period - now)
-        with contextlib.suppress(GLib.Error):  # a camera that is gone is told by its heartbeat
-            camera.software_trigger()
+        due = (now // period + 1) * period
+        time.sleep(due - now)
+        if time.monotonic() - due < MAX_TRIGGER_DELAY:
+            got(camera.software_trigger)  # that a camera is gone is told by its heartbeat
 
 
 def read_clock(device: Any, ended: threading.Event) -> None:
@@ -282,7 +299,7 @@ def pump(stream: Any, memory: Memory, counters: Counters, ended: threading.Event
     told = time.monotonic()
     while not ended.is_set():
         buffer = stream.timeout_pop_buffer(POP_TIMEOUT_US)
-        now, today = time.monotonic(), time.time_ns()
+        now, today = both_clocks()
         if lost.is_set():
             raise ValueError("the camera does not answer any more")
         if buffer is None:
@@ -296,6 +313,17 @@ def pump(stream: Any, memory: Memory, counters: Counters, ended: threading.Event
             stream.push_buffer(buffer)
 
 
+def both_clocks() -> tuple[float, int]:
+    """The monotonic clock, s, and the time of day, ns, of one instant, as near as a few tries come."""
+    tries = []
+    for _ in range(CLOCK_TRIES):
+        before, today, after = time.monotonic(), time.time_ns(), time.monotonic()
+        tries.append((after - before, (before + after) / 2, today))
+        if after - before < CLOCK_APART:
+            break
+    return min(tries)[1:]
+
+
 def frame_of(buffer: Any, memory: Memory, counters: Counters, now: float, today: int) -> dict[str, Any]:
     """A frame in words; `buffer` is None where packets are missing. arrival: of its first packet, s."""
     good = buffer.get_status() == Aravis.BufferStatus.SUCCESS
@@ -306,6 +334,7 @@ def frame_of(buffer: Any, memory: Memory, counters: Counters, now: float, today:
         "stamp": stamp,
         "arrival": now - behind if behind < 1 else now,
         "counts": counters.add(number),
+        "infos": {k: counters._info(k) for k in counters._infos if k.startswith("n_")},
         "buffer": None,
     }
     if good:

@@ -184,6 +184,7 @@ class Capture(Protocol):
 
     ends: bool  # whether it can end, as a file does
     clocked: bool  # whether `position` may be by the machine's own clock
+    exact: bool  # whether `position` is the instant itself, without the jitter of a machine that is busy
 
     @property
     def incomplete(self) -> bool:
@@ -239,7 +240,7 @@ def _open_ffmpeg(identity: Identity) -> cv2.VideoCapture:
 class _OpenCapture:
     """OpenCV's capture; a video file is played at its rate."""
 
-    incomplete: bool = False
+    exact = incomplete = False
     transport: Transport | None = None
 
     def __init__(self, capture: cv2.VideoCapture, source: CameraSource, clock: Clock) -> None:

@@ -249,7 +249,7 @@ class Feed:
             self._leave_out(FrameFault.INCOMPLETE)
             return
         missed = self._stamping.pll.missed
-        stamped = self._stamping(now, position, capture.clocked)
+        stamped = self._stamping(now, position, capture.clocked, capture.exact)
         image = capture.retrieve()
         fault = self._watch.fault(image) or (None if stamped.fresh else FrameFault.BACKLOG)
         fault = FrameFault.INCOMPLETE if capture.incomplete else fault

@@ -91,7 +91,7 @@ def open_genicam(source: CameraSource, size: tuple[int, int] | None, clock: Cloc
 class GenicamCapture:
     """A camera, and the process that grabs it."""
 
-    ends, clocked = False, True
+    ends, clocked, exact = False, True, True
 
     def __init__(self, python: str, source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> None:
         """CameraError where it cannot be opened. size: (W, H) px; None: as the camera is set."""

@@ -31,6 +31,7 @@ MAX_DELAY_CHANGE = 0.01  # s between the least delays of both halves of the wind
 CLOCK_BIN, CLOCK_BINS = 1.0, 60  # s, of which the surest reading is kept; so many, as temperature changes a rate
 DRIFT_BINS = 5  # from which a device clock's rate is estimated; before, it is as ours
 MAX_DRIFT = 2e-4  # of a quartz: 50 ppm each, aged and warm; more is no rate but a change of load
+MIN_ARRIVALS = 10  # of which the earliest is believed: one may be late by what else the machine does
 CLOCK_STEP = 1.0  # s: a reading farther off says that the device's clock was set anew
 
 
@@ -136,7 +137,7 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._begin, self._bins, self._line = 0, deque[ClockReading](maxlen=CLOCK_BINS), (0.0, 0.0)
-        self._latched = False
+        self._latched, self._count = False, 0
 
     @property
     def drift(self) -> float:
@@ -161,17 +162,19 @@ class DeviceClock:
         self._take(device, (sent + received) / 2, (received - sent) / 2)
 
     def __call__(self, device: int) -> float:
-        """Our instant, s, of a device's stamp, ns; nan before anything is known of its clock."""
-        if not self._bins:
-            return math.nan
+        """Our instant, s, of a device's stamp, ns; nan before enough is known of its clock."""
+        return self._mapped(device) if self._latched or self._count >= MIN_ARRIVALS else math.nan
+
+    def _mapped(self, device: int) -> float:
         own = (device - self._begin) / 1e9
         return own + self._line[0] + self._line[1] * own
 
     def _take(self, device: int, ours: float, doubt: float) -> None:
-        if self._bins and abs(self(device) - ours) > CLOCK_STEP:
+        if self._bins and abs(self._mapped(device) - ours) > CLOCK_STEP:
             self._bins.clear()
         if not self._bins:
-            self._begin = device
+            self._begin, self._count = device, 0
+        self._count += 1
         own = (device - self._begin) / 1e9
         reading = ClockReading(own, ours - own, doubt)
         if self._bins and own < self._bins[-1].device // CLOCK_BIN * CLOCK_BIN + CLOCK_BIN:
@@ -227,7 +230,7 @@ class FrameStamp:
     """When a frame was exposed."""
 
     stamp: float  # s, middle of the exposure
-    steady: float  # s, the same without jitter, for pairing
+    steady: float  # s, the same without jitter, for pairing; of an exact stamp itself
     by: StampedBy
     lag: float  # s, from stamp to arrival
     fresh: bool  # False for a frame of a backlog, whose instant is unknown
@@ -243,10 +246,11 @@ class FrameStamper:
         self._late: deque[float] = deque(maxlen=DELAY_WINDOW)  # s, behind the steady beat
         self.pll = PhaseLockedLoop(period)
 
-    def __call__(self, arrival: float, position: float, clocked: bool) -> FrameStamp:
+    def __call__(self, arrival: float, position: float, clocked: bool, exact: bool = False) -> FrameStamp:
         """Stamp the frame that arrived at `arrival` (s).
 
-        position: s, the source's own stamp (nan: none). clocked: whether that may be by the machine's own clock.
+        position: s, the source's own stamp (nan: none). clocked: whether that may be by the machine's own clock. exact:
+        whether it then has no jitter, so that a camera that exposes off its beat does so.
         """
         by, instant = self._source(arrival, position, clocked)
         if by != self._by:
@@ -257,7 +261,7 @@ class FrameStamper:
             instant = min(arrival, beat.steady + sorted(self._late)[len(self._late) // EARLIEST_ONE_IN])
         middle = self.exposure / 2
         fresh = by != "arrival" or beat.count > 0
-        steady = instant if by == "arrival" else beat.steady
+        steady = instant if by == "arrival" or exact else beat.steady
         return FrameStamp(instant - middle, steady - middle, by, arrival - instant + middle, fresh)
 
     def _source(self, arrival: float, position: float, clocked: bool) -> tuple[StampedBy, float]:
