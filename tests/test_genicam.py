@@ -17,10 +17,10 @@ from estimation.errors import InputError
 from hardware.cameras import genicam
 from hardware.cameras.capture import Control, Transport, image_from_pixels
 from hardware.cameras.feed import CameraPlace, Feed, FrameFault
-from hardware.cameras.genicam import PACKAGES
+from hardware.cameras.genicam import PACKAGES, exposure_end
 from hardware.cameras.live import LiveCameras
 from hardware.cameras.sources import DEPTHS, PIXEL_FORMATS, CameraSource, Identity, SourceKind, read_live_rig
-from hardware.cameras.stamping import CLOCK_BIN, CLOCK_BINS, DeviceClock
+from hardware.cameras.stamping import CLOCK_BIN, CLOCK_BINS, DeviceClock, FrameStamper
 from hardware.cli import doctor
 from hardware.cli.main import main
 from hardware.operator.view import CheckVerdict
@@ -82,6 +82,16 @@ def test_readings_there_and_back_leave_no_delay() -> None:
     stamp = device_stamp(99.5, offset, rate)
     assert abs(clock(stamp) - 99.5) < 2e-4 and clock.drift == pytest.approx(-rate, abs=3e-6)
     assert 1e-4 <= clock.doubt < 4e-4
+    assert exposure_end(clock, stamp, 0.008, 99.6) == pytest.approx(99.508, abs=2e-4)  # a stamp is of the begin
+    assert exposure_end(clock, stamp, 0.2, 99.6) == 99.6  # what has arrived has been exposed
+
+
+def test_a_stamp_is_believed_only_after_ten_arrivals_and_then_is_of_the_end_of_the_exposure() -> None:
+    clock, late = DeviceClock(), [0.009, 0.004, 0.01, 0.008, 0.006, 0.005, 0.007, 0.009, 0.01, 0.004]
+    for k, delay in enumerate(late):
+        assert math.isnan(clock(device_stamp(k / 20, 7.0, 0)))
+        clock.arrived(device_stamp(k / 20, 7.0, 0), k / 20 + delay)
+    assert exposure_end(clock, device_stamp(0.5, 7.0, 0), 0.008, 0.6) == pytest.approx(0.504, abs=1e-9)
 
 
 def test_a_clock_that_is_set_anew_is_mapped_anew() -> None:
@@ -92,6 +102,25 @@ def test_a_clock_that_is_set_anew_is_mapped_anew() -> None:
     for k in range(200, 210):  # it began at 0 again
         clock.arrived(device_stamp(k / 20, -9.0, 0), k / 20 + 0.01)
     assert clock(device_stamp(10.45, -9.0, 0)) == pytest.approx(10.46, abs=1e-6)
+
+
+def test_seconds_in_which_all_came_late_do_not_bend_the_line() -> None:
+    clock, rate = DeviceClock(), 5e-5
+    for k in range(1200):
+        late = 0.006 if (k // 20) % 4 == 1 or k > 1000 else 0.0  # whole seconds, and the last ten
+        clock.arrived(device_stamp(k / 20, 3.0, rate), k / 20 + 0.002 + late)
+    assert clock(device_stamp(60.0, 3.0, rate)) == pytest.approx(60.002, abs=2e-4)
+    assert clock.drift == pytest.approx(-rate, abs=1e-6)
+
+
+def test_an_exact_stamp_is_paired_as_it_is_and_another_by_its_beat() -> None:
+    for exact in (True, False):
+        stamper = FrameStamper(0.05)
+        for k in range(40):
+            off = 0.015 if k == 35 else 0.0
+            stamped = stamper(k / 20 + off + 0.01, k / 20 + off, True, exact)
+            if k == 35:
+                assert stamped.stamp == k / 20 + off and (stamped.steady == stamped.stamp) is exact
 
 
 def test_a_clock_forgets_what_is_old() -> None:

@@ -80,6 +80,16 @@ def list_industrial() -> tuple[IndustrialCamera, ...] | None:
     return tuple(IndustrialCamera(*(one[key] for key in keys)) for one in found)
 
 
+def exposure_end(clock: DeviceClock, stamp: int, exposure: float, arrival: float) -> float:
+    """Our instant, s, of the end of an exposure of so many s; nan before the camera's clock is known.
+
+    stamp: the camera's, ns. arrival: s, of the first packet. By arrivals, a stamp is mapped to the earliest arrival,
+    which follows the exposure. By readings of the camera's clock it is mapped to itself: the exposure's begin (SFNC).
+    """
+    instant = clock(stamp)
+    return instant if math.isnan(clock.doubt) else min(instant + exposure, arrival)
+
+
 def open_genicam(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> GenicamCapture:
     """Open a camera and let pictures flow; CameraError says why that is not possible."""
     python = aravis_python()
@@ -170,18 +180,11 @@ class GenicamCapture:
         self.transport = Transport(**counts, drift=self._clock.drift, doubt=self._clock.doubt)
 
     def position(self) -> float:
-        """The end of the exposure on our clock, s, as far as it is known; nan where the frame's begin was lost.
-
-        By arrivals, the earliest arrival is mapped to, which follows the exposure. By readings of the camera's clock
-        the stamp itself is, which is that of the exposure's begin (SFNC, Timestamp).
-        """
+        """The end of the exposure on our clock, s, as far as it is known; nan where the frame's begin was lost."""
         if not self._frame.get("stamp"):
             return math.nan
-        instant = self._clock(self._frame["stamp"])
-        if math.isnan(self._clock.doubt):
-            return instant
-        exposure = self._ready["controls"]["exposure_s"] or 0.0
-        return min(instant + float(exposure), float(self._frame["arrival"]))
+        exposure = float(self._ready["controls"]["exposure_s"] or 0.0)
+        return exposure_end(self._clock, self._frame["stamp"], exposure, self._frame["arrival"])
 
     def retrieve(self) -> Image | None:
         """The grabbed frame (H, W) or (H, W, 3) BGR; None where packets are missing."""
