@@ -239,6 +239,18 @@ def test_incomplete_frames_are_left_out_and_losses_add_up_when_a_camera_comes_ba
     assert state.transport is not None and (state.transport.received, state.transport.lost) == (200, 6)
 
 
+def test_a_triggered_camera_has_no_phase_of_its_own() -> None:
+    for trigger in (None, "Line1"):
+        clock, given = SimClock(), list[float | None]()
+        shots = [Shot(1 + k / 20, 1 + k / 20 - 0.01, picture(k)) for k in range(20)]
+        source = CameraSource(NAMED.identity, fps=20.0, trigger=trigger)
+        opener = lambda *_, shots=shots, clock=clock: LossyCapture(shots, clock, True)  # noqa: E731
+        feed = Feed(CameraPlace(0, "cam", None), source, clock, lambda a, given=given: given.append(a.period), opener)
+        for _ in range(20):
+            feed.step()
+        assert given[-1] == (pytest.approx(0.05) if trigger is None else None)
+
+
 def test_a_fake_camera_is_found_set_up_and_watched(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     need_fakes(several=True)
     camera = FakeCamera(0)

@@ -139,7 +139,7 @@ class Arrival:
 
     frame: Frame
     steady: float  # s, its stamp without jitter
-    period: float | None  # s, of its camera; None before it is known
+    period: float | None  # s, of its camera; None before it is known, and of a triggered one, which has no phase
     now: float  # s, when it was ready
 
 
@@ -277,7 +277,8 @@ class Feed:
         with self._lock:
             self._fault, self._good, self._broken = None, now, 0
             self._given += 1
-        self._deliver(Arrival(frame, stamped.steady + offset, self._stamping.pll.period, now))
+        period = None if self.source.trigger else self._stamping.pll.period
+        self._deliver(Arrival(frame, stamped.steady + offset, period, now))
 
     def _leave_out(self, fault: FrameFault) -> None:
         with self._lock:
