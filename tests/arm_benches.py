@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm.driver import ArmDriver, Reply
+from hardware.arm.driver import G1, ArmDriver, Reply
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
+from hardware.arm.queue import ArmQueue
 from hardware.arm.s6h4d import S6H4D
 from hardware.process.clock import Clock, SimClock, WallClock, WatchedClock
 from hardware.simulator.arm.controller import VirtualArm
@@ -22,6 +25,7 @@ from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Move
 
 STEP = 0.002  # s between looks
+EXAMPLE = Path(__file__).parents[1] / "docs/examples/own_arm.py"
 LISTEN_TIME = 0.3  # s in which an arm that answers has told where it stands
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 
@@ -56,6 +60,10 @@ class ArmBench:
     @abstractmethod
     def plug(self) -> None:
         """It is back."""
+
+    def end(self) -> None:
+        """Let go of what it was tried on."""
+        return
 
     def run(self, seconds: float, each: Callable[[float], None] = lambda now: None) -> None:
         """Let time pass; `each` is called once a tick."""
@@ -158,6 +166,77 @@ class PtyBench(ArmBench):
     def plug(self) -> None:
         self._serve(self.profile)
 
+    def end(self) -> None:
+        self.unplug()
+
+
+class ExampleBench(ArmBench):
+    """The example's driver, before an arm of our own that takes its lines in a thread."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, ...]] = []
+        self._silent = threading.Event()
+        profile = ArmProfile(dead_time=0.0, lag=0.01)
+        self._place, self._clock = profile.arm.home.copy(), WallClock()
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self._port = self._server.getsockname()[1]
+        self.plug()
+        spec = spec_from_file_location("own_arm", EXAMPLE)
+        assert spec is not None and spec.loader is not None
+        example = module_from_spec(spec)
+        spec.loader.exec_module(example)
+        super().__init__(example.LineArm("127.0.0.1", str(self._port)), profile, self._clock)
+
+    def _serve(self, server: socket.socket, gone: threading.Event) -> None:
+        """Be the arm: straight to each target at its feed, one after the other; STOP drops them."""
+        with server:
+            server.settimeout(0.02)
+            line, rest, queue = None, b"", ArmQueue(self._place.tolist(), 0.0, self._clock.now())
+            while not gone.is_set():
+                now = self._clock.now()
+                if line is None:
+                    with suppress(TimeoutError):
+                        line = server.accept()[0]
+                        line.setblocking(False)
+                    continue
+                with suppress(BlockingIOError, OSError):
+                    *lines, rest = (rest + line.recv(4096)).split(b"\n")
+                    for words in map(bytes.split, lines):
+                        if words[0] == b"STOP":
+                            queue.stop()
+                            queue.stand(queue.at(now), now)
+                        else:
+                            numbers = [float(word) for word in words[1:]]
+                            queue.add(G1(np.array(numbers[:6]), numbers[6]), now)
+                self._place = np.array(queue.at(now))
+                self._rows.append((now, *self._place))
+                if not self._silent.is_set():
+                    with suppress(OSError):
+                        line.sendall(f"AT {' '.join(map(str, self._place))}\n".encode())
+                self._clock.wait_until(now + 0.005)
+            if line is not None:
+                line.close()
+
+    def truth(self) -> tuple[Array, Array]:
+        rows = np.array(self._rows)
+        return rows[:, 0], rows[:, 1:]
+
+    def silence(self) -> None:
+        self._silent.set()
+
+    def unplug(self) -> None:
+        self._gone.set()
+        self._thread.join(5.0)
+
+    def plug(self) -> None:
+        server = self._server if self._server.fileno() >= 0 else socket.create_server(("127.0.0.1", self._port))
+        self._gone = threading.Event()
+        self._thread = threading.Thread(target=self._serve, args=(server, self._gone), daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        self.unplug()
+
 
 def _silence(driver: ArmDriver) -> None:
     """Have what the arm answers come to nobody."""
@@ -179,5 +258,4 @@ def closing_bench(bench: ArmBench) -> Iterator[ArmBench]:
     finally:
         bench.arm.close()
         bench.arm.driver.release()
-        if isinstance(bench, PtyBench):
-            bench.unplug()
+        bench.end()

@@ -15,10 +15,19 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.rig import pixels_from_points
-from hardware.calibration.board_print import PrintOptions, board_of, drawing, pdf, svg, write_print
 from hardware.calibration.corners import collect_corners, content_key, read_corners, write_corners
 from hardware.calibration.inputs import open_source
-from hardware.calibration.run import CalibrationOptions, CalibrationResult, run_calibration
+from hardware.calibration.run import (
+    CalibrationOptions,
+    CalibrationResult,
+    PrintOptions,
+    board_of,
+    drawing,
+    pdf,
+    run_calibration,
+    svg,
+    write_print,
+)
 from hardware.cli.main import main
 from hardware.files.rig_file import read_board, read_rig, write_board
 from hardware.process.progress import no_progress

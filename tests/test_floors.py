@@ -69,6 +69,7 @@ OWNERS = {  # library: the files that may import it
     "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/recording/mcap_*.py", "hardware/offline/trajectory_files.py"),
     "foxglove": ("hardware/live/recorder_process.py",),
+    "franky": ("hardware/arm/franka.py",),
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
@@ -340,14 +341,13 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     """Every dependency is imported by someone, and every library that is imported is declared; in tests as well."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    run = _packages(
-        [*project["dependencies"], *extras["bench"], *extras["cluster"], *extras["foxglove"], *extras["train"]]
-    )
+    loaded = ("bench", "cluster", "foxglove", "franka", "train")  # by the product itself
+    run = _packages([*project["dependencies"], *(line for extra in loaded for line in extras[extra])])
     imported = set().union(*(module.roots for module in ours().modules.values()))
     assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run
     names = [name for path in TESTS for name in _imported(ast.parse(path.read_text("utf-8")), path.name)]
     tests = {name.split(".")[0].lstrip("_") for name in names}
-    develop = _packages(extras["dev"])
+    develop = _packages([*extras["dev"], *extras["counterparts"]])
     assert tests - {*FLOORS, *sys.stdlib_module_names, "tests", "future__", "gi"} <= run | develop
     assert develop - TOOLS <= tests | imported
 
@@ -359,6 +359,7 @@ def _packages(requirements: list[str]) -> Set[str]:
     """The names under which requirements are imported."""
     imports = {
         "foxglove-sdk": "foxglove",
+        "franky-control": "franky",
         "rerun-sdk": "rerun",
         "open3d-cpu": "open3d",
         "opencv-python-headless": "cv2",

@@ -12,7 +12,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState, ArmStatus
 from hardware.arm.driver import ArmDriver
 from hardware.arm.link import Arm, shut_down
-from hardware.arm.profile import AXIS_LETTERS, DISPLAY_UNITS, ArmProfile, LinkSettings
+from hardware.arm.profile import AXIS_LETTERS, DISPLAY_UNITS, DRIVERS, ArmProfile, LinkSettings, find_arms
 from hardware.process import checks
 from hardware.process.clock import Clock
 
@@ -85,6 +85,19 @@ def findings(status: ArmStatus, profile: ArmProfile) -> str:
     if np.isfinite(status.lag):
         known = f"the profile's lag_s = {profile.lag:.3f}"
         lines.append(f"its lag is {1000 * status.lag:.0f} ms: lag_s = {status.lag + profile.frame_time:.3f}; {known}")
+    return "\n".join(lines)
+
+
+def drivers_text() -> str:
+    """The drivers of arms, what each finds now, and how to install what it needs."""
+    lines = []
+    for kind in DRIVERS:
+        lines.append(f"{kind.name}: {kind.example}")
+        if not kind.installed:
+            lines.append(f"  not installed: {kind.remedy}")
+            continue
+        found = find_arms(kind)
+        lines += [f"  {address}  {words}" for address, words in found] or ["  none is found"]
     return "\n".join(lines)
 
 

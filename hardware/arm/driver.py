@@ -126,6 +126,7 @@ class ArmDriver(Protocol):
 
     def release(self) -> None:
         """Let other programs have it, for good."""
+        return
 
     def enable(self, now: float) -> str:
         """An operator lets the arm move again: clear what has stopped it. Why that cannot be, "" where it can."""
@@ -145,6 +146,7 @@ class ArmDriver(Protocol):
 
     def recall(self) -> None:
         """Take back what was given and of which nothing is out."""
+        return
 
     def blocked_for(self, now: float) -> float | None:
         """For how many s the line has taken nothing while something waits; None where nothing waits."""

@@ -44,6 +44,7 @@ class ArmProfile:
     tool: Array = field(default_factory=SYRINGE.copy)  # (K, 2) mm, of what hangs on it: height above the tip, radius
     dead_time: float | None = None  # s that a command takes to the arm; None: what a frame takes at `baud`
     flight: float | None = None  # s of motion that may be under way; None: the link's own limit
+    flange_from_nozzle: Array | None = None  # (4, 4) mm, for an arm that is told where its flange goes
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
@@ -56,6 +57,9 @@ class ArmProfile:
             raise InputError("arm profile", "tick", self.tick, allowed)
         if not 0 <= self.lag <= MAX_LAG:
             raise InputError("arm profile", "lag", self.lag, f"0 to {MAX_LAG} s")
+        if self.flange_from_nozzle is not None and not se3.is_transform(self.flange_from_nozzle):
+            got = self.flange_from_nozzle.tolist()
+            raise InputError("arm profile", "flange_from_nozzle", got, "a finite 4x4 rigid motion, mm")
         if self.flight is not None and not self.tick <= self.flight <= MAX_FLIGHT:
             allowed = f"{self.tick} s, a tick, to {MAX_FLIGHT} s"
             raise InputError("arm profile", "flight", self.flight, allowed)
@@ -157,14 +161,26 @@ class DriverKind:
     example: str  # an address
     extra: str = ""  # of stillbed, that brings what it imports; "": it needs none
     needs: str = ""  # what it imports, by which its extra is known to be there
+    file: str = ""  # of data/arms, the arm file that stands in where none is given; "": the S6H4D's defaults
 
     @property
     def installed(self) -> bool:
         """Whether what it imports is there."""
         return not self.needs or find_spec(self.needs) is not None
 
+    @property
+    def remedy(self) -> str:
+        """How to install what it imports."""
+        return f"pip install 'stillbed[{self.extra}]'"
 
-DRIVERS = (DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0"),)
+
+DRIVERS = (
+    DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0"),
+    DriverKind(
+        *("Franka FR3, Panda", ("franka",), "hardware.arm.franka", "franka://172.16.0.2"),
+        *("franka", "franky", "fr3.toml"),
+    ),
+)
 
 
 def driver_kind(address: str) -> DriverKind:
@@ -172,7 +188,7 @@ def driver_kind(address: str) -> DriverKind:
     scheme = address.partition("://")[0] if "://" in address else ""
     kind = next((kind for kind in DRIVERS if scheme in kind.schemes), DRIVERS[0])
     if not kind.installed:
-        raise InputError("arm", "address", address, f"stillbed with its extra: pip install 'stillbed[{kind.extra}]'")
+        raise InputError("arm", "address", address, f"stillbed with its extra: {kind.remedy}")
     return kind
 
 

@@ -153,7 +153,7 @@ def _distance(text: str) -> tuple[str, str, float]:
 
 
 def _board(a: argparse.Namespace) -> int:
-    from hardware.calibration.board_print import PrintOptions, write_print
+    from hardware.calibration.run import PrintOptions, write_print
 
     options = PrintOptions(a.kind, a.squares, a.square_mm, a.marker, a.dictionary, a.inverted, a.page)
     print(write_print(a.out, options, a.force))

@@ -46,6 +46,10 @@ PRIORITY_REMEDY = (
     "as root: echo 'USER - rtprio 20' > /etc/security/limits.d/stillbed.conf, with your name; then log in anew"
 )
 JOIN_GROUP = "sudo usermod -aG {group} $USER, then log in anew"
+RUN_EXTRAS = {  # of stillbed, that a lab may need, and for what
+    **{"franka": "a Franka arm", "foxglove": "live runs in Foxglove", "cluster": "smoothing on many machines"},
+    **{"train": "training the wound network", "bench": "the comparison with Ceres"},
+}
 LOAD_TIMEOUT = 60.0  # s for all of them on a slow disk
 LOADED_MARK = "loaded"  # the word by which the process tells of each
 LOADER = f"""import importlib, sys
@@ -208,6 +212,35 @@ def modules_of(names: list[str]) -> dict[str, str]:
     return {
         name: min(modules, key=lambda m: (m != name, m.startswith("_"))) for name, modules in by_name.items() if modules
     }
+
+
+def extras_check(extras: dict[str, list[str]] | None = None) -> Check:
+    """Which extras are not installed, and how to install each. extras: distributions of each; without it stillbed's."""
+    if extras is None:
+        try:
+            lines = [Requirement(line) for line in requires("stillbed") or []]
+        except PackageNotFoundError:
+            lines = []
+        known = [(extra, r.name) for r in lines for extra in RUN_EXTRAS if r.marker and _is_of(r, extra)]
+        extras = {extra: names for extra in RUN_EXTRAS if (names := [name for of, name in known if of == extra])}
+    missing = [extra for extra, names in extras.items() if not all(map(_is_installed, names))]
+    have = [extra for extra in extras if extra not in missing]
+    text = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(missing) or 'none'}"
+    remedy = "; ".join(f"{RUN_EXTRAS.get(extra, extra)}: pip install 'stillbed[{extra}]'" for extra in missing)
+    return Check("extras", CheckVerdict.PASS, f"{text}; to have {remedy}" if missing else text)
+
+
+def _is_of(requirement: Requirement, extra: str) -> bool:
+    assert requirement.marker is not None
+    return requirement.marker.evaluate({"extra": extra}) and not requirement.marker.evaluate({"extra": ""})
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        version(name)
+    except PackageNotFoundError:
+        return False
+    return True
 
 
 def load_failures(modules: list[str], patience: float = LOAD_TIMEOUT) -> dict[str, LoadFailure]:

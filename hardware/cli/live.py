@@ -183,15 +183,18 @@ def add_arm(commands: Commands) -> None:
         "arm",
         _run_arm,
         "see what answers on the arm's port, home it; or serve a virtual one",
-        "Listen on the port of a SEED S6H4D and tell what answers, how often and from where; nothing is\n"
-        "sent unless a move is asked for, and a move needs --yes. With --virtual, serve a virtual arm on a\n"
-        "pseudo-terminal instead, for any client that speaks its protocol; Ctrl-C ends it with a summary.",
+        "Listen to an arm and tell what answers, how often and from where; nothing is sent unless a move is\n"
+        "asked for, and a move needs --yes. Without DEVICE, list the drivers of arms, what each finds, and how\n"
+        "to install what is missing. With --virtual, serve a virtual SEED S6H4D on a pseudo-terminal instead,\n"
+        "for any client that speaks its protocol; Ctrl-C ends it with a summary.",
+        "stillbed arm",
         "stillbed arm /dev/ttyUSB0",
         "stillbed arm /dev/ttyUSB0 --home --yes",
         "stillbed arm --virtual --link ./arm --replies stream --fault 'stall 600ms at 5s'",
     )
-    which = command.add_mutually_exclusive_group(required=True)
-    which.add_argument("device", nargs="?", metavar="DEVICE", help="a path, or a URL of pyserial's such as socket://")
+    which = command.add_mutually_exclusive_group()
+    where = "a path, a URL of pyserial's such as socket://, or one of another driver; none: list drivers and arms"
+    which.add_argument("device", nargs="?", metavar="DEVICE", help=where)
     which.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
     command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="its home, limits, dialect and baud rate")
     add = command.add_argument_group("an arm on a port").add_argument
@@ -211,9 +214,14 @@ def add_arm(commands: Commands) -> None:
 
 
 def _run_arm(a: argparse.Namespace) -> int:
-    from hardware.files.arm_file import far_limits_text
+    from hardware.files.arm_file import arm_for, far_limits_text
 
-    profile = arm_profile(a.arm)
+    if not (a.device or a.virtual):
+        from hardware.arm.console import drivers_text
+
+        print(drivers_text())
+        return 0
+    profile = arm_for(a.device) if a.arm is None and a.device else arm_profile(a.arm)
     if text := far_limits_text(profile.limits):
         print(text, flush=True)
     return _serve_virtual_arm(a, profile) if a.virtual else _connect_arm(a, profile)

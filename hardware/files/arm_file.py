@@ -12,6 +12,7 @@ pwm_on = 1500                                 # optional, in its place while mat
 baud = 115200                                 # or 9600, at which a frame takes 50 ms
 tick_s = 0.02                                 # at least a frame's time on the wire, which is the default where longer
 dead_time_s = 0.0                             # optional, that a command takes to an arm without such a line
+flange_from_nozzle = [[...], ...]             # optional, 4x4, mm, for an arm that is told where its flange goes
 flight_s = 0.05                               # optional, motion that may be under way at once
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
@@ -44,11 +45,13 @@ from pathlib import Path
 
 import numpy as np
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import AXIS_LETTERS, ArmProfile, at_baud
+from hardware.arm.profile import ARM_FROM_BENCH, AXIS_LETTERS, ArmProfile, at_baud, driver_kind, placed
 from hardware.arm.protocol import Dialect
 from hardware.process import checks
+from perception import shipped_file
 from perception.frames import check_profile
 from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
@@ -166,7 +169,10 @@ FAR_LIMIT = 3.0  # times the S6H4D's own: the operator is told of a limit beyond
 MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
-_ARRAYS = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)}  # shapes
+_ARRAYS = {  # shapes
+    **{"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)},
+    "flange_from_nozzle": (4, 4),
+}
 ARM_KEYS = (
     *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
     *("dead_time_s", "flight_s"),
@@ -185,6 +191,22 @@ FILE_KEYS = {
 def read_arm(path: str | Path) -> ArmProfile:
     """The profile in an arm file; InputError names the key that makes no sense."""
     return _profile(Path(path), checks.read_toml(Path(path)))
+
+
+def arm_for(address: str) -> ArmProfile:
+    """The profile that stands in for the arm at an address where no arm file is given."""
+    file = driver_kind(address).file
+    return read_arm(shipped_file("arms", file)) if file else ArmProfile()
+
+
+def arm_over(known: ArmProfile, address: str) -> ArmProfile:
+    """That profile, put so that the surface below the home of a `known` arm is below this one's; or the known one."""
+    if not driver_kind(address).file:
+        return known
+    profile = arm_for(address)
+    base_from_surface = se3.inverse(known.arm.arm_from_base) @ ARM_FROM_BENCH
+    moved = profile.arm.home[:3] - ArmProfile().arm.home[:3]
+    return placed(profile, base_from_surface, se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + moved))
 
 
 def arm_from_text(text: str, where: str | Path) -> ArmProfile:
@@ -210,6 +232,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             baud=default.baud,
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
+            flange_from_nozzle=arrays.get("flange_from_nozzle"),
             dead_time=checks.number(path, "dead_time_s", table["dead_time_s"]) if "dead_time_s" in table else None,
             flight=checks.number(path, "flight_s", table["flight_s"]) if "flight_s" in table else None,
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
@@ -242,6 +265,11 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         f"tick_s = {checks.toml_number(profile.tick)}",
         f"lag_s = {checks.toml_number(profile.lag)}",
         *([] if profile.dead_time is None else [f"dead_time_s = {checks.toml_number(profile.dead_time)}"]),
+        *(
+            []
+            if profile.flange_from_nozzle is None
+            else [f"flange_from_nozzle = {checks.toml_numbers(profile.flange_from_nozzle)}"]
+        ),
         *([] if profile.flight is None else [f"flight_s = {checks.toml_number(profile.flight)}"]),
         f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
