@@ -25,6 +25,7 @@ from hardware.cli import doctor
 from hardware.cli.main import main
 from hardware.operator.view import CheckVerdict
 from hardware.process.clock import SimClock
+from hardware.recording.session_reader import open_session
 from tests.counterparts import (
     FakeCamera,
     PacketLoss,
@@ -317,6 +318,24 @@ def test_three_fake_cameras_are_a_rig_one_dies_and_packets_are_lost(monkeypatch:
     assert sum(is_wrong(one, period) for one in own) == 0
     assert max(map(abs, errors)) < 1e-3
     assert sum(len(one.frames) == 3 for one in first) > 0.7 * 18 / period
+
+
+@pytest.mark.slow
+def test_a_recording_of_three_fake_cameras_says_what_was_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    need_fakes(several=True)
+    cameras = [FakeCamera(i) for i in range(3)]
+    rig = rig_file(tmp_path, *(f'source = "genicam://{c.address}"\nfps = 20\ntrigger = "software"' for c in cameras))
+    rig.write_text(rig.read_text().replace("[1280, 720]", "[320, 240]"))
+    with own_network(3), running(*cameras):
+        PacketLoss(601)
+        assert main(["record", str(rig), "-o", str(tmp_path / "a.mcap"), "--seconds", "8", "--no-page"]) == 0
+    said = capsys.readouterr()
+    lost = re.findall(r"(c\d): (\d+) pictures left out, as packets were missing \((\d+)\)", said.out + said.err)
+    assert lost and all(1 <= int(pictures) <= int(packets) for _, pictures, packets in lost), said
+    session = open_session(tmp_path / "a.mcap")
+    assert len(session) > 60 and sum(len(refs) == 3 for refs in session.sets) > 30
 
 
 @pytest.mark.slow
