@@ -23,7 +23,7 @@ slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # Machines that others wrote: what can be installed is, what is missing is skipped, with what to install.
-COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_genicam.py tests/test_rtsp.py
+COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py tests/test_genicam.py tests/test_rtsp.py
 CAMERAS := aravis-tools gir1.2-aravis-0.8 python3-gi nftables faketime gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-good gstreamer1.0-plugins-ugly
 
 counterparts: $(STAMP)

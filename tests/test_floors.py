@@ -76,6 +76,7 @@ OWNERS = {  # library: the files that may import it
     "open3d": ("estimation/scans/*.py", "hardware/files/mesh_reader.py"),
     "orjson": ("hardware/recording/recorder.py",),
     "packaging": ("hardware/cli/doctor.py",),
+    "pinocchio": ("planning/urdf.py",),
     "pycolmap": ("hardware/bench/smoothing.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
     "rosbags": ("hardware/recording/ros_messages.py",),
@@ -360,6 +361,7 @@ def _packages(requirements: list[str]) -> Set[str]:
     imports = {
         "foxglove-sdk": "foxglove",
         "franky-control": "franky",
+        "pin": "pinocchio",
         "rerun-sdk": "rerun",
         "open3d-cpu": "open3d",
         "opencv-python-headless": "cv2",

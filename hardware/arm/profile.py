@@ -18,6 +18,7 @@ from perception.frames import SYRINGE, check_profile
 from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
 from planning.motion.curve import LOOKAHEAD
+from planning.urdf import UrdfArm
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
@@ -44,6 +45,7 @@ class ArmProfile:
     tool: Array = field(default_factory=SYRINGE.copy)  # (K, 2) mm, of what hangs on it: height above the tip, radius
     dead_time: float | None = None  # s that a command takes to the arm; None: what a frame takes at `baud`
     flight: float | None = None  # s of motion that may be under way; None: the link's own limit
+    urdf: UrdfArm | None = None  # the joints of an arm that `arm` has no model of
     flange_from_nozzle: Array | None = None  # (4, 4) mm, for an arm that is told where its flange goes
 
     def __post_init__(self) -> None:

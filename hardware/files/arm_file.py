@@ -35,6 +35,8 @@ speed_deg_s, acceleration_deg_s2 = [...]
 arm_from_foot = [[...], ...]                  # 4x4, mm, from where the table starts to the arm's frame
 flange_from_nozzle = [[...], ...]             # 4x4, mm
 posture = ["front", "up", "negative"]
+# or, of an arm of another build: name; urdf = "fr3.urdf", beside this file; flange = "link8", the link that carries the
+# tool of flange_from_nozzle; ready_deg = [...], the posture that its joints keep near
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ from perception import shipped_file
 from perception.frames import check_profile
 from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
+from planning.urdf import UrdfArm
 
+URDF_KEYS = ("name", "urdf", "flange", "ready_deg")
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
 _RAD = float(np.deg2rad(1.0))  # rad a degree
@@ -108,6 +112,23 @@ def _kinematics_lines(arm: SimpleArm) -> list[str]:
         *(f"{key} = {checks.toml_numbers(getattr(model, key))}" for key in PLACE_KEYS),
         f"posture = {json.dumps(model.posture)}",
     ]
+
+
+def _urdf(path: Path, table: checks.Table) -> UrdfArm:
+    """The arm that a URDF file describes, which is not read here."""
+    checks.check_keys(path, "kinematics.", table, URDF_KEYS, ())
+    name, file, flange = (checks.text(path, f"kinematics.{key}", table[key]) for key in URDF_KEYS[:3])
+    ready = checks.numbers(path, "kinematics.ready_deg", table["ready_deg"], (None,), "degrees") * _RAD
+    return UrdfArm(name, path.parent / file, flange, np.asarray(ready))
+
+
+def _urdf_lines(arm: UrdfArm | None) -> list[str]:
+    """The table of such an arm as lines of TOML."""
+    if arm is None:
+        return []
+    texts = {"name": arm.name, "urdf": str(arm.file.resolve()), "flange": arm.flange}
+    ready = f"ready_deg = {checks.toml_numbers(np.rad2deg(arm.ready))}"
+    return ["", "[kinematics]", *(f"{key} = {json.dumps(text)}" for key, text in texts.items()), ready]
 
 
 ZONE_KINDS = ("half_space", "box", "cylinder")
@@ -217,6 +238,8 @@ def arm_from_text(text: str, where: str | Path) -> ArmProfile:
 def _profile(path: Path, table: checks.Table) -> ArmProfile:
     checks.check_keys(path, "", table, (), ARM_KEYS)
     try:
+        kinematics = table.get("kinematics")
+        by_urdf = isinstance(kinematics, dict) and "urdf" in kinematics
         default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
         arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _ARRAYS.items() if key in table}
         return ArmProfile(
@@ -224,7 +247,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
                 arrays.get("arm_from_base", default.arm.arm_from_base),
                 arrays.get("arm_from_upright", default.arm.arm_from_upright),
                 arrays["home_mm_deg"] * _AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
-                *_kinematics(path, table.get("kinematics")),
+                *_kinematics(path, None if by_urdf else kinematics),
                 tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
             ),
             limits=_limits(path, table.get("limits", {}), table.get("no_go")),
@@ -233,6 +256,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
             flange_from_nozzle=arrays.get("flange_from_nozzle"),
+            urdf=_urdf(path, table["kinematics"]) if by_urdf else None,
             dead_time=checks.number(path, "dead_time_s", table["dead_time_s"]) if "dead_time_s" in table else None,
             flight=checks.number(path, "flight_s", table["flight_s"]) if "flight_s" in table else None,
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
@@ -277,6 +301,7 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMIT_KEYS),
         *_no_go_lines(limits.zones),
         *_kinematics_lines(arm),
+        *_urdf_lines(profile.urdf),
     ]
     return "\n".join(lines) + "\n"
 
