@@ -14,8 +14,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import Image
 from perception.lens import Lenses
-from perception.mapping.colours import BELL_MM, MIN_SHIFT_MM, Colours
-from perception.mapping.masks import MASK_SCALE, TrackingMasks
+from perception.mapping.masks import BELL_MM, MASK_SCALE, MIN_SHIFT_MM, Colours, TrackingMasks
 from tests.campaigns.deceit.judge import Judge, frame_sets, tracker
 from tests.campaigns.deceit.kinds import NAMES, make_session
 from tests.campaigns.deceit.scenes import TRICK, Session
