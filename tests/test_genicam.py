@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
+import signal
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +20,7 @@ from estimation.errors import InputError
 from hardware.cameras import genicam
 from hardware.cameras.capture import Control, Transport, image_from_pixels
 from hardware.cameras.feed import CameraPlace, Feed, FrameFault
-from hardware.cameras.genicam import PACKAGES, exposure_end
+from hardware.cameras.genicam import PACKAGES, PROGRAM, controls_of, exposure_end
 from hardware.cameras.live import LiveCameras
 from hardware.cameras.sources import DEPTHS, PIXEL_FORMATS, CameraSource, Identity, SourceKind, read_live_rig
 from hardware.cameras.stamping import CLOCK_BIN, CLOCK_BINS, DeviceClock, FrameStamper
@@ -209,6 +212,20 @@ def test_without_aravis_one_line_says_what_to_install(
     assert doctor.aravis_check("/usr/bin/python3").verdict is CheckVerdict.PASS
 
 
+def test_what_a_camera_did_not_take_is_named() -> None:
+    own = {"format": "Mono8", "fps": 25.0, "exposure_s": 0.004, "gain": 2.0, "trigger": "Line1", "ptp": "Slave"}
+    source = CameraSource(NAMED.identity, 0.004, 2.0, None, None, 25.0, "Mono8", "Line1", True)
+    assert all(control.accepted for control in controls_of(source, own, ()))
+    assert {c.name for c in controls_of(NAMED, own, ())} == {"format", "fps", "exposure_s", "gain"}
+    wrong = {"format": "BayerRG8", "fps": 20.0, "exposure_s": 0.01, "gain": 3.0, "trigger": "Line2", "ptp": "Listening"}
+    for name, value in wrong.items():
+        refused = [c.name for c in controls_of(source, own | {name: value}, ()) if not c.accepted]
+        assert refused == [name]
+    assert [c.name for c in controls_of(source, own | {"ptp": None}, ("gain",)) if not c.accepted] == ["gain", "ptp"]
+    blurred = replace(source, focus=3.0)
+    assert [c.name for c in controls_of(blurred, own, ()) if not c.accepted] == ["focus_abs"]
+
+
 class LossyCapture(ListedCapture):
     """A list that is a camera, some of whose frames lack packets: those without a picture, of whose begin some lack."""
 
@@ -318,6 +335,24 @@ def test_three_fake_cameras_are_a_rig_one_dies_and_packets_are_lost(monkeypatch:
     assert sum(is_wrong(one, period) for one in own) == 0
     assert max(map(abs, errors)) < 1e-3
     assert sum(len(one.frames) == 3 for one in first) > 0.7 * 18 / period
+
+
+@pytest.mark.slow
+def test_a_camera_whose_grabbing_process_is_killed_is_opened_again() -> None:
+    """The camera itself lets go of who is gone after its heartbeat, some seconds."""
+    need_fakes(several=True)
+    camera = FakeCamera(0)
+    with own_network(1), running(camera), LiveCameras(rig_of(1), [camera.source(fps=20.0)], CLOCK) as live:
+        assert len(sets_until(live, CLOCK.now() + 4)) > 20
+        for entry in Path("/proc").glob("[0-9]*/cmdline"):
+            if PROGRAM.name in entry.read_text() and f"PPid:\t{os.getpid()}" in (entry.parent / "status").read_text():
+                os.kill(int(entry.parent.name), signal.SIGKILL)
+        sets_until(live, CLOCK.now() + 1)
+        assert (
+            "the process that grabs it has ended" in live.health().trouble or "another program" in live.health().trouble
+        )
+        assert len(sets_until(live, CLOCK.now() + 12)) > 20
+        assert live.health().trouble == "" and live.health().cameras[0].reopened == 1
 
 
 @pytest.mark.slow

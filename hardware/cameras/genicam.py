@@ -13,6 +13,7 @@ import os
 import select
 import subprocess
 import sys
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -88,6 +89,17 @@ def exposure_end(clock: DeviceClock, stamp: int, exposure: float, arrival: float
     """
     instant = clock(stamp)
     return instant if math.isnan(clock.doubt) else min(instant + exposure, arrival)
+
+
+def controls_of(source: CameraSource, own: dict[str, Any], automatic: Collection[str]) -> tuple[Control, ...]:
+    """What was requested of a camera, and what it has by `own`, by the keys of rig.toml. automatic: names of some."""
+    requests = {"format": source.format, "fps": source.fps, "exposure_s": source.exposure, "gain": source.gain}
+    requests |= {} if source.trigger is None else {"trigger": source.trigger}
+    controls = [Control(name, wish, own[name], name in automatic) for name, wish in requests.items()]
+    if source.ptp:
+        controls.append(Control("ptp", "on", "on" if own["ptp"] in GOOD_PTP else own["ptp"]))
+    others = {"focus_abs": source.focus, "white_balance_k": source.white_balance}
+    return (*controls, *(Control(name, wish, None) for name, wish in others.items() if wish is not None))
 
 
 def open_genicam(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> GenicamCapture:
@@ -198,20 +210,7 @@ class GenicamCapture:
 
     def lock(self) -> tuple[Control, ...]:
         """The controls as the camera has them."""
-        source, own = self._source, self._ready["controls"]
-        requests = {
-            "format": source.format,
-            "fps": source.fps,
-            "exposure_s": source.exposure,
-            "gain": source.gain,
-        } | ({} if source.trigger is None else {"trigger": source.trigger})
-        automatic = self._ready["automatic"]
-        controls = [Control(name, wish, own[name], name in automatic) for name, wish in requests.items()]
-        if source.ptp:
-            agreed = own["ptp"] in GOOD_PTP
-            controls.append(Control("ptp", "on", "on" if agreed else own["ptp"]))
-        others = {"focus_abs": source.focus, "white_balance_k": source.white_balance}
-        return (*controls, *(Control(name, wish, None) for name, wish in others.items() if wish is not None))
+        return controls_of(self._source, self._ready["controls"], self._ready["automatic"])
 
     def release(self) -> None:
         """Stop the camera and let others have it."""
