@@ -270,6 +270,20 @@ MUTANTS = (
         ("test_arm_link.py::test_an_arm_that_runs_away_is_stopped_at_once",),
     ),
     Mutant(
+        "an arm that has stopped by itself is sent more",
+        "hardware/arm/link.py",
+        "if self.fault and self.state is ArmState.ARMED",
+        "if False",
+        ("test_arm_laws.py::test_an_arm_that_has_stopped_by_itself_is_stopped_and_says_why",),
+    ),
+    Mutant(
+        "an arm that is away is thought to stand where it was",
+        "hardware/arm/device.py",
+        "self._online, self._queue = False, None",
+        "self._online = False",
+        ("test_arm_laws.py::test_unplugged_it_is_known_nowhere_and_back_it_waits_for_the_operator",),
+    ),
+    Mutant(
         "a frame with wrong reserved bytes is taken",
         "hardware/arm/protocol.py",
         "if encode(instruction, dialect) != frame",

@@ -6,16 +6,22 @@ A new driver adds a line to BENCHES, and passes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.arm import franka, profile, s6h4d
+from hardware.arm.console import drivers_text
 from hardware.arm.device import ArmState, LinkCode
+from hardware.arm.driver import UnpluggedError
+from hardware.arm.profile import ArmProfile
 from planning.command import Hold, Move
 from tests.arm_benches import ArmBench, ExampleBench, PtyBench, VirtualTimeBench, closing_bench
-from tests.franka_bench import MISSING, FrankaBench, installed
+from tests.franka_bench import MISSING, FrankaBench, fr3, installed
 
 BENCHES = [
     pytest.param(lambda folder: VirtualTimeBench(), id="s6h4d"),
@@ -184,3 +190,71 @@ def test_closed_it_is_sent_nothing(bench: ArmBench) -> None:
     bench.arm.close()
     bench.run(0.7)
     assert bench.arm.state is ArmState.UNPLUGGED and bench.arm.frames == frames
+
+
+# -- what the link makes of what a driver may say, whatever the arm
+
+
+def test_an_arm_that_has_stopped_by_itself_is_stopped_and_says_why() -> None:
+    bench = VirtualTimeBench()
+    bench.begin()
+    driver, whole = bench.arm.driver, bench.arm.driver.state
+    driver.state = lambda now: replace(whole(now), fault="joint 3 is at its end")
+    bench.run(0.01)
+    assert bench.arm.state is ArmState.STOPPED and "joint 3 is at its end" in bench.arm.reason
+    driver.enable = lambda now: "its brakes are shut"
+    assert bench.arm.arm(bench.clock.now() + 1.0).code is not None  # not before it can
+    bench.run(0.5)
+    refused = bench.arm.arm(bench.clock.now())
+    assert refused.code is LinkCode.ARM_FAULT and "brakes" in refused
+
+
+def test_an_arm_that_finds_home_by_itself_is_left_alone_until_it_is_there() -> None:
+    bench = VirtualTimeBench()
+    start = bench.begin()
+    driver, whole, asked = bench.arm.driver, bench.arm.driver.state, []
+    driver.home = lambda now: asked.append(now) is None
+    driver.state = lambda now: replace(whole(now), busy=bench.clock.now() < asked[-1] + 0.5)
+    frames = bench.arm.frames
+    assert bench.arm.home(bench.clock.now()) == ""
+    bench.run(0.3)
+    assert bench.arm.travels and bench.arm.hold(bench.clock.now()).code is LinkCode.OWN_MOVE
+    assert bench.arm.frames == frames and not bench.arm.arrived(bench.clock.now())
+    bench.run(0.5)
+    assert not bench.arm.travels and bench.arm.arrived(bench.clock.now())
+    assert bench.arm.target == pytest.approx(start, abs=0.11) and bench.arm.hold(bench.clock.now()) == ""
+
+
+def test_each_driver_is_found_by_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(profile, "find_spec", lambda module: object())
+    serial, robot = "SEED S6H4D", "Franka FR3, Panda"
+    for address, name in (("/dev/ttyUSB0", serial), ("socket://a:1", serial), ("franka://a", robot)):
+        assert profile.driver_kind(address).name == name
+    monkeypatch.setattr(profile, "find_spec", lambda module: None)
+    assert profile.driver_kind("/dev/ttyUSB0").installed
+    with pytest.raises(InputError, match=r"pip install 'stillbed\[franka\]'"):
+        profile.driver_kind("franka://a")
+
+
+def test_the_drivers_are_listed_with_what_they_find_and_lack(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(profile, "find_spec", lambda module: None)
+    monkeypatch.setattr(s6h4d, "serial_ports", lambda: [("/dev/ttyUSB7", "an adapter")])
+    text = drivers_text()
+    assert "  /dev/ttyUSB7  an adapter" in text.splitlines()
+    assert "  not installed: pip install 'stillbed[franka]'" in text.splitlines()
+
+
+def test_a_franka_without_what_hangs_on_it_is_refused() -> None:
+    with pytest.raises(InputError, match="flange_from_nozzle"):
+        franka.open_arm("franka://a", ArmProfile())
+    with pytest.raises(InputError, match="franka://HOST"):
+        franka.open_arm("franka://", fr3())
+
+
+def test_a_robot_that_does_not_answer_is_said_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without franky its process ends at once; with it nobody answers at that port."""
+    robot = franka.open_arm("franka://127.0.0.9", fr3())
+    with pytest.raises(UnpluggedError, match=r"franka://127\.0\.0\.9: "):
+        robot.connect(0.0)
+    robot.release()
+    assert robot._former is None

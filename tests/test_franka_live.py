@@ -18,16 +18,18 @@ from hardware.files.path_file import read_path
 from hardware.live.recorded_run import ReplayedTick, commands_of, replay_run
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.path import PrintPhase
-from tests.franka_bench import HOST, MISSING, FrankaServer, installed
+from tests.arm_benches import closing_bench
+from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, installed
 from tests.light_live import HOME, TILT, prepare_files
 from tests.live_runs import CLOCK, Running, messages
 from tests.moving import breathing
+from tests.test_arm_laws import straight
 from tests.test_live_run import confirmed
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
 ADDRESS = f"franka://{HOST}"
 HEIGHT = 2.0  # mm up and 2 mm down: breaths of 4 mm
-ABOVE = HOME - 50.0  # mm of home above the surface
+STANDSTILL = 0.05  # mm from where it comes to rest
 
 
 class Live:
@@ -148,3 +150,41 @@ def test_a_robot_that_is_gone_is_held_in_time_and_printing_goes_on_where_it_was(
     slack = 0.02  # checkpoints, two ticks
     assert done <= places[again] <= places[:again].max() + slack  # nothing is printed twice, and nothing left out
     assert (np.diff(places[again:]) >= -1e-9).all()
+
+
+def test_a_motion_process_that_is_killed_leaves_the_robot_at_rest(live: Live) -> None:
+    run = live.start(live.folder / "run.mcap", "--yes")
+    run.wait_for(r"\nprint\n")
+    CLOCK.wait_until(CLOCK.now() + 3.0)
+    killed = run.kill("motion")
+    run.wait_for("the motion process was killed by SIGKILL")
+    assert run.end() == 1
+    CLOCK.wait_until(killed + 2.0)
+    stamps, axes = live.server.truth(live.profile)
+    before, after = axes[(stamps > killed - 0.5) & (stamps < killed)], axes[stamps > killed + 0.3]
+    assert np.ptp(before[:, :3], axis=0).max() > 0.5 and np.ptp(after[:, :3], axis=0).max() < 0.2
+
+
+def test_fifty_stops_are_short_in_time_and_way(tmp_path: Path) -> None:
+    with closing_bench(FrankaBench(tmp_path)) as bench:
+        bench.begin()
+        decided, sign = [], 1.0
+        for number in range(50):
+            target = bench.arm.target
+            bench.follow(straight(target, sign * 20.0), 0.5 + 0.013 * (number % 7))
+            decided.append(bench.clock.now())
+            bench.arm.stop("to measure it", decided[-1])
+            bench.run(0.5)
+            assert bench.arm.arm(bench.clock.now()) == ""
+            sign = -sign
+        stamps, axes = bench.truth()
+    times, ways = [], []
+    for since in decided:
+        begin, end = np.searchsorted(stamps, [since, since + 0.45])
+        left = np.linalg.norm(axes[begin:end, :3] - axes[end, :3], axis=1)
+        moving = np.flatnonzero(left > STANDSTILL)
+        times.append(stamps[begin + moving[-1]] - since if len(moving) else 0.0)
+        ways.append(left[0])
+    time, way = np.percentile(times, 99), np.percentile(ways, 99)
+    print(f"99 % of 50 stops: {1000 * time:.0f} ms, {way:.2f} mm, load {os.getloadavg()[0]:.1f}")
+    assert time <= 0.15 and way <= 1.0

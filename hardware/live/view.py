@@ -10,6 +10,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, nan
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -51,10 +52,8 @@ from planning.kinematics import nozzle_from_axes
 from planning.path import Path, PrintPhase, way_lengths
 from planning.placement import tangent_of
 
-MAX_COMMANDS_KEPT = 64  # a second of them
-MAX_COMMAND_GAP = 0.1  # s between two commands that a straight line joins
-MAX_LATENCY = 0.035  # s from frames to the wire that 99 % are to keep
-MAX_IN_FLIGHT = 0.05  # s of motion that may be under way
+MAX_COMMANDS_KEPT, MAX_COMMAND_GAP = 64, 0.1  # a second of them; s between two that a straight line joins
+MAX_LATENCY, MAX_IN_FLIGHT = 0.035, 0.05  # s from frames to the wire that 99 % are to keep; of motion under way
 RATE_DECAY = 0.9  # share of the last rate that is kept when it is smoothed
 MAX_KEYS_READ = 100  # at once
 PHASE_ACTIVITIES = {
@@ -62,15 +61,13 @@ PHASE_ACTIVITIES = {
     PrintPhase.LEAVING: Activity.LEAVING,
     PrintPhase.RETREATING: Activity.LEAVING,
 }
-ACTION_KEYS = dict.fromkeys(" \r\n", Wish.STOP) | {
-    key: wish for wish, key in WISH_KEYS.items() if wish is not Wish.STOP
-}
+OTHER_KEYS = {key: wish for wish, key in WISH_KEYS.items() if wish is not Wish.STOP}
+ACTION_KEYS = dict.fromkeys(" \r\n", Wish.STOP) | OTHER_KEYS
 KEYS_HELP = "   ".join(
     f"{'space or Enter' if wish is Wish.STOP else key}: {WISH_WORDS[wish]}" for wish, key in WISH_KEYS.items()
 )
 LOG_LINES = 16  # newest ones in each view: the page keeps what it was sent before
-REST_SPAN = 10.0  # s over which the surface's movement under a resting nozzle is seen: two breaths
-MIN_REST_POINTS = 4  # of it
+REST_SPAN, MIN_REST_POINTS = 10.0, 4  # s over which movement under a resting nozzle is seen, two breaths; poses of it
 
 
 @dataclass(slots=True)
@@ -135,9 +132,17 @@ class ViewBuilder:
         path = self.prepared.task.path
         self._true_error = NozzleErrorEstimate(path)
         lengths = way_lengths(path.surface_from_nozzle)
-        seconds = lengths / path.speed[1:]  # at the path's own speeds
+        self._times_left = np.concatenate([np.cumsum((lengths / path.speed[1:])[::-1])[::-1], [0.0]])
+        Thread(target=self._time_path, daemon=True).start()  # of 36,000 checkpoints a second and more
         self._ways = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
-        self._times_left = np.concatenate([np.cumsum(seconds[::-1])[::-1], [0.0]])
+
+    def _time_path(self) -> None:
+        """Replace the times at the path's own speeds by those that the arm takes."""
+        from planning.motion.retime import run_times
+
+        task, profile = self.prepared.task, self.prepared.task.profile
+        times = run_times(task.path, profile.arm, profile.limits, profile.tick)
+        self._times_left = times[-1] - times
 
     def update(self, reports: RunReports, profile: ArmProfile | None) -> float:
         """Take the newest reports; the true error at the nozzle, mm, where a new one is known, else NaN.

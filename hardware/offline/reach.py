@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.files.arm_file import far_limits_text, read_arm
 from hardware.files.path_file import read_path, write_path
-from hardware.process.progress import prepare_out
+from hardware.process.progress import duration_text, prepare_out
 from hardware.report.page import (
     MAX_LINE_POINTS,
     Plot,
@@ -28,6 +28,7 @@ from hardware.report.page import (
     spanning,
 )
 from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
+from planning.motion.retime import run_times
 from planning.path import REACH_REASONS, Path, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
 from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
 
@@ -116,11 +117,12 @@ def run_reach(
     if out is not None:
         prepare_out(out, force)
     model, motion, reach = _evaluated(checkpoints, arm, question)
-    best = None
+    best, profile = None, read_arm(arm)
     if isinstance(model, JointModel):
         best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
-    text = reach_text(model, reach, best, question)
-    text = "\n".join(filter(None, [text, far_limits_text(read_arm(arm).limits)]))
+    seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
+    text = reach_text(model, reach, best, question, seconds)
+    text = "\n".join(filter(None, [text, far_limits_text(profile.limits)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
@@ -177,11 +179,16 @@ def with_feasible_column(path: Path, reach: Reach) -> Path:
 
 
 def reach_text(
-    model: JointModel | UrdfKinematics, reach: Reach, best: tuple[int, int] | None, question: ReachQuestion
+    model: JointModel | UrdfKinematics,
+    reach: Reach,
+    best: tuple[int, int] | None,
+    question: ReachQuestion,
+    seconds: float,
 ) -> str:
     """The answer as a table of text.
 
     best: posture by its row of POSTURES, and its number of printable checkpoints; None of an arm by a URDF file.
+    seconds: that a run takes.
     """
     if not isinstance(model, JointModel):
         posture, nominal = f"near {', '.join(f'{angle:.0f}' for angle in np.rad2deg(model.ready))} degrees", False
@@ -206,6 +213,7 @@ def reach_text(
         ("nearest to a joint's end", f"{_smallest(np.rad2deg(reach.bound))} degrees"),
         *singular,
         ("most of a joint's speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
+        ("a run over a surface at rest", f"{duration_text(seconds)} once it is at the first checkpoint"),
         ("spin of the tool", f"{np.rad2deg(reach.spin.min()):.0f} to {np.rad2deg(reach.spin.max()):.0f} degrees"),
     ]
     if best is not None and best[1] > good:

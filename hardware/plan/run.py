@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile
+from hardware.files.arm_file import read_arm
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import gcode_text, write_path
 from hardware.offline.reach import read_jointed_arm, with_feasible
@@ -31,6 +33,7 @@ from hardware.process.progress import Progress, count_text, duration_text
 from hardware.process.provenance import provenance
 from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
 from planning.layers.wound import WoundVolume
+from planning.motion.retime import run_times
 from planning.path import check_path
 from planning.placement import PathPlacement, placement_by_scan
 
@@ -80,7 +83,8 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     if request.gcode is not None:
         _write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
     with _progress("measure", "layers") as progress:
-        layers = figures_of(plan, progress)
+        profile = ArmProfile() if request.arm is None else read_arm(request.arm)
+        layers = figures_of(plan, progress, run_times(path, profile.arm, profile.limits, profile.tick))
     total = total_of(layers)
     written = [request.out.name, *_tables(request, plan, subject, layers, total, arm)]
     if request.pictures:

@@ -16,6 +16,7 @@ from estimation.se3 import Array
 from planning.fill.bead import SHARP_TURN, Bead, Pattern, PrintPace
 from planning.fill.fill import fill, settle_angle
 from planning.fill.region import FillCoverage, fill_coverage, region_of
+from planning.kinematics import SimpleArm
 from planning.layers.checkpoints import (
     Checkpoints,
     CheckpointSettings,
@@ -29,12 +30,15 @@ from planning.layers.checkpoints import (
 from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, unroll
 from planning.layers.slicing import BumpPassing, Layer, LayerMode, LayerStack, Tissue, layer_stack
 from planning.layers.wound import WoundFindings, WoundVolume, nodes_within
+from planning.limits import MotionLimits
+from planning.motion.retime import run_times
 from planning.path import Path
 
 Report = Callable[[int, int], None]  # (layers done, layers)
 SHARP_TURN_TIME = 0.05  # s for each sharp turn, as other planners' times are counted
 # of a closed line's length, from layer to layer: keeps seams apart for the most layers, by the three-distance theorem
 SEAM_SHIFT = 0.6180339887498949
+TICK = 0.02  # s of an arm of no particular kind
 MIN_DISC_AREA = 0.75  # widths squared: a part of less area holds no disc of that width, which has pi / 4 of them
 GRID_STEP, GRID_MARGIN = 1.0, 5.0  # mm: a plane needs no fine grid
 MAX_GRID_NODES = 1000.0  # nodes along a side
@@ -144,7 +148,7 @@ class LayerFigures:
     checkpoints: int
     printed: float  # mm
     travelled: float  # mm
-    seconds: float  # of printing, travels, turns and waits
+    seconds: float  # that a run takes over a surface at rest, waits included
     volume: float  # mm^3
     coverage: FillCoverage
     gap: float  # mm^2 of all gaps
@@ -171,7 +175,8 @@ class PlanTotal:
 def seconds_to(points: Checkpoints) -> Array:
     """Times (N,), s from the first, at which checkpoints are reached: ways at their speeds, sharp turns and waits.
 
-    A turn of more than SHARP_TURN costs SHARP_TURN_TIME, as in other planners' figures; the arm's planner knows more.
+    A turn of more than SHARP_TURN costs SHARP_TURN_TIME, as in other planners' figures: for comparisons with these, and
+    for a picture that moves. `run_times` says how long the arm takes.
     """
     step = np.diff(points.tip, axis=0)
     length = np.linalg.norm(step, axis=1)
@@ -182,9 +187,14 @@ def seconds_to(points: Checkpoints) -> Array:
     return np.asarray(np.cumsum(durations))
 
 
-def figures_of(plan: Plan, report: Report = lambda done, total: None) -> list[LayerFigures]:
-    """The figures of each layer that has beads. One thread a core: GEOS, which unites the beads, releases the GIL."""
-    moments = seconds_to(plan.points)
+def figures_of(
+    plan: Plan, report: Report = lambda done, total: None, moments: Array | None = None
+) -> list[LayerFigures]:
+    """The figures of each layer that has beads. One thread a core: GEOS, which unites the beads, releases the GIL.
+
+    moments: times (N,), s, at which a run is at the path's checkpoints; by default as an arm of no particular kind.
+    """
+    moments = run_times(plan.path, SimpleArm(), MotionLimits(), TICK) if moments is None else moments
     printed_layers = [layer for layer in plan.layers if layer.beads]
     figures_list = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -201,12 +211,12 @@ def _figures(plan: Plan, layer: PlannedLayer, moments: Array) -> LayerFigures:
     points, number = plan.points, layer.layer.number
     own = points.layer == number
     step = np.r_[0.0, np.linalg.norm(np.diff(points.tip, axis=0), axis=1)]
-    durations = np.diff(moments, prepend=0.0)
+    seconds = float(np.diff(moments, prepend=0.0)[plan.path.layer == number].sum())
     result, tissue = layer.coverage, layer.layer.slab.tissue
     half, whole = (_wide_area(result.gaps, part * plan.order.pattern.width) for part in (0.5, 1.0))
     return LayerFigures(
         number, tissue.name, tissue.material, float(layer.region.area), len(layer.beads), int(own.sum()),
-        float(step[own & points.extrude].sum()), float(step[own & ~points.extrude].sum()), float(durations[own].sum()),
+        float(step[own & points.extrude].sum()), float(step[own & ~points.extrude].sum()), seconds,
         float(points.volume[own].sum()), result, float(result.gaps.area), half, whole,
     )  # fmt: skip
 

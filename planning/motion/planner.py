@@ -25,8 +25,7 @@ from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints
 from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
 from planning.material import FlowCommands, FlowOrder, Outlets, RestsAhead, material_plan
 from planning.motion.curve import (
-    CORNER_SPEED_CHANGE,
-    CORNER_TOLERANCE,
+    HORIZON_TIME,
     LOOKAHEAD,
     AxisFollower,
     Gridpoints,
@@ -41,7 +40,6 @@ from planning.motion.curve import (
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import Path, PrintPhase, PrintProgress, check_path, check_start
 
-HORIZON_TIME = 1.0  # s of path timed at once: any speed can be stopped in it
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second
 PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
 PAUSED = "paused"
@@ -79,7 +77,7 @@ class Planner:
         one that is not among them leaves at once.
         """
         self._path, self._limits, self._arm, self._tick, self.lag = check_path(path), limits, arm, tick, lag
-        self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], CORNER_TOLERANCE, CORNER_SPEED_CHANGE)
+        self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], ~path.extrude[1:])
         self._zone = path.zone
         self._follower = AxisFollower(arm.home, limits, tick)
         self._segment: Segment | None = None
