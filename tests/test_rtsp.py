@@ -63,5 +63,6 @@ def test_an_rtsp_camera_is_stamped_but_for_a_constant_delay_and_opened_again() -
     for sets in (first, second, third):
         off = late(sets)
         assert off.min() > 0 and off.max() < MAX_DELAY, off
-        assert np.percentile(off, 95) - np.percentile(off, 5) < PERIOD / 2
+        # FFmpeg mostly holds a picture back until the next one begins
+        assert np.percentile(off, 95) - np.percentile(off, 5) < 1.25 * PERIOD and np.median(off) < 2 * PERIOD
     assert {one.frames[0].by for one in first} <= {"arrival", "stream"}
