@@ -59,7 +59,7 @@ def test_an_rtsp_camera_is_stamped_but_for_a_constant_delay_and_opened_again() -
             third = sets_until(live, CLOCK.now() + 6)
             assert live.health().cameras[0].reopened == 2 and live.health().trouble == ""
     print(len(first), len(second), len(third), "pictures; late, ms:", 1e3 * np.percentile(late(first), [0, 50, 100]))
-    assert healthy.trouble == "" and healthy.cameras[0].missed <= 5 and len(first) > 6 / PERIOD
+    assert healthy.trouble == "" and healthy.cameras[0].missed < 0.1 * len(first) and len(first) > 6 / PERIOD
     for sets in (first, second, third):
         off = late(sets)
         assert off.min() > 0 and off.max() < MAX_DELAY, off
