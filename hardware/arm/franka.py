@@ -184,7 +184,7 @@ def find_arms() -> list[tuple[str, str]]:
     found = []
     for host in USUAL_HOSTS:
         with suppress(OSError), socket.create_connection((host, FCI_PORT), FIND_TIME):
-            found.append((f"{SCHEME}{host}", "a controller answers"))
+            found.append((f"{SCHEME}{host}", "something answers at libfranka's port"))
     return found
 
 
