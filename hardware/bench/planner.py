@@ -24,7 +24,7 @@ from estimation.se3 import Array
 from estimation.surface_map import Warp
 from hardware.arm.profile import ArmProfile
 from hardware.bench.fault_run import AXES_LIMITS, AxesOracle, FaultRun, prepare_scenario
-from hardware.bench.figures import Figure, at_most, milliseconds, percentile, with_progress
+from hardware.bench.figures import Figure, at_least, at_most, milliseconds, percentile, with_progress
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import CpuClock
 from hardware.report.page import section
@@ -55,6 +55,7 @@ FRAME_RATES = 6, 30, 60  # Hz
 STALL_SHARE = 0.002  # of ticks before which the caller stalls
 JUMP_SIZES = np.array([0.01] * 3 + [5.0] * 3)  # rad and mm of a jump
 OUT_OF_REACH = np.array([0.0, 0, 0, 800.0, 0, 0])  # mm
+MIN_PRINTING = 0.02  # share of the updates that print, below which a bench of printing has measured nothing
 FORECAST_HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
 
 
@@ -249,7 +250,7 @@ def _limits(tally: StreamTally) -> list[Figure]:
         Figure("uncaught errors", len(tally.errors), "", none, "toppra #150", next(iter(tally.errors), "")),
         Figure("moves that the guard refused", tally.refused, "", none),
         Figure("printed twice", tally.twice, "mm", at_most(1e-6), note="over outages, stalls and a second run"),
-        Figure("share of updates that print", tally.printing / max(tally.samples, 1)),
+        Figure("share of updates that print", tally.printing / max(tally.samples, 1), "", at_least(MIN_PRINTING)),
     ]
 
 

@@ -304,10 +304,12 @@ def _library_check(name: str, module: str, failed: dict[str, LoadFailure]) -> Ch
 def device_checks() -> list[Check]:
     """Cameras, arm, lock, videos, network. It imports what needs the libraries: called where these load."""
     from hardware.arm.port import lock_folder, serial_ports
+    from hardware.cameras.genicam import aravis_python
     from hardware.cameras.sources import list_devices
 
     ports = [arm_check(serial_ports()), lock_check(lock_folder())]
-    return [camera_check(list_devices()), *ports, video_check(), network_check()]
+    cameras = [camera_check(list_devices()), aravis_check(aravis_python())]
+    return [*cameras, *ports, video_check(), network_check()]
 
 
 def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
@@ -316,6 +318,15 @@ def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
         return Check("cameras", CheckVerdict.WARN, "none is plugged in", "plug them in; `stillbed cameras` says more")
     names = ", ".join(device.name or str(device.node) for device in devices)
     return _access_check("cameras", [(str(device.node), names) for device in devices], names, "video")
+
+
+def aravis_check(python: str | None) -> Check:
+    """Whether industrial cameras can be read: the Python that has Aravis's binding, None: none has."""
+    from hardware.cameras.genicam import INSTALL
+
+    if python is None:
+        return Check("industrial cameras", CheckVerdict.WARN, "not read: Aravis is not installed", INSTALL)
+    return Check("industrial cameras", CheckVerdict.PASS, f"read by Aravis with {python}")
 
 
 def arm_check(ports: list[tuple[str, str]]) -> Check:

@@ -16,8 +16,16 @@ from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST
-from hardware.simulator.scene.appearance import Appearance, Lamp, PrintedBeads, lamps
-from hardware.simulator.scene.drape import Drape, backdrop, drape_over, node_axes
+from hardware.simulator.scene.appearance import (
+    Appearance,
+    Drape,
+    Lamp,
+    PrintedBeads,
+    backdrop,
+    drape_over,
+    lamps,
+    node_axes,
+)
 from hardware.simulator.scene.fields import Field, Layers, as_field, linear_light
 from hardware.simulator.scene.rays import HeightField, RenderView, height_field
 from hardware.simulator.scene.shape import Deformation, Shape

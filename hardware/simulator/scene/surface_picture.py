@@ -14,8 +14,7 @@ import numpy as np
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.scene.appearance import mirror_slopes, surface_light
-from hardware.simulator.scene.drape import CLOTH_TEAL, DRAPE_STEP, DRAPE_TEXEL
+from hardware.simulator.scene.appearance import CLOTH_TEAL, DRAPE_STEP, DRAPE_TEXEL, mirror_slopes, surface_light
 from hardware.simulator.scene.fields import Field, Mask, as_field, block_mean, sample, sample_texture, upsample
 from hardware.simulator.scene.rays import (
     CELL_PX,

@@ -8,8 +8,14 @@ import cv2
 import numpy as np
 
 from estimation.errors import InputError
-from hardware.simulator.scene.appearance import Appearance
-from hardware.simulator.scene.drape import cloth_colour, cloth_thickness, node_axes, opening_distance, weave_texture
+from hardware.simulator.scene.appearance import (
+    Appearance,
+    cloth_colour,
+    cloth_thickness,
+    node_axes,
+    opening_distance,
+    weave_texture,
+)
 from hardware.simulator.scene.fields import (
     BLOCK_TEXELS,
     Field,
