@@ -369,6 +369,19 @@ def far_limits_text(limits: MotionLimits) -> str:
     return f"limits far beyond a SEED S6H4D's: {'; '.join(far)}. Does this arm bear them?" if far else ""
 
 
+def unreached_limits_text(profile: ArmProfile) -> str:
+    """One line about speeds that the planner never reaches, as jump and turn in a tick allow less; "" without any."""
+    limits, unit = profile.limits, _unit("speed")
+    most = limits.per_tick(profile.tick)
+    axes = np.flatnonzero(most < limits.speed * (1 - _ROUNDING)).tolist()
+    groups: dict[str, list[str]] = {}
+    for i in axes:
+        groups.setdefault(f"{(limits.speed / unit)[i]:g}, at most {(most / unit)[i]:.1f}", []).append(AXIS_LETTERS[i])
+    told = "; ".join(f"{' '.join(letters)} {each}" for each, letters in groups.items())
+    why = f"limits.jump and limits.turn of a tick of {profile.tick:g} s hold for all axes together"
+    return f"limits.speed that is never reached: {told}, as {why}" if told else ""
+
+
 def _dialect(path: Path, table: checks.Table) -> Dialect:
     default = Dialect()
     slots = table.get("slots", list(default.slots))

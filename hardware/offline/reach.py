@@ -13,7 +13,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.files.arm_file import far_limits_text, read_arm
+from hardware.files.arm_file import far_limits_text, read_arm, unreached_limits_text
 from hardware.files.path_file import read_path, write_path
 from hardware.process.progress import duration_text, prepare_out
 from hardware.report.page import (
@@ -122,7 +122,7 @@ def run_reach(
         best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
     seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
     text = reach_text(model, reach, best, question, seconds)
-    text = "\n".join(filter(None, [text, far_limits_text(profile.limits)]))
+    text = "\n".join(filter(None, [text, far_limits_text(profile.limits), unreached_limits_text(profile)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
