@@ -1,4 +1,4 @@
-# make demo | test | slow | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser | deceit | docs: each makes .venv and installs what it needs; a second time costs nothing.
+# make demo | test | slow | counterparts | mutants | bench | check | format | outages | faults | fuzz | hazards | references | audit | browser | deceit | docs: each makes .venv and installs what it needs; a second time costs nothing.
 
 PYTHON ?= python3
 BIN    := .venv/bin
@@ -10,7 +10,7 @@ DEMO   := demo
 # Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test slow mutants bench check format install outages faults fuzz hazards references audit browser deceit docs
+.PHONY: demo test slow counterparts mutants bench check format install outages faults fuzz hazards references audit browser deceit docs
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -21,6 +21,15 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+# Machines that others wrote: what can be installed is, what is missing is skipped, with what to install.
+COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py tests/test_genicam.py tests/test_rtsp.py
+CAMERAS := aravis-tools gir1.2-aravis-0.8 python3-gi nftables faketime gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-good gstreamer1.0-plugins-ugly
+
+counterparts: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[counterparts]'
+	@$(call apt,$(CAMERAS),command -v arv-fake-gv-camera-0.8)
+	$(BIN)/python -m pytest -m "slow or not slow" -rs $(COUNTERPARTS)
 
 mutants: $(STAMP)
 	$(BIN)/python -m tests.mutants

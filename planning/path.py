@@ -238,7 +238,7 @@ class SurfaceMotion:
 class Reach:
     """The reach of N checkpoints, the worst over the places of the surface; distances as in JointDistance."""
 
-    joints: Array  # (N, 6) rad, with the surface at rest
+    joints: Array  # (N, J) rad, with the surface at rest
     bound: Array  # (N,) rad
     wrist: Array  # (N,) rad
     elbow: Array  # (N,) rad
@@ -292,22 +292,29 @@ def spin_path(path: Path, spin: Array) -> Array:
 
 def _speed(model: JointModel, joints: Array, arm_from_surface: Array, path: Path, motion: SurfaceMotion) -> Array:
     """Share (N,) of the joints' speeds that the way to each checkpoint (or from the first) and the surface take."""
+    inverse = np.full((len(path), 6, 6), np.nan)
+    matrix = jacobian(model, joints)
+    regular = np.isfinite(matrix).all(axis=(1, 2)) & (joint_distance(model, joints).manipulability > 1e-6)
+    inverse[regular] = np.linalg.inv(matrix[regular])
+    return joint_speed_share(inverse, model.speed, arm_from_surface, path, motion)
+
+
+def joint_speed_share(
+    inverse: Array, limit: Array, arm_from_surface: Array, path: Path, motion: SurfaceMotion
+) -> Array:
+    """The same by the inverse (N, J, 6) of the Jacobian, turn and then tip, and the joints' limits (J,), rad/s."""
     poses = arm_from_surface @ path.surface_from_nozzle
     turns = se3.log_rotation(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], -1, -2))
     step = np.concatenate([turns, np.diff(poses[:, :3, 3], axis=0)], axis=1)
     along = step * (path.speed[1:] / way_lengths(path.surface_from_nozzle))[:, None]  # (N - 1, 6): turn and tip, per s
     along = np.concatenate([along[:1], along])
-    inverse = np.full((len(path), 6, 6), np.nan)
-    matrix = jacobian(model, joints)
-    regular = np.isfinite(matrix).all(axis=(1, 2)) & (joint_distance(model, joints).manipulability > 1e-6)
-    inverse[regular] = np.linalg.inv(matrix[regular])
     speeds = np.abs(inverse @ along[..., None])[..., 0]
     pace = 2 * np.pi * motion.rate  # a swing's greatest speed by its height
     for swing in motion.swings @ np.kron(np.eye(2), arm_from_surface[:3, :3].T):
         tip = swing[3:] + np.cross(swing[:3], poses[:, :3, 3] - arm_from_surface[:3, 3])
         turn = np.broadcast_to(swing[:3], tip.shape)
         speeds = speeds + pace * np.abs(inverse @ np.concatenate([turn, tip], 1)[..., None])[..., 0]
-    return np.asarray((speeds / model.speed).max(axis=1))
+    return np.asarray((speeds / limit).max(axis=1))
 
 
 def best_spin(model: JointModel, arm_from_surface: Array, path: Path, motion: SurfaceMotion) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hardware.arm.port import UnpluggedError
+from hardware.arm.driver import UnpluggedError
 from hardware.dispenser.dispenser import DispenserProfile, DispenserState
 from hardware.dispenser.line_dispenser import LineDispenser
 from hardware.dispenser.messages import PRESETS, DispenserLine

@@ -5,11 +5,13 @@ from __future__ import annotations
 import struct
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 RATE = 30.0  # frame sets a second
 AGE = 0.03  # s of a pose when it comes
+TILT = 0.005  # rad by which the surface turns as it breathes
 HOME = 65.0  # mm of Z: the surface lies at 50
 SIZE = (16, 12)  # px
 RIG = """[[camera]]
@@ -39,10 +41,10 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
     write_arm(folder / "arm.toml", replace(profile, arm=replace(profile.arm, home=home)), "near the surface")
 
 
-def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
-    """The body of a tracking process that knows where the surface is. last: phase of the print that it sees no more of.
+def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 1.0) -> None:
+    """The body of a tracking process that knows where the surface is, which breathes by `height` mm up and down.
 
-    "" to see all of it.
+    last: phase of the print that it sees no more of, "" to see all of it.
     """
     from dataclasses import replace
 
@@ -71,7 +73,7 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
         due += 1 / RATE
         clock.wait_until(due)
         stamp, sets = due - AGE, round((due - begin) * RATE)
-        pose = pose_at(lambda t: breathing(t, height=1.0, tilt=0.005), stamp)
+        pose = pose_at(lambda t: breathing(t, height=height, tilt=TILT), stamp)
         channels.poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
         seen = {"used": (50, 50), "looks": channels.looks.value, "surface": ground, "since": begin}
         channels.reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, **seen))
@@ -82,11 +84,6 @@ def track_nothing(prepared: Any, channels: Any, last: str = "") -> None:
             channels.reports.put(replace(channels.reports.get(), ended="session is over"))
             break
     outbox.close()
-
-
-def track_until_printed(*given: Any) -> None:
-    """The same of a recorded session that is over as soon as the last checkpoint is printed."""
-    track_nothing(*given, last="leaving")
 
 
 def png() -> bytes:
@@ -122,7 +119,11 @@ def main(folder: Path, record: Path, *flags: str) -> int:
     else:
         rig, path, profile = (folder / name for name in ("rig.toml", "path.csv", "arm.toml"))
         device = next((flag for flag in flags if not flag.startswith("--")), "virtual")
-        more = {"unattended": "--yes" in flags, "page": "--page" in flags, "stands_home": True}
+        more = {
+            "unattended": "--yes" in flags,
+            "page": "--page" in flags,
+            "stands_home": not device.startswith("franka"),
+        }
         ports = [int(flag.partition("=")[2]) for flag in flags if flag.startswith("--foxglove=")]
         more |= {"foxglove_port": sum(ports), "operator": "Ada" if ports else ""}
         given = LiveSettings(rig=rig, path=path, arm=device, profile=profile, record=record, **more)
@@ -134,7 +135,9 @@ def main(folder: Path, record: Path, *flags: str) -> int:
 
         run.recorded_begin = unkept
     with Console() as console:
-        outcome = LiveRun(prepared, console, track_until_printed if "--until-printed" in flags else track_nothing)()
+        heights = [float(flag.partition("=")[2]) for flag in flags if flag.startswith("--height=")]
+        last = "leaving" if "--until-printed" in flags else ""
+        outcome = LiveRun(prepared, console, partial(track_nothing, last=last, height=sum(heights) or 1.0))()
         console.say(outcome.words)
     return outcome.code
 

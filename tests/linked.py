@@ -10,6 +10,7 @@ import numpy as np
 from estimation.se3 import Array
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.s6h4d import S6H4D
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault
 from hardware.simulator.arm.controller import VirtualArm
@@ -92,7 +93,7 @@ def linked(
     settings = ArmSettings(servo_lag=0.0) if settings is None else settings
     virtual = VirtualArm(settings, profile.dialect, begin, faults, profile.baud)
     device = VirtualDevice(virtual, clock, profile.baud, port)
-    made = Linked(clock, virtual, device, Arm(device, profile, 0.0, link or LinkSettings()))
+    made = Linked(clock, virtual, device, Arm(S6H4D(device, profile), profile, 0.0, link or LinkSettings()))
     if stand:
         assert made.arm.stand(begin, 0.0) == "" and made.arm.arm(0.0) == ""
     return made

@@ -101,6 +101,8 @@ class Shot:
 class ListedCapture:
     """A list that is a camera: each frame comes at its arrival; after the last one the camera has gone."""
 
+    exact, incomplete, transport = False, False, None
+
     def __init__(self, shots: Sequence[Shot], clock: Clock, clocked: bool, controls: tuple[Control, ...] = ()) -> None:
         self._shots, self._clock, self._controls = iter(shots), clock, controls
         self._shot = Shot(0.0)

@@ -21,6 +21,7 @@ from estimation.synthetic.world import arc_rig
 from hardware.arm.console import ArmRequest, axes_from_text, findings, jog_from_text, origin_from_text, run_arm
 from hardware.arm.device import ArmState, ArmStatus
 from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
+from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import COMMANDED_FILE, read_commanded
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm, write_arm
@@ -46,7 +47,7 @@ def asked(
     clock, profile = SimClock(), ArmProfile()
     arm = VirtualArm(ArmSettings(replies=replies), profile.dialect, AWAY, faults)
     lines: list[str] = []
-    status = run_arm(VirtualDevice(arm, clock, faults=port), profile, request, clock, lines.append)
+    status = run_arm(S6H4D(VirtualDevice(arm, clock, faults=port), profile), profile, request, clock, lines.append)
     arm.advance(clock.now())
     return status, arm, lines
 

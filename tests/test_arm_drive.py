@@ -17,6 +17,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile
+from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import (
     ARM_FILE,
     COMMANDED_FILE,
@@ -49,7 +50,7 @@ SHORT = MoveOptions(places=4, dwell=0.3, swing=1.0, speed=100.0)
 def driven(folder: Path, profile: ArmProfile = PROFILE, tell: object = no_progress) -> tuple[VirtualArm, Arm, SimClock]:
     clock = SimClock()
     virtual = VirtualArm(ArmSettings(servo_lag=0.02), profile.dialect, HOME, (), profile.baud)
-    arm = Arm(VirtualDevice(virtual, clock, profile.baud), profile, 0.0)
+    arm = Arm(S6H4D(VirtualDevice(virtual, clock, profile.baud), profile), profile, 0.0)
     try:
         move_arm(arm, clock, folder, HOME, SHORT, tell)
     finally:

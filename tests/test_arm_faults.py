@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm.device import BLIND_RESENDS, RESEND_AFTER, ArmState
+from hardware.arm.driver import G1, G4, Pause, Reply, ReplyKind
 from hardware.arm.link import shut_down
 from hardware.arm.profile import LinkSettings
-from hardware.arm.protocol import G1, G4, Pause, Reply, ReplyKind, encode
+from hardware.arm.protocol import encode
 from hardware.motion.loop import Order
 from hardware.process.faults import Fault, FaultKind, FaultPart, WorkRates
 from hardware.simulator.arm.ports import PortFaults
@@ -324,7 +325,7 @@ def test_the_last_stop_of_a_session_is_said_again_too(ends: str) -> None:
 @pytest.mark.parametrize("kind", [ReplyKind.PLACE, ReplyKind.TOOL])
 def test_an_arm_that_answers_half_is_told_for_as_long_as_that_half_moves(kind: ReplyKind) -> None:
     link = linked(ANSWERING, arm_fault("drop at 1s for 0.7s"))
-    line = link.arm._line
+    line = link.arm.driver
     whole = line.receive
 
     def half() -> tuple[list[Reply], bytes]:

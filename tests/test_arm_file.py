@@ -17,7 +17,14 @@ from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import Dialect
 from hardware.cli.main import main
 from hardware.files import arm_file
-from hardware.files.arm_file import FAR_LIMIT, LIMIT_KEYS, far_limits_text, read_arm, write_arm
+from hardware.files.arm_file import (
+    FAR_LIMIT,
+    LIMIT_KEYS,
+    far_limits_text,
+    read_arm,
+    unreached_limits_text,
+    write_arm,
+)
 from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
 from planning.command import Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm
@@ -55,6 +62,7 @@ def test_a_profile_comes_back(tmp_path_factory: pytest.TempPathFactory, seed: in
         draw.uniform(0.01, 0.04),
         draw.uniform(0, 0.5),
         np.stack([np.cumsum(draw.uniform(0.1, 30, 3 + seed % 4)), draw.uniform(0, 9, 3 + seed % 4)], axis=-1),
+        *(None if seed % 3 else draw.uniform(0, 0.009), None if seed % 2 else draw.uniform(0.05, 0.5)),
     )
     file = tmp_path_factory.mktemp("arm") / "arm.toml"
     write_arm(file, profile, "made up\nfor a test")
@@ -284,6 +292,15 @@ def test_a_limit_is_told_exactly_if_it_is_more_than_three_times_the_usual_one(
     told = far_limits_text(limits)
     assert (f"limits.{name} = " in told) == (times > FAR_LIMIT) == bool(told)
     assert "\n" not in told
+
+
+@given(st.floats(10.0, 300.0), st.floats(0.2, 10.0))
+def test_a_speed_that_a_jump_never_allows_is_told_and_no_other(speed: float, jump: float) -> None:
+    """By the planner's own rule: in one tick of 0.02 s all three axes may move at once."""
+    limits = MotionLimits(speed=np.array([speed] * 3 + [0.1] * 3), jump=jump)
+    told, most = unreached_limits_text(ArmProfile(limits=limits)), jump / 3**0.5 / 0.02
+    assert bool(told) == (most < speed * (1 - 1e-9))
+    assert not told or (f"X Y Z {speed:g}, at most {most:.1f}, as" in told)
 
 
 def test_arms_that_come_along_have_usual_limits() -> None:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm.device import ArmState
-from hardware.arm.port import ArmLine
+from hardware.arm.driver import G1, G4, Pause, Reply, ReplyKind
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.arm.protocol import G1, G4, Dialect, Pause, Reply, ReplyKind, decode, encode
+from hardware.arm.protocol import Dialect, decode, encode
 from hardware.arm.queue import ArmQueue, FlowControl
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults
@@ -353,7 +353,7 @@ def test_one_wrong_answer_alone_is_not_believed() -> None:
     link = linked(ANSWERING)
     link.follow(1.0)
     assert link.arm._queue is not None
-    link.arm._feedback.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, np.zeros(3), 1.0)
+    link.arm._feedback.take(Reply(ReplyKind.PLACE, HOME[:3] + 100), link.arm._queue, 1.0)
     assert link.arm.hold(1.0) == "" and link.follow(1.0) == []
 
 
@@ -489,7 +489,7 @@ def test_a_lag_that_was_learned_of_a_stalled_arm_alone_is_learned_anew() -> None
 
 def test_what_a_stall_piled_up_counts_as_motion_under_way() -> None:
     flow, queue = FlowControl(ArmProfile(), LinkSettings()), ArmQueue(HOME.tolist(), 0.004, 0.0)
-    line = ArmLine(linked().device())
+    line = linked().arm.driver
     assert flow.full(line, queue, 0.02, 0.0) == flow.full(line, queue, 0.02, 0.0, 0.02) == ""
     assert "under way" in flow.full(line, queue, 0.02, 0.0, 0.03)
     link = linked(ANSWERING, arm_fault("stall 28ms at 2s"))  # less than what is called back

@@ -19,9 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
+from hardware.arm.driver import ReplyKind
 from hardware.arm.port import CLOSE_TIME, PortLock, SerialPort, lock_folder
 from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import ReplyKind, reply_stream
+from hardware.arm.protocol import reply_stream
 from hardware.process.clock import WallClock
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import POLL_PERIOD, PtyLink, _arrivals, run_virtual_arm

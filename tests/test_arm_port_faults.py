@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm.device import ArmState
+from hardware.arm.driver import Reply, ReplyKind, UnpluggedError
 from hardware.arm.jog import lifted_travel_steps, travel_steps
 from hardware.arm.link import Arm
-from hardware.arm.port import UnpluggedError
 from hardware.arm.profile import ArmProfile, LinkSettings, at_baud
-from hardware.arm.protocol import Reply, ReplyKind, encode_reply
+from hardware.arm.protocol import encode_reply
+from hardware.arm.s6h4d import S6H4D
 from hardware.simulator.arm.ports import PortFaults, VirtualPort
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
@@ -57,7 +58,7 @@ def gone(data: bytes) -> int:
 def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
     link = linked(ANSWERING)
     link.run(0.5)
-    line = link.arm._line
+    line = link.arm.driver
     monkeypatch.setattr(line.port, "write", gone)
     monkeypatch.setattr(line, "receive", lambda: ([Reply(ReplyKind.ORIGIN, np.array([5.0, 0, 0]))], b""))
     link.arm.poll(link.clock.now())
@@ -67,7 +68,7 @@ def test_a_port_that_goes_while_a_wrong_origin_is_stopped_is_an_arm_unplugged(mo
 def test_a_port_that_goes_while_an_arm_is_asked_to_obey_is_an_arm_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
     link = linked(ANSWERING, arm_fault("drop at 1s for 900ms"))
     link.follow(1.4)
-    line, frames = link.arm._line, link.arm.frames
+    line, frames = link.arm.driver, link.arm.frames
     monkeypatch.setattr(line.port, "write", gone)
     link.run(0.2)
     assert link.arm.frames == frames and any("gone" in event.text for event in link.arm.events())
@@ -87,7 +88,7 @@ def test_a_step_home_that_waited_in_the_port_when_called_back_is_made_after_all(
 
 def test_bytes_that_wait_in_the_port_are_a_hold() -> None:
     link = linked()
-    port = link.arm._line.port
+    port = link.arm.driver.port
     port.waiting = lambda: 500
     assert "500 bytes wait" in link.arm.hold(0.0)
 
@@ -192,7 +193,7 @@ def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:
 
 def test_an_origin_that_is_not_the_one_it_was_told_stops_it() -> None:
     link = linked()
-    port = link.arm._line.port
+    port = link.arm.driver.port
     answers = [encode_reply(Reply(ReplyKind.ORIGIN, place)) for place in (np.array([0.1, 0, 0]), HOME[:3])]
     port.read = lambda: answers.pop(0) if answers else b""
     link.arm.poll(0.0)
@@ -210,14 +211,14 @@ def test_a_device_that_another_program_took_meanwhile_is_waited_for() -> None:
             raise taken.pop()
         return link.device()
 
-    link.arm._opener = opener
+    link.arm.driver.opener = opener
     link.run(1.9)
     assert link.arm.state is ArmState.UNPLUGGED and "a port that is free" in link.arm.reason
     link.run(0.6)
     assert link.arm.state is ArmState.DISARMED
     with pytest.raises(InputError):  # at the very first there is nothing to wait for
         taken.append(InputError("arm", "port", "x", "a port that is free"))
-        Arm(opener, ArmProfile(), 0.0)
+        Arm(S6H4D(opener, ArmProfile()), ArmProfile(), 0.0)
 
 
 def test_a_device_that_goes_while_a_frame_is_given_out_is_unplugged_and_nothing_is_thought_sent() -> None:
@@ -242,7 +243,7 @@ def test_an_arm_turned_off_its_way_is_held() -> None:
     link.follow(1.0)
     for _ in range(2):
         tool = Reply(ReplyKind.TOOL, HOME[3:] + np.deg2rad([0, 3.0, 0]))
-        link.arm._feedback.take(tool, link.arm._queue, np.zeros(3), link.clock.now())
+        link.arm._feedback.take(tool, link.arm._queue, link.clock.now())
     assert "degrees off its way, limit 2 degrees" in link.arm.hold(link.clock.now())
     link.run(0.5)
     assert link.arm.take_up() is not None and link.arm.hold(link.clock.now()) == ""

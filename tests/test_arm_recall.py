@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from hardware.arm.device import ArmState
+from hardware.arm.driver import G1, Pause, Reply, ReplyKind
 from hardware.arm.feedback import ArmFeedback, near
 from hardware.arm.jog import MIN_TRIAL_STEP, AbortRecovery, is_underway
 from hardware.arm.link import RECALLED
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.arm.protocol import G1, Pause, Reply, ReplyKind
 from hardware.arm.queue import ArmQueue
 from hardware.motion.loop import Order, Tick
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
@@ -216,8 +216,8 @@ def test_where_it_rests_is_as_known_as_its_answer_allows(place: np.ndarray, besi
     answered, echo = np.round(true / COUNT) * COUNT, ArmFeedback(LinkSettings(), 0.02)
     assert echo.stands(known, 0.0) is None  # it has not answered
     queue = ArmQueue(known.tolist(), 0.004, 0.0)
-    echo.take(Reply(ReplyKind.PLACE, answered[:3]), queue, np.zeros(3), 0.1)
-    echo.take(Reply(ReplyKind.TOOL, answered[3:]), queue, np.zeros(3), 0.1)
+    echo.take(Reply(ReplyKind.PLACE, answered[:3]), queue, 0.1)
+    echo.take(Reply(ReplyKind.TOOL, answered[3:]), queue, 0.1)
     stands = echo.stands(known, 0.1)
     assert stands is not None and (np.abs(stands - answered) <= 0.501 * COUNT).all()
     if near(answered, known):
@@ -245,7 +245,7 @@ def test_what_an_arm_does_with_its_step_says_whether_it_obeys(away: list[float],
 
     def answer(place: np.ndarray, now: float) -> None:
         for kind, values in (ReplyKind.PLACE, place[:3]), (ReplyKind.TOOL, place[3:]):
-            echo.take(Reply(kind, values), ArmQueue(HOME.tolist(), 0.004, 0.0), np.zeros(3), now)
+            echo.take(Reply(kind, values), ArmQueue(HOME.tolist(), 0.004, 0.0), now)
 
     recall.begin("a stall", HOME + [5, 0, 0, 0, 0, 0], None, 1.0)
     for now in 0.95, 1.05, 1.1:

@@ -16,6 +16,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile
+from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, check_moves
 from hardware.calibration.dispenser_lines import (
     LN2,
@@ -271,7 +272,7 @@ def draw(
     clock, profile = port.clock, ArmProfile()
     start = profile.arm.home - [0, 0, 60.0, 0, 0, 0]
     virtual = VirtualArm(ArmSettings(), profile.dialect, start, (), profile.baud)
-    arm = Arm(VirtualDevice(virtual, clock, profile.baud), profile, clock.now())
+    arm = Arm(S6H4D(VirtualDevice(virtual, clock, profile.baud), profile), profile, clock.now())
     line = replace(PRESETS["new_era"].line, port="/dev/none")
     driver = LineDispenser(dispenser, line, port)
 

@@ -11,20 +11,8 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.protocol import (
-    G1,
-    G4,
-    G54,
-    THESIS_DIALECT,
-    ControllerReset,
-    Dialect,
-    Mode,
-    Pause,
-    ReplyKind,
-    Reset,
-    encode,
-    reply_stream,
-)
+from hardware.arm.driver import G1, G4, G54, Pause, ReplyKind
+from hardware.arm.protocol import THESIS_DIALECT, ControllerReset, Dialect, Mode, Reset, encode, reply_stream
 from hardware.simulator.arm.controller import SERVO_STEP, Polyline, Servo, VirtualArm
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import MIN_TRAVEL

@@ -26,8 +26,7 @@ from estimation.synthetic.world import arc_rig
 from hardware.files.path_file import read_path
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.frame_source import FrameRing, RingSource
-from hardware.live.ipc import ProcessGroup
-from hardware.live.session_player import play_session
+from hardware.live.ipc import ProcessGroup, play_session
 from hardware.offline.replay import FrameFaults, tracked_sets
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import (

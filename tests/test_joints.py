@@ -228,9 +228,10 @@ def test_the_guard_refuses_a_place_that_the_posture_does_not_reach() -> None:
     assert isinstance(refused, Refusal) and "no posture" in refused.reason and refused.code is RefusalCode.POSTURE
 
 
-def test_both_arm_files_come_back_as_written(tmp_path: Folder) -> None:
+def test_arm_files_with_a_table_of_joints_come_back_as_written(tmp_path: Folder) -> None:
     for file in sorted(FILE.parent.glob("*.toml")):
-        first = read_arm(file)
+        if (first := read_arm(file)).urdf is not None:
+            continue  # tests/test_urdf.py has it
         write_arm(tmp_path / "a.toml", first)
         again = read_arm(tmp_path / "a.toml")
         assert first.arm.angles is again.arm.angles

@@ -30,6 +30,7 @@ from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import ProgressWriter, read_progress, write_path, write_progress_durably
 from hardware.live.checklist import PrintTask, place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
+from hardware.live.ipc import schedule, turning_sets
 from hardware.live.motion_process import LAG_STEP, LiveMotion
 from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
 from hardware.live.prepared import (
@@ -44,7 +45,6 @@ from hardware.live.prerender import cached
 from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
 from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry, recorded_begin
-from hardware.live.session_player import schedule, turning_sets
 from hardware.live.settings import (
     LiveSettings,
     available_cores,

@@ -97,8 +97,8 @@ def rise(height: float, seconds: float) -> Callable[[float], float]:
 CASES = [
     (DENSE, 30.0, 2.0, 0.0, still),
     (DENSE, 13.0, 2.0, 1.0, breathing),
-    (DENSE, 13.0, 2.0, 8.0, still),
-    (DENSE, 30.0, 3.0, 6.0, breathing),
+    pytest.param(DENSE, 13.0, 2.0, 8.0, still, marks=pytest.mark.slow),
+    pytest.param(DENSE, 30.0, 3.0, 6.0, breathing, marks=pytest.mark.slow),
     (SPARSE, 30.0, 6.0, 2.3, breathing),
     (SPARSE, 13.0, 2.0, 0.0, breathing),
     (SPARSE, 13.0, 3.0, 12.0, still),

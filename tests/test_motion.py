@@ -11,8 +11,9 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import TrackState
+from hardware.arm.driver import G1, G4
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, placed
-from hardware.arm.protocol import G1, G4, Dialect, decode, encode, frame_from_command, motion_from_frame
+from hardware.arm.protocol import Dialect, decode, encode, frame_from_command, motion_from_frame
 from hardware.motion.step import MotionStep
 from hardware.process.clock import Clock, SimClock, WallClock
 from planning.command import Hold, Move, Refusal

@@ -12,7 +12,8 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import Trajectory
 from estimation.synthetic.world import arc_rig
-from hardware.arm.protocol import G1, encode
+from hardware.arm.driver import G1
+from hardware.arm.protocol import encode
 from hardware.bench.campaigns import link as link_run
 from hardware.bench.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from hardware.bench.prediction import (

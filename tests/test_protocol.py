@@ -11,12 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
+from hardware.arm.driver import G1, G4, G54, Pause, Reply, ReplyKind
 from hardware.arm.protocol import (
     FRAME_LENGTH,
     FRAME_TAILS,
-    G1,
-    G4,
-    G54,
     REPLY_LENGTH,
     THESIS_DIALECT,
     ControllerReset,
@@ -24,9 +22,6 @@ from hardware.arm.protocol import (
     FrameStream,
     Instruction,
     Mode,
-    Pause,
-    Reply,
-    ReplyKind,
     Reset,
     decode,
     decode_reply,

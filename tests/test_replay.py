@@ -17,8 +17,9 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
+from hardware.arm.driver import G1, G4
 from hardware.arm.profile import ARM_FROM_BENCH
-from hardware.arm.protocol import G1, G4, decode, frame_from_command
+from hardware.arm.protocol import decode, frame_from_command
 from hardware.motion.step import MotionStep
 from hardware.offline.replay import COMMAND_COLUMNS, CommandWriter, placed_by, replay
 from planning.command import Command, Hold, Move

@@ -275,3 +275,10 @@ def test_a_network_that_is_damaged_fails(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(network, "shipped_model", lambda: damaged)
     check = doctor.network_check()
     assert check.verdict is FAIL and "sha256" in check.found
+
+
+def test_extras_that_are_missing_are_named_with_how_to_install_them() -> None:
+    check = doctor.extras_check({"franka": ["no-such-distribution"], "cluster": ["numpy"]})
+    assert check.verdict is PASS and "installed: cluster; not installed: franka" in check.found
+    assert "a Franka arm: pip install 'stillbed[franka]'" in check.found and "[cluster]" not in check.found
+    assert doctor.extras_check({"cluster": ["numpy"]}).found == "installed: cluster; not installed: none"

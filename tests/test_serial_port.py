@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from estimation.errors import InputError
-from hardware.arm import link as arm_link
 from hardware.arm import port as arm_port
+from hardware.arm import s6h4d
 from hardware.arm.device import ArmState
-from hardware.arm.link import Arm, emergency_stop
-from hardware.arm.port import PortOpener, SerialPort, UnpluggedError
-from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import FRAME_LENGTH, Pause, encode
+from hardware.arm.driver import Pause, UnpluggedError
+from hardware.arm.link import Arm
+from hardware.arm.port import PortOpener, SerialPort
+from hardware.arm.profile import ArmProfile, emergency_stop, open_arm
+from hardware.arm.protocol import FRAME_LENGTH, encode
 from hardware.process.clock import WallClock
 from hardware.simulator.arm.ports import open_pty
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
@@ -157,7 +158,7 @@ def test_an_adapter_back_under_another_name_is_the_same(pair: tuple[int, str], m
 def test_over_a_pty_in_real_time_the_arm_moves_answers_and_stops(tmp_path: Path) -> None:
     settings = ArmSettings(servo_lag=0.0, replies=ReplyMode.STREAM)
     with serving(tmp_path / "arm", settings) as ended:
-        device = PortOpener(str(tmp_path / "arm"), 115_200)
+        device = open_arm(str(tmp_path / "arm"), ArmProfile())
         arm = Arm(device, ArmProfile(), CLOCK.now())
         assert arm.stand(HOME, CLOCK.now()) == "" and arm.arm(CLOCK.now()) == ""
         phase, start, most = 0.0, CLOCK.now(), 0.0
@@ -189,7 +190,7 @@ def test_over_a_pty_in_real_time_the_arm_moves_answers_and_stops(tmp_path: Path)
 
 def test_a_pty_that_goes_and_comes_back_is_disarmed(tmp_path: Path) -> None:
     link = tmp_path / "arm"
-    device = PortOpener(str(link), 115_200)
+    device = open_arm(str(link), ArmProfile())
     with serving(link):
         arm = Arm(device, ArmProfile(), CLOCK.now())
         arm.stand(HOME, CLOCK.now())
@@ -220,7 +221,7 @@ def full(name: str) -> int:
 
 def test_an_emergency_stop_waits_for_a_full_line_and_goes_out_whole(pair: tuple[int, str]) -> None:
     (ours, name), received = pair, bytearray()
-    waiting, stop = full(name), encode(Pause(), ArmProfile().dialect) * arm_link.STOP_FRAMES
+    waiting, stop = full(name), encode(Pause(), ArmProfile().dialect) * s6h4d.STOP_FRAMES
 
     def drain() -> None:
         CLOCK.wait_until(CLOCK.now() + 0.1)
@@ -253,6 +254,6 @@ def test_an_emergency_stop_tries_again_on_a_line_that_goes_while_it_writes(
 
     monkeypatch.setattr(SerialPort, "write", failing)
     assert emergency_stop(name, ArmProfile())[1] == "" and not failures
-    assert os.read(ours, 999) == encode(Pause(), ArmProfile().dialect) * arm_link.STOP_FRAMES
+    assert os.read(ours, 999) == encode(Pause(), ArmProfile().dialect) * s6h4d.STOP_FRAMES
     failures.extend([UnpluggedError("gone")] * 1000)
     assert emergency_stop(name, ArmProfile())[1] == "gone"

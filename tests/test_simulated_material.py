@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from hardware.arm.port import UnpluggedError
+from hardware.arm.driver import UnpluggedError
 from hardware.files.path_file import read_path
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text

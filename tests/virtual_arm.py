@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.se3 import Array
-from hardware.arm.protocol import G1, THESIS_DIALECT, encode
+from hardware.arm.driver import G1
+from hardware.arm.protocol import THESIS_DIALECT, encode
 from hardware.process.faults import Fault, FaultPart, fault_from_text
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.settings import ArmSettings

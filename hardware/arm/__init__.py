@@ -1,1 +1,1 @@
-"""The arm on its serial line: protocol, port, queue model, feedback, flow control and every way to stop."""
+"""The arm: the link that any arm has above the seam, and the drivers below it, one for each make."""

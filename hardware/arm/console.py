@@ -10,9 +10,9 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, ArmStatus
+from hardware.arm.driver import ArmDriver
 from hardware.arm.link import Arm, shut_down
-from hardware.arm.port import Opener
-from hardware.arm.profile import AXIS_LETTERS, DISPLAY_UNITS, ArmProfile, LinkSettings
+from hardware.arm.profile import AXIS_LETTERS, DISPLAY_UNITS, DRIVERS, ArmProfile, LinkSettings, find_arms
 from hardware.process import checks
 from hardware.process.clock import Clock
 
@@ -39,7 +39,7 @@ class ArmRequest:
 
 
 def run_arm(
-    opener: Opener,
+    driver: ArmDriver,
     profile: ArmProfile,
     request: ArmRequest,
     clock: Clock,
@@ -55,7 +55,7 @@ def run_arm(
     if request.moves and not request.confirmed:
         raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
     start, settings = clock.now(), LinkSettings() if settings is None else settings
-    arm = Arm(opener, profile, start, settings)
+    arm = Arm(driver, profile, start, settings)
     if arm.state is ArmState.UNPLUGGED and (request.moves or np.isfinite(request.seconds)):
         raise InputError("arm", "port", arm.reason, "a device that is there, or --watch to wait for it")
     console = _Console(arm, clock, say, start)
@@ -85,6 +85,19 @@ def findings(status: ArmStatus, profile: ArmProfile) -> str:
     if np.isfinite(status.lag):
         known = f"the profile's lag_s = {profile.lag:.3f}"
         lines.append(f"its lag is {1000 * status.lag:.0f} ms: lag_s = {status.lag + profile.frame_time:.3f}; {known}")
+    return "\n".join(lines)
+
+
+def drivers_text() -> str:
+    """The drivers of arms, what each finds now, and how to install what it needs."""
+    lines = []
+    for kind in DRIVERS:
+        lines.append(f"{kind.name}: {kind.example}")
+        if not kind.installed:
+            lines.append(f"  not installed: {kind.remedy}")
+            continue
+        found = find_arms(kind)
+        lines += [f"  {address}  {words}" for address, words in found] or ["  none is found"]
     return "\n".join(lines)
 
 

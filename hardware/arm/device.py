@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from math import degrees
@@ -14,10 +15,9 @@ from math import degrees
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.arm.driver import G1, G4, ArmDriver, Pause, Reply, ReplyKind, Sent, UnpluggedError
 from hardware.arm.feedback import ArmFeedback
-from hardware.arm.port import ArmLine, Opener, UnpluggedError
-from hardware.arm.profile import BITS_PER_BYTE, ArmProfile, LinkSettings
-from hardware.arm.protocol import G1, G4, REPLY_LENGTH, Instruction, Pause, Reply, ReplyKind, encode
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.queue import ArmQueue, QueuedCommand
 
 RESEND_AFTER = 0.09  # s: a frame on the wire, the lag, the way to rest, and the slowest answer of a public driver
@@ -51,6 +51,7 @@ class LinkCode(Enum):
     FLOW_CONTROL = "flow_control"  # enough is under way
     FEEDBACK = "feedback"  # the arm's answers are late, missing or off its way
     LIMIT = "limit"  # the command breaks a limit of the link
+    ARM_FAULT = "arm_fault"  # the arm has stopped by itself, and is not ready again
 
 
 class Reason(str):
@@ -148,25 +149,25 @@ class StopRetry:
 
 
 class ArmDevice:
-    """The line to an arm, and its queue and answers as far as they are known.
+    """The line to an arm by its driver, and its queue and answers as far as they are known.
 
     state, reason: whether the arm may be moved, and why, for a person.
     frames: sent.
     strays: bytes that were in no answer; stray_bytes: the last of them with their instants, s.
-    origin: (3,) mm in machine axes, from which the arm counts.
+    fault: why the arm has stopped by itself, "" where it has not. busy: whether it makes a move of its own.
     stops: of each stop the instants, s, of its decision and of its frame on the wire.
     """
 
-    def __init__(self, opener: Opener, profile: ArmProfile, now: float, settings: LinkSettings) -> None:
-        """opener: opens the device, and opens it again after it was away. InputError where another program has it."""
+    def __init__(self, driver: ArmDriver, profile: ArmProfile, now: float, settings: LinkSettings) -> None:
+        """driver: of the arm, not connected yet. InputError where another program has it."""
+        self.driver = driver
         self.profile, self.settings = profile, settings
         self.state, self.reason = ArmState.UNPLUGGED, "not opened yet"
         self.frames, self.strays = 0, 0
+        self.fault, self.busy = "", False
         self.stray_bytes: deque[tuple[float, bytes]] = deque(maxlen=MAX_REMEMBERED)
-        self.origin = np.zeros(3)
+        self._online = False  # whether the driver is connected
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REMEMBERED)
-        self._opener = opener
-        self._line: ArmLine | None = None
         self._queue: ArmQueue | None = None  # None while nobody knows where the arm stands
         self._feedback, self._stop_retry = ArmFeedback(settings, profile.lag), StopRetry()
         self.stops = self._stop_retry.stops
@@ -199,84 +200,78 @@ class ArmDevice:
 
     def close(self) -> None:
         """Close the device; the arm is sent nothing."""
-        if self._line is not None:
-            self._line.port.close()
-        self._line, self.state, self.reason = None, ArmState.UNPLUGGED, "closed"
+        if self._online:
+            self.driver.close()
+        self._online, self.state, self.reason = False, ArmState.UNPLUGGED, "closed"
         self._reopen_at = float("inf")
 
     def _open(self, now: float) -> None:
         try:
-            self._line = ArmLine(self._opener())
+            self.driver.connect(now)
         except UnpluggedError as error:
             self._reopen_at, self.reason = now + self.settings.reopen, str(error)
             return
+        self._online = True
         self._feedback.restart()
         self._change(ArmState.DISARMED, "connected; the operator has not armed it", now)
 
     def _unplugged(self, reason: str, now: float) -> None:
         """The device is gone: nobody knows where the arm will stand when it comes back."""
-        if self._line is not None:
-            self._line.port.close()
-        self._line, self._queue = None, None
+        if self._online:
+            self.driver.close()
+        self._online, self._queue = False, None
+        self.fault, self.busy = "", False
         self._stop_retry.drop()
-        self.origin = np.zeros(3)
         self._reopen_at = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)
 
-    def _read(self, line: ArmLine, now: float) -> list[Reply]:
+    @property
+    def origin(self) -> Array:
+        """(3,) mm in machine axes, from which the arm counts."""
+        return self.driver.origin
+
+    def _read(self, now: float) -> list[Reply]:
         """Take the answers that have come; gives those about the arm's origin."""
-        replies, strays = line.receive()
-        now -= REPLY_LENGTH * BITS_PER_BYTE / self.profile.baud  # that an answer took on the wire
-        if strays:
-            self.strays += len(strays)
-            self.stray_bytes.append((now, strays))
-        for reply in replies:
+        reported = self.driver.state(now)
+        stamp, self.fault, self.busy = reported.stamp, reported.fault, reported.busy
+        if reported.strays:
+            self.strays += len(reported.strays)
+            self.stray_bytes.append((stamp, reported.strays))
+        for reply in reported.replies:
             if reply.kind is ReplyKind.ORIGIN:
                 continue
-            queue, origin = self._queue, self.origin
+            queue = self._queue
             if queue is None:  # nobody knows where the arm stands; its answers are believed when it is armed
                 place = [*reply.values, 0, 0, 0] if reply.kind is ReplyKind.PLACE else [0, 0, 0, *reply.values]
-                queue, origin = ArmQueue(place, self.profile.frame_time, now), np.zeros(3)
-            self._feedback.take(reply, queue, origin, now)
-        return [reply for reply in replies if reply.kind is ReplyKind.ORIGIN]
+                queue = ArmQueue(place, self.profile.frame_time, stamp)
+            self._feedback.take(reply, queue, stamp)
+        return [reply for reply in reported.replies if reply.kind is ReplyKind.ORIGIN]
 
-    def _give(self, instruction: Instruction, now: float, frame: bytes | None = None) -> None:
-        """Put an instruction in machine axes on the line. frame: its frame, where it is encoded already."""
-        assert self._line is not None
-        if frame is None:
-            shifted = instruction
-            if isinstance(instruction, G1) and self.origin.any():  # the arm counts from its origin
-                shifted = G1(
-                    instruction.axes - np.concatenate([self.origin, np.zeros(3)]),
-                    instruction.feed,
-                    instruction.material,
-                )
-            frame = encode(shifted, self.profile.dialect)
-
-        def sent(at: float, share: float) -> None:
-            self.frames += 1
-            self._book(instruction, at, share)
-
+    def _give(self, instruction: G1 | G4 | Pause, now: float) -> None:
+        """Give an instruction in machine axes to the driver."""
         try:
-            share = self._line.send(frame, sent, now)
-            if share and self._queue is not None:
-                self._queue.occupy(now, share)
+            if isinstance(instruction, Pause):
+                self._book(self.driver.stop(now), now)
+            else:
+                self._book(self.driver.send(instruction, now), now)
         except UnpluggedError as error:
             self._unplugged(str(error), now)
 
-    def _book(self, instruction: Instruction, now: float, share: float) -> None:
-        """The last byte of a frame is given out: enter what the arm will do because of it."""
-        if isinstance(instruction, G1 | G4):
-            assert self._queue is not None
-            self._queue.add(instruction, now, share)
-        elif self._queue is not None:
-            self._queue.occupy(now, share)
-        if isinstance(instruction, Pause):
-            on_wire = now + share * self.profile.frame_time
-            if self._queue is not None:
-                self._queue.stop()
-                on_wire = self._queue.wire_free
-            self._stop_retry.on_wire(on_wire)
+    def _book(self, sent: Sequence[Sent], now: float) -> None:
+        """Enter what the arm will do because of what has gone out."""
+        for each in sent:
+            self.frames += each.instruction is not None
+            if isinstance(each.instruction, G1 | G4):
+                assert self._queue is not None
+                self._queue.add(each.instruction, now, each.share)
+            elif self._queue is not None:
+                self._queue.occupy(now, each.share)
+            if isinstance(each.instruction, Pause):
+                on_wire = now + each.share * self.profile.frame_time
+                if self._queue is not None:
+                    self._queue.stop()
+                    on_wire = self._queue.wire_free
+                self._stop_retry.on_wire(on_wire)
 
     def _adopt_answers(self, now: float) -> None:
         """Take it that the arm stands where its answers say, unless their rounding allows what was known before."""

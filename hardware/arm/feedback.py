@@ -17,8 +17,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.arm.driver import Reply, ReplyKind
 from hardware.arm.profile import LinkSettings
-from hardware.arm.protocol import Reply, ReplyKind, unit
+from hardware.arm.protocol import unit
 from hardware.arm.queue import ArmQueue
 
 MIN_ANSWERS = 3  # answers before their absence means anything, as noise that looks like one comes alone
@@ -75,10 +76,10 @@ class ArmFeedback:
     _sums: tuple[float, float] = (0.0, 0.0)  # of the open stretch: (mm/s)^2 s and (mm/s)^2
     _stretches: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_LAG_BLOCKS))
 
-    def take(self, reply: Reply, queue: ArmQueue, origin: Array, now: float) -> None:
-        """Take an answer that came at `now`, s. origin: (3,) mm, from which the arm counts its place."""
+    def take(self, reply: Reply, queue: ArmQueue, now: float) -> None:
+        """Take an answer of `now`, s, in machine axes."""
         if reply.kind is ReplyKind.PLACE:
-            place = reply.values + origin
+            place = reply.values
             gap = now - self._place.stamp
             if math.isfinite(gap):
                 self._period = gap if math.isnan(self._period) else self._period + 0.1 * (gap - self._period)
@@ -127,6 +128,12 @@ class ArmFeedback:
         if place.values is None or turn.values is None or now - min(place.stamp, turn.stamp) > self.settings.silence:
             return None
         return np.concatenate([place.values, turn.values])
+
+    @property
+    def last(self) -> Array | None:
+        """The last answered axes (6,), however old; None without."""
+        place, turn = self._place.values, self._turn.values
+        return None if place is None or turn is None else np.concatenate([place, turn])
 
     def stands(self, known: Array | None, now: float) -> Array | None:
         """Where an arm at rest is (6,), by its answers: where it is `known` to be (6,) as far as rounding allows.

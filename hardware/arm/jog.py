@@ -19,8 +19,8 @@ from itertools import chain
 import numpy as np
 
 from estimation.se3 import Array
+from hardware.arm.driver import G1, Pause
 from hardware.arm.feedback import REST_TOLERANCE, ArmFeedback, near
-from hardware.arm.protocol import G1, Pause
 
 POSITION, ANGLES = slice(0, 3), slice(3, 6)  # of axes (6,)
 
@@ -98,6 +98,7 @@ class OwnMoves:
         self.step = next(steps, None)
 
 
+MAX_CREEP = 10.0  # mm, from where it was last seen: farther off, somebody has moved it since, as home
 MIN_TRIAL_STEP = 2 * REST_TOLERANCE[0]  # mm that answers tell from no step
 TRIAL_START_TIME = 0.01  # s of a step, beyond the lag, after which answers from its start mean that it did not begin
 
@@ -139,6 +140,7 @@ class AbortRecovery:
         self.stepped: float | None = None
         self.obeys = self.undone = False
         self.stood: Array | None = None
+        self._last: Array | None = None  # (6,) where it was last seen before its device was gone
 
     @property
     def waits(self) -> bool:
@@ -155,16 +157,18 @@ class AbortRecovery:
         self.goal = self.place = self.stood = self.rest = self.stepped = None
         self.why, self.obeys, self.undone = "", False, False
 
-    def break_off(self) -> None:
-        """A stop, or the device is gone: what was called back stays undone."""
+    def break_off(self, last: Array | None = None) -> None:
+        """A stop, or the device is gone, `last` (6,) seen there: what was called back stays undone."""
         undone = self.undone or (self.goal is not None and self.rest is None)
         self.drop()
-        self.undone = undone
+        self.undone, self._last = undone, self._last if last is None else last
 
     def resume(self, place: Array) -> None:
         """The arm is armed again, at rest at `place` (6,): the sender is to learn that moves are undone."""
         if self.undone:
-            self.place, self.obeys = place, True
+            last, self._last = self._last, None
+            moved_away = last is not None and np.linalg.norm((place - last)[:3]) > MAX_CREEP
+            self.place, self.obeys = last if moved_away else place, True
 
     def next(self, feedback: ArmFeedback, target: Array, now: float) -> tuple[G1 | Pause, ...]:
         """What to send to an arm that has nothing under way and, by dead reckoning, stands at `target` (6,)."""

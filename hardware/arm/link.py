@@ -8,19 +8,17 @@ and the answers.
 
 from __future__ import annotations
 
-from contextlib import closing
-
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.device import BY_OPERATOR, DONE, ArmDevice, ArmState, ArmStatus, LinkCode, Reason
+from hardware.arm.driver import G1, ArmDriver, Pause, Reply, UnpluggedError
 from hardware.arm.jog import AbortRecovery, OwnMoves, RecalledMoves
-from hardware.arm.port import ArmLine, Opener, PortOpener, UnpluggedError
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.arm.protocol import G1, G54, Pause, Reply, encode, frame_from_command, motion_from_frame
+from hardware.arm.protocol import frame_from_command, motion_from_frame
 from hardware.arm.queue import ArmQueue, FlowControl
-from hardware.process.clock import Clock, WallClock
+from hardware.process.clock import Clock
 from planning.command import MIN_FEED, Command, Hold, Move
 
 DEFAULT_SETTINGS = LinkSettings()
@@ -28,9 +26,6 @@ RECALLED = Reason("what was queued is called back", LinkCode.RECALLED)
 ORIGIN_ROUNDING = 0.11  # mm: an answer counts 0.1 mm
 MIN_SHUTDOWN_TIME = 0.05  # s in which a last frame goes out
 MAX_SHUTDOWN_TIME = 1.0  # s in which the stop is repeated to an arm that goes on moving
-LINE_TAKEOVER_TIME = 0.5  # s in which the kernel takes the line from a process that was killed
-TAKEOVER_RETRY_PERIOD = 0.002  # s between tries
-STOP_FRAMES = 2  # the first one may complete a frame that was torn when the process died
 
 
 class Arm(ArmDevice):
@@ -40,7 +35,7 @@ class Arm(ArmDevice):
     """
 
     def __init__(
-        self, opener: Opener, profile: ArmProfile, now: float, settings: LinkSettings = DEFAULT_SETTINGS
+        self, driver: ArmDriver, profile: ArmProfile, now: float, settings: LinkSettings = DEFAULT_SETTINGS
     ) -> None:
         """As ArmDevice's."""
         self._flow = FlowControl(profile, settings)
@@ -49,7 +44,7 @@ class Arm(ArmDevice):
         self._doubt_since: float | None = None
         self.command_frame = b""
         self._material = False  # whether the last frame let material flow
-        super().__init__(opener, profile, now, settings)
+        super().__init__(driver, profile, now, settings)
 
     # -- an operator's orders
 
@@ -67,10 +62,12 @@ class Arm(ArmDevice):
         """Let moves be sent. goal: (6,) where the motion left off: the arm first goes there slowly, if it is near."""
         if self.state is ArmState.ARMED:
             return DONE
-        if self._line is None:
+        if not self._online:
             return Reason(f"the arm is unplugged: {self.reason}", LinkCode.UNPLUGGED)
         if self.in_flight(now) > 0 or not self._feedback.still(now):
             return Reason("the arm still moves", LinkCode.MOVING)
+        if why := self._enable(now):
+            return Reason(why, LinkCode.ARM_FAULT)
         self._adopt_answers(now)
         if self._queue is None:
             why = "nobody knows where the arm stands: it does not answer, and was not told"
@@ -90,22 +87,22 @@ class Arm(ArmDevice):
 
     def disarm(self, now: float) -> None:
         """Send nothing more, except a stop that has not got through; what is under way, 50 ms at most, is done."""
-        if self.state in (ArmState.ARMED, ArmState.STOPPED) and self._line is not None:
+        if self.state in (ArmState.ARMED, ArmState.STOPPED) and self._online:
             stop_pending = self.stop_pending(now)
             self._drop_unsent()
             if stop_pending:
-                self._call_back(self._line, now)
-            if self._line is not None:
+                self._call_back(now)
+            if self._online:
                 self._change(ArmState.DISARMED, BY_OPERATOR, now)
 
     def stop(self, reason: str, now: float) -> None:
         """Stop at once: drop the frames that wait, and send the control frame that stops the arm next."""
-        if self._line is None:
+        if not self._online:
             return
         self._drop_unsent()
         if self.settings.pause_frame:
-            self._call_back(self._line, now)
-        if self._line is not None:  # the port may be lost over that
+            self._call_back(now)
+        if self._online:  # the port may be lost over that
             self._change(ArmState.STOPPED, reason, now)
 
     def go(self, axes: Array, now: float, lift: bool = False) -> Reason:
@@ -121,24 +118,27 @@ class Arm(ArmDevice):
         return DONE
 
     def home(self, now: float) -> Reason:
-        """Go home: by default X202.5 Y225 Z113 A0 B0 C0 (thesis 6.3)."""
+        """Go home by the arm's own way where it has one, or in slow steps; by default X202.5 Y225 Z113, thesis 6.3."""
+        if self.state is ArmState.ARMED and not self.travels and self.driver.home(now):
+            self.busy = True
+            return DONE
         return self.go(self.profile.arm.home, now, lift=True)
 
     def set_origin(self, origin: Array, now: float) -> Reason:
         """Make `origin` (3,), mm in machine axes, the arm's (0, 0, 0) by G54; callers go on in machine axes."""
         if self.state is not ArmState.ARMED or self._queue is None or self._queue.in_flight(now) > 0 or self.travels:
             return Reason("an origin is set while the arm is armed and at rest", LinkCode.MOVING)
-        frame = G54(origin)
-        encode(frame, self.profile.dialect)  # InputError for what no frame holds
-        self._give(frame, now)
-        self.origin = np.array(origin, float)
+        try:
+            self._book(self.driver.set_origin(origin, now), now)
+        except UnpluggedError as error:
+            self._unplugged(str(error), now)
         return DONE
 
     # -- the loop's calls
 
     def poll(self, now: float) -> None:
         """Read, write what waits, reopen a lost device, repeat a stop, send own moves; every few milliseconds."""
-        if self._line is None:
+        if not self._online:
             if now >= self._reopen_at:
                 try:
                     self._open(now)
@@ -146,19 +146,24 @@ class Arm(ArmDevice):
                     self._reopen_at, self.reason = now + self.settings.reopen, str(error)
             return
         try:
-            for reply in self._read(self._line, now):
+            was_busy = self.busy
+            for reply in self._read(now):
                 self._check_origin(reply, now)
-            if self._line is None:  # the port may be lost over that
+            if was_busy and not self.busy:
+                self._feedback.forgive()
+                self._adopt_answers(now)
+            if self.fault and self.state is ArmState.ARMED:
+                self.stop(f"the arm has stopped by itself: {self.fault}", now)
+            if not self._online:  # the port may be lost over that
                 return
-            if (share := self._line.flush(now)) and self._queue is not None:
-                self._queue.occupy(now, share)
+            self._book(self.driver.flush(now), now)
         except UnpluggedError as error:
             self._unplugged(str(error), now)
             return
-        self._repeat_stop(self._line, now)
-        if self.state is ArmState.ARMED:
+        self._repeat_stop(now)
+        if self.state is ArmState.ARMED and not self.busy:
             self._supervise(now)
-        travels = self.state is ArmState.ARMED and self.travels
+        travels = self.state is ArmState.ARMED and self._own.step is not None
         if travels and self.in_flight(now) <= self.profile.tick and not self._wait(now):  # one step ahead of the arm
             self._give(self._own.take(), now)
 
@@ -189,7 +194,7 @@ class Arm(ArmDevice):
             return Reason(words, LinkCode.LIMIT)
         self._own.last = None
         self._material = dialect.pwm_on is not None and isinstance(instruction, G1) and instruction.material
-        self._give(instruction, now, self.command_frame if not self.origin.any() else None)
+        self._give(instruction, now)
         return DONE
 
     def take_up(self) -> RecalledMoves | None:
@@ -207,8 +212,8 @@ class Arm(ArmDevice):
 
     @property
     def travels(self) -> bool:
-        """Whether the link makes a move of its own: home, or back to where the arm was stopped."""
-        return self._own.step is not None
+        """Whether link or arm make a move of their own: home, or back to where the arm was stopped."""
+        return self._own.step is not None or self.busy
 
     def arrived(self, now: float) -> bool:
         """Whether the arm stands where it was sent, by dead reckoning and by its answers where it gives any."""
@@ -220,8 +225,8 @@ class Arm(ArmDevice):
 
     def stop_pending(self, now: float) -> bool:
         """Whether a stop was sent that the arm is not known to have read."""
-        line, retry = self._line, self._stop_retry
-        return line is not None and retry.active and (line.blocked or retry.pending(self._feedback, now))
+        retry = self._stop_retry
+        return self._online and retry.active and (self._blocked(now) or retry.pending(self._feedback, now))
 
     def status(self, now: float) -> ArmStatus:
         """All that is known."""
@@ -235,8 +240,16 @@ class Arm(ArmDevice):
     def _unplugged(self, reason: str, now: float) -> None:
         """The device is gone, and what was under way with it."""
         self._own.drop()
-        self._recovery.break_off()
+        self._recovery.break_off(self._feedback.last)
         super()._unplugged(reason, now)
+
+    def _enable(self, now: float) -> str:
+        """Have the driver clear what has stopped its arm; why it cannot be."""
+        try:
+            return self.driver.enable(now)
+        except UnpluggedError as error:
+            self._unplugged(str(error), now)
+            return str(error)
 
     def _not_armed(self) -> Reason:
         return Reason(f"the arm is {self.state.value}: {self.reason}", LinkCode(self.state.value))
@@ -247,22 +260,21 @@ class Arm(ArmDevice):
 
     def _drop_unsent(self) -> None:
         """Drop own moves, and the frames of which no byte is on the wire."""
-        if self._line is not None:
-            self._line.recall()
+        if self._online:
+            self.driver.recall()
         self._own.drop()
         self._recovery.break_off()
 
     def _wait(self, now: float) -> Reason:
         """Why no command of a tick may go out now."""
-        assert self._line is not None and self._queue is not None
-        if words := self._flow.full(self._line, self._queue, self.profile.tick, now, self._feedback.backlog):
+        assert self._online and self._queue is not None
+        if words := self._flow.full(self.driver, self._queue, self.profile.tick, now, self._feedback.backlog):
             return Reason(words, LinkCode.FLOW_CONTROL)
         return Reason(self._feedback.doubt(now), LinkCode.FEEDBACK)
 
     def _supervise(self, now: float) -> None:
         """Stop the arm where a fault lasts for `patience`, or is too large to wait."""
-        assert self._line is not None
-        if (blocked := self._line.blocked_for(now)) > self.settings.write_timeout:
+        if (blocked := self.driver.blocked_for(now) or 0.0) > self.settings.write_timeout:
             self.stop(f"the port took no bytes for {blocked:.2f} s, limit {self.settings.write_timeout:g} s", now)
         elif self._feedback.off > self.settings.lost:
             self.stop(f"the arm is {self._feedback.off:.1f} mm off its way, limit {self.settings.lost:g} mm", now)
@@ -277,21 +289,21 @@ class Arm(ArmDevice):
 
     def _recover(self, now: float) -> None:
         """Call back the queue of an arm that does not follow; once it rests, try when it obeys again."""
-        assert self._line is not None and self._queue is not None
+        assert self._queue is not None
         recovery, feedback = self._recovery, self._feedback
         if recovery.goal is None and (doubt := feedback.doubt(now)):
             recovery.begin(f"{RECALLED}: {doubt}", np.array(self._queue.target), self._own.break_off(), now)
             self._note(recovery.why, now)
-            self._call_back(self._line, now)
-        elif recovery.goal is not None and not (recovery.obeys or self._line.blocked or self._queue.in_flight(now) > 0):
+            self._call_back(now)
+        elif recovery.goal is not None and not (recovery.obeys or self._blocked(now) or self._queue.in_flight(now) > 0):
             if recovery.stepped is None and feedback.settled(recovery.since):
                 self._adopt_answers(now)
             for instruction in recovery.next(feedback, np.array(self._queue.target), now):
                 if isinstance(instruction, Pause):
                     if recovery.stood is not None:  # the trial step is repeated from where it began
                         self._queue = ArmQueue(recovery.stood.tolist(), self.profile.frame_time, now)
-                    self._call_back(self._line, now)
-                elif self._line is not None:  # the port may be lost over the pause
+                    self._call_back(now)
+                elif self._online:  # the port may be lost over the pause
                     self._give(instruction, now)
             if recovery.obeys:
                 self._stop_retry.drop()
@@ -299,15 +311,18 @@ class Arm(ArmDevice):
                     self._own.go(np.array(self._queue.target), recovery.goal, then=recovery.rest)
                     recovery.drop()
 
-    def _repeat_stop(self, line: ArmLine, now: float) -> None:
+    def _blocked(self, now: float) -> bool:
+        """Whether something waits because the line takes no more."""
+        return self.driver.blocked_for(now) is not None
+
+    def _repeat_stop(self, now: float) -> None:
         """Send the stop once more to an arm that goes on moving."""
         stopped = self.state is not ArmState.ARMED or self._recovery.waits
-        if stopped and not line.blocked and self._stop_retry.due(self._feedback, now):
+        if stopped and not self._blocked(now) and self._stop_retry.due(self._feedback, now):
             self._give(Pause(), now)
 
-    def _call_back(self, line: ArmLine, now: float) -> None:
+    def _call_back(self, now: float) -> None:
         self._stop_retry.begin(now)
-        line.recall()
         self._give(Pause(), now)
 
 
@@ -321,31 +336,3 @@ def shut_down(arm: Arm, reason: str, clock: Clock, poll_period: float) -> None:
     ):
         arm.poll(now)
         clock.wait_until(now + poll_period)
-
-
-def emergency_stop(url: str, profile: ArmProfile) -> tuple[float, str]:
-    """Stop an arm whose motion process is gone: tries until its line is free and has taken the whole stop.
-
-    Gives when the stop was on the wire, s, and why it could not be sent, "" if it was.
-    """
-    clock, device = WallClock(), PortOpener(url, profile.baud)
-    stop = encode(Pause(), profile.dialect) * STOP_FRAMES
-    until, reason = clock.now() + LINE_TAKEOVER_TIME, ""
-    try:
-        while clock.now() < until:
-            try:
-                with closing(device()) as port:
-                    unsent = stop
-                    while (unsent := unsent[port.write(unsent) :]) and clock.now() < until:
-                        clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
-                    if not unsent:
-                        sent = clock.now() + profile.frame_time
-                        clock.wait_until(sent + profile.frame_time)
-                        return sent, ""
-                    reason = f"its line is full and took {len(stop) - len(unsent)} of the stop's {len(stop)} bytes"
-            except (InputError, UnpluggedError) as error:
-                reason = str(error)
-                clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
-    finally:
-        device.release()
-    return clock.now(), reason

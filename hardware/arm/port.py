@@ -4,9 +4,6 @@ Two programs can never write to one arm, and a crash leaves nothing to clean up.
 programs look for theirs (LCK..NAME in the folder for locks, the owner's process number in its first line), so minicom
 and others respect it. Between two of ours the kernel's lock on the open file decides, which ends with its process. A
 process number left by a crash, or reused since, stops nobody.
-
-A frame that is partly out is always completed first: torn, it would take bytes of the next one with it. A frame of
-which no byte is out may be called back.
 """
 
 from __future__ import annotations
@@ -19,7 +16,6 @@ import stat
 import struct
 import tempfile
 import termios
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -28,8 +24,8 @@ from typing import Protocol
 import serial
 from serial.tools import list_ports
 
-from estimation.errors import InputError, StillbedError
-from hardware.arm.protocol import FRAME_LENGTH, Reply, reply_stream
+from estimation.errors import InputError
+from hardware.arm.driver import UnpluggedError
 from hardware.process.clock import WallClock
 
 LOCK_FOLDERS = ("/run/lock", "/var/lock")  # of the Filesystem Hierarchy Standard, new and old
@@ -98,10 +94,6 @@ def _lives(process: int) -> bool:
 
 LOOP_WRITE_TIMEOUT = 0.1  # s of a write, where it can wait at all: loop:// is gone after that
 READ_BYTES = 4096  # at once: two seconds of answers
-
-
-class UnpluggedError(StillbedError):
-    """The device is not there, or not any more."""
 
 
 class PortTakenError(UnpluggedError):
@@ -265,59 +257,3 @@ def _adapters() -> list[tuple[str, Identity]]:
         for port in list_ports.comports()
         if port.vid is not None
     ]
-
-
-SentCallback = Callable[[float, float], None]  # (now, share of the frame that went just now, and not before)
-
-
-class ArmLine:
-    """Frames on their way out through one port."""
-
-    def __init__(self, port: Port) -> None:
-        self.port = port
-        self._frames: deque[tuple[bytes, SentCallback]] = deque()
-        self._done = 0  # bytes of the first frame that went out
-        self._since = 0.0  # when the first frame was to go
-        self._stream = reply_stream()
-
-    @property
-    def blocked(self) -> bool:
-        """Whether frames wait because the port takes no more."""
-        return bool(self._frames)
-
-    def blocked_for(self, now: float) -> float:
-        """Seconds that the first frame has waited."""
-        return now - self._since if self._frames else 0.0
-
-    def send(self, frame: bytes, sent: SentCallback, now: float) -> float:
-        """Give out a frame behind those that wait; `sent` is told when its last byte is gone. Gives what flush does."""
-        if not self._frames:
-            self._since = now
-        self._frames.append((frame, sent))
-        return self.flush(now)
-
-    def flush(self, now: float) -> float:
-        """Write what the port takes; the share of a frame that went out of one that is not complete."""
-        share = 0.0
-        while self._frames:
-            frame, sent = self._frames[0]
-            written = self.port.write(frame[self._done :])
-            self._done += written
-            share += written / FRAME_LENGTH
-            if self._done == FRAME_LENGTH:
-                self._frames.popleft()
-                self._done, self._since = 0, now
-                sent(now, share)
-                share = 0.0
-            elif not written:
-                break
-        return share
-
-    def recall(self) -> None:
-        """Take back the frames of which no byte is gone."""
-        while len(self._frames) > (1 if self._done else 0):
-            self._frames.pop()
-
-    def receive(self) -> tuple[list[Reply], bytes]:
-        """Answers that have come, and the bytes known to be in none."""
-        return self._stream(self.port.read())

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 
 import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.arm.driver import ArmDriver, ByteListener
 from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
 from perception.frames import SYRINGE, check_profile
 from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.limits import MotionLimits
-from planning.motion.follow import LOOKAHEAD
+from planning.motion.curve import LOOKAHEAD
+from planning.urdf import UrdfArm
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
+MAX_FLIGHT = 0.5  # s: what is under way cannot be called back by an arm without a stop of its own
 AXIS_LETTERS = "XYZABC"
 DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
 ARM_FROM_BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
@@ -38,16 +43,28 @@ class ArmProfile:
     tick: float = 0.02  # s, 50 commands a second: faster than any camera here, a fifth of what the wire carries
     lag: float = 0.024  # s, 4 ms of wire, and 20 ms that a hobby servo is taken to follow behind until it is measured
     tool: Array = field(default_factory=SYRINGE.copy)  # (K, 2) mm, of what hangs on it: height above the tip, radius
+    dead_time: float | None = None  # s that a command takes to the arm; None: what a frame takes at `baud`
+    flight: float | None = None  # s of motion that may be under way; None: the link's own limit
+    urdf: UrdfArm | None = None  # the joints of an arm that `arm` has no model of
+    flange_from_nozzle: Array | None = None  # (4, 4) mm, for an arm that is told where its flange goes
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
             raise InputError("arm profile", "baud", self.baud, "> 0 bits/s")
+        if self.dead_time is not None and not 0 <= self.dead_time <= MAX_LAG:
+            raise InputError("arm profile", "dead_time", self.dead_time, f"0 to {MAX_LAG} s")
         wire = self.frame_time
         if not wire <= self.tick <= LOOKAHEAD / 2:
             allowed = f"{wire:.5f} s, one frame on the wire, to {LOOKAHEAD / 2} s"
             raise InputError("arm profile", "tick", self.tick, allowed)
         if not 0 <= self.lag <= MAX_LAG:
             raise InputError("arm profile", "lag", self.lag, f"0 to {MAX_LAG} s")
+        if self.flange_from_nozzle is not None and not se3.is_transform(self.flange_from_nozzle):
+            got = self.flange_from_nozzle.tolist()
+            raise InputError("arm profile", "flange_from_nozzle", got, "a finite 4x4 rigid motion, mm")
+        if self.flight is not None and not self.tick <= self.flight <= MAX_FLIGHT:
+            allowed = f"{self.tick} s, a tick, to {MAX_FLIGHT} s"
+            raise InputError("arm profile", "flight", self.flight, allowed)
         check_profile("arm profile", "tool", self.tool)
         arm, limits = self.arm, self.limits
         if (arm.home < limits.low).any() or (arm.home > limits.high).any():
@@ -63,7 +80,9 @@ class ArmProfile:
 
     @property
     def frame_time(self) -> float:
-        """Seconds that one frame takes on the wire: 4.17 ms at 115200 bits/s."""
+        """Seconds that a command takes to the arm: the dead time, or a frame on the wire, 4.17 ms at 115200 bits/s."""
+        if self.dead_time is not None:
+            return self.dead_time
         return FRAME_LENGTH * BITS_PER_BYTE / self.baud
 
 
@@ -128,3 +147,66 @@ class LinkSettings:
                 raise InputError("link", name, value, "a finite number > 0")
         if self.ease > 0.1:
             raise InputError("link", "ease", self.ease, "0 to 0.1")
+
+
+@dataclass(frozen=True, slots=True)
+class DriverKind:
+    """One make of arm, by the addresses that lead to it.
+
+    Its module has `open_arm(address, profile, listener) -> ArmDriver`, `emergency_stop(address, profile) ->
+    (s, reason)` and `find_arms() -> [(address, description)]`, and is imported where it is used only.
+    """
+
+    name: str
+    schemes: tuple[str, ...]  # what stands before :// in an address; () : all addresses that no other has
+    module: str
+    example: str  # an address
+    extra: str = ""  # of stillbed, that brings what it imports; "": it needs none
+    needs: str = ""  # what it imports, by which its extra is known to be there
+    file: str = ""  # of data/arms, the arm file that stands in where none is given; "": the S6H4D's defaults
+
+    @property
+    def installed(self) -> bool:
+        """Whether what it imports is there."""
+        return not self.needs or find_spec(self.needs) is not None
+
+    @property
+    def remedy(self) -> str:
+        """How to install what it imports."""
+        return f"pip install 'stillbed[{self.extra}]'"
+
+
+DRIVERS = (
+    DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0"),
+    DriverKind(
+        *("Franka FR3, Panda", ("franka",), "hardware.arm.franka", "franka://172.16.0.2"),
+        *("franka", "franky", "fr3.toml"),
+    ),
+)
+
+
+def driver_kind(address: str) -> DriverKind:
+    """The driver of an address; InputError where its extra is not installed."""
+    scheme = address.partition("://")[0] if "://" in address else ""
+    kind = next((kind for kind in DRIVERS if scheme in kind.schemes), DRIVERS[0])
+    if not kind.installed:
+        raise InputError("arm", "address", address, f"stillbed with its extra: {kind.remedy}")
+    return kind
+
+
+def open_arm(address: str, profile: ArmProfile, listener: ByteListener | None = None) -> ArmDriver:
+    """The driver of the arm at an address, not connected yet. listener: is told the bytes that pass, both ways."""
+    driver: ArmDriver = importlib.import_module(driver_kind(address).module).open_arm(address, profile, listener)
+    return driver
+
+
+def emergency_stop(address: str, profile: ArmProfile) -> tuple[float, str]:
+    """Stop an arm whose motion process is gone: when the stop was out, s, and why it could not be, "" if it was."""
+    answer: tuple[float, str] = importlib.import_module(driver_kind(address).module).emergency_stop(address, profile)
+    return answer
+
+
+def find_arms(kind: DriverKind) -> list[tuple[str, str]]:
+    """The arms that a driver finds now, as (address, description)."""
+    found: list[tuple[str, str]] = importlib.import_module(kind.module).find_arms()
+    return found

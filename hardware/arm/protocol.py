@@ -15,13 +15,12 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from estimation.errors import InputError
-from estimation.se3 import Array
+from hardware.arm.driver import G1, G4, G54, Pause, Reply, ReplyKind
 from planning.command import Command, Move
 
 FRAME_LENGTH = 48
@@ -64,34 +63,6 @@ class Dialect:
 
 
 THESIS_DIALECT = Dialect()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class G1:
-    """Move in a straight line."""
-
-    axes: Array  # (6,) X Y Z A B C, mm and rad
-    feed: float  # mm/s
-    material: bool = False  # whether it is to flow; says nothing in a dialect without pwm_on
-
-
-@dataclass(frozen=True, slots=True)
-class G4:
-    """Pause all for `duration` s."""
-
-    duration: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class G54:
-    """Make `origin` (3,), mm, the place that is called (0, 0, 0)."""
-
-    origin: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Pause:
-    """Stop at once; what no queued G4 can do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,23 +219,6 @@ _REPLY = struct.Struct(">B3hBB")
 _REPLY_FIRST, _REPLY_LAST = 0xCE, 0xCF
 REPLY_TAILS = {_REPLY_FIRST: _REPLY_LAST}
 _MAX_COUNT = 32_767  # int16; its -32768 has no opposite and is not sent
-
-
-class ReplyKind(IntEnum):
-    """Which three numbers a reply holds; the value is byte 7. The driver knows a 4 and a 5, and does not use them."""
-
-    PLACE = 0  # X Y Z
-    TOOL = 1  # J4 J5 J6
-    ARM = 2  # J1 J2 J3
-    ORIGIN = 3  # X Y Z of the work origin
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reply:
-    """One answer."""
-
-    kind: ReplyKind
-    values: Array  # (3,) mm, or rad of TOOL and ARM
 
 
 def encode_reply(reply: Reply) -> bytes:

@@ -13,9 +13,9 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hardware.arm.port import ArmLine
+from hardware.arm.driver import G1, G4, ArmDriver
 from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.arm.protocol import FRAME_LENGTH, G1, G4
+from hardware.arm.protocol import FRAME_LENGTH
 from planning.command import MIN_TRAVEL
 
 Axes = tuple[float, ...]  # X Y Z A B C, mm and rad: six floats, quicker than an array of six
@@ -163,21 +163,22 @@ class FlowControl:
 
     @property
     def flight(self) -> float:
-        """Seconds that may be under way, wire included: the settings' flight, or on a slow line one frame and its move.
+        """Seconds that may be under way, wire included: the flight, or on a slow line one frame and its move.
 
         Either way a tick, of 50 ms at most, is all that is added to what the arm's queue holds.
         """
         slow = self.profile.frame_time * (1 + WIRE_ROUNDING_BYTES / FRAME_LENGTH) + self.profile.tick
-        return max(self.settings.flight, slow)
+        return max(self.settings.flight if self.profile.flight is None else self.profile.flight, slow)
 
-    def full(self, line: ArmLine, queue: ArmQueue, more: float, now: float, backlog: float = 0.0) -> str:
+    def full(self, driver: ArmDriver, queue: ArmQueue, more: float, now: float, backlog: float = 0.0) -> str:
         """Why a frame of `more` s must wait; "" where it need not. backlog: s that the arm is behind the model."""
-        if line.blocked:
-            return f"the port has taken no bytes for {line.blocked_for(now):.3f} s"
-        passing = max(queue.wire_free - now, 0.0) / self.profile.frame_time * FRAME_LENGTH
+        if (blocked := driver.blocked_for(now)) is not None:
+            return f"the port has taken no bytes for {blocked:.3f} s"
+        frame_time = self.profile.frame_time
+        passing = max(queue.wire_free - now, 0.0) / frame_time * FRAME_LENGTH if frame_time else 0.0
         if passing > WIRE_ROUNDING_BYTES:
             return f"{passing:.0f} bytes are on the wire: a stop would wait for two frames"
-        waiting = line.port.waiting() - passing
+        waiting = driver.waiting() - passing
         if waiting > FRAME_LENGTH:
             return f"{waiting:.0f} bytes wait in the port"
         if (count := queue.frames(now)) >= self.settings.frames:

@@ -18,6 +18,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
 from hardware.arm.link import Arm
 from hardware.arm.profile import LinkSettings
+from hardware.arm.s6h4d import S6H4D
 from hardware.files.path_file import read_path
 from hardware.live.checklist import silence_text
 from hardware.motion.loop import MotionLoop, Order, Tick
@@ -177,7 +178,7 @@ class FaultRun:
         self._profile = replace(scenario.profile, arm=replace(arm, home=home))
         self._virtual = VirtualArm(scenario.arm, self._profile.dialect, home, faults, self._profile.baud)
         self._device = VirtualDevice(self._virtual, self._clock, self._profile.baud)
-        self._arm = Arm(self._device, self._profile, 0.0, LinkSettings(poll=POLL_PERIOD))
+        self._arm = Arm(S6H4D(self._device, self._profile), self._profile, 0.0, LinkSettings(poll=POLL_PERIOD))
         self._faults = faults
         dispenser = scenario.dispenser if dispenser is None else dispenser
         self._dispensers = SimulatedDispensers(on.path, dispenser, self._clock, faults, scenario.path)

@@ -25,8 +25,8 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
+from hardware.arm.driver import ArmDriver
 from hardware.arm.link import Arm
-from hardware.arm.port import Opener
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.queue import QueuedCommand
 from hardware.cameras.live import LiveCameras
@@ -342,7 +342,7 @@ def move_arm(
 def record_live(
     live: LiveCameras,
     rig: Rig,
-    opener: Opener,
+    driver: ArmDriver,
     profile: ArmProfile,
     clock: Clock,
     folder: Path,
@@ -354,7 +354,7 @@ def record_live(
     """Move an arm before live cameras and record both in a session folder; Ctrl-C stops the arm, keeping the record."""
     write_arm(folder / ARM_FILE, profile, "the arm as it was taken to be while it was calibrated")
     with live:
-        arm = Arm(opener, profile, clock.now(), link)
+        arm = Arm(driver, profile, clock.now(), link)
         writer = PictureWriter(live, rig, clock, folder)
         writer.start()
 

@@ -27,8 +27,8 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.triangulation import triangulate
 from hardware.arm.link import Arm
-from hardware.arm.port import PortOpener
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, open_arm
+from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, MoveOptions, move_arm, read_commanded
 from hardware.calibration.arm_report import MAX_TIP_ERROR, ArmTruth, arm_page, arm_text, judge_arm
 from hardware.calibration.arm_solve import calibrated_profile, kinematics_of, numbers_text, solve_folder, tip_error
@@ -199,8 +199,8 @@ def record_on_terminal(
     """
     write_arm(folder / ARM_FILE, watched.profile, "the virtual arm as it is taken to be")
     with tempfile.TemporaryDirectory() as place, serve_arm(watched, Path(place) / "arm", clock) as device:
-        port = PortOpener(device.device, watched.profile.baud)
-        arm, begun = Arm(port, watched.profile, clock.now()), clock.now()
+        driver = open_arm(device.device, watched.profile)
+        arm, begun = Arm(driver, watched.profile, clock.now()), clock.now()
         broken: BaseException | None = None
         try:
             move_arm(arm, clock, folder, watched.begin, options, moves)
@@ -209,7 +209,7 @@ def record_on_terminal(
         finally:
             span = begun, clock.now()
             arm.close()
-            port.release()
+            driver.release()
     assert device.arm is not None
     take_pictures(watched, device.arm, device.begun, span, folder, images)
     if broken is not None:
@@ -224,7 +224,7 @@ def record_in_virtual_time(
     write_arm(folder / ARM_FILE, watched.profile, "the virtual arm as it is taken to be")
     clock = SimClock()
     virtual = VirtualArm(watched.settings, watched.profile.dialect, watched.begin, (), watched.profile.baud)
-    arm = Arm(VirtualDevice(virtual, clock, watched.profile.baud), watched.profile, 0.0)
+    arm = Arm(S6H4D(VirtualDevice(virtual, clock, watched.profile.baud), watched.profile), watched.profile, 0.0)
     move_arm(arm, clock, folder, watched.begin, options, moves)
     virtual.advance(clock.now())
     take_pictures(watched, virtual, 0.0, (0.0, clock.now()), folder, images)

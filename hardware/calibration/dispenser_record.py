@@ -19,9 +19,10 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
+from hardware.arm.driver import ArmDriver
 from hardware.arm.link import Arm
-from hardware.arm.port import Opener
 from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import (
     ARM_FILE,
     COMMANDED_FILE,
@@ -299,7 +300,7 @@ def drawn_lines(
 def record_live(
     live: LiveCameras,
     rig: Rig,
-    opener: Opener,
+    driver: ArmDriver,
     profile: ArmProfile,
     dispenser: Dispenser,
     clock: Clock,
@@ -313,7 +314,7 @@ def record_live(
     """Draw the lines before live cameras. where: as `stands` and `away` of `draw_lines`."""
     write_arm(folder / ARM_FILE, profile, "the arm as it was taken to be while a dispenser was calibrated")
     with live:
-        arm = Arm(opener, profile, clock.now(), link)
+        arm = Arm(driver, profile, clock.now(), link)
         writer = PictureWriter(live, rig, clock, folder)
         writer.keep = False
         writer.start()
@@ -347,7 +348,7 @@ def record_virtual(
     clock, model, looks = SimClock(), DispenserModel(true), []
     begin = np.concatenate([own.arm.home[:2], [50.0 + options.height], own.arm.home[3:]])
     virtual = VirtualArm(watched.settings, own.dialect, begin, (), own.baud)
-    arm = Arm(VirtualDevice(virtual, clock, own.baud), own, 0.0)
+    arm = Arm(S6H4D(VirtualDevice(virtual, clock, own.baud), own), own, 0.0)
 
     def look(wanted: bool) -> None:
         if wanted:

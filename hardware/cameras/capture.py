@@ -1,14 +1,15 @@
-"""A camera opened by OpenCV (device, stream or file), with its controls locked and read back.
+"""What a camera is to the rest (`Capture`), and one opened by OpenCV: device, stream or file.
 
-What the driver did not accept is named.
+Its controls are locked and read back; what the driver did not accept is named.
 """
 
 from __future__ import annotations
 
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -18,12 +19,16 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s, as READ_TI
 import cv2
 import numpy as np
 
+from estimation.errors import StillbedError
 from hardware.cameras.sources import CameraSource, Identity, SourceKind, device_node
 from hardware.process.clock import Clock
 from perception.frames import Image
 
 READ_TIMEOUT = 2  # s: a camera or stream that sends nothing for longer is opened again
 OPEN_TIMEOUT = 3  # s for a stream to answer
+CATCH_UP = 0.75  # of the time between two stamps: RTSP pictures that come faster had been waiting
+CATCH_UP_FRAMES = 5  # over which that is judged: FFmpeg reads a socket in pieces
+MAX_BACKLOG = 300  # pictures that FFmpeg may have read before it gives the first: five seconds at 60 Hz
 FILE_FPS = 30.0  # Hz, where neither the container nor rig.toml has a rate
 EXPOSURE_UNIT = 1e-4  # s: V4L2 counts an absolute exposure in 100 us
 MANUAL_EXPOSURE, AUTOMATIC_OFF = 1.0, 0.0  # V4L2_EXPOSURE_MANUAL; the other automatics are switches
@@ -148,14 +153,49 @@ def reads_videos() -> bool:
     return bool(cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG))
 
 
+class CameraError(StillbedError):
+    """Why a camera cannot be opened, or was lost: one line."""
+
+
+TRANSPORT_COUNTS = ("received", "lost", "resent", "frames_lost")
+
+
+@dataclass(frozen=True, slots=True)
+class Transport:
+    """What a camera on a network or bus lost on the way, and how its clock runs."""
+
+    received: int  # packets
+    lost: int  # packets that never came, not even when asked for again
+    resent: int  # packets that came when asked for again
+    frames_lost: int  # of which no packet came, by the numbers that the camera gives its frames
+    drift: float  # by how much our clock is faster than the camera's, of 1; nan before it is known
+    doubt: float  # s, of the offset between both clocks; nan where the camera's clock cannot be read
+
+    def after(self, earlier: Transport | None) -> Transport:
+        """The same with what was counted before the camera was opened again."""
+        if earlier is None:
+            return self
+        counts = {name: getattr(self, name) + getattr(earlier, name) for name in TRANSPORT_COUNTS}
+        return replace(self, **counts)
+
+
 class Capture(Protocol):
-    """An open camera."""
+    """An open camera. What its methods raise says why it was lost."""
 
     ends: bool  # whether it can end, as a file does
     clocked: bool  # whether `position` may be by the machine's own clock
+    exact: bool  # whether `position` is the instant itself, without the jitter of a machine that is busy
 
-    def grab(self) -> bool:
-        """Wait for the next frame; False if the camera is gone or has ended."""
+    @property
+    def incomplete(self) -> bool:
+        """Whether parts of the grabbed frame were lost on the way."""
+
+    @property
+    def transport(self) -> Transport | None:
+        """What was lost so far; None where nothing is known of it."""
+
+    def grab(self) -> bool | None:
+        """Wait for the next frame; None where none came yet, False if the camera is gone or has ended."""
 
     def position(self) -> float:
         """The source's own time stamp of the grabbed frame, s; nan without one."""
@@ -173,8 +213,8 @@ class Capture(Protocol):
 CaptureOpener = Callable[[CameraSource, "tuple[int, int] | None", Clock], "Capture | None"]
 
 
-def open_capture(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> Capture | None:
-    """Open a camera for pictures of `size` (W, H) px; None where that is not possible now."""
+def open_by_opencv(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> Capture | None:
+    """Open a device, stream or file for pictures of `size` (W, H) px; None where that is not possible now."""
     if source.identity.kind is SourceKind.DEVICE:
         node = device_node(source.identity)
         capture = None if node is None else cv2.VideoCapture(str(node), cv2.CAP_V4L2)
@@ -200,6 +240,9 @@ def _open_ffmpeg(identity: Identity) -> cv2.VideoCapture:
 class _OpenCapture:
     """OpenCV's capture; a video file is played at its rate."""
 
+    exact = incomplete = False
+    transport: Transport | None = None
+
     def __init__(self, capture: cv2.VideoCapture, source: CameraSource, clock: Clock) -> None:
         self._capture, self._source, self._clock = capture, source, clock
         self.clocked = source.identity.kind is SourceKind.DEVICE
@@ -207,15 +250,32 @@ class _OpenCapture:
         rate = capture.get(cv2.CAP_PROP_FPS)
         self._period = 1 / (source.fps or (rate if rate > 0 else FILE_FPS))
         self._next = clock.now()
+        self._behind = source.identity.text.startswith(("rtsp://", "rtsps://"))  # FFmpeg looks at these for a second
 
     def grab(self) -> bool:
         if self.ends:
             self._clock.wait_until(self._next)
             self._next = max(self._next, self._clock.now() - self._period) + self._period
+        begun = self._clock.now()
         try:
-            return bool(self._capture.grab())
+            grabbed = self._catch_up() if self._behind else bool(self._capture.grab())
         except cv2.error:
             return False
+        # at the time's end a decoder gives the picture that it still holds, which is as old as that
+        return grabbed and (self.ends or self._clock.now() - begun < READ_TIMEOUT)
+
+    def _catch_up(self) -> bool:
+        """Grab the first picture that was not read before: the others come faster than they were taken."""
+        seen = deque[tuple[float, float]](maxlen=CATCH_UP_FRAMES)
+        for _ in range(MAX_BACKLOG):
+            if not self._capture.grab():
+                return False
+            now, position = self._clock.now(), self.position()
+            seen.append((now, position))
+            if len(seen) == CATCH_UP_FRAMES and now - seen[0][0] >= CATCH_UP * (position - seen[0][1]):
+                break
+        self._behind = False
+        return True
 
     def position(self) -> float:
         position = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -239,3 +299,36 @@ class _OpenCapture:
 
     def release(self) -> None:
         self._capture.release()
+
+
+BAYER_CODES = {  # by the first two pixels of the first row
+    "RG": cv2.COLOR_BayerRGGB2BGR,
+    "BG": cv2.COLOR_BayerBGGR2BGR,
+    "GR": cv2.COLOR_BayerGRBG2BGR,
+    "GB": cv2.COLOR_BayerGBRG2BGR,
+}
+
+
+def image_from_pixels(data: memoryview, size: tuple[int, int], pixel_format: str, padding: int = 0) -> Image | None:
+    """The picture (H, W) or (H, W, 3) BGR in a camera's pixels, copied; None where they are too few.
+
+    size: (W, H) px. pixel_format: of PIXEL_FORMATS; of more than 8 bits the highest 8 are kept. padding: bytes after
+    each row.
+    """
+    width, height = size
+    channels = 3 if pixel_format in ("RGB8", "BGR8") else 1
+    depth = int("".join(c for c in pixel_format if c.isdigit()))
+    unit = 1 if depth == 8 else 2
+    row = width * channels * unit + padding
+    if len(data) < height * row - padding or not width * height:
+        return None
+    raw = np.frombuffer(data, np.uint8, min(len(data), height * row))
+    rows = np.lib.stride_tricks.as_strided(raw, (height, row - padding), (row, 1), writeable=False)
+    if unit == 2:
+        rows = (np.ascontiguousarray(rows).view("<u2") >> (depth - 8)).astype(np.uint8)
+    if pixel_format.startswith("Bayer"):
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), BAYER_CODES[pixel_format[5:7]]), np.uint8)
+    if channels == 1:
+        return np.array(rows)
+    picture = rows.reshape(height, width, 3)
+    return np.array(picture if pixel_format == "BGR8" else picture[..., ::-1])

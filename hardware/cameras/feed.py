@@ -12,8 +12,9 @@ from enum import Enum
 
 import numpy as np
 
-from hardware.cameras.capture import Capture, CaptureOpener, Control, locked_exposure, open_capture
-from hardware.cameras.sources import CameraSource
+from estimation.errors import StillbedError
+from hardware.cameras.capture import Capture, CaptureOpener, Control, Transport, locked_exposure, open_by_opencv
+from hardware.cameras.sources import CameraSource, SourceKind
 from hardware.cameras.stamping import FrameStamp, FrameStamper
 from hardware.process.clock import Clock
 from perception.frames import DuplicateFilter, Frame, Image, StampedBy
@@ -30,6 +31,7 @@ MAX_DAMAGED_FRAMES = 30  # in a row, after which a camera is opened again
 class FrameFault(Enum):
     """Why a frame is left out; the text follows a camera's name."""
 
+    INCOMPLETE = "sends pictures with packets missing"
     DAMAGED = "sends pictures that cannot be decoded"
     WRONG_SIZE = "sends pictures of another size"
     DUPLICATED = "sends the same stamp again"
@@ -98,6 +100,7 @@ class CameraState:
     controls: tuple[Control, ...]
     newest: Image | None  # its last picture, faulty or not
     error: str = ""  # the last one that its driver raised
+    transport: Transport | None = None  # what was lost on the way; None where nothing is known of it
 
     @property
     def trouble(self) -> str:
@@ -136,7 +139,7 @@ class Arrival:
 
     frame: Frame
     steady: float  # s, its stamp without jitter
-    period: float | None  # s, of its camera; None before it is known
+    period: float | None  # s, of its camera; None before it is known, and of a triggered one, which has no phase
     now: float  # s, when it was ready
 
 
@@ -148,6 +151,15 @@ class CameraPlace:
     name: str
     size: tuple[int, int] | None  # (W, H) px; None: any
     offset: float = 0.0  # s, added to its stamps
+
+
+def open_capture(source: CameraSource, size: tuple[int, int] | None, clock: Clock) -> Capture | None:
+    """Open a camera for pictures of `size` (W, H) px by the driver of its kind; None where that is not possible now."""
+    if source.identity.kind is SourceKind.GENICAM:
+        from hardware.cameras.genicam import open_genicam
+
+        return open_genicam(source, size, clock)
+    return open_by_opencv(source, size, clock)
 
 
 class Feed:
@@ -177,12 +189,14 @@ class Feed:
         self._stamped: FrameStamp | None = None
         self._newest: Image | None = None
         self._error = ""
+        self._transport: Transport | None = None
+        self._earlier: Transport | None = None  # before the camera was opened last
         self._begin()
 
     def _begin(self) -> None:
         """Reset the state of the last connection."""
         self._stamping, self._watch = FrameStamper(self._period), FrameWatch(self.place.size)
-        self._grabbed = 0
+        self._grabbed, self._earlier = 0, self._transport
 
     def run(self) -> None:
         """Step until closed, or the file has ended."""
@@ -206,9 +220,9 @@ class Feed:
         """Grab a frame and deliver it if it is good; or try to open the camera, and wait if that fails."""
         if self._capture is None:
             self._open()
-        elif self._capture.grab():
+        elif grabbed := self._capture.grab():
             self._take(self._capture)
-        else:
+        elif grabbed is not None:
             ended = self._capture.ends and self._grabbed > 0
             self._release()
             self._enter(CameraPhase.ENDED if ended else CameraPhase.GONE)
@@ -216,24 +230,29 @@ class Feed:
     def _open(self) -> None:
         capture = self._opener(self.source, self.place.size, self._clock)
         if capture is None:
-            self._wait(self._back_off)
-            self._back_off = min(2 * self._back_off, MAX_BACK_OFF)
+            self._pause()
             return
         self._begin()
         self._capture, self._broken = capture, 0
 
     def _take(self, capture: Capture) -> None:
-        now, position = self._clock.now(), capture.position()
+        now, position, transport = self._clock.now(), capture.position(), capture.transport
+        with self._lock:
+            self._transport = self._earlier if transport is None else transport.after(self._earlier)
         if self._grabbed == 0:  # accepted controls show only once pictures flow
             self._first(capture)
         self._grabbed += 1
         if self._watch.repeats(position):
             self._leave_out(FrameFault.DUPLICATED)
             return
+        if capture.incomplete and math.isnan(position):  # its begin was lost: an arrival instead would move the beat
+            self._leave_out(FrameFault.INCOMPLETE)
+            return
         missed = self._stamping.pll.missed
-        stamped = self._stamping(now, position, capture.clocked)
+        stamped = self._stamping(now, position, capture.clocked, capture.exact)
         image = capture.retrieve()
         fault = self._watch.fault(image) or (None if stamped.fresh else FrameFault.BACKLOG)
+        fault = FrameFault.INCOMPLETE if capture.incomplete else fault
         with self._lock:
             self._missed += max(0, self._stamping.pll.missed - missed)
             self._stamped = stamped
@@ -258,13 +277,14 @@ class Feed:
         with self._lock:
             self._fault, self._good, self._broken = None, now, 0
             self._given += 1
-        self._deliver(Arrival(frame, stamped.steady + offset, self._stamping.pll.period, now))
+        period = None if self.source.trigger else self._stamping.pll.period
+        self._deliver(Arrival(frame, stamped.steady + offset, period, now))
 
     def _leave_out(self, fault: FrameFault) -> None:
         with self._lock:
             self._faults[fault] += 1
             self._fault = fault
-        self._broken = self._broken + 1 if fault is FrameFault.DAMAGED else 0
+        self._broken = self._broken + 1 if fault in (FrameFault.DAMAGED, FrameFault.INCOMPLETE) else 0
         if self._broken >= MAX_DAMAGED_FRAMES:
             self._release()
             self._enter(CameraPhase.GONE)
@@ -274,9 +294,9 @@ class Feed:
             self._release()
         self._capture = None
         with self._lock:
-            self._error = f"{type(error).__name__}: {error}"
+            self._error = str(error) if isinstance(error, StillbedError) else f"{type(error).__name__}: {error}"
         self._enter(CameraPhase.GONE)
-        self._wait(self._back_off)
+        self._pause()
 
     def _enter(self, phase: CameraPhase) -> None:
         with self._lock:
@@ -287,6 +307,10 @@ class Feed:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+    def _pause(self) -> None:
+        self._wait(self._back_off)
+        self._back_off = min(2 * self._back_off, MAX_BACK_OFF)
 
     def _wait(self, seconds: float) -> None:
         end = self._clock.now() + seconds
@@ -316,4 +340,5 @@ class Feed:
                 controls=self._controls,
                 newest=self._newest,
                 error=self._error,
+                transport=self._transport,
             )

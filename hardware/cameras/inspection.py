@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hardware.cameras.capture import Transport
 from hardware.cameras.feed import CameraPhase, CameraState, LiveHealth
 from hardware.cameras.live import LiveCameras
 from hardware.process.clock import Clock
@@ -129,12 +130,31 @@ def _camera_table(camera: CameraState, offset: float, scatter: float) -> dict[st
         "not_fetched": camera.overrun,
         "left_out": dict(sorted((fault.name.lower(), count) for fault, count in camera.faults.items())),
         "reopened": camera.reopened,
+        "transport": _transport_table(camera.transport),
         "controls": [
             {"name": c.name, "asked": c.requested, "got": c.actual, "automatic": c.automatic, "taken": c.accepted}
             for c in camera.controls
         ],
         "trouble": camera.trouble,
     }
+
+
+def _transport_table(transport: Transport | None) -> dict[str, Any] | None:
+    if transport is None:
+        return None
+    counts = {f"{name}_packets": getattr(transport, name) for name in ("received", "lost", "resent")}
+    clock = {"clock_drift_ppm": _known(-1e6 * transport.drift), "clock_doubt_ms": _known(1e3 * transport.doubt)}
+    return counts | {"frames_without_packets": transport.frames_lost} | clock
+
+
+def _transport_text(one: dict[str, Any]) -> str:
+    drift, doubt = one["clock_drift_ppm"], one["clock_doubt_ms"]
+    clock = "its clock is not known yet" if drift is None else f"its clock runs {drift:+.1f} ppm beside ours"
+    known = "by arrivals, so that a constant delay stays" if doubt is None else f"known to {doubt:.2g} ms"
+    return (
+        f"packets: {one['received_packets']} came, {one['lost_packets']} lost, {one['resent_packets']} sent again; "
+        f"{one['frames_without_packets']} frames lost; {clock}, {known}"
+    )
 
 
 def _known(value: float) -> float | None:
@@ -168,6 +188,7 @@ def camera_lines(one: dict[str, Any]) -> list[str]:
         f"{one['frames']} frames; {one['missed']} missed; left out: {left_out or 'none'}",
     ]
     lines += [f"controls: {controls}"] if controls else []
+    lines += [_transport_text(one["transport"])] if one["transport"] else []
     return lines + ([f"TROUBLE: {one['trouble']}"] if one["trouble"] else [])
 
 

@@ -15,7 +15,7 @@ from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.cameras.feed import Arrival, CameraPlace, Feed, LiveHealth
-from hardware.cameras.sources import CameraSource, identity_from_text, read_live_rig
+from hardware.cameras.sources import CameraSource, SourceKind, identity_from_text, read_live_rig
 from hardware.process.clock import Clock
 from perception.frames import DEFAULT_PERIOD, Frame, FrameSet, Pairing, frame_set
 
@@ -165,12 +165,20 @@ class LiveCameras:
     """
 
     def __init__(self, rig: Rig | Sequence[CameraPlace], sources: Sequence[CameraSource], clock: Clock) -> None:
-        """rig: or the places of cameras that are not calibrated. sources: one per camera."""
+        """rig: or the places of cameras that are not calibrated. sources: one per camera.
+
+        InputError where the driver of one is not installed.
+        """
         if isinstance(rig, Rig):
             rig = [CameraPlace(i, c.name, c.size, c.clock_offset) for i, c in enumerate(rig.cameras)]
         places = tuple(rig)
         if len(sources) != len(places):
             raise InputError("live cameras", "sources", len(sources), f"one per camera of the rig, {len(places)}")
+        for place, source in zip(places, sources, strict=True):
+            if source.identity.kind is SourceKind.GENICAM:
+                from hardware.cameras.genicam import require_aravis
+
+                require_aravis(place.name, source)
         self._clock, self._changed = clock, threading.Condition()
         self._waiting: deque[Arrival] = deque()
         self._overrun = [0] * len(places)

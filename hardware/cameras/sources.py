@@ -8,6 +8,15 @@ focus_abs = 40                 # in the driver's own units
 white_balance_k = 4500
 fps = 30.0
 format = "MJPG"                # the driver's name: MJPG, YUYV
+
+[[camera]]
+source = "genicam://Basler-21876543"  # GigE Vision or USB3 Vision: Aravis's name, the serial number, MAC or IP address
+exposure_s = 0.004
+gain = 6.0                     # in the camera's own units
+fps = 30.0
+format = "BayerRG8"            # a name of PIXEL_FORMATS
+trigger = "software"           # or a line of the camera, such as "Line1"; without it the camera runs freely
+ptp = true                     # its clock follows the network's
 """
 
 from __future__ import annotations
@@ -26,7 +35,19 @@ from hardware.process.checks import Table
 FILE_ROOT = Path("/")
 URL_SCHEMES = ("rtsp://", "rtsps://", "http://", "https://")
 USB_PREFIX = "usb:"  # before a USB serial number
-IDENTITY_FORMS = "a path in /dev/v4l/by-id or /dev/v4l/by-path, usb:SERIAL, a URL (rtsp, http) or a video file"
+GENICAM_PREFIX = "genicam://"  # before an industrial camera's name
+IDENTITY_FORMS = (
+    "a path in /dev/v4l/by-id or /dev/v4l/by-path, usb:SERIAL, genicam://ID, a URL (rtsp, http) or a video file"
+)
+SOFTWARE_TRIGGER = "Software"  # as the standard (SFNC) names it; a line's name is any other
+MAX_NAME = 128  # characters of an industrial camera's name or of a line's
+DEPTHS = ("8", "10", "12", "16")  # bits of a pixel; more than 8 come in two bytes each, and lose the lowest
+PIXEL_FORMATS = (  # by the standard's names (PFNC), in the order of preference; packed ones are not read
+    *("Mono" + depth for depth in DEPTHS),
+    *("Bayer" + order + depth for depth in DEPTHS for order in ("RG", "BG", "GR", "GB")),
+    "RGB8",
+    "BGR8",
+)
 CONTROL_RANGES = {  # both ends included
     "exposure_s": (1e-5, 1.0),
     "gain": (0.0, 1e5),
@@ -45,6 +66,7 @@ class SourceKind(Enum):
     DEVICE = "device"
     STREAM = "stream"
     FILE = "file"
+    GENICAM = "genicam"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +109,16 @@ def identity_from_text(where: object, key: str, text: str, folder: Path, root: P
         return Identity(SourceKind.STREAM, text)
     if text.startswith("/dev/") or (text.startswith(USB_PREFIX) and text != USB_PREFIX):
         return Identity(SourceKind.DEVICE, text)
+    if text.startswith(GENICAM_PREFIX) and _is_name(text.removeprefix(GENICAM_PREFIX)):
+        return Identity(SourceKind.GENICAM, text)
     path = folder / text
     if "://" in text or not path.exists() or path.is_dir():
         raise InputError(where, key, text, IDENTITY_FORMS)
     return Identity(SourceKind.FILE, str(path.resolve()))
+
+
+def _is_name(text: str) -> bool:
+    return 0 < len(text) <= MAX_NAME and text.isprintable() and text == text.strip()
 
 
 def _instead(text: str, root: Path) -> str:
@@ -152,7 +180,9 @@ class CameraSource:
     focus: float | None = None  # the driver's units
     white_balance: float | None = None  # K
     fps: float | None = None  # Hz
-    format: str | None = None  # four characters
+    format: str | None = None  # four characters; of an industrial camera one of PIXEL_FORMATS
+    trigger: str | None = None  # of an industrial camera: SOFTWARE_TRIGGER or a line; None: it runs freely
+    ptp: bool = False  # whether an industrial camera's clock is to follow the network's
 
 
 def read_live_rig(path: str | Path) -> tuple[Rig, tuple[CameraSource, ...]]:
@@ -167,7 +197,18 @@ def read_live_rig(path: str | Path) -> tuple[Rig, tuple[CameraSource, ...]]:
         if (owner := owners.setdefault(source.identity, camera.name)) != camera.name:
             allowed = f"a source of its own; camera {owner!r} has this one"
             raise InputError(path, f"camera {camera.name!r}: source", source.identity.shown, allowed)
+    _check_beat(path, rig, sources)
     return rig, sources
+
+
+def _check_beat(path: Path, rig: Rig, sources: tuple[CameraSource, ...]) -> None:
+    """Refuse cameras that are to be triggered at one instant, but at different rates."""
+    fired = [i for i, source in enumerate(sources) if source.trigger == SOFTWARE_TRIGGER]
+    for i in fired:
+        if sources[i].fps != sources[fired[0]].fps:
+            key, first = f"camera {rig.cameras[i].name!r}: fps", rig.cameras[fired[0]].name
+            allowed = f"{sources[fired[0]].fps:g}, as camera {first!r}: one trigger for all"
+            raise InputError(path, key, sources[i].fps, allowed)
 
 
 def source_from_table(where: object, name: str, camera: Table, folder: Path) -> CameraSource:
@@ -179,7 +220,9 @@ def source_from_table(where: object, name: str, camera: Table, folder: Path) -> 
     text = str(written) if isinstance(written, int) else checks.text(where, key + "source", written)
     identity = identity_from_text(where, key + "source", text, folder)
     exposure, gain, focus, white, fps = (_number(where, key, camera, one) for one in CONTROL_RANGES)
-    return CameraSource(identity, exposure, gain, focus, white, fps, _format(where, key + "format", camera))
+    kind, form = identity.kind, _format(where, key + "format", camera, identity.kind)
+    trigger, ptp = _trigger(where, key, camera, kind, fps), _ptp(where, key, camera, kind)
+    return CameraSource(identity, exposure, gain, focus, white, fps, form, trigger, ptp)
 
 
 def _number(where: object, key: str, camera: Table, name: str) -> float | None:
@@ -191,10 +234,41 @@ def _number(where: object, key: str, camera: Table, name: str) -> float | None:
     return value
 
 
-def _format(where: object, key: str, camera: Table) -> str | None:
+def _format(where: object, key: str, camera: Table, kind: SourceKind) -> str | None:
     if "format" not in camera:
         return None
     text = checks.text(where, key, camera["format"])
-    if len(text) != 4 or not text.isascii():
+    if kind is SourceKind.GENICAM and text not in PIXEL_FORMATS:
+        raise InputError(where, key, text, "one of " + ", ".join(PIXEL_FORMATS))
+    if kind is not SourceKind.GENICAM and (len(text) != 4 or not text.isascii()):
         raise InputError(where, key, text, "four characters, such as MJPG or YUYV")
     return text
+
+
+def _trigger(where: object, key: str, camera: Table, kind: SourceKind, fps: float | None) -> str | None:
+    if "trigger" not in camera:
+        return None
+    _check_genicam(where, key + "trigger", camera["trigger"], kind)
+    text = checks.text(where, key + "trigger", camera["trigger"])
+    if not _is_name(text):
+        raise InputError(where, key + "trigger", text, '"software", or a line of the camera, such as "Line1"')
+    if text.lower() != SOFTWARE_TRIGGER.lower():
+        return text
+    if fps is None:
+        low, high = CONTROL_RANGES["fps"]
+        raise InputError(where, key + "fps", "missing", f"{low:g} to {high:g}: the rate at which software triggers")
+    return SOFTWARE_TRIGGER
+
+
+def _ptp(where: object, key: str, camera: Table, kind: SourceKind) -> bool:
+    value = camera.get("ptp", False)
+    if not isinstance(value, bool):
+        raise InputError(where, key + "ptp", value, "true or false")
+    if "ptp" in camera:
+        _check_genicam(where, key + "ptp", value, kind)
+    return value
+
+
+def _check_genicam(where: object, key: str, value: object, kind: SourceKind) -> None:
+    if kind is not SourceKind.GENICAM:
+        raise InputError(where, key, value, f"only for an industrial camera, {GENICAM_PREFIX}ID")

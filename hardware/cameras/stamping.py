@@ -1,4 +1,7 @@
-"""When a frame was exposed: by its driver's time stamp, its stream's, or its arrival, with a phase-locked loop."""
+"""When a frame was exposed: by its driver's time stamp, its stream's, or its arrival, with a phase-locked loop.
+
+A device that stamps by a clock of its own has that clock mapped to the machine's.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.se3 import Array
 from perception.frames import StampedBy
 
 PLL_BEATS = 30  # beats by which phase and period are smoothed: a second of a webcam
@@ -24,6 +28,11 @@ MAX_DRIVER_LAG = 1.0  # s: four buffers of 4 Hz; an older driver stamp is by ano
 DELAY_WINDOW = 60  # frames whose least delay is taken for the transport's: two seconds of a webcam
 EARLIEST_ONE_IN = 10  # frames arrive sooner than the transport delay that is assumed without any stamps
 MAX_DELAY_CHANGE = 0.01  # s between the least delays of both halves of the window: the stream's clock runs as ours
+CLOCK_BIN, CLOCK_BINS = 1.0, 60  # s, of which the surest reading is kept; so many, as temperature changes a rate
+DRIFT_BINS = 5  # from which a device clock's rate is estimated; before, it is as ours
+MAX_DRIFT = 2e-4  # of a quartz: 50 ppm each, aged and warm; more is no rate but a change of load
+MIN_ARRIVALS = 10  # of which the earliest is believed: one may be late by what else the machine does
+CLOCK_STEP = 1.0  # s: a reading farther off says that the device's clock was set anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +119,118 @@ class PhaseLockedLoop:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockReading:
+    """A device's clock beside ours."""
+
+    device: float  # s, by the device, since its first reading
+    ahead: float  # s, ours less the device's
+    doubt: float  # s, by which that may be too much: half a round trip, or inf where only an arrival is known
+
+
+class DeviceClock:
+    """Maps a device's stamps to our clock: offset and rate, by arrivals that come late or by readings there and back.
+
+    An arrival is late by an unknown delay of at least 0, so the line runs below all of them (Moon, Skelly and Towsley,
+    Estimation and Removal of Clock Skew, 1999): what is constant of the delay stays in it. A reading there and back
+    bounds the offset on both sides; once there are any, arrivals no longer count.
+    """
+
+    def __init__(self) -> None:
+        self._begin, self._bins, self._line = 0, deque[ClockReading](maxlen=CLOCK_BINS), (0.0, 0.0)
+        self._latched, self._count = False, 0
+
+    @property
+    def drift(self) -> float:
+        """By how much our clock runs faster than the device's, of 1; nan before it is known."""
+        return self._line[1] if len(self._bins) >= DRIFT_BINS else math.nan
+
+    @property
+    def doubt(self) -> float:
+        """Half the shortest round trip of the last minute, s; nan where the device's clock cannot be read."""
+        return min(one.doubt for one in self._bins) if self._latched else math.nan
+
+    def arrived(self, device: int, arrival: float) -> None:
+        """Take a stamp, ns by the device, of what arrived at `arrival`, s by us."""
+        if not self._latched:
+            self._take(device, arrival, math.inf)
+
+    def latched(self, device: int, sent: float, received: float) -> None:
+        """Take a reading, ns, of the device's clock that was asked for and answered at instants of ours, s."""
+        if not self._latched:
+            self._bins.clear()
+        self._latched = True
+        self._take(device, (sent + received) / 2, (received - sent) / 2)
+
+    def __call__(self, device: int) -> float:
+        """Our instant, s, of a device's stamp, ns; nan before enough is known of its clock."""
+        return self._mapped(device) if self._latched or self._count >= MIN_ARRIVALS else math.nan
+
+    def _mapped(self, device: int) -> float:
+        own = (device - self._begin) / 1e9
+        return own + self._line[0] + self._line[1] * own
+
+    def _take(self, device: int, ours: float, doubt: float) -> None:
+        if self._bins and abs(self._mapped(device) - ours) > CLOCK_STEP:
+            self._bins.clear()
+        if not self._bins:
+            self._begin, self._count = device, 0
+        self._count += 1
+        own = (device - self._begin) / 1e9
+        reading = ClockReading(own, ours - own, doubt)
+        if self._bins and own < self._bins[-1].device // CLOCK_BIN * CLOCK_BIN + CLOCK_BIN:
+            if self._surer(reading, self._bins[-1]):
+                self._bins[-1] = reading
+                self._line = self._bounded(reading)
+        else:
+            self._bins.append(reading)
+            self._line = self._fit()
+
+    def _surer(self, new: ClockReading, old: ClockReading) -> bool:
+        if self._latched:
+            return new.doubt < old.doubt
+        return self._excess(new) < self._excess(old)
+
+    def _excess(self, reading: ClockReading) -> float:
+        """How far a reading lies above the line, s."""
+        return reading.ahead - self._line[0] - self._line[1] * reading.device
+
+    def _bounded(self, reading: ClockReading) -> tuple[float, float]:
+        """The line, lowered to an arrival that is below it; of readings there and back, fitted anew."""
+        if self._latched:
+            return self._fit()
+        return self._line[0] + min(0.0, self._excess(reading)), self._line[1]
+
+    def _fit(self) -> tuple[float, float]:
+        """Offset, s, and rate of the line through, or below, the readings."""
+        x, y = (np.array([getattr(one, key) for one in self._bins]) for key in ("device", "ahead"))
+        slope = 0.0
+        if len(self._bins) >= DRIFT_BINS:
+            slope = float(np.polyfit(x, y, 1)[0]) if self._latched else _lower_slope(x, y)
+        slope = float(np.clip(slope, -MAX_DRIFT, MAX_DRIFT))
+        rest = y - slope * x
+        return float(np.median(rest) if self._latched else rest.min()), slope
+
+
+def _lower_slope(x: Array, y: Array) -> float:
+    """Slope of the edge of the lower hull of points (N,), (N,) below their middle; x rises."""
+    hull: list[int] = []
+    for i in range(len(x)):
+        while len(hull) > 1 and (y[hull[-1]] - y[hull[-2]]) * (x[i] - x[hull[-2]]) >= (y[i] - y[hull[-2]]) * (
+            x[hull[-1]] - x[hull[-2]]
+        ):
+            hull.pop()
+        hull.append(i)
+    after = next(k for k in range(1, len(hull)) if k == len(hull) - 1 or x[hull[k]] >= x.mean())
+    a, b = hull[after - 1], hull[after]
+    return float((y[b] - y[a]) / (x[b] - x[a]))
+
+
+@dataclass(frozen=True, slots=True)
 class FrameStamp:
     """When a frame was exposed."""
 
     stamp: float  # s, middle of the exposure
-    steady: float  # s, the same without jitter, for pairing
+    steady: float  # s, the same without jitter, for pairing; of an exact stamp itself
     by: StampedBy
     lag: float  # s, from stamp to arrival
     fresh: bool  # False for a frame of a backlog, whose instant is unknown
@@ -130,10 +246,11 @@ class FrameStamper:
         self._late: deque[float] = deque(maxlen=DELAY_WINDOW)  # s, behind the steady beat
         self.pll = PhaseLockedLoop(period)
 
-    def __call__(self, arrival: float, position: float, clocked: bool) -> FrameStamp:
+    def __call__(self, arrival: float, position: float, clocked: bool, exact: bool = False) -> FrameStamp:
         """Stamp the frame that arrived at `arrival` (s).
 
-        position: s, the source's own stamp (nan: none). clocked: whether that may be by the machine's own clock.
+        position: s, the source's own stamp (nan: none). clocked: whether that may be by the machine's own clock. exact:
+        whether it then has no jitter, so that a camera that exposes off its beat does so.
         """
         by, instant = self._source(arrival, position, clocked)
         if by != self._by:
@@ -144,7 +261,7 @@ class FrameStamper:
             instant = min(arrival, beat.steady + sorted(self._late)[len(self._late) // EARLIEST_ONE_IN])
         middle = self.exposure / 2
         fresh = by != "arrival" or beat.count > 0
-        steady = instant if by == "arrival" else beat.steady
+        steady = instant if by == "arrival" or exact else beat.steady
         return FrameStamp(instant - middle, steady - middle, by, arrival - instant + middle, fresh)
 
     def _source(self, arrival: float, position: float, clocked: bool) -> tuple[StampedBy, float]:

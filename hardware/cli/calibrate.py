@@ -323,8 +323,7 @@ def _virtual(a: argparse.Namespace) -> ArmCalibrationResult:
 
 def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     from hardware.arm.console import axes_from_text
-    from hardware.arm.port import PortOpener
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
     from hardware.calibration.arm_record import record_live
     from hardware.calibration.arm_run import check_out, check_record, copy_rig_json
     from hardware.cameras.live import LiveCameras
@@ -338,13 +337,13 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     rig, sources = read_live_rig(a.cameras)
     check_record(a.record)
     copy_rig_json(a.cameras, a.record)
-    device, link = PortOpener(a.device, profile.baud), LinkSettings(pause_frame=not a.no_pause_frame)
+    driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
     try:
         with progress_bar("moves", "ticks") as moves:
             live = LiveCameras(rig, sources, clock)
-            record_live(live, rig, device, profile, clock, a.record, stands, options, moves, link)
+            record_live(live, rig, driver, profile, clock, a.record, stands, options, moves, link)
     finally:
-        device.release()
+        driver.release()
     return _folder(a)
 
 

@@ -336,8 +336,7 @@ def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: L
 
 def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
     from hardware.arm.console import axes_from_text
-    from hardware.arm.port import PortOpener
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
     from hardware.calibration.dispenser_record import record_live
     from hardware.cameras.live import LiveCameras
     from hardware.cameras.sources import read_live_rig
@@ -348,13 +347,13 @@ def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptio
     where = stands, axes_from_text(a.away, profile.arm.home)
     rig, sources = read_live_rig(a.cameras)
     dispenser = dispenser_from_settings(settings)
-    device, link = PortOpener(a.device, profile.baud), LinkSettings(pause_frame=not a.no_pause_frame)
+    driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
     try:
         with progress_bar("lines", "ticks") as progress:
             live = LiveCameras(rig, sources, clock)
             record_live(
-                live, rig, device, profile, dispenser, clock, a.record, where, options, a.celsius, progress, link
+                live, rig, driver, profile, dispenser, clock, a.record, where, options, a.celsius, progress, link
             )
     finally:
-        device.release()
+        driver.release()
     return watchdog_text(settings.profile)

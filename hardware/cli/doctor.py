@@ -46,6 +46,10 @@ PRIORITY_REMEDY = (
     "as root: echo 'USER - rtprio 20' > /etc/security/limits.d/stillbed.conf, with your name; then log in anew"
 )
 JOIN_GROUP = "sudo usermod -aG {group} $USER, then log in anew"
+RUN_EXTRAS = {  # of stillbed, that a lab may need, and for what
+    **{"franka": "a Franka arm", "foxglove": "live runs in Foxglove", "cluster": "smoothing on many machines"},
+    **{"train": "training the wound network", "bench": "the comparison with Ceres"},
+}
 LOAD_TIMEOUT = 60.0  # s for all of them on a slow disk
 LOADED_MARK = "loaded"  # the word by which the process tells of each
 LOADER = f"""import importlib, sys
@@ -210,6 +214,35 @@ def modules_of(names: list[str]) -> dict[str, str]:
     }
 
 
+def extras_check(extras: dict[str, list[str]] | None = None) -> Check:
+    """Which extras are not installed, and how to install each. extras: distributions of each; without it stillbed's."""
+    if extras is None:
+        try:
+            lines = [Requirement(line) for line in requires("stillbed") or []]
+        except PackageNotFoundError:
+            lines = []
+        known = [(extra, r.name) for r in lines for extra in RUN_EXTRAS if r.marker and _is_of(r, extra)]
+        extras = {extra: names for extra in RUN_EXTRAS if (names := [name for of, name in known if of == extra])}
+    missing = [extra for extra, names in extras.items() if not all(map(_is_installed, names))]
+    have = [extra for extra in extras if extra not in missing]
+    text = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(missing) or 'none'}"
+    remedy = "; ".join(f"{RUN_EXTRAS.get(extra, extra)}: pip install 'stillbed[{extra}]'" for extra in missing)
+    return Check("extras", CheckVerdict.PASS, f"{text}; to have {remedy}" if missing else text)
+
+
+def _is_of(requirement: Requirement, extra: str) -> bool:
+    assert requirement.marker is not None
+    return requirement.marker.evaluate({"extra": extra}) and not requirement.marker.evaluate({"extra": ""})
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        version(name)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
 def load_failures(modules: list[str], patience: float = LOAD_TIMEOUT) -> dict[str, LoadFailure]:
     """Why modules did not load, by name. What kills or stops the process that loads it is named; the rest is tried.
 
@@ -271,10 +304,12 @@ def _library_check(name: str, module: str, failed: dict[str, LoadFailure]) -> Ch
 def device_checks() -> list[Check]:
     """Cameras, arm, lock, videos, network. It imports what needs the libraries: called where these load."""
     from hardware.arm.port import lock_folder, serial_ports
+    from hardware.cameras.genicam import aravis_python
     from hardware.cameras.sources import list_devices
 
     ports = [arm_check(serial_ports()), lock_check(lock_folder())]
-    return [camera_check(list_devices()), *ports, video_check(), network_check()]
+    cameras = [camera_check(list_devices()), aravis_check(aravis_python())]
+    return [*cameras, *ports, video_check(), network_check()]
 
 
 def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
@@ -283,6 +318,15 @@ def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
         return Check("cameras", CheckVerdict.WARN, "none is plugged in", "plug them in; `stillbed cameras` says more")
     names = ", ".join(device.name or str(device.node) for device in devices)
     return _access_check("cameras", [(str(device.node), names) for device in devices], names, "video")
+
+
+def aravis_check(python: str | None) -> Check:
+    """Whether industrial cameras can be read: the Python that has Aravis's binding, None: none has."""
+    from hardware.cameras.genicam import INSTALL
+
+    if python is None:
+        return Check("industrial cameras", CheckVerdict.WARN, "not read: Aravis is not installed", INSTALL)
+    return Check("industrial cameras", CheckVerdict.PASS, f"read by Aravis with {python}")
 
 
 def arm_check(ports: list[tuple[str, str]]) -> Check:

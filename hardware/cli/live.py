@@ -14,6 +14,7 @@ from perception import named_path
 
 if TYPE_CHECKING:
     from hardware.arm.profile import ArmProfile
+    from hardware.cameras.genicam import IndustrialCamera
     from hardware.cameras.sources import CameraDevice
 
 SETTINGS_FLAGS = (
@@ -25,6 +26,7 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
+NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
 REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
@@ -181,15 +183,18 @@ def add_arm(commands: Commands) -> None:
         "arm",
         _run_arm,
         "see what answers on the arm's port, home it; or serve a virtual one",
-        "Listen on the port of a SEED S6H4D and tell what answers, how often and from where; nothing is\n"
-        "sent unless a move is asked for, and a move needs --yes. With --virtual, serve a virtual arm on a\n"
-        "pseudo-terminal instead, for any client that speaks its protocol; Ctrl-C ends it with a summary.",
+        "Listen to an arm and tell what answers, how often and from where; nothing is sent unless a move is\n"
+        "asked for, and a move needs --yes. Without DEVICE, list the drivers of arms, what each finds, and how\n"
+        "to install what is missing. With --virtual, serve a virtual SEED S6H4D on a pseudo-terminal instead,\n"
+        "for any client that speaks its protocol; Ctrl-C ends it with a summary.",
+        "stillbed arm",
         "stillbed arm /dev/ttyUSB0",
         "stillbed arm /dev/ttyUSB0 --home --yes",
         "stillbed arm --virtual --link ./arm --replies stream --fault 'stall 600ms at 5s'",
     )
-    which = command.add_mutually_exclusive_group(required=True)
-    which.add_argument("device", nargs="?", metavar="DEVICE", help="a path, or a URL of pyserial's such as socket://")
+    which = command.add_mutually_exclusive_group()
+    where = "a path, a URL of pyserial's such as socket://, or one of another driver; none: list drivers and arms"
+    which.add_argument("device", nargs="?", metavar="DEVICE", help=where)
     which.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
     command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="its home, limits, dialect and baud rate")
     add = command.add_argument_group("an arm on a port").add_argument
@@ -209,10 +214,15 @@ def add_arm(commands: Commands) -> None:
 
 
 def _run_arm(a: argparse.Namespace) -> int:
-    from hardware.files.arm_file import far_limits_text
+    from hardware.files.arm_file import arm_for, far_limits_text, unreached_limits_text
 
-    profile = arm_profile(a.arm)
-    if text := far_limits_text(profile.limits):
+    if not (a.device or a.virtual):
+        from hardware.arm.console import drivers_text
+
+        print(drivers_text())
+        return 0
+    profile = arm_for(a.device) if a.arm is None and a.device else arm_profile(a.arm)
+    for text in filter(None, (far_limits_text(profile.limits), unreached_limits_text(profile))):
         print(text, flush=True)
     return _serve_virtual_arm(a, profile) if a.virtual else _connect_arm(a, profile)
 
@@ -232,8 +242,7 @@ def _serve_virtual_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
 def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
     from hardware.arm.console import ArmRequest, axes_from_text, jog_from_text, origin_from_text, run_arm
     from hardware.arm.device import ArmState
-    from hardware.arm.port import PortOpener
-    from hardware.arm.profile import LinkSettings
+    from hardware.arm.profile import LinkSettings, open_arm
 
     request = ArmRequest(
         seconds=float("inf") if a.watch else a.seconds,
@@ -244,11 +253,11 @@ def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
         confirmed=a.yes,
     )
     settings = LinkSettings(pause_frame=not a.no_pause_frame)
-    device = PortOpener(a.device, profile.baud)
+    driver = open_arm(a.device, profile)
     try:
-        status = run_arm(device, profile, request, WallClock(), settings=settings)
+        status = run_arm(driver, profile, request, WallClock(), settings=settings)
     finally:
-        device.release()
+        driver.release()
     return 0 if status.state is ArmState.DISARMED else 1
 
 
@@ -258,11 +267,11 @@ def add_cameras(commands: Commands) -> None:
         "cameras",
         _run_cameras,
         "list cameras; show what they deliver, how steadily and how sharply",
-        "Without a name, list the cameras that are plugged in, by names that stay. With names, watch them\n"
+        "Without a name, list what each driver finds, by names that stay. With names, watch them\n"
         "for a few seconds and tell of each: rate, jitter, lag, offset, sharpness, brightness, the controls it\n"
         "took, and the frames that were missing, frozen or black. A camera is named by /dev/v4l/by-id/...,\n"
-        "/dev/v4l/by-path/..., usb:SERIAL, a URL or a video file; RIG.toml stands for all cameras of a rig, set up\n"
-        "as it says. Exit code 1 where a camera delivers nothing or refuses a control.",
+        "/dev/v4l/by-path/..., usb:SERIAL, genicam://ID, a URL or a video file; RIG.toml stands for all cameras\n"
+        "of a rig, set up as it says. Exit code 1 where a camera delivers nothing or refuses a control.",
         "stillbed cameras",
         "stillbed cameras rig.toml -o sheet.jpg",
         "stillbed cameras rtsp://192.168.0.20/stream --seconds 10",
@@ -274,25 +283,46 @@ def add_cameras(commands: Commands) -> None:
 
 
 def _run_cameras(a: argparse.Namespace) -> int:
+    from hardware.cameras.genicam import INSTALL, list_industrial
     from hardware.cameras.sources import list_devices
 
     if a.which:
         return _watch_cameras(a)
-    devices, keys = list_devices(), ("identity", "name", "serial", "by_id", "by_path")
-    table = [{"node": str(device.node)} | {key: getattr(device, key) for key in keys} for device in devices]
-    print(json.dumps(table, indent=2) if a.json else list_text(devices))
+    devices, industrial = list_devices(), list_industrial()
+    if a.json:
+        print(json.dumps(_cameras_table(devices, industrial or ()), indent=2))
+        return 0
+    print(list_text(devices, industrial or ()))
+    if industrial is None:
+        print(f"\n{NO_ARAVIS_TEXT}\n  {INSTALL}")
     return 0
 
 
-def list_text(devices: tuple[CameraDevice, ...]) -> str:
+def _cameras_table(devices: tuple[CameraDevice, ...], industrial: tuple[IndustrialCamera, ...]) -> list[dict[str, str]]:
+    keys = ("identity", "name", "serial", "by_id", "by_path")
+    return [
+        *({"node": str(d.node), "address": ""} | {key: getattr(d, key) for key in keys} for d in devices),
+        *(
+            dict.fromkeys(("node", "by_id", "by_path"), "")
+            | {"address": c.address, "identity": c.identity, "name": f"{c.maker} {c.model}", "serial": c.serial}
+            for c in industrial
+        ),
+    ]
+
+
+def list_text(devices: tuple[CameraDevice, ...], industrial: tuple[IndustrialCamera, ...] = ()) -> str:
     """A paragraph a camera, or what to do where there is none."""
-    if not devices:
+    if not devices and not industrial:
         return NO_CAMERA_TEXT
     lines = [
         f"{d.identity or 'no name that stays'}\n  {d.name or 'unnamed'}, now {d.node}"
         + (f", serial number {d.serial} (usb:{d.serial})" if d.serial else "")
         + (f"\n  this socket: {d.by_path}" if d.by_path and d.by_path != d.identity else "")
         for d in devices
+    ]
+    lines += [
+        f"{c.identity}\n  {c.maker} {c.model}, serial number {c.serial}" + (f", at {c.address}" if c.address else "")
+        for c in industrial
     ]
     return "\n".join(lines)
 

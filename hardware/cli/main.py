@@ -112,13 +112,13 @@ def add_doctor(commands: Commands) -> None:
 
 
 def _run_doctor(a: argparse.Namespace) -> int:
-    from hardware.cli.doctor import device_checks, library_checks, machine_checks
+    from hardware.cli.doctor import device_checks, extras_check, library_checks, machine_checks
     from hardware.live.checklist import checks_table
     from hardware.operator.view import CheckVerdict
 
     if not a.folder.is_dir():
         raise wrong_option("--folder", a.folder, "a folder that exists")
-    libraries = library_checks()
+    libraries = [*library_checks(), extras_check()]
     machine = machine_checks(a.folder, WallClock())
     broken = any(check.verdict is CheckVerdict.FAIL for check in libraries)
     parts = {"machine": machine, "libraries": libraries, "devices": [] if broken else device_checks()}

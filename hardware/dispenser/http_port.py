@@ -11,7 +11,7 @@ import threading
 from urllib.parse import urlsplit
 
 from estimation.errors import InputError
-from hardware.arm.port import UnpluggedError
+from hardware.arm.driver import UnpluggedError
 
 METHODS = ("GET", "POST", "PUT")
 MAX_BODY = 4096  # bytes of an answer that are read

@@ -14,7 +14,8 @@ from dataclasses import replace
 from typing import Protocol
 
 from estimation.errors import InputError
-from hardware.arm.port import Port, PortOpener, UnpluggedError
+from hardware.arm.driver import UnpluggedError
+from hardware.arm.port import Port, PortOpener
 from hardware.dispenser.dispenser import (
     CLOSE_TIME,
     DispenserEvent,

@@ -11,6 +11,9 @@ pwm = 0                                       # bytes 27 to 30 of a G1 frame: 0,
 pwm_on = 1500                                 # optional, in its place while material is to flow: switches a dispenser
 baud = 115200                                 # or 9600, at which a frame takes 50 ms
 tick_s = 0.02                                 # at least a frame's time on the wire, which is the default where longer
+dead_time_s = 0.0                             # optional, that a command takes to an arm without such a line
+flange_from_nozzle = [[...], ...]             # optional, 4x4, mm, for an arm that is told where its flange goes
+flight_s = 0.05                               # optional, motion that may be under way at once
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
 [limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
@@ -32,6 +35,8 @@ speed_deg_s, acceleration_deg_s2 = [...]
 arm_from_foot = [[...], ...]                  # 4x4, mm, from where the table starts to the arm's frame
 flange_from_nozzle = [[...], ...]             # 4x4, mm
 posture = ["front", "up", "negative"]
+# or, of an arm of another build: name; urdf = "fr3.urdf", beside this file; flange = "link8", the link that carries the
+# tool of flange_from_nozzle; ready_deg = [...], the posture that its joints keep near
 """
 
 from __future__ import annotations
@@ -42,15 +47,19 @@ from pathlib import Path
 
 import numpy as np
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import AXIS_LETTERS, ArmProfile, at_baud
+from hardware.arm.profile import ARM_FROM_BENCH, AXIS_LETTERS, ArmProfile, at_baud, driver_kind, placed
 from hardware.arm.protocol import Dialect
 from hardware.process import checks
+from perception import shipped_file
 from perception.frames import check_profile
 from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
+from planning.urdf import UrdfArm
 
+URDF_KEYS = ("name", "urdf", "flange", "ready_deg")
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
 _RAD = float(np.deg2rad(1.0))  # rad a degree
@@ -103,6 +112,23 @@ def _kinematics_lines(arm: SimpleArm) -> list[str]:
         *(f"{key} = {checks.toml_numbers(getattr(model, key))}" for key in PLACE_KEYS),
         f"posture = {json.dumps(model.posture)}",
     ]
+
+
+def _urdf(path: Path, table: checks.Table) -> UrdfArm:
+    """The arm that a URDF file describes, which is not read here."""
+    checks.check_keys(path, "kinematics.", table, URDF_KEYS, ())
+    name, file, flange = (checks.text(path, f"kinematics.{key}", table[key]) for key in URDF_KEYS[:3])
+    ready = checks.numbers(path, "kinematics.ready_deg", table["ready_deg"], (None,), "degrees") * _RAD
+    return UrdfArm(name, path.parent / file, flange, np.asarray(ready))
+
+
+def _urdf_lines(arm: UrdfArm | None) -> list[str]:
+    """The table of such an arm as lines of TOML."""
+    if arm is None:
+        return []
+    texts = {"name": arm.name, "urdf": str(arm.file.resolve()), "flange": arm.flange}
+    ready = f"ready_deg = {checks.toml_numbers(np.rad2deg(arm.ready))}"
+    return ["", "[kinematics]", *(f"{key} = {json.dumps(text)}" for key, text in texts.items()), ready]
 
 
 ZONE_KINDS = ("half_space", "box", "cylinder")
@@ -164,15 +190,20 @@ FAR_LIMIT = 3.0  # times the S6H4D's own: the operator is told of a limit beyond
 MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
 _AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
 _ANGLES = ("turn", "surface_turn")  # single numbers in rad
-_ARRAYS = {"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)}  # shapes
+_ARRAYS = {  # shapes
+    **{"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)},
+    "flange_from_nozzle": (4, 4),
+}
 ARM_KEYS = (
     *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
+    *("dead_time_s", "flight_s"),
     *("limits", "no_go", "kinematics"),
 )
 # of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
 PART_PREFIXES = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}
 FILE_KEYS = {
     **{"home": "home_mm_deg", "tool_offset": "tool_offset_mm", "tick": "tick_s", "lag": "lag_s", "tool": "tool_mm"},
+    **{"dead_time": "dead_time_s", "flight": "flight_s"},
     "kinematics.dh": "kinematics.dh_mm_deg",
     **{f"kinematics.{name}": f"kinematics.{key}" for key, name in JOINT_KEYS.items()},
 }
@@ -183,6 +214,22 @@ def read_arm(path: str | Path) -> ArmProfile:
     return _profile(Path(path), checks.read_toml(Path(path)))
 
 
+def arm_for(address: str) -> ArmProfile:
+    """The profile that stands in for the arm at an address where no arm file is given."""
+    file = driver_kind(address).file
+    return read_arm(shipped_file("arms", file)) if file else ArmProfile()
+
+
+def arm_over(known: ArmProfile, address: str) -> ArmProfile:
+    """That profile, put so that the surface below the home of a `known` arm is below this one's; or the known one."""
+    if not driver_kind(address).file:
+        return known
+    profile = arm_for(address)
+    base_from_surface = se3.inverse(known.arm.arm_from_base) @ ARM_FROM_BENCH
+    moved = profile.arm.home[:3] - ArmProfile().arm.home[:3]
+    return placed(profile, base_from_surface, se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + moved))
+
+
 def arm_from_text(text: str, where: str | Path) -> ArmProfile:
     """The profile in the text of an arm file; InputError (where) as `read_arm`."""
     return _profile(Path(where), checks.toml_from_text(where, text))
@@ -191,6 +238,8 @@ def arm_from_text(text: str, where: str | Path) -> ArmProfile:
 def _profile(path: Path, table: checks.Table) -> ArmProfile:
     checks.check_keys(path, "", table, (), ARM_KEYS)
     try:
+        kinematics = table.get("kinematics")
+        by_urdf = isinstance(kinematics, dict) and "urdf" in kinematics
         default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
         arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _ARRAYS.items() if key in table}
         return ArmProfile(
@@ -198,7 +247,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
                 arrays.get("arm_from_base", default.arm.arm_from_base),
                 arrays.get("arm_from_upright", default.arm.arm_from_upright),
                 arrays["home_mm_deg"] * _AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
-                *_kinematics(path, table.get("kinematics")),
+                *_kinematics(path, None if by_urdf else kinematics),
                 tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
             ),
             limits=_limits(path, table.get("limits", {}), table.get("no_go")),
@@ -206,6 +255,10 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             baud=default.baud,
             tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
+            flange_from_nozzle=arrays.get("flange_from_nozzle"),
+            urdf=_urdf(path, table["kinematics"]) if by_urdf else None,
+            dead_time=checks.number(path, "dead_time_s", table["dead_time_s"]) if "dead_time_s" in table else None,
+            flight=checks.number(path, "flight_s", table["flight_s"]) if "flight_s" in table else None,
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
         )
     except InputError as error:
@@ -235,12 +288,20 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         f"baud = {profile.baud}",
         f"tick_s = {checks.toml_number(profile.tick)}",
         f"lag_s = {checks.toml_number(profile.lag)}",
+        *([] if profile.dead_time is None else [f"dead_time_s = {checks.toml_number(profile.dead_time)}"]),
+        *(
+            []
+            if profile.flange_from_nozzle is None
+            else [f"flange_from_nozzle = {checks.toml_numbers(profile.flange_from_nozzle)}"]
+        ),
+        *([] if profile.flight is None else [f"flight_s = {checks.toml_number(profile.flight)}"]),
         f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
         *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMIT_KEYS),
         *_no_go_lines(limits.zones),
         *_kinematics_lines(arm),
+        *_urdf_lines(profile.urdf),
     ]
     return "\n".join(lines) + "\n"
 
@@ -306,6 +367,19 @@ def far_limits_text(limits: MotionLimits) -> str:
             of = f" of {AXIS_LETTERS[axis]}" if name in _AXES else ""
             far.append(f"limits.{name} = {value[axis]:g}{of}, {times[axis]:.3g} times its {known[axis]:g}")
     return f"limits far beyond a SEED S6H4D's: {'; '.join(far)}. Does this arm bear them?" if far else ""
+
+
+def unreached_limits_text(profile: ArmProfile) -> str:
+    """One line about speeds that the planner never reaches, as jump and turn in a tick allow less; "" without any."""
+    limits, unit = profile.limits, _unit("speed")
+    most = limits.per_tick(profile.tick)
+    axes = np.flatnonzero(most < limits.speed * (1 - _ROUNDING)).tolist()
+    groups: dict[str, list[str]] = {}
+    for i in axes:
+        groups.setdefault(f"{(limits.speed / unit)[i]:g}, at most {(most / unit)[i]:.1f}", []).append(AXIS_LETTERS[i])
+    told = "; ".join(f"{' '.join(letters)} {each}" for each, letters in groups.items())
+    why = f"limits.jump and limits.turn of a tick of {profile.tick:g} s hold for all axes together"
+    return f"limits.speed that is never reached: {told}, as {why}" if told else ""
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:

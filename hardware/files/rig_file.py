@@ -24,7 +24,7 @@ CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
 SIGMA_KEY = "lens_sigma"  # standard deviations of fx fy cx cy k1 k2 p1 p2 k3, where a calibration gave them
 RECORDED_KEYS = ("video", "images")  # where a recorded session's images are
 # of live cameras, read by hardware/cameras
-LIVE_KEYS = ("source", "exposure_s", "gain", "focus_abs", "white_balance_k", "fps", "format")
+LIVE_KEYS = ("source", "exposure_s", "gain", "focus_abs", "white_balance_k", "fps", "format", "trigger", "ptp")
 PINHOLE = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px"
 ROTATION_TOLERANCE = 1e-3  # four digits written by hand pass (and are made orthonormal); a wrong matrix does not
 EXACT_ROTATION = 1e-12  # below, the matrix is kept bit by bit, so that a rig written by us comes back the same

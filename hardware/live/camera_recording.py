@@ -19,7 +19,7 @@ from typing import TextIO
 
 from estimation.errors import InputError
 from estimation.rig import Rig
-from hardware.cameras.feed import CameraPhase, CameraState
+from hardware.cameras.feed import CameraPhase, CameraState, FrameFault
 from hardware.cameras.inspection import sharpness
 from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
 from hardware.live.frame_source import LiveCameraSource, SourceEnded, TimedFrameSet
@@ -306,6 +306,7 @@ class CameraRecording:
             lines.append(f"frame sets left out, as a newer one was there: {self._passed}")
         if self._lost:
             lines.append(f"without pictures for a while: {', '.join(self._lost)}")
+        lines += filter(None, map(_losses, self._source.health().cameras))
         lines += [f"never came: {state.name}" for state in self._source.health().cameras if not state.given]
         if not self._sets:
             self.failed = True
@@ -320,3 +321,12 @@ class CameraRecording:
 
     def _say(self, text: str) -> None:
         print(text, file=sys.stderr if self._stream is None else self._stream, flush=True)
+
+
+def _losses(state: CameraState) -> str:
+    """How many pictures of a camera were left out, as parts of them were lost on the way; "" for none."""
+    count, transport = state.faults.get(FrameFault.INCOMPLETE, 0), state.transport
+    if transport is None or not (count or transport.frames_lost):
+        return ""
+    whole = f", and {transport.frames_lost} lost altogether" if transport.frames_lost else ""
+    return f"{state.name}: {count} pictures left out, as packets were missing ({transport.lost}){whole}"

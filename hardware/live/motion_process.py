@@ -19,8 +19,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
-from hardware.arm.port import Port, PortOpener
-from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag
+from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag, open_arm
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared
@@ -149,29 +148,6 @@ class LiveMotion:
             self._material.begin(self._step.progress.fraction, WallClock().now())
 
 
-ByteListener = Callable[[bytes, bool], None]  # (bytes, whether they were sent rather than received)
-
-
-class _LoggedPort:
-    """A port whose listener is called with all bytes that pass."""
-
-    def __init__(self, port: Port, listener: ByteListener) -> None:
-        self._port, self._listener = port, listener
-        self.waiting, self.close = port.waiting, port.close
-
-    def write(self, data: bytes) -> int:
-        count = self._port.write(data)
-        if count:
-            self._listener(data[:count], True)
-        return count
-
-    def read(self) -> bytes:
-        data = self._port.read()
-        if data:
-            self._listener(data, False)
-        return data
-
-
 class _OrderReceiver:
     """Takes the orders: those of a live run are followed here, those of the arm are returned.
 
@@ -289,7 +265,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     """
     settings, profile = prepared.settings, prepared.task.profile
     set_up_process("motion", settings.cores_motion, outlives=True)
-    clock, device, sender = WallClock(), PortOpener(channels.url, profile.baud), RecorderSender(channels.recorder)
+    clock, sender = WallClock(), RecorderSender(channels.recorder)
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
@@ -297,8 +273,9 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     reporter = _TickReporter(channels, sender, ticks, priority)
     motion = LiveMotion(profile, channels.place, material, reporter.arm_lag)
     orders = _OrderReceiver(channels, motion, ticks)
+    driver = open_arm(channels.url, profile, reporter.bytes_passed)
     try:
-        arm = Arm(lambda: _LoggedPort(device(), reporter.bytes_passed), profile, clock.now(), link_settings)
+        arm = Arm(driver, profile, clock.now(), link_settings)
         reporter.motion = motion
         poses, report = reporter.newest_pose, reporter.report
         loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks, material)
@@ -312,7 +289,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     except StillbedError as error:  # the arm cannot be used, or nothing is recorded any more
         channels.trouble.put(str(error))
     finally:
-        device.release()
+        driver.release()
         if orders.alone and orders.fingerprint:
             write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.value)
         for entry in reporter.times.entries(clock.now()):

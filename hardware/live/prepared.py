@@ -27,7 +27,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.dispenser.dispenser import check_path_materials
-from hardware.files.arm_file import far_limits_text, read_arm
+from hardware.files.arm_file import arm_over, far_limits_text, read_arm
 from hardware.files.dispenser_file import (
     dispensers_from_text,
     drivers_of,
@@ -247,7 +247,7 @@ def _prepared(
     if scenario is not None:
         rendered = _rendered(scenario, check_rig)
         session, virtual = rendered / RENDERED, rendered / "virtual_arm.toml"
-        given = given or read_arm(rendered / "arm.toml")
+        given = given or arm_over(read_arm(rendered / "arm.toml"), settings.arm)
         path = read_path(rendered / "path.csv") if settings.path is None else path
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None

@@ -245,6 +245,11 @@ def printed_range(record: File) -> tuple[float, float]:
     return (min(places), max(places)) if places else (float("nan"), float("nan"))
 
 
+def commands_of(record: File) -> list[tuple[Command, PrintProgress]]:
+    """A recorded run's commands in order, with the place on the path."""
+    return _commands(_read_run(record, "/tick", "/move"))
+
+
 def _commands(run: _RecordedRun) -> list[tuple[Command, PrintProgress]]:
     """Commands in order, with the place on the path."""
     ticks = {m["stamp"]: m for m in run.messages["/tick"]}

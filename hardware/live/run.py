@@ -25,8 +25,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
-from hardware.arm.link import emergency_stop
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, emergency_stop
 from hardware.dispenser.dispenser import switch_off
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import ProgressWriter

@@ -18,8 +18,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
-from hardware.arm.port import PortOpener
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import WallClock
 from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
@@ -138,8 +137,8 @@ def motion_process(
     plan: MotionPlan, poses: SharedLatest[SurfacePose], reports: SharedLatest[MotionReport], orders: Connection
 ) -> None:
     """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
-    clock, device = WallClock(), PortOpener(plan.url, plan.profile.baud)
-    arm, motion = Arm(device, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
+    clock, driver = WallClock(), open_arm(plan.url, plan.profile)
+    arm, motion = Arm(driver, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
     priority = ask_for_real_time() if plan.real_time else "nothing asked for"
     events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
 
@@ -158,4 +157,4 @@ def motion_process(
     finally:
         loop = None  # report and loop refer to each other: the planner's solver would live until the process ends
         arm.close()
-        device.release()
+        driver.release()

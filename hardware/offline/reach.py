@@ -13,7 +13,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.files.arm_file import far_limits_text, read_arm
+from hardware.files.arm_file import far_limits_text, read_arm, unreached_limits_text
 from hardware.files.path_file import read_path, write_path
 from hardware.process.progress import duration_text, prepare_out
 from hardware.report.page import (
@@ -30,6 +30,7 @@ from hardware.report.page import (
 from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
 from planning.motion.retime import run_times
 from planning.path import REACH_REASONS, Path, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
+from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
 
 PAGE_WIDTH_PX = 900
 PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS = "estimate", "off", "aside"  # classes of report.css
@@ -116,10 +117,12 @@ def run_reach(
     if out is not None:
         prepare_out(out, force)
     model, motion, reach = _evaluated(checkpoints, arm, question)
-    best, profile = best_posture(model, _arm_from_surface(question), checkpoints, motion), read_arm(arm)
+    best, profile = None, read_arm(arm)
+    if isinstance(model, JointModel):
+        best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
     seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
     text = reach_text(model, reach, best, question, seconds)
-    text = "\n".join(filter(None, [text, far_limits_text(profile.limits)]))
+    text = "\n".join(filter(None, [text, far_limits_text(profile.limits), unreached_limits_text(profile)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
@@ -133,13 +136,32 @@ def with_feasible(path: Path, arm: File) -> tuple[Path, str]:
     return with_feasible_column(path, reach), f"arm {model.name}: {count}; how, and on a moving one: stillbed reach"
 
 
-def _evaluated(path: Path, arm: File, question: ReachQuestion) -> tuple[JointModel, SurfaceMotion, Reach]:
+def _evaluated(
+    path: Path, arm: File, question: ReachQuestion
+) -> tuple[JointModel | UrdfKinematics, SurfaceMotion, Reach]:
     """The arm's model, the surface's motion, and the arm's reach along the path over that motion."""
+    profile = read_arm(arm)
+    if profile.urdf is not None:
+        return _evaluated_by_urdf(profile, profile.urdf, path, question)
     profile, model = read_jointed_arm(arm)
     motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
     place = _arm_from_surface(question)
     spin = best_spin(model, place, path, motion) if question.spin else np.zeros(len(path))
     return model, motion, _within(profile, place, path, motion, reach_at_spin(model, place, path, motion, spin))
+
+
+def _evaluated_by_urdf(
+    profile: ArmProfile, arm: UrdfArm, path: Path, question: ReachQuestion
+) -> tuple[UrdfKinematics, SurfaceMotion, Reach]:
+    """The same of an arm whose joints a URDF file describes; its tool is not spun."""
+    if question.spin:
+        raise InputError("command line", "--spin", "given", "an arm of six joints with a table of them")
+    if profile.flange_from_nozzle is None:
+        raise InputError(arm.file, "flange_from_nozzle", "missing", "a 4x4 matrix in the arm file, mm")
+    model = UrdfKinematics(arm, profile.flange_from_nozzle)
+    motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
+    place = _arm_from_surface(question, profile)
+    return model, motion, _within(profile, place, path, motion, urdf_reach(model, place, path, motion))
 
 
 def read_jointed_arm(arm: File) -> tuple[ArmProfile, JointModel]:
@@ -156,29 +178,45 @@ def with_feasible_column(path: Path, reach: Reach) -> Path:
     return replace(path, surface_from_nozzle=spin_path(path, reach.spin), extra={**path.extra, "feasible": column})
 
 
-def reach_text(model: JointModel, reach: Reach, best: tuple[int, int], question: ReachQuestion, seconds: float) -> str:
+def reach_text(
+    model: JointModel | UrdfKinematics,
+    reach: Reach,
+    best: tuple[int, int] | None,
+    question: ReachQuestion,
+    seconds: float,
+) -> str:
     """The answer as a table of text.
 
-    best: posture by its row of POSTURES, and its number of printable checkpoints. seconds: that a run takes.
+    best: posture by its row of POSTURES, and its number of printable checkpoints; None of an arm by a URDF file.
+    seconds: that a run takes.
     """
+    if not isinstance(model, JointModel):
+        posture, nominal = f"near {', '.join(f'{angle:.0f}' for angle in np.rad2deg(model.ready))} degrees", False
+    else:
+        posture, nominal = ", ".join(model.posture), model.nominal
+    singular = [("least manipulability", f"{np.nanmin([*reach.manipulability, np.inf]):.3f}")]
+    if isinstance(model, JointModel):
+        singular = [
+            ("nearest to a singular wrist", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
+            ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
+            ("wrist to the first axis", f"{_smallest(reach.shoulder)} mm"),
+        ]
     count, good = len(reach.reason), int(reach.feasible.sum())
     speed = reach.speed[np.isfinite(reach.speed)]
     swing = f"{question.amplitude_mm:g} mm and {question.turn_deg:g} degrees at {question.rate_hz:g} Hz"
     rows = [
-        ("arm", model.name + (" (NOMINAL: its numbers are made up)" if model.nominal else "")),
-        ("posture", ", ".join(model.posture)),
+        ("arm", model.name + (" (NOMINAL: its numbers are made up)" if nominal else "")),
+        ("posture", posture),
         ("surface moves by", f"+-{swing}" if question.amplitude_mm or question.turn_deg else "nothing"),
         ("checkpoints", f"{good} of {count} can be printed"),
         *((f"  {name}", str(int((reach.reason == i).sum()))) for i, name in enumerate(REACH_REASONS) if i),
         ("nearest to a joint's end", f"{_smallest(np.rad2deg(reach.bound))} degrees"),
-        ("nearest to a singular wrist", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
-        ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
-        ("wrist to the first axis", f"{_smallest(reach.shoulder)} mm"),
+        *singular,
         ("most of a joint's speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
         ("a run over a surface at rest", f"{duration_text(seconds)} once it is at the first checkpoint"),
         ("spin of the tool", f"{np.rad2deg(reach.spin.min()):.0f} to {np.rad2deg(reach.spin.max()):.0f} degrees"),
     ]
-    if best[1] > good:
+    if best is not None and best[1] > good:
         names = zip(POSTURES[best[0]], (SHOULDERS, ELBOWS, WRISTS), strict=True)
         posture = ", ".join(pair[0 if sign > 0 else 1] for sign, pair in names)
         rows.append(("better posture", f"{posture}: {best[1]} of {count}, without spin"))
@@ -186,7 +224,10 @@ def reach_text(model: JointModel, reach: Reach, best: tuple[int, int], question:
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
 
-def _arm_from_surface(question: ReachQuestion) -> Array:
+def _arm_from_surface(question: ReachQuestion, profile: ArmProfile | None = None) -> Array:
+    """Where the surface is; by default on the bench, or as far below the home of `profile`."""
+    if question.surface is None and profile is not None:
+        return se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + (profile.arm.home - ArmProfile().arm.home)[:3])
     if question.surface is None:
         return ARM_FROM_BENCH
     values = np.array(question.surface, float)
@@ -211,7 +252,8 @@ def _write(out: File, path: Path, reach: Reach) -> None:
     )
     with (out / "reach.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(REACH_COLUMNS)
+        more = (f"j{i}_deg" for i in range(7, reach.joints.shape[1] + 1))
+        writer.writerow([*REACH_COLUMNS[:9], *more, *REACH_COLUMNS[9:]])
         for i, row in enumerate(table.tolist()):
             numbers = [f"{value:.4f}" if np.isfinite(value) else "" for value in row]
             writer.writerow([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])

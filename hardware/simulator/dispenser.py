@@ -22,7 +22,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.port import UnpluggedError
+from hardware.arm.driver import UnpluggedError
 from hardware.process.checks import error_text
 from hardware.process.clock import Clock, WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking

@@ -1,20 +1,31 @@
-"""What must not be tracked, as it moves otherwise than the surface: the print head, fresh ink, and highlights."""
+"""What is not the surface: the print head, fresh ink and highlights, which are not tracked; and what colours tell.
+
+Hairs, a film, gauze carry more texture than the tissue under them, and tracks that follow them agree with each other.
+The tissue has its colours: a wound, its rim, the edge of a cloth. Shadows and shading change all channels of a picture
+by one factor, so the ratios of channels are compared with those of the first pictures. All cameras together tell by
+which displacement of the tissue the difference is explained (Lucas and Kanade 1981, on the surface, in three
+dimensions). Uniform skin tells nothing, nor does what a print head, ink or a highlight hides; grey cameras neither.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, cKDTree
 
 from estimation import se3
-from estimation.se3 import Array
+from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces
+from estimation.runtime import median
+from estimation.se3 import Array, Mask
+from estimation.surface_map import SurfaceMap, Warp, bells
 from perception.frames import SYRINGE, Image, PrintHead, check_profile
 from perception.lens import Lenses
+from perception.mapping.aliases import TangentPlane
 from perception.mapping.alignment_kernels import PATCH_RADIUS
 from perception.mapping.features import ImageMask
 
@@ -165,3 +176,173 @@ def highlights(image: Image, region: ImageMask) -> ImageMask:
         return np.zeros_like(region)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * HIGHLIGHT_HALO_PX + 1, 2 * HIGHLIGHT_HALO_PX + 1))
     return np.asarray(cv2.dilate(bright, around), np.uint8)
+
+
+PLACE_STEP_MM = 2.0  # between the places that are looked at: a wound's rim is as wide
+CELL_MM = 1.2  # of the surface that one value averages: noise of the pixels, and chroma that cameras subsample
+BELL_MM = 7.0  # one sigma: places that move together, and as far apart
+DARK_LEVELS = 8.0  # grey levels added to each channel: ratios of darker ones are noise
+LIGHT_SIGMA = 0.5  # of the logarithm of a place's brightness, by which those levels change a ratio: shadows, shading
+CLIPPED = 245.0  # grey level at which a channel may be clipped: a highlight
+MIN_NOISE = 0.01  # one sigma of a ratio's logarithm: the first picture's own, and light that is never quite the same
+FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
+SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference no longer grows with the displacement
+MIN_SHIFT_MM = 0.6  # that is told: a bit more than the guard allows
+MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
+MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
+MIN_SEEN_SHARE = 0.5  # of a bell's places
+MIN_SECOND_SHARE = 0.1  # of what a displacement explains, that is the share of a second camera
+MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
+MIN_COSINE = 0.7  # of the angle between one displacement and all
+USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
+MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
+WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
+MIN_PLACES = 20  # of a camera, to compare its picture
+AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
+UNSEEN_PX = -1e6  # where a place is said to be that a camera cannot see: out of every picture
+
+
+@dataclass(slots=True, eq=False)
+class _FirstPicture:
+    """How one camera first saw P places."""
+
+    scale: int  # pixels of the picture to one of its averages
+    ratios: Array  # (2, P) logarithms, red and blue to green
+    slopes: Array  # (2, P, 3) by a displacement of the surface, 1/mm, along both tangents and the normal
+    squares: Array  # (2, P, 9) outer products of the slopes
+    free: Mask  # (P,) places that are seen, and not clipped
+    noise: Array  # (2,) one sigma
+
+
+class Colours:
+    """Remembers the colours of one surface, and where they stand off its texture."""
+
+    def __init__(self, lenses: Lenses, masks: TrackingMasks) -> None:
+        """masks: where the print head hides the surface."""
+        self._lenses, self._masks = lenses, masks
+        self._first: dict[int, _FirstPicture] = {}
+
+    def begin(self, images: Mapping[int, Image], poses: Mapping[int, Array], surface_map: SurfaceMap) -> None:
+        """Learn a surface by pictures (by camera) in which it stands at `poses` (4, 4), each camera's own."""
+        self._first = {}
+        try:
+            plane = TangentPlane(surface_map)
+        except QhullError:  # landmarks on one line
+            return
+        self._axes = np.stack([*plane.axes, plane.normal])
+        self._points, self._centres = (_spread(plane, step) for step in (PLACE_STEP_MM, BELL_MM))
+        if not len(self._points) or not len(self._centres):
+            return
+        self._bells = bells(self._points, self._centres, BELL_MM).T
+        self._inked = np.zeros(len(self._points), bool)
+        self._sizes = np.zeros(len(self._centres))  # mm, of each bell while it is displaced, the largest since; else 0
+        for camera, image in images.items():
+            if camera in poses and image.ndim == 3:
+                self._first[camera] = self._picture(camera, image, poses[camera])
+
+    def cover(self, bead: Array) -> None:
+        """A bead (M, 3) mm, surface frame, lies on the surface: the colours there are its own from now on."""
+        if self._first:
+            self._inked |= near_bead(self._points, bead, np.full(len(self._points), CELL_MM))
+
+    def __call__(
+        self, images: Mapping[int, Image], poses: Mapping[int, Array], warp: Warp | None = None
+    ) -> DisplacedPlaces:
+        """Where colours contradict a pose: `poses` (4, 4) at each camera's exposure, of those that carry it."""
+        if not self._first:
+            return NOTHING_DISPLACED
+        points = self._points if warp is None else warp.apply(self._points)
+        sums = np.zeros((len(points), 14))  # normal equations, energy and number, of all cameras
+        pulls = list[Array]()  # (K, 3) of each
+        for camera, first in self._first.items():
+            if camera not in images or camera not in poses:
+                continue
+            pixels = self._pixels(camera, poses[camera], points)
+            now, dark, free = _ratios(images[camera], first.scale, pixels)
+            free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
+            if np.count_nonzero(free) < MIN_PLACES:
+                continue
+            before = sums[:, 9:12].copy()
+            for k in range(2):
+                away = now[k] - first.ratios[k]
+                away -= median(away[free])
+                first.noise[k] += (1.4826 * median(np.abs(away[free])) - first.noise[k]) / NOISE_MEMORY_SETS
+                precision = free / (max(first.noise[k], MIN_NOISE) ** 2 + (LIGHT_SIGMA * dark[k]) ** 2)
+                sums[:, :9] += precision[:, None] * first.squares[k]
+                sums[:, 9:12] -= (precision * away)[:, None] * first.slopes[k]
+                sums[:, 12] += precision * away * away
+                sums[:, 13] += free
+            pulls.append(self._bells @ (sums[:, 9:12] - before))
+        if not pulls:
+            return NOTHING_DISPLACED
+        summed = self._bells @ sums
+        whole = 2 * len(pulls) * self._bells.sum(1)
+        known = np.where(summed[:, 13] > MIN_SEEN_SHARE * whole, summed[:, 13], np.inf)  # else its edge looks displaced
+        return self._judge(summed[:, :9].reshape(-1, 3, 3), np.stack(pulls), summed[:, 12], known)
+
+    def _judge(self, normal: Array, pulls: Array, energy: Array, known: Array) -> DisplacedPlaces:
+        """By normal equations (K, 3, 3), (C, K, 3) of each camera and bell, squared sigmas and how many are usual."""
+        pull = pulls.sum(0)
+        shift = np.linalg.solve(normal + np.eye(3) / SHIFT_PRIOR_MM**2, pull[..., None])[..., 0]
+        size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
+        begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
+        begins &= explained > MIN_EXPLAINED * (energy - known)
+        if len(pulls) > 1:  # else it may be what one camera sees there: a print head that its first picture showed
+            begins &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
+        way = (explained * begins) @ shift  # what moves goes one way; highlights go theirs
+        begins &= shift @ way > MIN_COSINE * size * np.linalg.norm(way)
+        begins &= begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))
+        lasts = (self._sizes > 0) & (np.isinf(known) | (energy > USUAL_RATIO * known))
+        self._sizes = np.where(begins | lasts, np.maximum(self._sizes, np.where(begins, size, 0.0)), 0.0)
+        apart = self._sizes > 0
+        if not apart.any():
+            return NOTHING_DISPLACED
+        tells = np.linalg.eigvalsh(normal)[:, 1] > MIN_TOLD_MM**-2.0
+        whole = int((apart & tells).sum()) > WHOLE_SHARE * int(tells.sum())
+        return DisplacedPlaces(self._centres[apart], self._sizes[apart], BELL_MM, whole)
+
+    def _picture(self, camera: int, image: Image, pose: Array) -> _FirstPicture:
+        pixels = self._pixels(camera, pose, self._points)
+        beside = self._pixels(camera, pose, self._points + self._axes[0])
+        scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(beside - pixels, axis=1)))))
+        ratios, _, free = _ratios(image, scale, pixels)
+        ends = [
+            _ratios(image, scale, self._pixels(camera, pose, self._points + side * axis))[0]
+            for axis in self._axes
+            for side in (1, -1)
+        ]
+        slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
+        squares = (slopes[..., :, None] * slopes[..., None, :]).reshape(2, -1, 9)
+        for around in 2 * scale * AROUND:  # what an average or a slope reaches must be the surface's as well
+            free &= ~self._masks.hides(camera, pixels + around)
+        return _FirstPicture(scale, ratios, slopes, squares, free, np.full(2, FIRST_NOISE))
+
+    def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
+        """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px, far off for those unseen."""
+        in_camera = se3.transform_points(self._lenses.rig.camera_from_base[camera] @ pose, points)
+        depth = np.maximum(in_camera[:, 2], 1.0)
+        imaged, seen = self._lenses.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
+        return np.asarray(np.where(seen, imaged, UNSEEN_PX).T)
+
+
+def _spread(plane: TangentPlane, step: float) -> Array:
+    """Points (N, 3) mm of a surface, among its landmarks, a step, mm, apart."""
+    cells = max(1, int(np.ptp(plane.places, axis=0).max() / step))
+    flat = plane.grid(cells)[0].reshape(-1, 2)
+    return plane.lift(flat[plane.inside(flat)])[0]
+
+
+def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array, Mask]:
+    """Logarithms (2, N) of red and blue to green at pixels (N, 2), averaged over `scale` of them; how fast each changes
+    (2, N) with the logarithm of the brightness, where a channel is dark; and which (N,) are in view and not clipped."""
+    size = np.array(image.shape[1::-1]) // scale
+    low = np.clip(pixels.min(0) // scale - 2, 0, size - 1).astype(int)
+    width, height = np.clip(pixels.max(0) // scale + 3, low + 1, size).astype(int) - low
+    part = image[low[1] * scale : (low[1] + height) * scale, low[0] * scale : (low[0] + width) * scale]
+    small = cv2.resize(part, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+    across, down = ((pixels + 0.5) / scale - 0.5 - low).astype(np.float32).T
+    in_view = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
+    levels = cv2.remap(small.astype(np.float32), across[None], down[None], cv2.INTER_LINEAR)[0]
+    blue, green, red = (levels.astype(float) + DARK_LEVELS).T
+    ratios = np.log(np.stack([red, blue]) / green)
+    return ratios, DARK_LEVELS * (1 / green - 1 / np.stack([red, blue])), in_view & (levels.max(1) < CLIPPED)

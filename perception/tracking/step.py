@@ -25,10 +25,9 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import DuplicateFilter, FrameSet, Image, Roi, of_whole_pictures, parallel_map
 from perception.lens import Lenses, unfiltered
-from perception.mapping.aliases import Colours
 from perception.mapping.features import Relocaliser, grey
 from perception.mapping.mapping import Mapping, TrackedSet
-from perception.mapping.masks import Tool, TrackingMasks
+from perception.mapping.masks import Colours, Tool, TrackingMasks
 from perception.mapping.matcher import Matcher
 from perception.mapping.patches import Pyramid
 from perception.mapping.verification import (

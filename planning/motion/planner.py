@@ -26,6 +26,8 @@ from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
 from planning.material import FlowCommands, FlowOrder, Outlets, RestsAhead, material_plan
 from planning.motion.curve import (
     HORIZON_TIME,
+    LOOKAHEAD,
+    AxisFollower,
     Gridpoints,
     PathCurve,
     curve_through,
@@ -35,7 +37,6 @@ from planning.motion.curve import (
     point_above,
     straight_curve,
 )
-from planning.motion.follow import LOOKAHEAD, AxisFollower
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import Path, PrintPhase, PrintProgress, check_path, check_start
 

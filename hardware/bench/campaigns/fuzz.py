@@ -26,8 +26,9 @@ from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm import protocol
+from hardware.arm.driver import G1, Reply, ReplyKind
 from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream, Reply, ReplyKind
+from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
 from hardware.bench.campaigns.fuzz_process import (
     Reader,
     ReaderSum,
@@ -313,7 +314,7 @@ def _decoded(path: Path) -> str:
 
 def readers() -> dict[str, Reader]:
     """All of them by name."""
-    move = protocol.encode(protocol.G1(np.array([202.5, 225, 113, 0, 0.1, 0]), 5.0), protocol.THESIS_DIALECT) * 4
+    move = protocol.encode(G1(np.array([202.5, 225, 113, 0, 0.1, 0]), 5.0), protocol.THESIS_DIALECT) * 4
     reply = protocol.encode_reply(Reply(ReplyKind.PLACE, np.array([1.0, 2, 3]))) * 6
     frames, replies = (FRAME_LENGTH, FRAME_TAILS, protocol.decode), (REPLY_LENGTH, REPLY_TAILS, protocol.decode_reply)
     sources = [ImageSource("video", f"{k}.avi") for k in range(3)]

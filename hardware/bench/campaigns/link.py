@@ -18,6 +18,7 @@ from hardware.arm.device import BY_OPERATOR, ArmState
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings, at_baud
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
+from hardware.arm.s6h4d import S6H4D
 from hardware.bench.figures import Figure, at_most, milliseconds, with_progress
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
@@ -148,7 +149,7 @@ class LinkRun:
         self._blocked = port.blocked
         device = VirtualDevice(self._virtual, self._clock, profile.baud, port, seed, _PortLogger(counts))
         self._stalls = windows(rng, 30.0, MAX_STALL)  # of the host's loop
-        self._arm = Arm(device, profile, 0.0, LinkSettings(poll=POLL_INTERVAL))
+        self._arm = Arm(S6H4D(device, profile), profile, 0.0, LinkSettings(poll=POLL_INTERVAL))
         self._phase, self._last_frame, self._frames, self._stops = 0.0, -1.0, 0, 0
 
     def run(self) -> None:

@@ -23,7 +23,8 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm import protocol
-from hardware.arm.protocol import G1, G4, G54, ControllerReset, Dialect, Instruction, Mode
+from hardware.arm.driver import G1, G4, G54
+from hardware.arm.protocol import ControllerReset, Dialect, Instruction, Mode
 from hardware.process.faults import Fault, FaultPart, WorkRates, WorkStretches, faults_striking
 from hardware.simulator.arm.settings import ArmSettings, FaultyLine, Telemetry
 from planning.command import MIN_TRAVEL

@@ -24,7 +24,7 @@ import numpy as np
 import serial
 
 from estimation.errors import InputError
-from hardware.arm.port import UnpluggedError
+from hardware.arm.driver import UnpluggedError
 from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
 from hardware.process.checks import error_text
 from hardware.process.clock import Clock, WallClock

@@ -32,8 +32,9 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.arm.driver import Reply, ReplyKind
 from hardware.arm.profile import BITS_PER_BYTE
-from hardware.arm.protocol import FRAME_LENGTH, Reply, ReplyKind, encode_reply
+from hardware.arm.protocol import FRAME_LENGTH, encode_reply
 from hardware.process import checks
 from hardware.process.faults import (
     Fault,

@@ -1,7 +1,4 @@
-"""How a scene looks: skin and lamps, light that leaves a surface, printed beads, the image sensor, and the drape.
-
-The surgical drape is a height field that follows the body near the opening and rests on the table far away.
-"""
+"""How a scene looks: skin and lamps, light off a surface, printed beads, the surgical drape, the image sensor."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Pictures of a scene: what each camera sees at each instant; and single ones with exact ground truth.
-
-The nozzle is in front of what is behind it. Single pictures are of wounds with their masks, to train and to judge the
-segmentation and to be published, and of calibration boards with their corners.
-"""
+"""Pictures of a scene: what each camera's image is at each instant, the nozzle in front of what is behind it."""
 
 from __future__ import annotations
 

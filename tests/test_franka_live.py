@@ -1,0 +1,190 @@
+"""Live runs with a Franka in MuJoCo: `make counterparts`. Where its nozzle was, the simulator's own flange says."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile
+from hardware.files.arm_file import arm_over, write_arm
+from hardware.files.path_file import read_path
+from hardware.live.recorded_run import ReplayedTick, commands_of, replay_run
+from hardware.simulator.truth import Truth, TruthLog, row_instants
+from planning.path import PrintPhase
+from tests.arm_benches import closing_bench
+from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, installed
+from tests.light_live import HOME, TILT, prepare_files
+from tests.live_runs import CLOCK, Running, messages
+from tests.moving import breathing
+from tests.test_arm_laws import straight
+from tests.test_live_run import confirmed
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
+ADDRESS = f"franka://{HOST}"
+HEIGHT = 2.0  # mm up and 2 mm down: breaths of 4 mm
+STANDSTILL = 0.05  # mm from where it comes to rest
+
+
+class Live:
+    """A simulated Franka and the runs that print with it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.runs = folder, list[Running]()
+        prepare_files(folder, lines=12, speed=5.0)
+        profile = arm_over(ArmProfile(), ADDRESS)
+        home = profile.arm.home.copy()
+        home[2] += HOME - ArmProfile().arm.home[2]
+        self.profile = replace(profile, arm=replace(profile.arm, home=home))
+        write_arm(folder / "arm.toml", self.profile, "near the surface")
+        self.server = FrankaServer(folder)
+
+    def start(self, record: Path, *flags: str) -> Running:
+        program = "tests.light_live", str(self.folder), str(record), *flags
+        self.runs.append(Running(ADDRESS, f"--height={HEIGHT}", cache=self.folder, program=program))
+        return self.runs[-1]
+
+    def close(self) -> None:
+        for run in self.runs:
+            run.close()
+        if self.server.process is not None:
+            self.server.end(signal.SIGKILL)
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[Live]:
+    made = Live(tmp_path)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+class _Breathing:
+    """The true motion of the surface."""
+
+    def __call__(self, times: Array) -> Array:
+        return np.stack([breathing(t, height=HEIGHT, tilt=TILT) for t in times])
+
+    def twist(self, times: Array) -> Array:
+        raise NotImplementedError
+
+
+def nozzle_errors(record: Path, path: Path, profile: ArmProfile, stamps: Array, axes: Array) -> tuple[Array, float]:
+    """Error (N,), mm, of each extruding millisecond by the true nozzle, and the duty."""
+    commands = commands_of(record)
+    log = TruthLog(read_path(path), profile.arm, Truth(np.eye(4), _Breathing()), profile.tick, profile.lag)
+    for command, progress in commands:
+        log.write(command, progress)
+    printed = PrintPhase.LEAVING, PrintPhase.FINISHED
+    end = min([c.stamp for c, p in commands if p.phase in printed], default=np.inf)
+    last = min(log.known_until, float(stamps[-1]), end)
+
+    def axes_at(times: Array) -> Array:
+        return np.stack([np.interp(times, stamps, axes[:, i]) for i in range(6)], axis=1)
+
+    rows = log.rows(row_instants(commands[0][0].stamp, last), axes_at, None)
+    known = rows.extrude & np.isfinite(rows.place)
+    off = rows.base_from_nozzle[known, :3, 3] - rows.base_from_target[known, :3, 3]
+    due = int((np.isfinite(rows.place) & (rows.place > 0)).sum())
+    return np.linalg.norm(off, axis=1), int(rows.extrude.sum()) / due
+
+
+def test_a_breathing_surface_is_printed_and_the_true_flange_says_how_well(live: Live) -> None:
+    record = live.folder / "run.mcap"
+    run = live.start(record, "--yes", "--until-printed")
+    run.wait_for(r"\nprint\n")
+    run.wait_for("done|finished|ended")
+    code = run.end()
+    stamps, axes = live.server.truth(live.profile)
+    errors, duty = nozzle_errors(record, live.folder / "path.csv", live.profile, stamps, axes)
+    p95, most, load = float(np.percentile(errors, 95)), float(errors.max()), os.getloadavg()[0]
+    rate = len(stamps) / (stamps[-1] - stamps[0]) / 1000
+    words = (
+        f"P95 {p95:.2f} mm, max {most:.2f} mm, duty {100 * duty:.0f} %, load {load:.1f}, physics at {rate:.2f} of time"
+    )
+    print(words)
+    assert code == 0, run.said
+    ticks: list[ReplayedTick] = list(replay_run(record))
+    assert len(ticks) > 200 and all(tick.frame == tick.recorded for tick in ticks)
+    assert p95 <= 0.5 and most <= 1.0 and duty >= 0.8, words
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
+def test_a_robot_that_is_gone_is_held_in_time_and_printing_goes_on_where_it_was(
+    live: Live, number: signal.Signals
+) -> None:
+    record = live.folder / "run.mcap"
+    run = live.start(record, "--until-printed")
+    at = confirmed(run)
+    CLOCK.wait_until(CLOCK.now() + 4.0)
+    assert live.server.process is not None
+    gone = CLOCK.now()
+    live.server.process.send_signal(number)
+    at = run.wait_for("stopped: the arm is unplugged", at)
+    live.server.end(signal.SIGKILL)
+    live.server.start()
+    at = run.wait_for("the arm is back", at)
+    run.press("h")
+    at = run.wait_for("stopped: at home", at)
+    run.press("r")
+    at = run.wait_for(r"\nprint\n", at)
+    run.wait_for("done", at)
+    assert run.end() == 0, run.said
+    moves = sorted(float(str(m["stamp"])) for m in messages(record, "/move"))
+    last = max(stamp for stamp in moves if stamp < gone + 1.0)
+    print(f"last move {1000 * (last - gone):.0f} ms after it was {number.name}, load {os.getloadavg()[0]:.1f}")
+    assert last - gone <= 0.1
+    extruding = {m["stamp"]: m["extrude"] for m in messages(record, "/move")}
+    ticks = [tick for tick in messages(record, "/tick") if extruding.get(tick["stamp"])]
+    stamps, places = np.array(sorted((float(str(tick["stamp"])), float(str(tick["fraction"]))) for tick in ticks)).T
+    again = np.searchsorted(stamps, gone + 1.0)
+    print(f"printed to {places[:again].max():.3f}, then from {places[again]:.3f} on")
+    done = places[stamps <= gone - live.profile.tick - live.profile.lag].max()  # what the robot had surely done
+    slack = 0.02  # checkpoints, two ticks
+    assert done <= places[again] <= places[:again].max() + slack  # nothing is printed twice, and nothing left out
+    assert (np.diff(places[again:]) >= -1e-9).all()
+
+
+def test_a_motion_process_that_is_killed_leaves_the_robot_at_rest(live: Live) -> None:
+    run = live.start(live.folder / "run.mcap", "--yes")
+    run.wait_for(r"\nprint\n")
+    CLOCK.wait_until(CLOCK.now() + 3.0)
+    killed = run.kill("motion")
+    run.wait_for("the motion process was killed by SIGKILL")
+    assert run.end() == 1
+    CLOCK.wait_until(killed + 2.0)
+    stamps, axes = live.server.truth(live.profile)
+    before, after = axes[(stamps > killed - 0.5) & (stamps < killed)], axes[stamps > killed + 0.3]
+    assert np.ptp(before[:, :3], axis=0).max() > 0.5 and np.ptp(after[:, :3], axis=0).max() < 0.2
+
+
+def test_fifty_stops_are_short_in_time_and_way(tmp_path: Path) -> None:
+    with closing_bench(FrankaBench(tmp_path)) as bench:
+        bench.begin()
+        decided, sign = [], 1.0
+        for number in range(50):
+            target = bench.arm.target
+            bench.follow(straight(target, sign * 20.0), 0.5 + 0.013 * (number % 7))
+            decided.append(bench.clock.now())
+            bench.arm.stop("to measure it", decided[-1])
+            bench.run(0.5)
+            assert bench.arm.arm(bench.clock.now()) == ""
+            sign = -sign
+        stamps, axes = bench.truth()
+    times, ways = [], []
+    for since in decided:
+        begin, end = np.searchsorted(stamps, [since, since + 0.45])
+        left = np.linalg.norm(axes[begin:end, :3] - axes[end, :3], axis=1)
+        moving = np.flatnonzero(left > STANDSTILL)
+        times.append(stamps[begin + moving[-1]] - since if len(moving) else 0.0)
+        ways.append(left[0])
+    time, way = np.percentile(times, 99), np.percentile(ways, 99)
+    print(f"99 % of 50 stops: {1000 * time:.0f} ms, {way:.2f} mm, load {os.getloadavg()[0]:.1f}")
+    assert time <= 0.15 and way <= 1.0
