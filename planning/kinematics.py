@@ -30,7 +30,7 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from planning.limits import MotionLimits
+from planning.command import MotionLimits
 
 SHOULDERS, ELBOWS, WRISTS = ("front", "back"), ("up", "down"), ("positive", "negative")
 POSTURES = np.array(list(product([1.0, -1.0], repeat=3)))  # (8, 3): shoulder, elbow, wrist; see JointModel.signs

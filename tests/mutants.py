@@ -222,7 +222,7 @@ MUTANTS = (
     ),
     Mutant(
         "a hold leaves the material on",
-        "hardware/motion/material.py",
+        "hardware/motion/loop.py",
         "if not isinstance(command, Move):\n            self.off(now)",
         "if not isinstance(command, Move):\n            self.poll(now)",
         ("test_material_loop.py::test_what_ends_extrusion_ends_the_material",),

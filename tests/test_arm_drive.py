@@ -40,7 +40,7 @@ from hardware.simulator.arm.settings import ArmSettings
 from hardware.simulator.watched_arm import watched_arm
 from perception.boards.needle_tip import _TO_LIGHT, TipFinder, background
 from perception.frames import Image
-from planning.limits import MotionLimits, NoGo
+from planning.command import MotionLimits, NoGo
 
 PROFILE = ArmProfile()
 HOME = PROFILE.arm.home

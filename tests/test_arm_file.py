@@ -26,9 +26,8 @@ from hardware.files.arm_file import (
     write_arm,
 )
 from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
-from planning.command import Move, Refusal, RefusalCode
+from planning.command import MotionLimits, Move, NoGo, Refusal, RefusalCode, box, cylinder, half_space
 from planning.kinematics import SimpleArm
-from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 from planning.motion.guard import Guard
 from tests.test_guard import ARM, TICK, WIDE, axes, move, pose
 

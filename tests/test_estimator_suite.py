@@ -24,7 +24,7 @@ from estimation.synthetic.world import World, synthetic_world
 from estimation.triangulation import triangulated_map
 from hardware.bench.estimator import nees, pool_errors
 from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
-from planning.limits import MotionLimits
+from planning.command import MotionLimits
 from tests.slowly import slowly
 
 TRACKING, DEGRADED, COASTING, LOST = (TrackState.TRACKING, TrackState.DEGRADED, TrackState.COASTING, TrackState.LOST)

@@ -20,7 +20,7 @@ from hardware.live.prepared import RunFiles
 from hardware.live.recorder_process import FOXGLOVE_BACKLOG, FoxgloveServer
 from hardware.live.settings import LiveSettings, check_settings
 from hardware.process.clock import WallClock, utc_now
-from hardware.process.provenance import file_hash
+from hardware.process.system import file_hash
 from hardware.recording import ros_messages
 from hardware.recording.mcap_file import FileMetadata, walk
 from hardware.recording.recorder import PublishedMessage, Recorder

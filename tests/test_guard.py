@@ -23,9 +23,8 @@ from hardware.bench.campaigns.guard import (
     random_log,
     simple_rules,
 )
-from planning.command import MAX_FLOW, Command, Hold, Move, Refusal, RefusalCode
+from planning.command import MAX_FLOW, Command, Hold, MotionLimits, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, joints_from_axes
-from planning.limits import MotionLimits
 from planning.motion.guard import Guard
 from tests.slowly import slowly
 

@@ -22,8 +22,7 @@ from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, Reco
 from hardware.live.settings import LiveSettings
 from hardware.live.state_machine import RunStateMachine
 from hardware.live.view import ViewBuilder, stage_line
-from hardware.motion.loop import Order, Tick
-from hardware.motion.material import MaterialStatus
+from hardware.motion.loop import MaterialStatus, Order, Tick
 from hardware.operator.shared_state import OperatorRequest, Polygons
 from hardware.operator.view import (
     MAX_MOVE_DEG,

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from planning.command import Command, Move
+from planning.command import Command, MotionLimits, Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.limits import MotionLimits
 from planning.material import MAX_DELAY, Outlet, Outlets, SwitchDelay, material_plan, with_offsets
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner

@@ -15,8 +15,7 @@ from hardware.arm.device import ArmState
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import Dialect, decode
 from hardware.dispenser.dispenser import ArmPwmDispenser, DispenserProfile, Dispensers
-from hardware.motion.loop import MotionLoop, Order, Tick
-from hardware.motion.material import MaterialControl
+from hardware.motion.loop import MaterialControl, MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock
 from hardware.simulator.arm.ports import PortFaults

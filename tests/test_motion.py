@@ -16,9 +16,8 @@ from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, placed
 from hardware.arm.protocol import Dialect, decode, encode, frame_from_command, motion_from_frame
 from hardware.motion.step import MotionStep
 from hardware.process.clock import Clock, SimClock, WallClock
-from planning.command import Hold, Move, Refusal
+from planning.command import Hold, MotionLimits, Move, Refusal
 from planning.kinematics import axes_from_nozzle, nozzle_from_axes
-from planning.limits import MotionLimits
 from planning.motion.curve import APPROACH_HEIGHT
 from planning.path import PrintPhase
 from tests.moving import REST, Motion, breathing, pose_at, raster, still

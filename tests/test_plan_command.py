@@ -34,9 +34,8 @@ from hardware.plan.order import (
 )
 from hardware.plan.run import MAX_MIDDLE_DISTANCE, WoundSighting, _sighting, placement_lines
 from perception.lens import Lenses
-from planning.command import Move
+from planning.command import MotionLimits, Move
 from planning.kinematics import SimpleArm
-from planning.limits import MotionLimits
 from planning.motion.planner import Planner
 from tests.moving import pose_at, still
 from tests.wounds import scan_of

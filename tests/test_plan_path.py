@@ -18,6 +18,7 @@ from estimation.se3 import Array
 from hardware.files.path_file import gcode_text, read_path, write_path
 from hardware.simulator.scene.shape import Wound as Carved
 from hardware.simulator.scene.shape import body
+from planning.command import MotionLimits
 from planning.fill.bead import Bead, Pattern, even_bead, fill_coverage
 from planning.kinematics import SimpleArm
 from planning.layers.checkpoints import CheckpointSettings, bead_points, spacing_over, with_spacing
@@ -26,7 +27,6 @@ from planning.layers.plan import Plan, PlanOrder, figures_of, flat_wound, make_p
 from planning.layers.repair import repair_mesh
 from planning.layers.slicing import LAYER_MODES, LayerMode, Tissue
 from planning.layers.wound import WoundVolume, find_wound
-from planning.limits import MotionLimits
 from planning.motion.retime import run_times
 from planning.path import check_path
 from tests.slowly import slowly

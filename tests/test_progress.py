@@ -16,9 +16,8 @@ from estimation.pose import SurfacePose, TrackState
 from hardware.arm.profile import ArmProfile
 from hardware.files.path_file import ProgressFile, read_progress
 from hardware.motion.step import MotionStep
-from planning.command import Move
+from planning.command import MotionLimits, Move
 from planning.kinematics import SimpleArm
-from planning.limits import MotionLimits
 from planning.motion.planner import Planner
 from planning.path import Path, PrintPhase, fingerprint, progress_mark, resume_fraction
 from tests.moving import breathing, pose_at, raster

@@ -20,8 +20,7 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.images import encode
-from hardware.motion.loop import RecordedTick
-from hardware.motion.material import DispenserRecord
+from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.recording import ros_messages
 from hardware.recording.mcap_file import ChunkMessages, Damage, walk
 from hardware.recording.messages import message_from_rig

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose
 from hardware.bench.planner import SwingingSurface, random_path
+from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits
-from planning.limits import MotionLimits
 from planning.motion.curve import PathCurve, curve_through, gridpoints_on
 from planning.motion.planner import Planner
 from planning.motion.retime import (

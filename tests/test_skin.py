@@ -17,9 +17,9 @@ from hardware.bench.wounds import LIMBS, CarvedWound, carve, score_wound, tube
 from hardware.cli.main import main
 from hardware.files.mesh_file import read_raw_mesh, write_ply
 from planning.layers.grid import grid_over
-from planning.layers.places import ScanColour, WoundQuestionError, depressions
+from planning.layers.outline import ScanColour, WoundQuestionError
 from planning.layers.repair import repair_mesh
-from planning.layers.skin import bent_base, restored_skin, skin_cells
+from planning.layers.skin import bent_base, depressions, restored_skin, skin_cells
 from planning.layers.wound import find_wound
 
 

@@ -25,7 +25,7 @@ from hardware.files.rig_file import read_rig
 from hardware.files.session import FrameRef
 from hardware.offline import smooth as run_module
 from hardware.offline.smooth_tracks import Rhythm, breathing_rhythm, pulse_rhythm, reobserve, source_hash, tracks_of
-from hardware.process.provenance import file_hash
+from hardware.process.system import file_hash
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session, read_observations, read_poses, read_smoothed
 from hardware.report.evaluation import best_constant

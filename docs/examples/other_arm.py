@@ -12,9 +12,8 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.cli.parser import run_script
 from hardware.files.path_file import read_path
-from planning.command import Command, Hold
+from planning.command import Command, Hold, MotionLimits
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.limits import MotionLimits
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 

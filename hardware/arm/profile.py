@@ -15,8 +15,8 @@ from estimation.se3 import Array
 from hardware.arm.driver import ArmDriver, ByteListener
 from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
 from perception.frames import SYRINGE, check_profile
+from planning.command import MotionLimits
 from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
-from planning.limits import MotionLimits
 from planning.motion.curve import LOOKAHEAD
 from planning.urdf import UrdfArm
 

@@ -38,9 +38,8 @@ from hardware.simulator.scene.shape import Shape
 from hardware.simulator.simulate import LandmarkTracker
 from hardware.simulator.truth import Truth, TruthLog, disturbed_motion, drape_path, fold_deformation, row_instants
 from perception.frames import FrameSet
-from planning.command import Move
+from planning.command import MotionLimits, Move
 from planning.kinematics import axes_from_nozzle
-from planning.limits import MotionLimits
 from planning.path import Path, PrintPhase
 
 AXES_LIMITS = "speed", "acceleration", "jerk", "jump", "turn"

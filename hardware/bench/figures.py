@@ -23,8 +23,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
-from hardware.process.provenance import code_commit
-from hardware.process.system import SPAWN, exit_with_parent
+from hardware.process.system import SPAWN, code_commit, exit_with_parent
 
 Item = TypeVar("Item")
 

@@ -45,7 +45,7 @@ from hardware.offline.smooth_report import evaluate_smoothed
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reobserve, tracks_of
 from hardware.process.clock import CpuClock, ProcessorClock, WallClock
 from hardware.process.progress import cache_folder, no_progress
-from hardware.process.provenance import file_hash
+from hardware.process.system import file_hash
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import best_constant, spread

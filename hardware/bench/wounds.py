@@ -24,8 +24,7 @@ from estimation.se3 import Array, Index
 from hardware.bench.figures import Figure, Target, at_least, at_most, with_progress
 from hardware.files.mesh_file import read_raw_mesh
 from planning.layers.checkpoints import ToolLimits, tilt_field, tool_rotations
-from planning.layers.grid import as_multi, interpolate
-from planning.layers.outline import nodes_within
+from planning.layers.grid import as_multi, interpolate, nodes_within
 from planning.layers.repair import repair_mesh
 from planning.layers.wound import WoundVolume, find_wound
 

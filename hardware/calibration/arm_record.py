@@ -35,8 +35,7 @@ from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
 from hardware.process.clock import Clock
 from hardware.process.progress import ProgressReport, no_progress
-from planning.command import Move, Refusal, feed_for
-from planning.limits import AXIS_MARGIN, MotionLimits
+from planning.command import AXIS_MARGIN, MotionLimits, Move, Refusal, feed_for
 from planning.motion.guard import Guard
 
 ARM_FILE = "arm.toml"  # of a recorded calibration: the arm before it

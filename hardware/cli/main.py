@@ -24,8 +24,7 @@ from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
 from hardware.process.progress import left_files_text, prepare_out, write_error_text
-from hardware.process.provenance import state_inputs
-from hardware.process.system import fill_standard_streams
+from hardware.process.system import fill_standard_streams, state_inputs
 from perception import named_path
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ flange_from_nozzle = [[...], ...]             # optional, 4x4, mm, for an arm th
 flight_s = 0.05                               # optional, motion that may be under way at once
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
-[limits]                                      # as in planning/limits.py; arrays are X Y Z in mm, A B C in degrees
+[limits]                                      # as in planning/command.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
 [[no_go]]                                     # optional, a zone each, mm, base frame
@@ -55,8 +55,8 @@ from hardware.arm.protocol import Dialect
 from hardware.process import checks
 from perception import shipped_file
 from perception.frames import check_profile
+from planning.command import MotionLimits, NoGo, box, cylinder, half_space
 from planning.kinematics import AngleMode, JointModel, SimpleArm
-from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 from planning.urdf import UrdfArm
 
 URDF_KEYS = ("name", "urdf", "flange", "ready_deg")

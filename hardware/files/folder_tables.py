@@ -25,7 +25,7 @@ from estimation.se3 import Array
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.files.session import NO_PRINT_HEADS, FrameRef, PrintHeadLog
 from hardware.process import checks
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 from perception.frames import Roi
 
 TUM_HEADER = "# stamp_s x y z qx qy qz qw (mm, base_from_surface)\n"

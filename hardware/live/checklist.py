@@ -14,8 +14,8 @@ from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, RunReports, TrackingReport
 from hardware.operator.view import MAX_MOVE_DEG, MAX_MOVE_MM, Check, CheckVerdict, MoveRequest
 from hardware.process.progress import count_text
+from planning.command import AXIS_MARGIN, JOINT_MARGIN
 from planning.kinematics import axes_from_nozzle, joints_from_axes
-from planning.limits import AXIS_MARGIN, JOINT_MARGIN
 from planning.material import Outlets, with_offsets
 from planning.path import Path, fingerprint
 from planning.placement import NoSurfaceError, PathPlacement, PlacedBy, SurfaceMove, moved_along

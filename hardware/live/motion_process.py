@@ -38,8 +38,7 @@ from hardware.live.records import (
     StageTiming,
     WireEntry,
 )
-from hardware.motion.loop import MotionLoop, Order, RecordedTick, Tick
-from hardware.motion.material import MaterialControl
+from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import WallClock
 from hardware.process.system import ask_for_real_time, set_up_process, take_messages

@@ -22,7 +22,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import RunReports, StageHistograms, StageTiming
 from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import HoldRow, RunResult, RunStage
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 from hardware.process.ticks import Histogram
 from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes

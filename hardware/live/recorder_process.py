@@ -39,11 +39,9 @@ from hardware.live.records import (
     WireEntry,
 )
 from hardware.live.settings import LOOPBACK, LiveSettings, used_files
-from hardware.motion.loop import RecordedTick
-from hardware.motion.material import DispenserRecord
+from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
-from hardware.process.provenance import state_inputs
-from hardware.process.system import SharedLatest, set_up_process
+from hardware.process.system import SharedLatest, set_up_process, state_inputs
 from perception.frames import OutlinedPicture, Roi
 
 if TYPE_CHECKING:

@@ -20,8 +20,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
-from hardware.motion.loop import RecordedTick, Tick
-from hardware.motion.material import DispenserRecord, MaterialStatus
+from hardware.motion.loop import DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
 from hardware.process.system import SharedLatest
 from hardware.process.ticks import Histogram

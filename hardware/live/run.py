@@ -51,7 +51,7 @@ from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
-from hardware.process.provenance import state_inputs
+from hardware.process.system import state_inputs
 from planning.placement import PlacedBy
 
 POLL_PERIOD = 0.02  # s between looks while nothing happens

@@ -20,7 +20,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series, read_truth_series
 from hardware.process.progress import prepare_out
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 from hardware.report.evaluation import (
     NEES_BOUND,
     PoseErrors,

@@ -31,7 +31,7 @@ from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reob
 from hardware.offline.trajectory_files import write_copy, write_instants, write_map
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, prepare_out
-from hardware.process.provenance import file_hash, provenance
+from hardware.process.system import file_hash, provenance
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import finite
 

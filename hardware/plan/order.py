@@ -20,7 +20,7 @@ from hardware.process.progress import ProgressReport, no_progress
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits
-from planning.layers.places import WoundQuestionError
+from planning.layers.outline import WoundQuestionError
 from planning.layers.plan import PlanOrder, flat_wound
 from planning.layers.repair import Repairs, repair_mesh
 from planning.layers.slicing import BumpPassing, LayerMode, Tissue

@@ -16,9 +16,8 @@ from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from hardware.report.page import document, section
-from planning.layers.grid import HeightMap, height_map
-from planning.layers.outline import axes_along, points_on
-from planning.layers.places import ScanColour, WoundPlace, WoundQuestionError
+from planning.layers.grid import HeightMap, axes_along, height_map
+from planning.layers.outline import ScanColour, WoundPlace, WoundQuestionError, points_on
 from planning.layers.repair import mean_normal
 
 Colours = NDArray[np.uint8]

@@ -30,7 +30,7 @@ from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, orde
 from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
 from planning.layers.wound import WoundFindings, WoundVolume
 from planning.motion.retime import run_times

@@ -18,8 +18,7 @@ from estimation.se3 import Array
 from estimation.surface_map import LocalError, Warp
 from hardware.files.images import decode, encode
 from hardware.files.rig_file import rig_from_table, table_from_rig
-from hardware.motion.loop import RecordedTick
-from hardware.motion.material import DispenserRecord
+from hardware.motion.loop import DispenserRecord, RecordedTick
 from perception.frames import OutlinedPicture, Roi
 from planning.command import Hold, Move
 

@@ -24,10 +24,9 @@ from hardware.arm.profile import ArmProfile
 from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.images import check_size, encode
 from hardware.files.session import SURFACE_SUFFIXES, head_from_row
-from hardware.motion.loop import RecordedTick
-from hardware.motion.material import DispenserRecord
+from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.checks import read_bytes
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 from hardware.recording import messages, ros_messages
 from hardware.recording.mcap_file import NO_SCHEMA, UTC_LOG_TIMES, ChunkMessages, sealed, walk
 from hardware.recording.mcap_writer import McapWriter

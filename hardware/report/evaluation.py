@@ -22,7 +22,7 @@ from estimation.pose import TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.files.pose_file import PoseTable
 from hardware.files.session import damage_text
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 
 MAX_TRACKING_ERROR_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
 NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %

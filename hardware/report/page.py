@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 
 
 def document(kind: str, title: str, lead: str, body: Sequence[str], footer: str) -> str:

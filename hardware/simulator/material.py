@@ -31,7 +31,7 @@ from hardware.dispenser.dispenser import DispenserProfile, Dispensers, check_pat
 from hardware.dispenser.line_dispenser import LineDispenser
 from hardware.dispenser.messages import PRESETS
 from hardware.files.dispenser_file import DispenserSettings, outlets_from, read_dispensers
-from hardware.motion.material import MaterialControl
+from hardware.motion.loop import MaterialControl
 from hardware.motion.step import MotionStep
 from hardware.process import checks
 from hardware.process.clock import Clock

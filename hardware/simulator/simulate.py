@@ -35,7 +35,7 @@ from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import Progress, open_in_browser, prepare_out
-from hardware.process.provenance import provenance
+from hardware.process.system import provenance
 from hardware.report.evaluation import Evaluation, evaluate, write_summary
 from hardware.report.report import write_report
 from hardware.simulator.arm.ports import PtyLink

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_erosion, binary_fill_holes, distance_transform_edt, gaussian_filter
+from scipy.ndimage import binary_erosion, binary_fill_holes, distance_transform_edt, gaussian_filter, map_coordinates
 from shapely import MultiPolygon
 
 from estimation import se3
@@ -348,3 +348,28 @@ def _noise(grid: Grid, heights: Array, scanned: Mask) -> float:
     inner = binary_erosion(scanned, iterations=max(1, int(2 * sigma)))
     sample = off[inner] if inner.any() else off[scanned]
     return 1.4826 * float(np.median(sample)) if len(sample) else 0.0
+
+
+def upsampled(grid: Grid, coarse: Grid, values: Array) -> Array:
+    """Values (h, w) of a coarse grid at the nodes of a fine one (H, W), by cubic splines."""
+    ratio = grid.step / coarse.step
+    rows, columns = (np.arange(n) * ratio for n in grid.shape)
+    return np.asarray(map_coordinates(values, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest"))
+
+
+def axes_along(z: Array, x: Array) -> Array:
+    """The rotation whose z is `z` and whose x is as near to `x` as that allows."""
+    if abs(z @ x) > 0.95:
+        x = np.roll(x, 1)
+    x = x - (x @ z) * z
+    x = x / np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def nodes_within(grid: Grid, shape: MultiPolygon) -> Mask:
+    """(H, W) which nodes lie inside; at least one does."""
+    x, y = grid.nodes[..., 0], grid.nodes[..., 1]
+    inside = shapely.contains_xy(shape, x, y)
+    if not inside.any():
+        inside.flat[np.argmin(shapely.distance(shape, shapely.points(x, y)))] = True
+    return np.asarray(inside)

@@ -13,6 +13,7 @@ from shapely import MultiPolygon
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.command import MotionLimits
 from planning.fill.bead import SHARP_TURN, Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
 from planning.fill.fill import fill, settle_angle
 from planning.kinematics import SimpleArm
@@ -26,11 +27,9 @@ from planning.layers.checkpoints import (
     path_from,
     tilt_field,
 )
-from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, unroll
-from planning.layers.outline import nodes_within
+from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, nodes_within, unroll
 from planning.layers.slicing import BumpPassing, Layer, LayerMode, LayerStack, Tissue, layer_stack
 from planning.layers.wound import WoundFindings, WoundVolume
-from planning.limits import MotionLimits
 from planning.motion.retime import run_times
 from planning.path import Path
 

@@ -25,8 +25,8 @@ from shapely import MultiPolygon
 from estimation.errors import InputError
 from estimation.se3 import Array, Index
 from planning.fill.bead import without_bumps
-from planning.layers.grid import Grid, Mask, as_multi, interpolate, positive_region, smoothed
-from planning.layers.outline import OUTLINE_TOLERANCE, nodes_within
+from planning.layers.grid import Grid, Mask, as_multi, interpolate, nodes_within, positive_region, smoothed
+from planning.layers.outline import OUTLINE_TOLERANCE
 from planning.layers.wound import WoundVolume
 
 EIGHT_NEIGHBOURS = np.ones((3, 3), int)  # nodes joined across corners too, so that no outline runs between them

@@ -16,7 +16,18 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
-from planning.layers.grid import Grid, HeightMap, as_multi, filled, gradient, height_map, interpolate
+from planning.layers.grid import (
+    Grid,
+    HeightMap,
+    as_multi,
+    axes_along,
+    filled,
+    gradient,
+    height_map,
+    interpolate,
+    nodes_within,
+    upsampled,
+)
 from planning.layers.outline import (
     MIN_DEPTH,
     MIN_NODES,
@@ -26,15 +37,15 @@ from planning.layers.outline import (
     SEARCH_STEP,
     SKIN_STEP,
     OutlinedWound,
-    axes_along,
-    nodes_within,
+    ScanColour,
+    chosen_place,
     outlined,
+    refusal,
     share_cut,
     surround_box,
-    upsampled,
     with_skin,
+    wound_places,
 )
-from planning.layers.places import ScanColour, chosen_place, refusal, wound_places
 from planning.layers.repair import mean_normal
 
 MAX_CUT_SHARE = 0.25  # share of the outline that may lie along the scan's rim, where no skin holds the restored surface

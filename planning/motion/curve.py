@@ -26,7 +26,7 @@ from ruckig import ControlInterface, InputParameter, Ruckig, RuckigError, Synchr
 
 from estimation import se3
 from estimation.se3 import Array
-from planning.limits import MotionLimits
+from planning.command import MotionLimits
 from planning.path import LEVER_ARM, MIN_SPACING, lengths_from, moves_and_turns, way_lengths
 
 LOOKAHEAD = 0.1  # s; half of it doubled the error by chatter, twice of it by errors of the prediction

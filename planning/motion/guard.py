@@ -14,9 +14,8 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import MAX_FLOW, Command, Move, Refusal, RefusalCode
+from planning.command import MAX_FLOW, Command, MotionLimits, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
-from planning.limits import MotionLimits
 
 AXIS_NAMES = "XYZABC"
 LINEAR_AXES = 3  # X Y Z in mm, the others in rad

@@ -20,9 +20,18 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from planning.command import Command, Hold, HoldReason, Move, RefusalCode, feed_for
+from planning.command import (
+    AXIS_MARGIN,
+    JOINT_MARGIN,
+    Command,
+    Hold,
+    HoldReason,
+    MotionLimits,
+    Move,
+    RefusalCode,
+    feed_for,
+)
 from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits, joints_from_axes, nozzle_from_axes
-from planning.limits import AXIS_MARGIN, JOINT_MARGIN, MotionLimits
 from planning.material import FlowCommands, FlowOrder, Outlets, RestsAhead, material_plan
 from planning.motion.curve import (
     HORIZON_TIME,

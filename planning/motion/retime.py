@@ -30,8 +30,8 @@ from toppra.solverwrapper import seidelWrapper
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
+from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axis_limits, limited_axes, max_axis_change, nozzle_from_axes
-from planning.limits import MotionLimits
 from planning.material import material_plan
 from planning.motion.curve import HORIZON_TIME, Gridpoints, PathCurve, curve_through, gridpoints_on
 from planning.path import Path

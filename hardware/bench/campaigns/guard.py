@@ -18,9 +18,8 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.bench.figures import Figure, at_most, columns
 from perception import shipped_file
-from planning.command import Command, Hold, Move
+from planning.command import Command, Hold, MotionLimits, Move, NoGo, box, cylinder, half_space
 from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_joints
-from planning.limits import MotionLimits, NoGo, box, cylinder, half_space
 from planning.motion.guard import Guard
 
 Flags = NDArray[np.bool_]

@@ -22,7 +22,7 @@ from hardware.offline.track import FrameSetStep, _network_segmenter
 from perception.frames import FrameSet, Image
 from perception.tracking.step import TrackingStep
 from perception.tracking.wound_step import RegionSearch, RegionTrackingStep
-from planning.limits import MotionLimits
+from planning.command import MotionLimits
 from tests.campaigns.deceit.kinds import make_session
 from tests.campaigns.deceit.scenes import Session
 from tests.campaigns.deceit.world import Renderer
