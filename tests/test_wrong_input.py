@@ -162,7 +162,6 @@ track empty
 track empty -o OUT --speed
 track empty -o OUT --method dance
 simulate STILL -o OUT --threads many
-arm
 arm /dev/nothing --seconds -1
 arm --virtual --replies loud
 smooth empty -o OUT --rate fast

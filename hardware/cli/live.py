@@ -214,7 +214,7 @@ def add_arm(commands: Commands) -> None:
 
 
 def _run_arm(a: argparse.Namespace) -> int:
-    from hardware.files.arm_file import arm_for, far_limits_text, unreached_limits_text
+    from hardware.files.arm_file import arm_for, far_limits_text
 
     if not (a.device or a.virtual):
         from hardware.arm.console import drivers_text
@@ -222,7 +222,7 @@ def _run_arm(a: argparse.Namespace) -> int:
         print(drivers_text())
         return 0
     profile = arm_for(a.device) if a.arm is None and a.device else arm_profile(a.arm)
-    for text in filter(None, (far_limits_text(profile.limits), unreached_limits_text(profile))):
+    if text := far_limits_text(profile.limits):
         print(text, flush=True)
     return _serve_virtual_arm(a, profile) if a.virtual else _connect_arm(a, profile)
 
