@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,11 +10,19 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose
-from hardware.bench.planner import SwingingSurface, random_path
+from hardware.arm.profile import ArmProfile
+from hardware.bench.planner import (
+    STILL,
+    SWUNG,
+    SwingingSurface,
+    random_path,
+    seconds_as_a_whole,
+    seconds_to_print,
+    zigzag_with_hops,
+)
 from planning.command import MotionLimits
-from planning.kinematics import SimpleArm, axes_from_nozzle, axis_limits
+from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.motion.curve import PathCurve, curve_through, gridpoints_on
-from planning.motion.planner import Planner
 from planning.motion.retime import (
     LIMIT_SHARE,
     PATH_SPEED_SHARE,
@@ -25,7 +32,7 @@ from planning.motion.retime import (
     retime,
     run_times,
 )
-from planning.path import Path, PrintPhase
+from planning.path import Path
 from tests.moving import Motion, path_through, pose_at, raster, still
 
 ARM, LIMITS = SimpleArm(), MotionLimits()
@@ -75,42 +82,13 @@ def most_of_the_limits(curve: PathCurve, timing: Timing, pose: SurfacePose, end:
     return float(speed.max(initial=0.0)), float(acceleration.max(initial=0.0))
 
 
-def zigzag_with_hops() -> Path:
-    """Ways of 0.3 mm at 20 mm/s with a sharp corner every 3 mm, and a hop over 2 mm now and then."""
-    corners = np.array([[3 * (k // 2 % 2 != k % 2), 1.5 * (k // 2), 0] for k in range(24)], float)
-    points, printed = [corners[:1]], [True]
-    for number, (start, end) in enumerate(pairwise(corners)):
-        ways = start + np.linspace(0, 1, 11)[1:, None] * (end - start)
-        hop = np.stack([end + [0, 0, 2], end + [4, 0, 2], end + [4, 0, 0]])
-        hops = number % 8 == 7
-        points += [ways, hop] if hops else [ways]
-        printed += [True] * 10 + [False] * 3 * hops
-        corners[number + 1 :] += [4.0 * hops, 0, 0]
-    path = path_through(np.concatenate(points), 20.0)
-    return replace(path, extrude=np.array(printed), speed=np.where(printed, 20.0, 40.0))
-
-
-def seconds_to_print(path: Path, motion: Motion) -> float:
-    """By the planner, tick by tick."""
-    planner, now, ticks = Planner(path, LIMITS, ARM, STEP), 10.0, 0
-    while planner.progress.phase is not PrintPhase.LEAVING:
-        planner(pose_at(motion, now), now)
-        ticks, now = ticks + (planner.progress.phase is PrintPhase.PRINTING), now + STEP
-    return ticks * STEP
-
-
 def test_a_dense_path_takes_no_longer_in_horizons_than_timed_as_a_whole_and_as_long_as_is_told() -> None:
     """Measured: 1.06 of the whole, at rest and on a surface that swings by 10 mm; with even grid points alone 1.95."""
-    path = zigzag_with_hops()
-    curve = curve_on(path)
-    grid, bounds = gridpoints_on(curve, 0.0, curve.length, 200), axis_limits(ARM, replace(LIMITS, speed=SPEED))
-    whole = retime(grid, axis_derivatives(ARM, pose_at(still, 10.0), curve, grid, 10.0), 0.0, 10.0, bounds)
-    assert isinstance(whole, Timing)
-    ideal, told = whole.end - 10.0, run_times(path, ARM, LIMITS, STEP)[-1]
-    taken = seconds_to_print(path, still)
-    print(ideal, told, taken)
+    path, profile = zigzag_with_hops(), ArmProfile()
+    ideal, told = seconds_as_a_whole(path, profile), run_times(path, ARM, LIMITS, STEP)[-1]
+    taken = seconds_to_print(path, profile, STILL)
     assert taken < 1.08 * ideal and taken == pytest.approx(told, rel=0.05)
-    assert seconds_to_print(path, SwingingSurface(10.0, 0.05, 0.25).at) < 1.15 * ideal
+    assert seconds_to_print(path, profile, SWUNG) < 1.15 * ideal
 
 
 @settings(max_examples=20)

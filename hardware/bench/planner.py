@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,10 +35,12 @@ from hardware.simulator.nozzle_error import EndsOfBeads, MaterialFigures, materi
 from hardware.simulator.nozzle_report import ends_chart
 from perception import shipped_file
 from planning.command import Hold, Move
-from planning.kinematics import axes_from_nozzle
+from planning.kinematics import axes_from_nozzle, axis_limits
+from planning.motion.curve import curve_through, gridpoints_on
 from planning.motion.guard import Guard
 from planning.motion.planner import STALL_TICKS, Planner
-from planning.path import MIN_SPACING, Path, progress_mark, resume_fraction, way_lengths
+from planning.motion.retime import Timing, axis_derivatives, retime, run_times
+from planning.path import MIN_SPACING, Path, PrintPhase, progress_mark, resume_fraction, way_lengths
 
 Draw = np.random.Generator
 Tick = tuple[float, SurfacePose | None]  # now, s, and the newest pose
@@ -73,6 +76,10 @@ class SwingingSurface:
         sine, none = np.sin(phase), np.zeros_like(phase)
         turn = [self.tilt * sine, 0.6 * self.tilt * np.cos(phase), none]
         return np.asarray(SWING_REST @ se3.exp(np.stack([*turn, none, none, self.height * sine], -1)))
+
+
+STILL, SWUNG = SwingingSurface(0.0, 0.0, 0.25), SwingingSurface(10.0, 0.05, 0.25)
+WHOLE_HORIZONS = 200  # of grid points for one timing of a path of some seconds
 
 
 def random_path(draw: Draw) -> Path:
@@ -122,18 +129,23 @@ def _ticks(draw: Draw, ticks: int) -> Iterator[Tick]:
 
 
 def _pose(swing: SwingingSurface, stamp: float, draw: Draw, with_forecast: bool) -> SurfacePose:
-    """The exact pose and twist at `stamp`, s."""
-    step = 1e-4
-    before, here, after = swing.at(stamp + np.array([-step, 0, step]))
-    twist = se3.log(se3.inverse(before) @ after) / (2 * step)
-    covariance = np.diag([1e-6] * 3 + [1e-4] * 3)
+    """The exact pose and twist at `stamp`, s, now and then DEGRADED."""
+    pose = _exact_pose(swing, stamp)
     state = TrackState.DEGRADED if draw.random() < 0.1 else TrackState.TRACKING
     forecast = None
     if with_forecast:
-        increments = se3.log(se3.inverse(here) @ swing.at(stamp + FORECAST_HORIZONS)) * draw.normal(1.0, 0.05)
-        covariances = covariance + FORECAST_HORIZONS[:, None, None] * 0.01 * np.eye(6)
+        ahead = se3.inverse(pose.base_from_surface) @ swing.at(stamp + FORECAST_HORIZONS)
+        increments = se3.log(ahead) * draw.normal(1.0, 0.05)
+        covariances = pose.covariance + FORECAST_HORIZONS[:, None, None] * 0.01 * np.eye(6)
         forecast = Forecast(FORECAST_HORIZONS, increments, covariances)
-    return SurfacePose(stamp, here, covariance, twist, state, forecast=forecast)
+    return replace(pose, state=state, forecast=forecast)
+
+
+def _exact_pose(swing: SwingingSurface, stamp: float) -> SurfacePose:
+    step = 1e-4
+    before, here, after = swing.at(stamp + np.array([-step, 0, step]))
+    twist = se3.log(se3.inverse(before) @ after) / (2 * step)
+    return SurfacePose(stamp, here, np.diag([1e-6] * 3 + [1e-4] * 3), twist, TrackState.TRACKING)
 
 
 def _invalid(pose: SurfacePose, draw: Draw) -> SurfacePose | None:
@@ -192,6 +204,7 @@ def run_planner(options: argparse.Namespace) -> list[Figure]:
     return [
         *_limits(tally),
         *_costs(tally),
+        *pace_figures(profile),
         Figure(f"{name}, 99 %", milliseconds(transform, 99), "ms", at_most(1), "thesis < 1", note),
         Figure(f"{name}, median", milliseconds(transform, 50), "ms"),
         Figure(f"{name}, axes X to C too, 99 %", milliseconds(axes, 99), "ms", note=note),
@@ -262,6 +275,54 @@ def _costs(tally: StreamTally) -> list[Figure]:
         for word, share, target in zip(("median", "99 %"), (50, 99), targets, strict=True):
             figures.append(Figure(f"{name}, {word}", percentile(ms[rows], share), "ms", target, "", note))
     return figures
+
+
+def zigzag_with_hops() -> Path:
+    """Ways of 0.3 mm at 20 mm/s with a sharp corner every 3 mm or less, and two hops over 2 mm on the way."""
+    corners = np.array([[3 * (k // 2 % 2 != k % 2), 1.5 * (k // 2), 0] for k in range(24)], float)
+    points, printed = [corners[:1]], [True]
+    for number, (start, end) in enumerate(pairwise(corners)):
+        ways = start + np.linspace(0, 1, 11)[1:, None] * (end - start)
+        hop = np.stack([end + [0, 0, 2], end + [4, 0, 2], end + [4, 0, 0]])
+        hops = number % 8 == 7
+        points += [ways, hop] if hops else [ways]
+        printed += [True] * 10 + [False] * 3 * hops
+        corners[number + 1 :] += [4.0 * hops, 0, 0]
+    poses, extrude = se3.make(np.eye(3), np.concatenate(points)), np.array(printed)
+    count, speed = len(poses), np.where(extrude, 20.0, 40.0)
+    return Path(poses, speed, np.ones(count, np.int64), np.full(count, 20.0), np.zeros(count, np.int64), extrude)
+
+
+def seconds_to_print(path: Path, profile: ArmProfile, swing: SwingingSurface) -> float:
+    """From the first checkpoint to the last, by the planner, tick by tick, on exact poses."""
+    planner, now, ticks = Planner(path, profile.limits, profile.arm, TICK_S), FIRST_TICK, 0
+    while planner.progress.phase is not PrintPhase.LEAVING:
+        planner(_exact_pose(swing, now), now)
+        ticks, now = ticks + (planner.progress.phase is PrintPhase.PRINTING), now + TICK_S
+    return ticks * TICK_S
+
+
+def seconds_as_a_whole(path: Path, profile: ArmProfile) -> float:
+    """By one timing of TOPP-RA for the whole path under the planner's rules, on fine grid points; at rest."""
+    curve = curve_through(path.surface_from_nozzle, path.speed[1:], ~path.extrude[1:])
+    grid = gridpoints_on(curve, 0.0, curve.length, WHOLE_HORIZONS)
+    derivatives = axis_derivatives(profile.arm, _exact_pose(STILL, 0.0), curve, grid, 0.0)
+    limits = replace(profile.limits, speed=profile.limits.per_tick(TICK_S))
+    timing = retime(grid, derivatives, 0.0, 0.0, axis_limits(profile.arm, limits))
+    return timing.end if isinstance(timing, Timing) else float("nan")
+
+
+def pace_figures(profile: ArmProfile) -> list[Figure]:
+    """How long a path of short ways, corners and hops takes: by one timing of the whole, and as it is told before."""
+    path = zigzag_with_hops()
+    ideal, told = seconds_as_a_whole(path, profile), run_times(path, profile.arm, profile.limits, TICK_S)[-1]
+    at_rest, swung = (seconds_to_print(path, profile, swing) for swing in (STILL, SWUNG))
+    note = f"{len(path)} checkpoints, {ideal:.2f} s as a whole"
+    return [
+        Figure("dense path, time by that of one timing, at rest", at_rest / ideal, "", at_most(1.08), "", note),
+        Figure("dense path, the same on a swing of 10 mm", swung / ideal, "", at_most(1.15)),
+        Figure("dense path, time told before off by", 100 * abs(told / at_rest - 1), "%", at_most(5.0)),
+    ]
 
 
 def carries(checkpoints: int, count: int) -> tuple[Array, Array]:

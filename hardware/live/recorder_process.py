@@ -311,7 +311,7 @@ class _EntryWriter:
             self._recorder = self._opened(rig=entry)
             early, self._early = self._early, []
             for each in early:
-                self._write(each)
+                _write_entry(self._recorder, each)
         elif self._recorder is None:
             self._early.append(entry)
         else:

@@ -10,7 +10,6 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, nan
-from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -49,11 +48,14 @@ from hardware.operator.view import (
 from hardware.process.progress import TimeLeft, open_in_browser
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
+from planning.motion.retime import run_times
 from planning.path import Path, PrintPhase, way_lengths
 from planning.placement import tangent_of
 
-MAX_COMMANDS_KEPT, MAX_COMMAND_GAP = 64, 0.1  # a second of them; s between two that a straight line joins
-MAX_LATENCY, MAX_IN_FLIGHT = 0.035, 0.05  # s from frames to the wire that 99 % are to keep; of motion under way
+MAX_COMMANDS_KEPT = 64  # a second of them
+MAX_COMMAND_GAP = 0.1  # s between two commands that a straight line joins
+MAX_LATENCY = 0.035  # s from frames to the wire that 99 % are to keep
+MAX_IN_FLIGHT = 0.05  # s of motion that may be under way
 RATE_DECAY = 0.9  # share of the last rate that is kept when it is smoothed
 MAX_KEYS_READ = 100  # at once
 PHASE_ACTIVITIES = {
@@ -67,7 +69,8 @@ KEYS_HELP = "   ".join(
     f"{'space or Enter' if wish is Wish.STOP else key}: {WISH_WORDS[wish]}" for wish, key in WISH_KEYS.items()
 )
 LOG_LINES = 16  # newest ones in each view: the page keeps what it was sent before
-REST_SPAN, MIN_REST_POINTS = 10.0, 4  # s over which movement under a resting nozzle is seen, two breaths; poses of it
+REST_SPAN = 10.0  # s over which the surface's movement under a resting nozzle is seen: two breaths
+MIN_REST_POINTS = 4  # of it
 
 
 @dataclass(slots=True)
@@ -129,20 +132,12 @@ class ViewBuilder:
     _resting: deque[tuple[float, Array, float]] = field(default_factory=deque)  # s, tip on the surface, height: mm
 
     def __post_init__(self) -> None:
-        path = self.prepared.task.path
+        path, profile = self.prepared.task.path, self.prepared.task.profile
         self._true_error = NozzleErrorEstimate(path)
-        lengths = way_lengths(path.surface_from_nozzle)
-        self._times_left = np.concatenate([np.cumsum((lengths / path.speed[1:])[::-1])[::-1], [0.0]])
-        Thread(target=self._time_path, daemon=True).start()  # of 36,000 checkpoints a second and more
-        self._ways = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
-
-    def _time_path(self) -> None:
-        """Replace the times at the path's own speeds by those that the arm takes."""
-        from planning.motion.retime import run_times
-
-        task, profile = self.prepared.task, self.prepared.task.profile
-        times = run_times(task.path, profile.arm, profile.limits, profile.tick)
+        times = run_times(path, profile.arm, profile.limits, profile.tick)  # 36,000 checkpoints take 1.5 s
         self._times_left = times[-1] - times
+        lengths = way_lengths(path.surface_from_nozzle)
+        self._ways = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
 
     def update(self, reports: RunReports, profile: ArmProfile | None) -> float:
         """Take the newest reports; the true error at the nozzle, mm, where a new one is known, else NaN.

@@ -2,7 +2,7 @@
 
 The nozzle's target is base_from_surface(t) @ surface_from_nozzle(s(t)): the surface as its pose predicts it, the place
 s on the path as TOPP-RA times it. No pose, a pose that must not be followed, a target out of reach or a failed solve
-brakes the arm within its limits and then holds it. Afterwards the nozzle returns to where it stopped, to the point.
+brakes the arm within its limits and holds it. It goes on where it stopped: nothing is left out or printed twice.
 
 Printing goes on with a DEGRADED pose: what decides is the covariance of the place under the nozzle, the warp's
 included. Where the surface deforms and its warp is known, the warp moves the checkpoints with the tissue.
