@@ -28,11 +28,8 @@ from hardware.bench.fault_run import AXES_LIMITS, AxesOracle, FaultRun, prepare_
 from hardware.bench.figures import Figure, at_least, at_most, milliseconds, percentile, with_progress
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import CpuClock
-from hardware.report.page import section
-from hardware.report.report import HALF_CHART_WIDTH
 from hardware.simulator.deposit import planned_line
 from hardware.simulator.nozzle_error import EndsOfBeads, MaterialFigures, material_figures, nozzle_errors
-from hardware.simulator.nozzle_report import ends_chart
 from perception import shipped_file
 from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle, axis_limits
@@ -396,15 +393,3 @@ def _by_speed(ends: EndsOfBeads) -> str:
     speeds, error = np.round(ends.speed[there]), ends.error[there]
     each = (f"{speed:g} mm/s {error[speeds == speed].mean():+.2f}" for speed in np.unique(speeds))
     return ", ".join(each)
-
-
-def beads_section(prints: Mapping[str, BeadsPrint]) -> str:
-    """Both prints' beads about where they are to begin and end."""
-    charts = [
-        f"<div>{ends_chart(ends, f'{way}: about where beads {what}', HALF_CHART_WIDTH)}</div>"
-        for way, one in prints.items()
-        for what, ends in (("begin", one.material.begins), ("end", one.material.stops))
-    ]
-    late = 1000 * prints[LED].delay
-    text = f"Half of the dispenser's flow comes {late:.0f} ms after it is told. Laid of the planned, by mm of the path."
-    return section(LATE_DISPENSER, text, f'<div class="two">{"".join(charts)}</div>')

@@ -33,11 +33,13 @@ from estimation.se3 import Array
 from hardware.bench import figures
 from hardware.bench.fault_run import FaultRun, PreparedScenario, prepare_scenario
 from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
-from hardware.bench.planner import LED, NOT_LED, BeadsPrint, bead_figures, beads_section, print_beads
+from hardware.bench.planner import LATE_DISPENSER, LED, NOT_LED, BeadsPrint, bead_figures, print_beads
 from hardware.bench.subjects import BREATHING
 from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock
 from hardware.report.page import Plot, document, legend, line_key, section
+from hardware.report.report import HALF_CHART_WIDTH
+from hardware.simulator.nozzle_report import ends_chart
 from hardware.simulator.scenario import read_scenario
 from perception import shipped_file
 from perception.frames import FrameSet
@@ -349,7 +351,7 @@ def _figures(scenario: str, prints: dict[tuple[str, str], Print]) -> list[Figure
 
 def loop_page(prints: dict[tuple[str, str], Print], beads: Mapping[str, BeadsPrint]) -> str:
     """The error at the nozzle over time, a plot for each way, one scale a scenario; and where beads lie, if any do."""
-    body = [beads_section(beads)] if beads else []
+    body = [_beads_section(beads)] if beads else []
     keys = legend([line_key("estimate", "error while extruding, mm"), line_key("limit", f"{MAX_NOZZLE_ERROR:g} mm")])
     for scenario in dict.fromkeys(name for name, _ in prints):
         ways = {way: one for (name, way), one in prints.items() if name == scenario}
@@ -366,3 +368,15 @@ def loop_page(prints: dict[tuple[str, str], Print], beads: Mapping[str, BeadsPri
     lead = "The same print, by what the motion is told of where the surface will be."
     footer = "Virtual time, the virtual arm; the true error, every millisecond."
     return document("bench", "closed loop", lead, body, footer)
+
+
+def _beads_section(prints: Mapping[str, BeadsPrint]) -> str:
+    """Both prints' beads about where they are to begin and end."""
+    charts = [
+        f"<div>{ends_chart(ends, f'{way}: about where beads {what}', HALF_CHART_WIDTH)}</div>"
+        for way, one in prints.items()
+        for what, ends in (("begin", one.material.begins), ("end", one.material.stops))
+    ]
+    late = 1000 * prints[LED].delay
+    text = f"Half of the dispenser's flow comes {late:.0f} ms after it is told. Laid of the planned, by mm of the path."
+    return section(LATE_DISPENSER, text, f'<div class="two">{"".join(charts)}</div>')
