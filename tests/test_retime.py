@@ -38,7 +38,6 @@ from tests.moving import Motion, path_through, pose_at, raster, still
 ARM, LIMITS = SimpleArm(), MotionLimits()
 BOUNDS = LIMITS.speed, LIMITS.acceleration
 STEP = 0.02  # s, a tick
-SPEED = LIMITS.per_tick(STEP)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
