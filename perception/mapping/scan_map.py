@@ -9,9 +9,8 @@ their pictures look alike, and what is left is a shift of a node or two. On the 
 measured to come out to 0.02 mm (skin) and 0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's
 wall give 0.2.
 
-The depth map is a height field over the first map. Landmarks are few and their patches flat, so they miss a wound's
-walls by tenths of a millimetre. Their smooth surface is where dense matching begins; it is then matched and corrected
-repeatedly, from coarse to fine.
+The depth map is a height field over the first map. Landmarks are few and their patches flat: they miss a wound's walls by
+tenths of a millimetre. Dense matching begins at their smooth surface and corrects it repeatedly, from coarse to fine.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class DenseMatch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _LatticeImage:
+class LatticeImage:
     """One camera's picture on the lattice."""
 
     even: Image  # (H, W) brightness and contrast evened out
@@ -80,12 +79,12 @@ def match_near(
     Each node's ray in the reference camera is intersected with those of the other cameras at the places that match.
     every: step in rows and columns between the nodes given, (H', W', 3).
     """
-    towards = _normals(nodes)
-    first = _lattice_image(lenses, reference, images[reference], nodes, towards)
+    towards = lattice_normals(nodes)
+    first = lattice_image(lenses, reference, images[reference], nodes, towards)
     flow = _flow()
     pixels, camera, used = [first.pixels], [reference], [first.visible]
     for c in sorted(set(images) - {reference}):
-        other = _lattice_image(lenses, c, images[c], nodes, towards)
+        other = lattice_image(lenses, c, images[c], nodes, towards)
         matches, correlation = _matched(flow, first, other)
         pixels.append(matches)
         camera.append(c)
@@ -127,13 +126,16 @@ def _triangulated(
     return DenseMatch(points, sure)
 
 
-def _normals(nodes: Array) -> Array:
+def lattice_normals(nodes: Array) -> Array:
     down, right = np.gradient(nodes, axis=(0, 1))
     across = np.cross(right, down)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
 
 
-def _lattice_image(lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array) -> _LatticeImage:
+def lattice_image(
+    lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array, evening: float = EVENING_SIGMA_NODES
+) -> LatticeImage:
+    """A picture laid on nodes (H, W, 3), base frame, with normals; evened over `evening` nodes."""
     lens = lenses.rig.cameras[camera]
     ideal, depth = ideal_pixels(lens, nodes.reshape(-1, 3))
     imaged, in_lens = lenses.image(camera, ideal, depth)
@@ -144,10 +146,10 @@ def _lattice_image(lenses: Lenses, camera: int, image: Image, nodes: Array, norm
     x, y = imaged.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1)
     laid = cv2.remap(image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_CUBIC)
     grey = np.asarray(laid).astype(np.float32)
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), EVENING_SIGMA_NODES)
-    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), EVENING_SIGMA_NODES))
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), evening)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), evening))
     even = np.clip(np.rint(128 + EVENED_CONTRAST * centred / (spread + 2.0)), 0, 255).astype(np.uint8)
-    return _LatticeImage(even, ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING))
+    return LatticeImage(even, ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING))
 
 
 def _flow() -> cv2.DISOpticalFlow:
@@ -163,7 +165,7 @@ def _flow() -> cv2.DISOpticalFlow:
     return flow
 
 
-def _matched(flow: cv2.DISOpticalFlow, first: _LatticeImage, other: _LatticeImage) -> tuple[Array, Float32]:
+def _matched(flow: cv2.DISOpticalFlow, first: LatticeImage, other: LatticeImage) -> tuple[Array, Float32]:
     """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and their correlation (H, W)."""
     still = np.zeros((*first.even.shape, 2), np.float32)
     shift = np.asarray(flow.calc(first.even, other.even, still))
@@ -198,29 +200,29 @@ def relief_points(
     finest = node_size(lenses, cameras, centre)
     points = first.map.points
     low, high = np.percentile(points[:, :2], [1, 99], axis=0) + np.array([[-LATTICE_MARGIN_MM], [LATTICE_MARGIN_MM]])
-    heights, relief, sure = _initial_heights(points, low, high), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
+    heights, relief, sure = initial_heights(points, low, high), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
     for width in NODE_WIDTHS:
-        flat = _lattice(low, high, width * finest)
+        flat = lattice_nodes(low, high, width * finest)
         resized = np.asarray(cv2.resize(heights, flat.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
         nodes = np.dstack([flat, resized.astype(float)])
-        match = match_near(lenses, images, _transformed(first.base_from_surface, nodes), reference)
+        match = match_near(lenses, images, transformed_nodes(first.base_from_surface, nodes), reference)
         if match is None:
             return np.zeros((0, 3))
         relief, sure = match.points, match.sure
-        inner = _transformed(se3.inverse(first.base_from_surface), relief)
-        heights = _corrected(nodes, inner, sure, width * finest)
+        inner = transformed_nodes(se3.inverse(first.base_from_surface), relief)
+        heights = corrected_heights(nodes, inner, sure, width * finest)
     sure &= _inside(lenses, reference, relief, polygons)
     return np.asarray(relief[::step, ::step][sure[::step, ::step]])
 
 
-def _lattice(low: Array, high: Array, step: float) -> Array:
+def lattice_nodes(low: Array, high: Array, step: float) -> Array:
     x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def _initial_heights(points: Array, low: Array, high: Array) -> Float32:
+def initial_heights(points: Array, low: Array, high: Array) -> Float32:
     """Heights on a coarse lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
-    flat = _lattice(low, high, GUESS_SIGMA_MM / 2)
+    flat = lattice_nodes(low, high, GUESS_SIGMA_MM / 2)
     away = points[None, :, :2] - flat.reshape(-1, 1, 2)
     weight = np.exp(-(away**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
     design = np.concatenate([np.ones((*away.shape[:2], 1)), away / GUESS_SIGMA_MM], 2)
@@ -229,11 +231,11 @@ def _initial_heights(points: Array, low: Array, high: Array) -> Float32:
     return np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2]).astype(np.float32)
 
 
-def _transformed(transform: Array, nodes: Array) -> Array:
+def transformed_nodes(transform: Array, nodes: Array) -> Array:
     return se3.transform_points(transform, nodes.reshape(-1, 3)).reshape(nodes.shape)
 
 
-def _corrected(nodes: Array, matches: Array, sure: NDArray[np.bool_], step: float) -> Float32:
+def corrected_heights(nodes: Array, matches: Array, sure: NDArray[np.bool_], step: float) -> Float32:
     """New heights (H, W) from the points (H, W, 3) matched at the nodes (H, W, 3), in the surface frame."""
     heights, off = nodes[..., 2], matches - nodes
     down, right = np.gradient(heights, step)
