@@ -8,7 +8,8 @@ piece of bead is not wronged by its neighbours. What both fields are off by toge
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +62,9 @@ def pieces_between(path: Path, first: float, last: float, where: object = "path"
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1) > MIN_SPACING
     ways = ways[path.extrude[ways] & moved[ways - 1]]
     area = bead_areas(path, where)[ways]
+    width = np.sqrt(2.5 * area)  # of a bead 0.4 as high as it is wide
     if "width_mm" in path.extra:
         width = path.extra["width_mm"][ways].astype(float)
-    else:
-        width = np.sqrt(2.5 * area)  # of a bead 0.4 as high as it is wide
     start, end = poses[ways - 1, :3, 3], poses[ways, :3, 3]
     return BeadPieces(start, end, area, width, bead[ways], path.layer[ways], knots[ways - 1])
 
@@ -228,3 +228,51 @@ def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPiece
         scale = np.where(enough, total(risen * due, seen) / squares, np.nan)
         scale_sigma = np.sqrt(total(variance * due**2, seen) * shared) / squares
     return LaidBeads(stations, planned, volume, sigma, scale * stations.crest, scale_sigma * stations.crest)
+
+
+def with_looks(path: Path, beads: int = 0) -> Path:
+    """The path with a look after each layer, or after every so many beads and the last one."""
+    ends = np.flatnonzero(path.extrude & ~np.append(path.extrude[1:], False))
+    if beads:
+        ends = ends[np.append(np.arange(beads - 1, len(ends) - 1, beads), len(ends) - 1)] if len(ends) else ends
+    else:
+        ends = ends[np.append(path.layer[ends[1:]] != path.layer[ends[:-1]], True)] if len(ends) else ends
+    looks = np.full(len(path), "0")
+    looks[ends] = "1"
+    return replace(path, extra={**path.extra, "look": looks})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """A look at what was laid."""
+
+    stamp: float  # s, when it was done
+    first: float  # checkpoints, of the path from where
+    last: float  # to where it was laid
+    seconds: float  # that the needle stood aside
+    width: float  # of beads, by the planned
+    laid: LaidBeads
+
+    @property
+    def text(self) -> str:
+        """What was found, in a sentence or two."""
+        volume, planned, seen = self.laid.total
+        if not planned > 0:
+            return "nothing could be judged: the beads are not seen"
+        crest = self.laid.stations.crest
+        off = self.laid.height - crest
+        parts = [f"{volume:.1f} of {planned:.1f} mm³ lie there ({volume / planned:.0%})"]
+        parts.append(f"beads {np.nanmedian(self.laid.height):.2f} mm high (planned {np.median(crest):.2f})")
+        parts.append(f"{np.nanmedian(self.laid.stations.width):.1f} mm wide, {np.nanstd(off):.2f} mm uneven")
+        parts += [f"clogged from {a:.0f} to {b:.0f} mm of the path" for a, b in self.laid.clogs]
+        gaps, blobs = int(self.laid.gap.sum()), int(self.laid.blob.sum())
+        parts += [
+            f"{n} of {len(crest)} pieces {word}" for n, word in ((gaps, "lack gel"), (blobs, "have too much")) if n
+        ]
+        parts += [f"{1 - seen:.0%} not seen"] if seen < 0.99 else []
+        return ", ".join(parts)
+
+
+def clogged(looks: Sequence[Look]) -> list[tuple[float, float]]:
+    """From, to, mm along the path: the clogs of all looks."""
+    return [clog for look in looks for clog in look.laid.clogs]

@@ -51,7 +51,9 @@ class SurfaceView:
 
 def view_of(frames: FrameSet, base_from_surface: Array) -> SurfaceView:
     """A frame set as a view."""
-    grey = {f.camera: f.image if f.image.ndim == 2 else cv2.cvtColor(f.image, cv2.COLOR_BGR2GRAY) for f in frames.frames}
+    grey = {
+        f.camera: f.image if f.image.ndim == 2 else cv2.cvtColor(f.image, cv2.COLOR_BGR2GRAY) for f in frames.frames
+    }
     return SurfaceView({camera: np.asarray(image) for camera, image in grey.items()}, base_from_surface)
 
 
@@ -77,9 +79,7 @@ def dense_heights(lenses: Lenses, views: Sequence[SurfaceView], start: SurfaceHe
     shape = start.heights.shape
     filled = np.where(often, mean, _resampled(start.heights, flat.shape[:2]))
     seen = _resampled(often.astype(float), shape) > 0.5
-    return replace(
-        start, heights=np.where(seen, _resampled(filled, shape), np.nan), sigma=_resampled(spread, shape)
-    )
+    return replace(start, heights=np.where(seen, _resampled(filled, shape), np.nan), sigma=_resampled(spread, shape))
 
 
 def _matched_heights(
@@ -95,7 +95,9 @@ def _matched_heights(
         if match is None:
             return heights, np.zeros(heights.shape, bool)
         sure = match.sure
-        heights = scan_map.corrected_heights(nodes, scan_map.transformed_nodes(surface_from_base, match.points), sure, step).astype(float)
+        heights = scan_map.corrected_heights(
+            nodes, scan_map.transformed_nodes(surface_from_base, match.points), sure, step
+        ).astype(float)
     return heights, sure
 
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from estimation.errors import InputError
@@ -15,7 +15,6 @@ from estimation.rig import Camera
 from estimation.se3 import Array
 from hardware.simulator.scene.fields import (
     Field,
-    Layers,
     Size,
     Texture,
     as_field,

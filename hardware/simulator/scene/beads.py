@@ -30,8 +30,9 @@ DROP_STEP = 0.08  # mm of way at most from one drop to the next: less than a tex
 class Gel:
     """How a material lies."""
 
-    aspect: float = BEAD_HEIGHT_BY_WIDTH  # height by width of a bead at rest
+    aspect: float = 0.3  # height by width of a bead at rest: it meets the surface at 50 degrees
     sag_time: float = 2.0  # s in which 63 % of the way to it is gone
+    gloss: float = GEL_GLOSS  # 0 matt, as behind crossed polarisers, to 1 wet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +154,7 @@ class PrintedBeads:
         opacity = colour[..., 3:]
         self._layers.colour[0][y0:y1, x0:x1, :3] = colour[..., :3] * (1 - share) + GEL_COLOUR * opacity * share
         wet = np.clip(height / 0.06, 0, 1)[..., None]
-        gloss = np.full_like(height, GEL_GLOSS)
+        gloss = np.full_like(height, GEL_GLOSS if self.gel is None else self.gel.gloss)
         over = np.dstack([relief[..., 0] * 0.5 + sx, relief[..., 1] * 0.5 + sy, gloss, relief[..., 3]])
         self._layers.relief[0][y0:y1, x0:x1] = relief * (1 - wet) + over * wet
 
