@@ -162,7 +162,7 @@ class LaidBeads:
     @property
     def share(self) -> Array:
         """Laid of the planned (S,)."""
-        return self.volume / self.planned
+        return np.asarray(self.volume / self.planned)
 
     @property
     def gap(self) -> NDArray[np.bool_]:
@@ -215,7 +215,7 @@ def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPiece
     seen = own & np.isfinite(risen) & np.isfinite(variance)
 
     def total(values: Array, where: NDArray[np.bool_]) -> Array:
-        return np.bincount(station[where], values[where], count)[:count]
+        return np.asarray(np.bincount(station[where], values[where], count)[:count], float)
 
     nodes_seen, squares = total(np.ones_like(due), seen), total(due**2, seen)
     enough = (nodes_seen >= MIN_SEEN * np.maximum(total(np.ones_like(due), own), 1)) & (nodes_seen > 0)
@@ -231,14 +231,14 @@ def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPiece
 
 
 def with_looks(path: Path, beads: int = 0) -> Path:
-    """The path with a look after each layer, or after every so many beads and the last one."""
+    """The path with a look before all, and after each layer, or after every so many beads and the last one."""
     ends = np.flatnonzero(path.extrude & ~np.append(path.extrude[1:], False))
     if beads:
         ends = ends[np.append(np.arange(beads - 1, len(ends) - 1, beads), len(ends) - 1)] if len(ends) else ends
     else:
         ends = ends[np.append(path.layer[ends[1:]] != path.layer[ends[:-1]], True)] if len(ends) else ends
     looks = np.full(len(path), "0")
-    looks[ends] = "1"
+    looks[[0, *ends]] = "1"
     return replace(path, extra={**path.extra, "look": looks})
 
 

@@ -138,7 +138,7 @@ def _rests(path: Path, knots: Array, materials: tuple[str, ...], where: object) 
     looks = _numbers(path, "look", where) if "look" in path.extra else np.zeros(len(path))
     rests = []
     for i in range(1, len(path)):
-        if looks[i - 1] and i > 1:
+        if looks[i - 1]:
             rests.append(Rest(float(knots[i - 1]), i, 0.0, LOOK))
         changed = i > 1 and materials[i] != materials[i - 1]
         if changed or (wait[i] > 0 and i > 1):
@@ -171,6 +171,8 @@ class RestsAhead:
         self._plan = plan
         self._number = sum(rest.place < place - ROUNDING for rest in plan.rests)
         self._until = math.nan  # s, until when it lasts; NaN: it is not reached
+        if (rest := self.next) is not None and rest.material == LOOK and rest.place <= place + ROUNDING:
+            self._until = 0.0  # the needle need not go there first
 
     @property
     def next(self) -> Rest | None:

@@ -1,7 +1,7 @@
 """Looks at what was laid: gathers the views while the needle stands aside, measures, judges, and draws the result.
 
-`begin` is given frame sets before anything is laid, `at` those of the print; the last one of each look takes it some
-two seconds of a core.
+The first look, before anything is laid, measures the surface; each of the others what has come since. The last frame
+set of a look takes some two seconds of a core.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
+from estimation.se3 import Array
 from estimation.surface_map import SurfaceHeights
 from hardware.offline.track import FrameSetStep
 from hardware.recording import messages
@@ -43,7 +44,7 @@ from planning.path import LOOK, Path, PrintProgress, way_lengths
 VIEWS = 4  # frame sets of a look: each at another place of the breath, so that pixels fall elsewhere
 VIEW_SPACING = 0.25  # s between them
 SETTLED = 0.3  # s after the needle came to rest aside: it may swing, and pictures are late
-MARGIN = 4.0  # mm of surface beside the path that is measured as well: there nothing is laid
+MARGIN = 10.0  # mm of surface beside the path that is measured as well: matching begins with what is coarse
 MIN_STEP = 0.2  # mm between nodes: ten across a bead, and a look in two seconds
 WIDTHS = (1.0, 1.12, 1.25, 1.4)  # by the planned: gel spreads
 LOOK_TOPIC = "/look"
@@ -52,7 +53,7 @@ SHARE_COLOURS = ((0.6, "#c0392b"), (0.8, "#e67e22"), (1.25, "#27ae60"), (1.6, "#
 
 
 class SurfaceLooks:
-    """The looks of one print. surface: as it was measured last; None before `begin`."""
+    """The looks of one print. surface: as it was measured last, None before the first. last: what the last one told."""
 
     def __init__(self, rig: Rig, path: Path) -> None:
         """path: with its column `look`, in the surface frame of the poses. InputError where it says no amounts."""
@@ -61,40 +62,40 @@ class SurfaceLooks:
         self._views: list[SurfaceView] = []
         self._gathered = -math.inf  # s, of the last view
         self._from = 0.0  # checkpoints, up to where was looked at
-        self._aside, self._judged = math.nan, False  # s, since when the needle stands aside
+        self._aside, self._done = math.nan, False  # s, since when the needle stands aside
+        self.last: Look | None = None
         self.surface: SurfaceHeights | None = None
 
-    def begin(self, frames: FrameSet, pose: SurfacePose, step: FrameSetStep) -> bool:
-        """Whether the surface is measured, before anything is laid, by this frame set and those given before.
+    def at(
+        self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose, step: FrameSetStep
+    ) -> bool:
+        """Whether a look is done by this frame set and those given before, which is said once; `last` is what it told.
 
-        step: the tracker, whose map says about where it lies.
+        command: the last one. step: the tracker, whose map says about where the surface lies.
         """
-        if not self._keep(frames, pose) or (surface_map := getattr(step, "map", None)) is None:
+        if progress.wanted != LOOK:
+            self._aside, self._done = math.nan, False
             return False
+        if self._done or not (isinstance(command, Hold) and command.reason == LOOKS):
+            return False
+        self._aside = pose.stamp if math.isnan(self._aside) else self._aside
+        surface_map = getattr(step, "map", None)
+        if surface_map is None or not self._keep(frames, pose, self._aside):
+            return False
+        self._done = True
+        if self.surface is None:
+            self._from, self.last = progress.fraction, None
+            self._measure(surface_map.points)
+        else:
+            self.last = self._judge(progress.fraction, pose.stamp)
+        return True
+
+    def _measure(self, landmarks: Array) -> None:
+        """Measure the surface before anything is laid, near landmarks (N, 3) mm, surface frame."""
         views, self._views = self._views, []
         low, high = self._path.zone[:, :2] + np.array([[-MARGIN], [MARGIN]])
         node = node_size(self._lenses, sorted(views[0].images), views[0].base_from_surface[:3, 3])
-        start = first_heights(surface_map.points, low, high, max(node, MIN_STEP))
-        self.surface = dense_heights(self._lenses, views, start)
-        return True
-
-    def at(
-        self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose, now: float
-    ) -> Look | None:
-        """The look, once the needle is at rest aside and there are enough frame sets; then no more until the next.
-
-        command: the last. now: s, when judging it will be done.
-        """
-        if progress.wanted != LOOK:
-            self._aside, self._judged = math.nan, False
-            return None
-        if self._judged or not (isinstance(command, Hold) and command.reason == LOOKS):
-            return None
-        self._aside = pose.stamp if math.isnan(self._aside) else self._aside
-        if not self._keep(frames, pose, self._aside):
-            return None
-        self._judged = True
-        return self.judge(progress.fraction, self._aside, now)
+        self.surface = dense_heights(self._lenses, views, first_heights(landmarks, low, high, max(node, MIN_STEP)))
 
     def _keep(self, frames: FrameSet, pose: SurfacePose, since: float = -math.inf) -> bool:
         """Keep a frame set if it is of use; whether there are enough. since: s, when the needle came to rest aside."""
@@ -104,8 +105,8 @@ class SurfaceLooks:
             self._views.append(view_of(frames, pose.base_from_surface))
         return len(self._views) >= VIEWS
 
-    def judge(self, fraction: float, since: float, now: float) -> Look:
-        """What lies there of the path up to `fraction` checkpoints. since, now: s, the needle stands aside."""
+    def _judge(self, fraction: float, now: float) -> Look:
+        """What lies there of the path up to `fraction` checkpoints."""
         assert self.surface is not None
         views, self._views = self._views, []
         before, first = self.surface, self._from
@@ -120,7 +121,7 @@ class SurfaceLooks:
         known = np.isfinite(self.surface.heights)  # what could not be told is taken for laid as planned
         filled = np.where(known, self.surface.heights, before.heights + dues[swept.width])
         self.surface, self._from = replace(self.surface, heights=filled), fraction
-        return Look(now, first, fraction, now - since, width, laid)
+        return Look(now, first, fraction, now - self._aside, width, laid)
 
 
 def read_looks(recording: File) -> list[Look]:
@@ -144,8 +145,9 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
     rows = []
     for look in looks:
         volume, planned, _ = look.laid.total
-        crest, laid = look.laid.stations.crest, look.laid
-        heights = np.nanmedian(laid.height), np.median(crest), np.nanstd(laid.height - crest)
+        laid, crest = look.laid, look.laid.stations.crest
+        off = laid.height[np.isfinite(laid.height)] - crest[np.isfinite(laid.height)]
+        heights = [np.median(crest) + _median(off), np.median(crest), float(np.std(off)) if len(off) else math.nan]
         clogs = "; ".join(f"{a:.0f} to {b:.0f} mm" for a, b in laid.clogs) or "none"
         values = f"{look.stamp:.1f}", f"{look.seconds:.1f}", figure(volume), figure(planned), *map(figure, heights)
         rows.append([*values, str(int(laid.gap.sum())), str(int(laid.blob.sum())), clogs])
@@ -161,6 +163,10 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
         "quarter; orange: less than 0.8 or more than 1.25; red: a gap; violet: a blob; grey: not seen."
     )
     return page.section("Looks at what was laid", text, table + f'<div class="pictures">{drawn}</div>')
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else math.nan
 
 
 def look_picture(look: Look, path: Path) -> str:

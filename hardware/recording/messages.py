@@ -269,10 +269,16 @@ _LAID = ("planned", "volume", "sigma", "height", "height_sigma")  # mm^3, and mm
 
 def message_from_look(look: Look) -> Message:
     """A look as a message; what could not be judged is null."""
-    names = ("stamp", "first", "last", "seconds", "width")
+    names = ("stamp", "first", "last", "seconds")
     laid = {name: [v if np.isfinite(v) else None for v in getattr(look.laid, name).tolist()] for name in _LAID}
     stations = {name: getattr(look.laid.stations, name).tolist() for name in _STATIONS}
-    return {**{name: float(getattr(look, name)) for name in names}, "text": look.text, **stations, **laid}
+    return {
+        **{name: float(getattr(look, name)) for name in names},
+        "spread": look.width,
+        "text": look.text,
+        **stations,
+        **laid,
+    }
 
 
 def look_from_message(message: Message) -> Look:
@@ -280,7 +286,7 @@ def look_from_message(message: Message) -> Look:
     kinds = (np.int64, np.int64, float, float, float, float)
     stations = Stations(*(np.array(message[name], kind) for name, kind in zip(_STATIONS, kinds, strict=True)))
     laid = LaidBeads(stations, *(np.array(message[name], float) for name in _LAID))  # null: NaN
-    return Look(*(message[name] for name in ("stamp", "first", "last", "seconds", "width")), laid)
+    return Look(message["stamp"], message["first"], message["last"], message["seconds"], message["spread"], laid)
 
 
 def message_from_bytes(stamp: float, data: bytes) -> Message:

@@ -201,7 +201,6 @@ class SimulatedWorld:
         self._rows_until = 0.0
         beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
         self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
-        self._placed: Path | None = None  # in the tracker's surface frame
         self._looks: SurfaceLooks | None = None
         self._end = scenario.seconds
         self._killed = self._broken = False
@@ -333,11 +332,6 @@ class SimulatedWorld:
         if self.motion.progress is not None:
             self._look_at(pose, frames)
             return
-        if self._placed is not None:  # before anything is laid the surface is measured, the arm at home
-            assert self._looks is not None
-            if self._looks.begin(frames, pose, self._step):
-                self._begin_print(self._placed)
-            return
         if pose.state is not TrackState.TRACKING:
             return
         change: Array | None = np.eye(4)
@@ -350,27 +344,25 @@ class SimulatedWorld:
         if change is None:
             return
         placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
+        self.motion.begin(placed_path, scenario.profile, 0.0, self.dispensers.outlets)
         self._sink.registered(change)
-        self._placed = placed_path
-        if scenario.looks is None:
-            self._begin_print(placed_path)
-        else:
+        if scenario.looks is not None:
             self._looks = SurfaceLooks(scenario.known_rig, placed_path)
 
-    def _begin_print(self, path: Path) -> None:
-        self.motion.begin(path, self.scenario.profile, 0.0, self.dispensers.outlets)
-
     def _look_at(self, pose: SurfacePose, frames: FrameSet) -> None:
-        if self._looks is None or (progress := self.motion.progress) is None:
-            return
-        done = self._time.now() + LOOK_SECONDS
-        look = self._looks.at(progress, self.motion.last, frames, pose, done)
-        if look is not None:
-            self._events.at(done, TICK_EVENT, partial(self._looked, look))
+        looks, progress = self._looks, self.motion.progress
+        if (
+            looks is not None
+            and progress is not None
+            and looks.at(progress, self.motion.last, frames, pose, self._step)
+        ):
+            self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks.last))
 
-    def _looked(self, look: Look, now: float) -> None:
-        self._sink.look(look)
-        self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
+    def _looked(self, look: Look | None, now: float) -> None:
+        if look is not None:
+            look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
+            self._sink.look(look)
+            self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
         self.motion.put_in()
 
     def _orders(self) -> list[Order]:

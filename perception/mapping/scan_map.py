@@ -9,8 +9,8 @@ their pictures look alike, and what is left is a shift of a node or two. On the 
 measured to come out to 0.02 mm (skin) and 0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's
 wall give 0.2.
 
-The depth map is a height field over the first map. Landmarks are few and their patches flat: they miss a wound's walls by
-tenths of a millimetre. Dense matching begins at their smooth surface and corrects it repeatedly, from coarse to fine.
+The depth map is a height field over the first map. Landmarks are few and their patches flat, so they miss a wound's
+walls by 0.1 mm and more. Dense matching begins at their smooth surface and corrects it, from coarse to fine.
 """
 
 from __future__ import annotations
@@ -127,6 +127,7 @@ def _triangulated(
 
 
 def lattice_normals(nodes: Array) -> Array:
+    """Unit normals (H, W, 3) of the surface through nodes (H, W, 3)."""
     down, right = np.gradient(nodes, axis=(0, 1))
     across = np.cross(right, down)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
@@ -216,6 +217,7 @@ def relief_points(
 
 
 def lattice_nodes(low: Array, high: Array, step: float) -> Array:
+    """x and y (H, W, 2), mm, of nodes `step` apart from `low` to at least `high` (2,)."""
     x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
     return np.stack(np.meshgrid(x, y), -1)
 
@@ -232,6 +234,7 @@ def initial_heights(points: Array, low: Array, high: Array) -> Float32:
 
 
 def transformed_nodes(transform: Array, nodes: Array) -> Array:
+    """Nodes (H, W, 3) carried by a transform (4, 4)."""
     return se3.transform_points(transform, nodes.reshape(-1, 3)).reshape(nodes.shape)
 
 

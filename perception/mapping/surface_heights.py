@@ -27,8 +27,8 @@ from perception.frames import FrameSet, Image
 from perception.lens import Lenses
 from perception.mapping import scan_map
 
-DENSE_ROUNDS = 3  # of matching and correcting, from a first surface that is right to a millimetre
-DENSE_STEP = 2.0  # lattice steps of the fine lattice between the nodes of the dense matching, in pixels of the cameras
+FIRST_WIDTHS = (2.0, 2.0, 1.0, 1.0)  # widths of a node, in its finest size, from landmarks on (scan_map.NODE_WIDTHS)
+NEXT_WIDTHS = (1.0, 1.0)  # in a further view, from the surface of the first
 MATCH_FLOOR = 0.03  # mm: what the mean of any number of frame sets is off by (scan_map)
 COARSE_SHARES = np.arange(-0.25, 2.26, 0.25)  # of the planned bead
 FINE_SHARES = np.arange(-0.25, 0.251, 0.125)  # about what the coarse sweep found
@@ -67,38 +67,35 @@ def first_heights(points: Array, low: Array, high: Array, step: float) -> Surfac
 
 def dense_heights(lenses: Lenses, views: Sequence[SurfaceView], start: SurfaceHeights) -> SurfaceHeights:
     """The surface by dense matching in each view, near `start`; NaN where no two cameras see it in most of them."""
-    centre = views[0].base_from_surface[:3, 3]
-    step = max(start.step, DENSE_STEP / 2 * scan_map.node_size(lenses, sorted(views[0].images), centre))
-    low, high = start.low, start.low + start.step * (np.array(start.heights.shape[::-1]) - 1)
-    flat = scan_map.lattice_nodes(low, high, step)
-    found = [_matched_heights(lenses, view, flat, _resampled(start.heights, flat.shape[:2]), step) for view in views]
-    heights, sure = np.stack([h for h, _ in found]), np.stack([s for _, s in found])
-    often = sure.mean(axis=0) > 0.5
-    mean = np.where(often, np.median(heights, axis=0), np.nan)
-    spread = np.sqrt(heights.var(axis=0) / max(len(views) - 1, 1) + MATCH_FLOOR**2)
-    shape = start.heights.shape
-    filled = np.where(often, mean, _resampled(start.heights, flat.shape[:2]))
-    seen = _resampled(often.astype(float), shape) > 0.5
-    return replace(start, heights=np.where(seen, _resampled(filled, shape), np.nan), sigma=_resampled(spread, shape))
+    finest = scan_map.node_size(lenses, sorted(views[0].images), views[0].base_from_surface[:3, 3])
+    heights, seen, found = start.heights, np.zeros(start.heights.shape, bool), list[tuple[Array, NDArray[np.bool_]]]()
+    for view in views:
+        for width in NEXT_WIDTHS if found else FIRST_WIDTHS:
+            heights, seen = _matched_heights(lenses, view, start, heights, max(width * finest, start.step))
+        found.append((heights, seen))
+    each, sure = np.stack([h for h, _ in found]), np.mean([s for _, s in found], axis=0)
+    spread = np.sqrt(each.var(axis=0) / max(len(views) - 1, 1) + MATCH_FLOOR**2)
+    return replace(start, heights=np.where(sure > 0.5, np.median(each, axis=0), np.nan), sigma=spread)
 
 
 def _matched_heights(
-    lenses: Lenses, view: SurfaceView, flat: Array, heights: Array, step: float
+    lenses: Lenses, view: SurfaceView, field: SurfaceHeights, heights: Array, step: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    cameras = sorted(view.images)
-    reference = scan_map.middle_camera(lenses, cameras, view.base_from_surface[:3, 3])
-    surface_from_base, sure = se3.inverse(view.base_from_surface), np.zeros(heights.shape, bool)
-    for _ in range(DENSE_ROUNDS):
-        nodes = np.dstack([flat, heights])
-        base = scan_map.transformed_nodes(view.base_from_surface, nodes)
-        match = scan_map.match_near(lenses, view.images, base, reference)
-        if match is None:
-            return heights, np.zeros(heights.shape, bool)
-        sure = match.sure
-        heights = scan_map.corrected_heights(
-            nodes, scan_map.transformed_nodes(surface_from_base, match.points), sure, step
-        ).astype(float)
-    return heights, sure
+    """Heights (H, W) on the lattice of `field`, matched near `heights` on one of `step` mm, and where they are sure."""
+    shape = heights.shape
+    high = field.low + field.step * (np.array(shape[::-1]) - 1)
+    count = np.maximum(np.rint((high - field.low) / step).astype(int) + 1, 2)
+    flat = np.stack(np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(field.low, high, count, strict=True))), -1)
+    nodes = np.dstack([flat, _resampled(heights, flat.shape[:2])])
+    reference = scan_map.middle_camera(lenses, sorted(view.images), view.base_from_surface[:3, 3])
+    match = scan_map.match_near(
+        lenses, view.images, scan_map.transformed_nodes(view.base_from_surface, nodes), reference
+    )
+    if match is None:
+        return heights, np.zeros(shape, bool)
+    inner = scan_map.transformed_nodes(se3.inverse(view.base_from_surface), match.points)
+    corrected = scan_map.corrected_heights(nodes, inner, match.sure, step).astype(float)
+    return _resampled(corrected, shape), _resampled(match.sure.astype(float), shape) > 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -345,8 +345,8 @@ def aside_curve(surface_from_nozzle: Array, goal: Array) -> PathCurve | None:
     return _through([surface_from_nozzle, lifted, goal], APPROACH_SPEED)
 
 
-def pose_aside(surface_from_nozzle: Array, zone: tuple[Array, Array]) -> Array:
-    """The nozzle (4, 4) beside the path's zone (low, high), mm, and above it: nothing laid there is behind the tool.
+def pose_aside(surface_from_nozzle: Array, zone: Array) -> Array:
+    """The nozzle (4, 4) above and beside the path's zone (2, 3), low and high, mm: nothing there is behind the tool.
 
     It goes along the surface's x, to the side that is nearer: cameras stand on an arc in the plane of y and z.
     """
