@@ -61,6 +61,7 @@ class SurfaceLooks:
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
         self._gathered = -math.inf  # s, of the last view
+        self._widths = WIDTHS
         self._from = 0.0  # checkpoints, up to where was looked at
         self._aside, self._done = math.nan, False  # s, since when the needle stands aside
         self.last: Look | None = None
@@ -113,9 +114,10 @@ class SurfaceLooks:
         pieces = pieces_between(self._path, first, fraction)
         stations, nodes = stations_of(pieces), before.nodes
         station, _ = nearest_station(pieces, stations, nodes)
-        dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in WIDTHS]
+        dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in self._widths]
         swept = sweep_beads(self._lenses, views, before, dues, station)
-        width = WIDTHS[swept.width]
+        width = self._widths[swept.width]
+        self._widths = (width,)  # a property of the gel, seen best on the bare surface
         self.surface = heights_with_beads(before, dues[swept.width], station, swept)
         laid = judge_beads(before, self.surface, replace(pieces, width=pieces.width * width))
         known = np.isfinite(self.surface.heights)  # what could not be told is taken for laid as planned
