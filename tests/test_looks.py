@@ -17,7 +17,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceHeights
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.offline.looks import look_picture, looks_section, read_looks
+from hardware.offline.looks import look_at, look_picture, looks_section, read_looks
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
 from hardware.recording.messages import message_from_look
@@ -36,19 +36,14 @@ from perception.mapping.surface_heights import (
     SurfaceView,
     dense_heights,
     first_heights,
-    heights_with_beads,
-    sweep_beads,
 )
 from planning.command import Move
 from planning.kinematics import nozzle_from_axes
 from planning.laid_beads import (
     BeadPieces,
-    LaidBeads,
     Look,
     bead_heights,
     judge_beads,
-    nearest_station,
-    stations_of,
     with_looks,
 )
 from planning.motion.guard import Guard
@@ -219,26 +214,17 @@ def test_cameras_tell_how_much_was_laid_and_that_nothing_was() -> None:
     bare, lenses = views(scene, rig, rng), Lenses(rig)
     low, high = np.array([[-16.0, -13.0], [16.0, 13.0]])
     before = dense_heights(lenses, bare, first_heights(landmarks(scene), low, high, 0.2))
-    nothing = told(lenses, bare, before, pieces)
+    nothing, *_ = look_at(lenses, bare, before, pieces)
     assert nothing.gap.mean() > 0.9 and len(nothing.clogs) == 1
     for a, b in zip(pieces.start[:, :2], pieces.end[:, :2], strict=True):
         way = np.linspace(a, b, 141)
         scene.ink.flow(GelPieces(way[:-1], way[1:], np.full(140, 0.064), np.full(140, 0.64)), 0.0)
     scene.ink.flow(none_left(), 30.0)
-    laid = told(lenses, views(scene, rig, rng), before, pieces)
+    laid, _, width = look_at(lenses, views(scene, rig, rng), before, pieces)
+    assert width in (1.12, 1.25)
     volume, planned, seen = laid.total
     assert seen > 0.9 and volume == pytest.approx(planned, rel=0.12) and not laid.clogs and not laid.gap.any()
     assert np.sqrt(np.nanmean((laid.height - 0.537) ** 2)) < 0.08  # mm; a parabola of 0.64 mm^2, 0.3 as high as wide
-
-
-def told(lenses: Lenses, seen: list[SurfaceView], before: SurfaceHeights, pieces: BeadPieces) -> LaidBeads:
-    """What a look tells of beads."""
-    station, _ = nearest_station(pieces, stations_of(pieces), before.nodes)
-    widths = (1.0, 1.12, 1.25)
-    dues = [bead_heights(replace(pieces, width=width * pieces.width), before.nodes) for width in widths]
-    swept = sweep_beads(lenses, seen, before, dues, station)
-    after = heights_with_beads(before, dues[swept.width], station, swept)
-    return judge_beads(before, after, replace(pieces, width=pieces.width * widths[swept.width]))
 
 
 def views(scene: Scene, rig: Rig, rng: np.random.Generator) -> list[SurfaceView]:

@@ -37,7 +37,16 @@ from perception.mapping.surface_heights import (
     view_of,
 )
 from planning.command import Command, Hold
-from planning.laid_beads import Look, bead_heights, judge_beads, nearest_station, pieces_between, stations_of
+from planning.laid_beads import (
+    BeadPieces,
+    LaidBeads,
+    Look,
+    bead_heights,
+    judge_beads,
+    nearest_station,
+    pieces_between,
+    stations_of,
+)
 from planning.motion.planner import LOOKS
 from planning.path import LOOK, Path, PrintProgress, way_lengths
 
@@ -110,20 +119,30 @@ class SurfaceLooks:
         """What lies there of the path up to `fraction` checkpoints."""
         assert self.surface is not None
         views, self._views = self._views, []
-        before, first = self.surface, self._from
-        pieces = pieces_between(self._path, first, fraction)
-        stations, nodes = stations_of(pieces), before.nodes
-        station, _ = nearest_station(pieces, stations, nodes)
-        dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in self._widths]
-        swept = sweep_beads(self._lenses, views, before, dues, station)
-        width = self._widths[swept.width]
+        pieces = pieces_between(self._path, self._from, fraction)
+        laid, self.surface, width = look_at(self._lenses, views, self.surface, pieces, self._widths)
         self._widths = (width,)  # a property of the gel, seen best on the bare surface
-        self.surface = heights_with_beads(before, dues[swept.width], station, swept)
-        laid = judge_beads(before, self.surface, replace(pieces, width=pieces.width * width))
-        known = np.isfinite(self.surface.heights)  # what could not be told is taken for laid as planned
-        filled = np.where(known, self.surface.heights, before.heights + dues[swept.width])
-        self.surface, self._from = replace(self.surface, heights=filled), fraction
+        first, self._from = self._from, fraction
         return Look(now, first, fraction, now - self._aside, width, laid)
+
+
+def look_at(
+    lenses: Lenses,
+    views: Sequence[SurfaceView],
+    before: SurfaceHeights,
+    pieces: BeadPieces,
+    widths: Sequence[float] = WIDTHS,
+) -> tuple[LaidBeads, SurfaceHeights, float]:
+    """What lies of planned beads, the surface after, and how wide beads are by the planned, one of `widths`."""
+    nodes = before.nodes
+    station, _ = nearest_station(pieces, stations_of(pieces), nodes)
+    dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in widths]
+    swept = sweep_beads(lenses, views, before, dues, station)
+    width, due = widths[swept.width], dues[swept.width]
+    after = heights_with_beads(before, due, station, swept)
+    laid = judge_beads(before, after, replace(pieces, width=pieces.width * width))
+    filled = np.where(np.isfinite(after.heights), after.heights, before.heights + due)  # unknown: taken for laid
+    return laid, replace(after, heights=filled), width
 
 
 def read_looks(recording: File) -> list[Look]:
