@@ -239,12 +239,25 @@ def trace_page(trace: Trace, title: str) -> str:
             "Milliseconds a set, from its pixels in memory to the first move on the wire; processes work side by side.",
             figures_table(("what", "all sets", f"slowest {SLOWEST_SHARE:.0%}"), rows),
         ),
-        section("The slowest sets", "Each lane a process; the grey band is the set's way. Point at a bar.", charts),
+        section("The slowest sets", "Each lane a process; the grey band is the set's way.", _legend(trace) + charts),
     ]
     return document("trace", title, lead, body, "stillbed")
 
 
-COLOURS = ("#3d7edb", "#e07b39", "#3aa37b", "#b65fc4", "#c9a227", "#d1495b", "#5aa9c7", "#8d8d8d")
+COLOURS = (
+    *("#3d7edb", "#e07b39", "#3aa37b", "#b65fc4", "#c9a227", "#d1495b", "#5aa9c7", "#8d8d8d"),
+    *("#7a5c3e", "#1f4e8c", "#9bc53d", "#f19cbb", "#5f4bb6", "#00798c"),
+)
+
+
+def _colours(trace: Trace) -> dict[str, str]:
+    names = sorted({span[0] for entry in trace.entries for span in entry.spans})
+    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
+
+
+def _legend(trace: Trace) -> str:
+    keys = (f'<span style="color:{c}">■</span> {escape(name)}' for name, c in _colours(trace).items())
+    return f"<p>{', '.join(keys)}</p>"
 
 
 def _lanes(trace: Trace, way: SetWay) -> str:
@@ -253,16 +266,16 @@ def _lanes(trace: Trace, way: SetWay) -> str:
     scale, lanes = CHART_PX / (end - begin), (TRACKING_LANE, MOTION_LANE, RECORDER_LANE)
     band = f'<rect x="{DRAWN_BEFORE_S * scale:.1f}" y="0" width="{(end - way.handed) * scale:.1f}" '
     parts = [f'{band}height="{LANE_PX * len(lanes)}" fill="#8883"/>']
-    names = sorted({span[0] for entry in trace.entries for span in entry.spans})
+    colours = _colours(trace)
     for entry in trace.entries:
         for name, start, stop in entry.spans:
             if stop <= begin or start >= end:
                 continue
             left, width = (max(start, begin) - begin) * scale, (min(stop, end) - max(start, begin)) * scale
-            row, colour = lanes.index(entry.lane), COLOURS[names.index(name) % len(COLOURS)]
+            row = lanes.index(entry.lane)
             text = escape(f"{entry.lane}: {name}, {1000 * (stop - start):.1f} ms")
             place = f'x="{left:.1f}" y="{row * LANE_PX + 1}" width="{max(width, 0.5):.1f}" height="{LANE_PX - 2}"'
-            parts.append(f'<rect {place} fill="{colour}"><title>{text}</title></rect>')
+            parts.append(f'<rect {place} fill="{colours[name]}"><title>{text}</title></rect>')
     text = f"stamp {way.stamp:.3f} s: {1000 * (way.wired - way.handed):.1f} ms; from above: {', '.join(lanes)}"
     size = f'viewBox="0 0 {CHART_PX} {LANE_PX * len(lanes)}" width="100%"'
     return f'<p>{escape(text)}</p><svg {size} role="img" aria-label="{escape(text)}">{"".join(parts)}</svg>'
