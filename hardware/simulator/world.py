@@ -12,8 +12,8 @@ stopped; he puts material in and makes a dispenser ready that is not.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from ctypes import c_double
 from dataclasses import replace
 from functools import partial
@@ -107,7 +107,7 @@ class _Wire:
         pass
 
 
-class _Operator:
+class _SimulatedOperator:
     """Gives the orders that an operator gives. seen_to: s, at which he made a dispenser ready or put material in."""
 
     def __init__(self, motion: PrintMotion, material: MaterialControl) -> None:
@@ -197,7 +197,7 @@ class SimulatedWorld:
         material = self.dispensers.control
         material.begin(0.0, 0.0)
         self.motion = PrintMotion(profile, self._time, c_double(), material, lambda: self.link.lag)
-        self._operator = _Operator(self.motion, material)
+        self._operator = _SimulatedOperator(self.motion, material)
         self._rows_until = 0.0
         beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
         self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
@@ -216,14 +216,12 @@ class SimulatedWorld:
             *(self.motion, self.link, self, poses, self._orders, self._report),
             *(self.motion.homed, self._ticks, material),
         )
-        complete = False
         try:
             with suppress(_MotionKilledError):
                 loop.run(self._end)
             self._advance(self._end)  # of a motion that was killed
-            complete = True
         finally:
-            self._emit_rows(self._end if complete else min(self._end, self._time.now()))
+            self._emit_rows(self.ended)
 
     def every(self, period: float, action: Callable[[float], None]) -> None:
         """Do `action` every `period` s from the beginning on; it is given the instant, s."""
@@ -288,15 +286,21 @@ class SimulatedWorld:
         def until() -> float:
             return -math.inf if self._broken else min(past, self._end)
 
-        try:
+        with self._ending():
             for _ in self._events.run(until):
                 if self.pipeline.tracked > self._reported:
                     self._reported = self.pipeline.tracked
                     self._progress(self._reported, total)
-        except BaseException:  # nothing more is rendered while the loop stops its arm
-            self._broken = True
-            raise
         self._time.wait_until(instant)
+
+    @contextmanager
+    def _ending(self) -> Iterator[None]:
+        """What is raised meanwhile ends the run: nothing more is rendered while the loop stops its arm."""
+        try:
+            yield
+        except BaseException:
+            self._broken, self._end = True, self.ended
+            raise
 
     # -- what cameras see
 
@@ -319,7 +323,8 @@ class SimulatedWorld:
     def _print_beads(self, until: float) -> None:
         if self._scene is not None and self.scenario.beads:
             self._device.advance(self._time.now())
-            self.dispensers.advance(self._time.now())
+            if self.scenario.gel is not None:
+                self.dispensers.advance(self._time.now())
             self._beads.draw(self._scene, until)
 
     # -- what the motion is given, and what it does
@@ -350,12 +355,8 @@ class SimulatedWorld:
             self._looks = SurfaceLooks(scenario.known_rig, placed_path)
 
     def _look_at(self, pose: SurfacePose, frames: FrameSet) -> None:
-        looks, progress = self._looks, self.motion.progress
-        if (
-            looks is not None
-            and progress is not None
-            and looks.at(progress, self.motion.last, frames, pose, self._step)
-        ):
+        looks, progress, last = self._looks, self.motion.progress, self.motion.last
+        if looks is not None and progress is not None and looks.at(progress, last, frames, pose, self._step):
             self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks.last))
 
     def _looked(self, look: Look | None, now: float) -> None:
@@ -380,12 +381,13 @@ class SimulatedWorld:
             self._commanded.add(tick.command, now)
             if progress.phase is PrintPhase.FINISHED:
                 self._end = min(self._end, now + RUN_OUT)
-        self._sink.tick(tick, progress)
-        for event in self.link.events():
-            level = INFO if event.state in (None, ArmState.ARMED, ArmState.DISARMED) else WARNING
-            self._sink.event(event.stamp, f"arm: {event.text}", level)
-        if now - self._rows_until >= ROW_BLOCK:
-            self._emit_rows(now)
+        with self._ending():
+            self._sink.tick(tick, progress)
+            for event in self.link.events():
+                level = INFO if event.state in (None, ArmState.ARMED, ArmState.DISARMED) else WARNING
+                self._sink.event(event.stamp, f"arm: {event.text}", level)
+            if now - self._rows_until >= ROW_BLOCK:
+                self._emit_rows(now)
 
     def _emit_rows(self, now: float) -> None:
         self._device.advance(self._time.now())
