@@ -364,7 +364,7 @@ def _laid_layer(seed: int, clog: bool) -> tuple[LaidBeads, bool]:
     lenses, (area, width), rows = Lenses(rig), BEAD_SIZE, np.arange(4)
     start = np.array([[-7.0, width * (k - 1.5), 0.0] for k in rows])
     end = start * [-1.0, 1.0, 1.0]
-    pieces = BeadPieces(start, end, np.full(4, area), np.full(4, width), rows, 0 * rows, 16.0 * rows)
+    pieces = BeadPieces(start, end, np.full(4, area), np.full(4, width), rows, 0 * rows, 16 * rows.astype(float))
     points = scene.shape.points(rng.uniform(-25.0, 25.0, (150, 2)))
     low, high = start[0, :2] - 10.0, end[-1, :2] + 10.0
     before = dense_heights(lenses, _look_views(scene, rig, rng), first_heights(points, low, high, 0.2))

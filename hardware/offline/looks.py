@@ -70,7 +70,7 @@ class SurfaceLooks:
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
         self._gathered = -math.inf  # s, of the last view
-        self._widths = WIDTHS
+        self._widths: tuple[float, ...] = WIDTHS
         self._from = 0.0  # checkpoints, up to where was looked at
         self._aside, self._done = math.nan, False  # s, since when the needle stands aside
         self.last: Look | None = None

@@ -4,13 +4,12 @@ First the scan is registered to the surface's depth map. Then the pictures are m
 it lies right they look alike, where it lies wrong they differ, by as much as its relief rises or falls along the error.
 That needs no estimate of the relief, so the last steps are free of the error that flat patches make on a wound's walls.
 
-Dense matching: cameras stand 36 to 84 degrees apart, but once resampled on a surface that is right to a millimetre
-their pictures look alike, and what is left is a shift of a node or two. On the true surface thousands of points were
-measured to come out to 0.02 mm (skin) and 0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's
-wall give 0.2.
+Dense matching: cameras stand 36 to 84 degrees apart, but resampled on a surface that is right to a millimetre pictures
+look alike, and a shift of a node or two is left. On the true surface thousands of points came out to 0.02 mm (skin) and
+0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's wall give 0.2.
 
-The depth map is a height field over the first map. Landmarks are few and their patches flat, so they miss a wound's
-walls by 0.1 mm and more. Dense matching begins at their smooth surface and corrects it, from coarse to fine.
+The depth map is a height field over the first map: matching begins at the landmarks' smooth surface, which misses a
+wound's walls by tenths of a millimetre, and corrects it from coarse to fine.
 """
 
 from __future__ import annotations
@@ -115,8 +114,7 @@ def _triangulated(
     """The points where rays (K, H, W, 2) meet, K cameras, of those `used` (K, H, W), at nodes seen by `both` (H, W)."""
     number = np.cumsum(both.ravel()).reshape(both.shape) - 1
     which, row, column = np.nonzero(used)
-    point = number[row, column]
-    looks = pixels[which, row, column]
+    point, looks = number[row, column], pixels[which, row, column]
     met, _, residual = triangulate(lenses.rig, point, camera[which], looks, int(both.sum()), iterations=2)
     aside = np.zeros(len(met))
     np.maximum.at(aside, point, np.linalg.norm(residual, axis=1))
@@ -144,9 +142,8 @@ def lattice_image(
     facing = np.abs(np.einsum("hwi,hwi->hw", view, normals)) / np.linalg.norm(view, axis=2)
     inside = in_lens & ((imaged > 1) & (imaged < np.array(lens.size) - 2)).all(1)
     shape = nodes.shape[:2]
-    x, y = imaged.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1)
-    laid = cv2.remap(image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_CUBIC)
-    grey = np.asarray(laid).astype(np.float32)
+    x, y = np.ascontiguousarray(imaged.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1))
+    grey = np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC)).astype(np.float32)
     centred = grey - cv2.GaussianBlur(grey, (0, 0), evening)
     spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), evening))
     even = np.clip(np.rint(128 + EVENED_CONTRAST * centred / (spread + 2.0)), 0, 255).astype(np.uint8)
@@ -154,8 +151,7 @@ def lattice_image(
 
 
 def _flow() -> cv2.DISOpticalFlow:
-    """Dense inverse search (Kroeger et al. 2016). Patches do not ask their neighbours: with that, results would depend
-    on the number of threads."""
+    """Dense inverse search (Kroeger et al. 2016); patches do not ask neighbours: threads would change the results."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setPatchSize(FLOW_PATCH_NODES)
     flow.setPatchStride(FLOW_STRIDE_NODES)
@@ -242,8 +238,7 @@ def corrected_heights(nodes: Array, matches: Array, sure: NDArray[np.bool_], ste
     """New heights (H, W) from the points (H, W, 3) matched at the nodes (H, W, 3), in the surface frame."""
     heights, off = nodes[..., 2], matches - nodes
     down, right = np.gradient(heights, step)
-    up = (off[..., 2] - right * off[..., 0] - down * off[..., 1]).astype(np.float32)
-    up = np.where(sure, up, 0).astype(np.float32)
+    up = np.where(sure, off[..., 2] - right * off[..., 0] - down * off[..., 1], 0).astype(np.float32)
     around = np.asarray(cv2.medianBlur(up, 5))
     up = np.where(np.abs(up - around) < MAX_JUMP_MM, up, around)
     weight = sure.astype(np.float32) + 1e-6
