@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from tests.browser import Browser
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as the command line does
-settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=60)
+settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile("many", settings.get_profile("fixed"), max_examples=250)  # `make slow`
 settings.register_profile("unshrunk", settings.get_profile("fixed"), phases=[Phase.explicit, Phase.generate])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))  # mutants need no smallest example
 
@@ -39,5 +40,9 @@ def browser() -> Iterator[Browser]:
     made.close()
 
 
+@pytest.hookimpl(tryfirst=True)  # before those that are not asked for are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if hasattr(getattr(item, "obj", None), "hypothesis"):
+            item.add_marker("law")
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))

@@ -17,6 +17,7 @@ from tests.campaigns.deceit.judge import GUARD_MM, Judge, run
 from tests.campaigns.deceit.kinds import NAMES, make_session
 from tests.campaigns.deceit.scenes import Draw, Session, changed, ordinary
 from tests.campaigns.deceit.world import Renderer, local_places, on_tissue
+from tests.slowly import slowly
 
 SMALL = 320, 240
 COUNT, SEED = 200, 1
@@ -168,7 +169,12 @@ def named(index: int) -> str:
     return f"{index}-{NAMES[index % len(NAMES)]}"
 
 
-@pytest.mark.parametrize("index", [i for i in TENTH if i not in STILL_WRONG], ids=named)
+# A pattern that repeats, a dressing that slips, and two that stay followed: a camera that hangs, few pictures a second.
+AT_ONCE = (11, 55, 77, 33)
+LATER = [i for i in TENTH if i not in STILL_WRONG and i not in AT_ONCE]
+
+
+@pytest.mark.parametrize("index", [*AT_ONCE, *slowly(*LATER)], ids=named)
 def test_a_tenth_of_the_sessions_that_would_fool_the_tracker(index: int) -> None:
     session = make_session(SEED, index, SMALL)
     verdict = run(session)
