@@ -204,6 +204,7 @@ def recording(request: pytest.FixtureRequest) -> tuple[str, BoardViews, Rig]:
     return request.param, views, session.rig
 
 
+@pytest.mark.slow  # with given lenses they are as good
 def test_corners_are_good_to_half_a_pixel_and_half_a_millimetre(recording: tuple[str, BoardViews, Rig]) -> None:
     found = calibrate(recording[1])
     assert median_residual(found) < 0.25 and held_out_residual(found) < 0.25 and board_scatter(found) < 0.4

@@ -5,13 +5,12 @@ from __future__ import annotations
 import ast
 import pickle
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from hardware.arm.device import DONE, LinkCode, Reason
+from tests.test_floors import ours
 
-ROOT = Path(__file__).parents[1]
 PROSE = {"reason", "reasons", "words", "text", "answer", "message", "said", "trouble", "doubt", "hold", "held", "error"}
 SEARCHES = {"startswith", "endswith", "find", "rfind", "index", "count", "partition", "rpartition", "removeprefix"}
 MATCHES = {"match", "fullmatch", "search"}
@@ -60,10 +59,9 @@ def searched_words(tree: ast.AST) -> Iterator[str]:
 
 def test_the_product_decides_nothing_by_words() -> None:
     found = {}
-    for floor in ("estimation", "perception", "planning", "hardware"):
-        for path in sorted((ROOT / floor).rglob("*.py")):
-            if tests := list(searched_words(ast.parse(path.read_text(encoding="utf-8")))):
-                found[path.relative_to(ROOT).as_posix()] = tests
+    for module in ours().modules.values():
+        if tests := list(searched_words(module.tree)):
+            found[module.file] = tests
     assert {file: tests for file, tests in found.items() if file not in EXCEPTIONS} == {}
 
 
