@@ -105,6 +105,7 @@ def test_a_camera_that_errs_is_named(session: Path, refused: Refused, camera: st
     refused(words)
 
 
+@pytest.mark.slow  # a camera turned by 180 degrees is told by the same words
 def test_a_camera_turned_by_90_degrees_whose_size_was_changed_along_is_named(session: Path, refused: Refused) -> None:
     change(session, "b", lambda image: np.rot90(image))
     a, b, c = small_rig().cameras

@@ -52,7 +52,7 @@ def darkest(dark: Array, about: Array, reach: int = 6) -> Array:
     return np.array([column + (part * x).sum() / part.sum(), row + (part * y).sum() / part.sum()])
 
 
-@pytest.mark.parametrize("rise", [0.0, 3.0])
+@pytest.mark.parametrize("rise", [3.0, *slowly(0.0)])
 def test_a_dot_is_drawn_where_the_camera_model_says(session: Session, rise: float) -> None:
     lie = replace(session.world.relief, rise=lambda t: rise * (t > 0.5))
     made, t = changed(session, relief=lie), 0.7
@@ -82,7 +82,7 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_another(session: Session) 
         assert np.abs(darkest(dark, pixel) - pixel).max() < 0.15
 
 
-@pytest.mark.parametrize("kind", ["board_covered", "shimmer", "wet_film"])
+@pytest.mark.parametrize("kind", ["shimmer", *slowly("board_covered", "wet_film")])
 def test_a_session_comes_out_the_same_to_the_last_bit(kind: str) -> None:
     a, b, other = (make_session(seed, NAMES.index(kind), (96, 72)) for seed in (1, 1, 2))
     number = len(a.stamps) - 5

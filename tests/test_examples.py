@@ -138,10 +138,9 @@ def test_each_example_says_how_it_is_started(
 
 def test_an_example_is_a_program() -> None:
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parents[1])}
-    command = [sys.executable, str(EXAMPLES / "plan_wound.py"), "--help"]
-    assert (
-        "plan_wound.py" in subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-    )
+    command = [sys.executable, str(EXAMPLES / "other_dispenser.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert "other_dispenser.py" in done.stdout
 
 
 def test_what_a_script_cannot_take_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:

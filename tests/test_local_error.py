@@ -126,10 +126,13 @@ def test_a_bump_under_the_needle_is_claimed_before_it_is_two_frame_sets_old(
     assert rim.max() < LIMIT_MM or lifted.mean() > MAX_PARTED_SHARE  # of so many nobody knows that they are a part
 
 
-@pytest.mark.parametrize("rate", [13.0, 30.0])
-@pytest.mark.parametrize("seconds", [0.0, 1.0, 2.4])
-def test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence(rate: float, seconds: float) -> None:
+RISES = [(13.0, 0.0), (30.0, 1.0), (13.0, 2.4), *slowly((30.0, 0.0), (13.0, 1.0), (30.0, 2.4))]
+
+
+@pytest.mark.parametrize("case", RISES)
+def test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence(case: tuple[float, float]) -> None:
     """4 mm wide, one sigma: smaller than the bells under which displacements are averaged."""
+    rate, seconds = case
     top = DENSE[np.linalg.norm(DENSE, axis=1).argmin()]
     shape = np.exp(-((DENSE - top) ** 2).sum(1) / (2 * 4.0**2))[:, None] * [0.0, 0.0, 1.0]
     follow, lifts = Followed(DENSE, rate, breathing), rise(3.0, seconds)

@@ -52,7 +52,7 @@ def searched_words(tree: ast.AST) -> Iterator[str]:
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             of_words = node.func.attr in SEARCHES and is_prose(node.func.value)
             if of_words or (
-                ast.unparse(node.func.value) == "re" and node.func.attr in MATCHES and any(map(is_prose, node.args[1:]))
+                node.func.attr in MATCHES and ast.unparse(node.func.value) == "re" and any(map(is_prose, node.args[1:]))
             ):
                 yield f"line {node.lineno}: {ast.unparse(node)}"
 

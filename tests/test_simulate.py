@@ -62,6 +62,7 @@ def same_columns(one: Path, other: Path) -> bool:
     return kept[0] == kept[1]
 
 
+@pytest.mark.slow  # test_scene_render draws by several threads, and the process replay compares whole runs
 def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) -> None:
     run_simulation(recorded / "scenario.toml", recorded / "two", SimulationOptions(threads=2))
     one, two = recorded / "one", recorded / "two"
