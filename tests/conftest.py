@@ -28,7 +28,7 @@ LONGEST = (  # files that take longest, begun first: of two workers neither then
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """A real browser; what needs one is skipped where there is none."""
     from tests.browser import Browser, executable

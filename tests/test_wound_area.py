@@ -195,7 +195,7 @@ def test_an_area_on_a_surface_moves_with_rig_and_surface() -> None:
     assert (after.area, after.low, after.high) == pytest.approx((before.area, before.low, before.high), rel=1e-8)
 
 
-@pytest.mark.parametrize("seed", [8, *slowly(0, 14)])
+@pytest.mark.parametrize("seed", [14, *slowly(0, 8)])
 def test_the_area_inside_true_outlines_is_the_true_one(seed: int) -> None:
     taken = rendered(seed)
     area = measured(taken)
