@@ -169,8 +169,8 @@ def named(index: int) -> str:
     return f"{index}-{NAMES[index % len(NAMES)]}"
 
 
-# A pattern that repeats, a dressing that slips, and two that stay followed: a camera that hangs, few pictures a second.
-AT_ONCE = (11, 55, 77, 33)
+# A pattern that repeats, a dressing that slips, hairs combed aside, and a camera that hangs, which is to stay followed.
+AT_ONCE = (11, 55, 176, 77)
 LATER = [i for i in TENTH if i not in STILL_WRONG and i not in AT_ONCE]
 
 

@@ -256,7 +256,7 @@ def true_from_estimated() -> Array:
     return np.asarray(se3.inverse(turning(first.stamp)) @ first.base_from_surface)
 
 
-@pytest.mark.slow  # landmarks of one camera are proven above, one by one
+@pytest.mark.slow  # test_tracking follows by one camera for a while
 def test_a_limb_that_one_camera_sees_is_followed_around() -> None:
     poses, _, _ = alone_followed()
     change = se3.inverse(true_from_estimated())
