@@ -21,10 +21,11 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))  # mutants 
 pytest_plugins = ["estimation.synthetic.plugin"]  # by name, so that a checkout that is not installed has it too
 
 LONGEST = (  # files that take longest, begun first: of two workers neither then waits long for the other's last file
-    *("test_tracking", "test_live_run", "test_simulate", "test_camera_calibration", "test_world", "test_estimator"),
-    *("test_calibrate_refused", "test_scene_render", "test_guard", "test_registration"),
-    *("test_estimator_suite", "test_examples", "test_track", "test_operator_page", "test_segment_command"),
-    *("test_live_faults", "test_growth", "test_fill_laws", "test_odd_camera", "test_outages", "test_fault_bench"),
+    *("test_live_run", "test_estimator_suite", "test_tracking", "test_wrong_input", "test_record", "test_local_error"),
+    *("test_bench", "test_wound_area", "test_calibrate_refused", "test_deceit", "test_track", "test_live_parts"),
+    *("test_segment_command", "test_examples", "test_cli", "test_growth", "test_outages", "test_world"),
+    *("test_recordings", "test_floors", "test_operator_stages", "test_calibrate_dispenser", "test_first_print"),
+    *("test_camera_calibration", "test_foxglove", "test_fuzz", "test_smooth_command", "test_simulated_material"),
 )
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import main, parser, subject_parser
+from hardware.cli.main import main
 from tests.api_links import broken_links
-from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
+from tests.documents import DOCUMENTS, ROOT, commands, leaf, parser, shown, subject_parser
 from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
