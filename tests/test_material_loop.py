@@ -143,7 +143,7 @@ def test_what_ends_extrusion_ends_the_material(what: Order | str, instant: float
 
 
 @given(st.data())
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_whatever_happens_it_is_on_only_with_a_move_that_was_sent(data: st.DataObject) -> None:
     instant = st.floats(2.0, 6.0)
     orders = data.draw(
