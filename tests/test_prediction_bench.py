@@ -14,8 +14,6 @@ from estimation.pose import Trajectory
 from estimation.synthetic.world import arc_rig
 from hardware.arm.driver import G1
 from hardware.arm.protocol import encode
-from hardware.bench.campaigns import link as link_run
-from hardware.bench.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from hardware.bench.prediction import (
     POINTS_AROUND,
     PREDICTION_HORIZONS,
@@ -44,6 +42,8 @@ from hardware.files.folder_tables import write_tum
 from hardware.live.prerender import cached
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
 from perception import shipped_file
+from tests.campaigns import link as link_run
+from tests.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from tests.slowly import slowly
 from tests.synthetic import write_session
 from tests.virtual_arm import HOME
