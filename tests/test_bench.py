@@ -195,6 +195,7 @@ def test_each_part_is_a_subject_with_options_that_it_has(part: BenchPart) -> Non
         subject_parser(part.subject, SUBJECTS[part.subject]).parse_args(list(options))
 
 
+@pytest.mark.slow  # what they are made of is measured, kept and shown below
 def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = (
         BenchPart("planner", ("--updates", "20"), ("--updates", "20")),

@@ -75,7 +75,7 @@ SLOW = pytest.mark.slow
         pytest.param(
             replace(BOARD, inverted=True), r"camera a: .* black and white exchanged \(`inverted`\)", marks=SLOW
         ),
-        (replace(BOARD, squares=(5, 4)), "camera a: .* another board: 4 x 5|markers"),
+        pytest.param(replace(BOARD, squares=(5, 4)), "camera a: .* another board: 4 x 5|markers", marks=SLOW),
         pytest.param(
             replace(BOARD, squares=(3, 4)), "board.toml: squares = .*3 x 4.*it has markers 6, 7, 8, 9 too", marks=SLOW
         ),
@@ -147,7 +147,7 @@ TABLE = {
     ("row", "words"),
     [
         ("BOTTOM", "camera b: .* allowed"),
-        ("k3", "camera b: k3 = 5751, allowed -50 to 50|camera b: corners scatter"),
+        pytest.param("k3", "camera b: k3 = 5751, allowed -50 to 50|camera b: corners scatter", marks=SLOW),
         ("focal length", "camera b: corners scatter by .* px about the best lens|fx beside"),
     ],
 )
