@@ -134,6 +134,7 @@ def test_a_pattern_that_meets_no_scene_is_told_the_scenes() -> None:
         run_bench(_arguments("estimator", "--only", "dancing"))
 
 
+@pytest.mark.slow
 def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[str]) -> None:
     run_bench(_arguments("estimator", "--soak", "0.001", "--maps", "told"))
     lines = capsys.readouterr().out.splitlines()
@@ -289,6 +290,7 @@ def test_a_file_that_is_no_table_is_one_clear_line(tmp_path: Path) -> None:
             read_whole(file)
 
 
+@pytest.mark.slow
 def test_too_few_views_to_calibrate_from_are_told_and_the_figures_are_not_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -129,6 +129,7 @@ def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: py
         assert verdict.recovered <= MAX_RECOVERY and not (verdict.silent or verdict.restless)
 
 
+@pytest.mark.slow  # single faults are judged above
 def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fault_run, "MAX_RUN_S", 8.0)
     rows = one_run(SCENARIOS, 1, 1)
