@@ -28,7 +28,8 @@ SHARED_ERROR = 1.0  # mm within which nodes share their error: about half a patc
 MIN_SEEN = 0.6  # share of a piece's nodes that must be measured
 GAP_SHARE, BLOB_SHARE = 0.6, 1.6  # of the planned volume: less is a gap, more a blob
 SURE = 2.0  # sigmas by which it is so
-CLOG_LENGTH = 5.0  # mm of gaps in a row, in the order in which they were laid, that make a clog
+THIN_SHARE = 0.9  # surely less than that of the planned: a part of a clog, which may begin within a piece
+CLOG_LENGTH = 4.0  # mm of bead that thin pieces in a row lack together, in the order in which they are laid: a clog
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,18 +179,16 @@ class LaidBeads:
 
     @property
     def clogs(self) -> list[tuple[float, float]]:
-        """From, to, mm along the path: gaps that follow each other over more than CLOG_LENGTH of bead."""
-        found, begin = [], None
-        length, end = 0.0, 0.0
-        for i, gap in enumerate([*self.gap.tolist(), False]):
-            if gap:
-                begin = float(self.stations.begin[i]) if begin is None else begin
-                length, end = length + float(self.stations.end[i] - self.stations.begin[i]), float(self.stations.end[i])
-            elif begin is not None:
-                if length > CLOG_LENGTH:
-                    found.append((begin, end))
-                begin, length = None, 0.0
-        return found
+        """From, to, mm along the path: thin pieces that follow each other and lack more than CLOG_LENGTH of bead."""
+        with np.errstate(invalid="ignore"):
+            thin = self.volume + SURE * self.sigma < THIN_SHARE * self.planned
+        lacks = np.nan_to_num((1 - self.share) * (self.stations.end - self.stations.begin))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], thin, [False]]).astype(np.int8))).reshape(-1, 2)
+        return [
+            (float(self.stations.begin[a]), float(self.stations.end[b - 1]))
+            for a, b in edges.tolist()
+            if lacks[a:b].sum() > CLOG_LENGTH
+        ]
 
     @property
     def total(self) -> tuple[float, float, float]:
