@@ -16,8 +16,10 @@ from estimation.se3 import Array
 from planning.command import MotionLimits
 from planning.fill.bead import SHARP_TURN, Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
 from planning.fill.fill import fill, settle_angle
+from planning.clearance import ToolBody
 from planning.kinematics import SimpleArm
 from planning.layers.checkpoints import (
+    BeadPoints,
     Checkpoints,
     CheckpointSettings,
     TipSurface,
@@ -26,7 +28,9 @@ from planning.layers.checkpoints import (
     curvature,
     path_from,
     tilt_field,
+    with_travels,
 )
+from planning.layers.clearing import LaidTissue, ToolClearance, beads_with_room, travels_with_room
 from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, nodes_within, unroll
 from planning.layers.slicing import BumpPassing, Layer, LayerMode, LayerStack, Tissue, layer_stack
 from planning.layers.wound import WoundFindings, WoundVolume
@@ -53,6 +57,7 @@ class PlanOrder:
     way: CheckpointSettings = field(default_factory=CheckpointSettings)
     crossed: bool = True  # lines of every second layer across the others'
     passing: BumpPassing = field(default_factory=BumpPassing)  # how bumps of the bed are passed
+    tool: ToolBody | None = None  # that must have room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +69,7 @@ class PlannedLayer:
     beads: tuple[Bead, ...]  # in printing order
     over: MultiPolygon  # bumps that it goes over
     around: MultiPolygon  # bumps that it goes round
+    left_out: tuple[Array, ...] = ()  # lines (N, 2) of beads over which the tool has no room
 
     @property
     def coverage(self) -> FillCoverage:
@@ -83,6 +89,7 @@ class Plan:
     ground: TipSurface
     layers: tuple[PlannedLayer, ...]
     order: PlanOrder
+    clearance: ToolClearance | None = None  # None: no tool was given
 
 
 def make_plan(
@@ -105,9 +112,34 @@ def make_plan(
         raise InputError(where, "beads", "none has room", allowed)
     layer_of = np.repeat([p.layer.number for p in planned], [len(p.beads) for p in planned])
     ground = _tip_surface(wound, stack, chart, order.way)
-    points = checkpoints_on(ground, beads, layer_of, order.way)
+    runs, printed = checkpoints_on(ground, beads, layer_of, order.way)
+    if order.tool is None:
+        points, clearance = with_travels(ground, printed, runs, order.way), None
+    else:
+        laid = LaidTissue(wound, stack, order.tool)
+        runs, printed, clearance = beads_with_room(runs, printed, laid, order.way, wound.surface_from_plane)
+        if not len(printed.tip):
+            worst = max(clearance.left_out, key=lambda left: left.short)
+            allowed = f"a longer or thinner needle, or more tilt: the {worst.part} lacks up to {worst.short:.1f} mm"
+            raise InputError(where, "beads", "none over which the tool has room", allowed)
+        planned = [_without_left_out(layer, runs, printed, clearance) for layer in planned]
+        points = travels_with_room(with_travels(ground, printed, runs, order.way), laid)
     path = path_from(points, ground, order.way.tool.spin)
-    return Plan(path, points, wound, stack, chart, ground, tuple(planned), order)
+    return Plan(path, points, wound, stack, chart, ground, tuple(planned), order, clearance)
+
+
+def _without_left_out(
+    layer: PlannedLayer, runs: BeadPoints, printed: Checkpoints, clearance: ToolClearance
+) -> PlannedLayer:
+    """The layer with what is printed of its beads, and the lines of what is not."""
+    number = layer.layer.number
+    left = tuple(each.line for each in clearance.left_out if each.layer == number)
+    if not left:
+        return layer
+    own = np.flatnonzero(printed.layer == number)
+    cuts = np.flatnonzero(np.diff(runs.bead[own])) + 1
+    beads = tuple(Bead(runs.points[rows], runs.width[rows]) for rows in np.split(own, cuts) if len(rows))
+    return replace(layer, beads=beads, left_out=left)
 
 
 def _in_chart(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
