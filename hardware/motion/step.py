@@ -8,9 +8,12 @@ thread for as long as it takes.
 
 from __future__ import annotations
 
+import math
 import signal
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from ctypes import c_double
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from types import FrameType
 
@@ -18,9 +21,9 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
-from hardware.motion.loop import MotionLoop, Order, Tick
-from hardware.process.clock import WallClock
+from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag, open_arm
+from hardware.motion.loop import MaterialControl, MotionLoop, Order, Tick
+from hardware.process.clock import Clock, WallClock
 from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
@@ -85,6 +88,110 @@ class MotionStep:
     def progress(self) -> PrintProgress:
         """How far the print is, and in which phase."""
         return self._planner.progress
+
+
+PAUSED_REASON = "paused by the operator"
+WAITING_REASON = "no path was confirmed yet"
+LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
+
+
+class PrintMotion:
+    """The motion of a print: holds until a path is begun, then a MotionStep that can be paused, or begun at home.
+
+    Where material cannot flow, the nozzle waits above the surface as in a pause.
+
+    last: the last command.
+    asked: whether planner and guard made it.
+    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
+    waits: whether they were told to wait above the surface.
+    material_in: whether the material that was wanted was put in since this was last reset.
+    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
+        tick, so that a replay is equal byte by byte.
+    """
+
+    last: Command
+
+    def __init__(
+        self,
+        profile: ArmProfile,
+        clock: Clock,
+        place: c_double,
+        material: MaterialControl | None = None,
+        measured: Callable[[], float] = lambda: math.nan,
+    ) -> None:
+        """clock: of the loop. place: kept up to date, in checkpoints.
+
+        measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
+        """
+        self._profile, self._clock, self._place = profile, clock, place
+        self._material, self._measured = material, measured
+        self.waits = self.material_in = False
+        self._step: MotionStep | None = None
+        self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
+        self.paused = self.asked = False
+        self.begun = self.lag = math.nan
+
+    def begin(self, path: Path, profile: ArmProfile, start: float, outlets: Outlets) -> None:
+        """Print this path, surface frame, from now on. start: place on it, in checkpoints."""
+        self._begin = lambda place: MotionStep(path, profile, place, outlets)
+        self._make(start)
+
+    def homed(self) -> None:
+        """Begin anew at the same place of the path, as the arm stands at home."""
+        if self._step is not None:
+            self._make(self._step.progress.fraction)
+
+    def resume(self) -> None:
+        """Go on after a pause, with the dispenser made ready again."""
+        self.paused = False
+        self._prepare_material()
+
+    def put_in(self) -> None:
+        """The operator has put in the material that was wanted."""
+        if self._step is not None and self._step.progress.wanted:
+            self._step.material_in()
+            self.material_in = True
+            self._prepare_material()
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
+        if self._step is not None:
+            self._step.recalled(place, stands)
+
+    @property
+    def progress(self) -> PrintProgress | None:
+        """How far the print is; None before a path was begun."""
+        return None if self._step is None else self._step.progress
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s."""
+        self.asked = self._step is not None
+        if self._step is None:
+            self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
+            return self.last
+        dry = "" if self._material is None else self._material.reason
+        self._step.paused = self.waits = self.paused or bool(dry)
+        measured = self._measured()
+        lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
+        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
+        if not math.isnan(self.lag):
+            self._step.lag = lag
+        self.last = self._step(pose, now)
+        if self.waits and isinstance(self.last, Hold):
+            self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
+        self._place.value = self._step.progress.fraction
+        return self.last
+
+    def _make(self, start: float) -> None:
+        assert self._begin is not None
+        self._step = self._begin(start)
+        self._place.value = self.begun = start
+        self.material_in = False
+        self._prepare_material()
+
+    def _prepare_material(self) -> None:
+        if self._step is not None and self._material is not None and not self._step.progress.wanted:
+            self._material.begin(self._step.progress.fraction, self._clock.now())
 
 
 MAX_REPORTED_EVENTS = 50
