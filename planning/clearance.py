@@ -55,7 +55,7 @@ class ToolPart:
         across = {"box": float(size.min()), "mesh": np.inf}.get(self.kind, 2 * float(self.radii.max()))
         if not np.isfinite(self.ends).all() or np.abs(self.ends).max() > MAX_PART_REACH:
             raise InputError("tool", self.name, self.ends.tolist(), f"within {MAX_PART_REACH:g} mm of the tip")
-        if not MIN_PART_SIZE <= across or (self.radii < 0).any() or not (self.radii <= MAX_PART_REACH).all():
+        if not across >= MIN_PART_SIZE or (self.radii < 0).any() or not (self.radii <= MAX_PART_REACH).all():
             got = size.tolist() if self.kind == "box" else self.radii.tolist()
             raise InputError("tool", self.name, got, f"{MIN_PART_SIZE:g} mm across or more; the unit is mm, not m")
         if self.kind not in ("box", "mesh") and not np.linalg.norm(size) > 0:

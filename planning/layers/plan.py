@@ -13,10 +13,10 @@ from shapely import MultiPolygon
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.clearance import ToolBody
 from planning.command import MotionLimits
 from planning.fill.bead import SHARP_TURN, Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
 from planning.fill.fill import fill, settle_angle
-from planning.clearance import ToolBody
 from planning.kinematics import SimpleArm
 from planning.layers.checkpoints import (
     BeadPoints,
