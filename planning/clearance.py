@@ -1,4 +1,4 @@
-"""The tool as a body, and the room between it and the tissue: balls that cover the one, distances to the other on a grid.
+"""The tool as a body, and its room: balls that cover it, and distances to the tissue on a grid.
 
 Tool: needle, syringe, print head are parts in the nozzle frame, whose origin is the tip and whose z leads back into the
 tool. Their surfaces are covered by balls, the finer the nearer to the tip; balls near each other have one around them
@@ -315,3 +315,23 @@ def _distances(envelope: Envelope, surface_from_nozzle: Array, places: Array) ->
     rotation, tip = surface_from_nozzle[:, :3, :3], surface_from_nozzle[:, :3, 3]
     points = places @ np.swapaxes(rotation, 1, 2) + tip[:, None]
     return envelope.at(points.reshape(-1, 3)).reshape(len(tip), len(places))
+
+
+GUARD_TOUCH = 1.0  # mm deeper than its radius that the needle may be in the tissue: what tracking and scan are off by
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TissueGuard:
+    """The tool and the tissue as a live run keeps them apart."""
+
+    body: ToolBody
+    envelope: Envelope  # in the surface frame
+
+    def room(self, surface_from_nozzle: Array) -> tuple[float, str]:
+        """The tool's least room, mm, at a pose (4, 4), and the part there: below 0 it is exact, above a lower bound."""
+        room, part = rooms(self.body, self.envelope, surface_from_nozzle[None])
+        return float(room[0]), self.body.names[part[0]] if part[0] >= 0 else "tool"
+
+    def moved(self, surface_from_path: Array) -> TissueGuard:
+        """The same where the path's own frame lies at (4, 4), mm, on the surface."""
+        return replace(self, envelope=self.envelope.moved(surface_from_path))

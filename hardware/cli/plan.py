@@ -166,6 +166,8 @@ def add_reach(commands: Commands) -> None:
     add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="of its motion along its normal")
     add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="of its motion about x, y and z")
     add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="of that motion; default 0.25")
+    scan = "that the tool must stay out of, in the path's frame; default: PATH_scan.ply, where plan wrote it"
+    add("--scan", type=named_path, metavar="SCAN", help=scan)
     add("--spin", action="store_true", help="let the tool spin about its own axis where that helps")
     add("-o", "--out", type=Path, metavar="OUT", help="folder to write to, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
@@ -184,7 +186,7 @@ def _six_numbers(text: str) -> tuple[float, ...]:
 def _run_reach(a: argparse.Namespace) -> int:
     from hardware.offline.reach import ReachQuestion, run_reach
 
-    question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin)
+    question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin, a.scan)
     answer = run_reach(a.path, a.arm, question, a.out, a.force)
     print(answer.text)
     return 0 if answer.feasible else FAILED

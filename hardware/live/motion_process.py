@@ -69,7 +69,7 @@ class _OrderReceiver:
                 orders.append(order)
             elif isinstance(order, BeginPrint):
                 self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
-                self._motion.begin(order.path, order.profile, order.start, order.outlets)
+                self._motion.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
             elif order is PauseOrder.MATERIAL_IN:
                 self._motion.put_in()
             elif order is PauseOrder.RESUME:

@@ -25,6 +25,7 @@ from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag, open_ar
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, Tick
 from hardware.process.clock import Clock, WallClock
 from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
+from planning.clearance import TissueGuard
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
@@ -36,15 +37,23 @@ class MotionStep:
     """One arm printing one path; call it once a tick."""
 
     def __init__(
-        self, path: Path, profile: ArmProfile | None = None, start: float = 0.0, outlets: Outlets | None = None
+        self,
+        path: Path,
+        profile: ArmProfile | None = None,
+        start: float = 0.0,
+        outlets: Outlets | None = None,
+        tissue: TissueGuard | None = None,
     ) -> None:
-        """start: place on the path where printing begins, in checkpoints. outlets: of the path's materials."""
+        """start: place on the path where printing begins, in checkpoints. outlets: of the path's materials.
+
+        tissue: that the tool is kept out of, where a scan tells of it.
+        """
         self.profile = ArmProfile() if profile is None else profile
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
         path = with_offsets(path, outlets or {})
         self._planner = Planner(path, *settings, lag, start, outlets)
-        self._guard = Guard(*settings, path.zone, lag)
+        self._guard = Guard(*settings, path.zone, lag, tissue)
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s, as the guard lets it pass. pose: the newest there is."""
@@ -131,9 +140,11 @@ class PrintMotion:
         self.paused = self.asked = False
         self.begun = self.lag = math.nan
 
-    def begin(self, path: Path, profile: ArmProfile, start: float, outlets: Outlets) -> None:
-        """Print this path, surface frame, from now on. start: place on it, in checkpoints."""
-        self._begin = lambda place: MotionStep(path, profile, place, outlets)
+    def begin(
+        self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
+    ) -> None:
+        """Print this path, surface frame, from now on. start: place on it, in checkpoints. tissue: see `MotionStep`."""
+        self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
         self._make(start)
 
     def homed(self) -> None:

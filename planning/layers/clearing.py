@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.errors import InputError
+from estimation.scans.scan import Scan
 from estimation.se3 import Array
-from planning.clearance import MAX_DEPTH, Envelope, ToolBody, envelope_over, rooms
+from planning.clearance import MAX_DEPTH, Envelope, TissueGuard, ToolBody, envelope_over, rooms
 from planning.layers.checkpoints import BeadPoints, Checkpoints, CheckpointSettings, ToolLimits, tool_rotations
-from planning.layers.grid import interpolate, nodes_within
+from planning.layers.grid import HeightMap, axes_along, height_map, interpolate, nodes_within
 from planning.layers.slicing import LayerStack
 from planning.layers.wound import WoundVolume
+from planning.path import Path
 
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -31,6 +34,7 @@ ENTRY_COST = 5.0 * OUT_COST  # of beginning and ending a stretch that is left ou
 SHRINK_STEPS = 5  # halvings of how far a bead's tilts can be taken back: to a 32nd of them
 MIN_STRETCH = 2.0  # mm of a bead, five widths: shorter pieces between stretches that are left out are left out too
 RAISE_STEP, MAX_RAISES = 1.0, 30  # mm, of a travel: to 30 mm over where it was
+TOOL_SIDEWAYS = 30.0  # mm beside a path that its tool reaches over: 96 mm of syringe, leaning 20 degrees
 MIN_GRID_STEP, MAX_GRID_NODES = 0.5, 300_000  # mm, of an envelope; 40 ms to fill
 
 
@@ -207,7 +211,7 @@ def _tilts_to_try(limits: ToolLimits) -> Array:
     """Tilts (C, 2) all over what is allowed, TILT_STEP apart."""
     count = int(limits.tilt / TILT_STEP) + 1
     grid = TILT_STEP * np.stack(np.meshgrid(*[np.arange(-count, count + 1)] * 2), axis=-1).reshape(-1, 2)
-    return grid[np.linalg.norm(grid, axis=1) <= limits.tilt]
+    return np.asarray(grid[np.linalg.norm(grid, axis=1) <= limits.tilt])
 
 
 def _least_tilt(along: Array, tilts: Array, free: Mask, limits: ToolLimits) -> Index:
@@ -245,3 +249,52 @@ def _without_scraps(along: Array, out: Mask) -> Mask:
         if along[end - 1] - along[first] < MIN_STRETCH:
             out[first:end] = True
     return out
+
+
+def plane_under(path: Path) -> Array:
+    """surface_from_plane (4, 4), mm, of a plane in the middle of what a path extrudes, z as its tools stand."""
+    own = path.surface_from_nozzle[path.extrude] if path.extrude.any() else path.surface_from_nozzle
+    up = own[:, :3, 2].mean(axis=0)
+    return se3.make(axes_along(up / np.linalg.norm(up), np.eye(3)[0]), own[:, :3, 3].mean(axis=0))
+
+
+def scanned_heights(scan: Scan, path: Path) -> HeightMap:
+    """The heights of a scan around a path, over the plane under it; InputError where there is none of it."""
+    plane = plane_under(path)
+    places = se3.transform_points(se3.inverse(plane), path.surface_from_nozzle[:, :3, 3])[:, :2]
+    box = np.stack([places.min(axis=0) - TOOL_SIDEWAYS, places.max(axis=0) + TOOL_SIDEWAYS])
+    points = se3.transform_points(se3.inverse(plane), scan.vertices)[:, :2]
+    low, high = np.maximum(points.min(axis=0), box[0]), np.minimum(points.max(axis=0), box[1])
+    if not (high - low > 2 * MIN_GRID_STEP).all():
+        raise InputError("scan", "place", "nothing of it at the path", "the scan that the path was planned on")
+    area = float(np.prod(high - low))
+    return height_map(scan, plane, max(MIN_GRID_STEP, (area / MAX_GRID_NODES * 40) ** 0.5), box)
+
+
+def tissue_guard(scan: Scan, path: Path, body: ToolBody) -> TissueGuard:
+    """What a live run keeps the tool out of: the scan around a path, both in one frame."""
+    heights = scanned_heights(scan, path)
+    return TissueGuard(body, _over(heights, heights.heights, body.reach))
+
+
+def path_rooms(scan: Scan, path: Path, body: ToolBody) -> tuple[Array, list[str]]:
+    """The tool's room (N,), mm, at a path's checkpoints, as `rooms`, and the part there.
+
+    It meets the scan, and what the layers before have laid.
+    """
+    lies = scanned_heights(scan, path)
+    grid, heights = lies.grid, lies.heights.copy()
+    tips = se3.transform_points(se3.inverse(lies.surface_from_plane), path.surface_from_nozzle[:, :3, 3])
+    nodes = np.rint((tips[:, :2] - grid.origin) / grid.step).astype(np.int64).clip(0, np.array(grid.shape[::-1]) - 1)
+    room, part = np.full(len(path), np.inf), np.full(len(path), -1)
+    for layer in np.unique(path.layer):
+        own = np.flatnonzero(path.layer == layer)
+        envelope = _over(lies, heights, body.reach)
+        room[own], part[own] = rooms(body, envelope, path.surface_from_nozzle[own])
+        laid = own[path.extrude[own]]
+        np.maximum.at(heights, (nodes[laid, 1], nodes[laid, 0]), tips[laid, 2])
+    return room, [body.names[k] if k >= 0 else "" for k in part]
+
+
+def _over(lies: HeightMap, heights: Array, reach: float) -> Envelope:
+    return envelope_over(se3.inverse(lies.surface_from_plane), lies.grid.origin, lies.grid.step, heights, reach)
