@@ -51,9 +51,11 @@ def add_plan(commands: Commands) -> None:
     )  # fmt: skip
     add(
         "--arm", type=named_path, metavar="ARM.toml",
-        help="ask this arm's joints about each checkpoint and write the column `feasible`; without, there is none, and "
-        "`stillbed reach` adds it",
+        help="keep this arm's tool clear of the tissue, turning it or leaving beads out; and ask its joints about each "
+        "checkpoint, for the column `feasible`, which `stillbed reach` adds without it",
     )  # fmt: skip
+    motion = "measure --amplitude-mm: a recording, a folder of `stillbed track`, or a trajectory of the surface"
+    add("--motion", metavar="SESSION", help=motion)
     add("--no-pictures", action="store_true", help="write neither pictures nor the report")
     add("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
     _add_scan(command)
@@ -130,6 +132,7 @@ def _add_way(command: argparse.ArgumentParser) -> None:
         ("--tilt-deg", 30.0, "DEG", "most the tool leans off the plane's normal"),
         ("--turning-deg-mm", 5.0, "DEG/MM", "most it turns on its way"),
         ("--spin-deg", 0.0, "DEG", "about its own axis, free for a round nozzle"),
+        ("--amplitude-mm", 0.0, "MM", "by which the tissue moves, kept free around the tool of --arm beside 0.5 mm"),
     ):
         add(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
 
@@ -141,7 +144,9 @@ def _run_plan(a: argparse.Namespace) -> int:
     values = {f.name: getattr(a, f.name) for f in fields(PlanSettings) if f.name != "tissues"}
     settings = PlanSettings(tissues=tuple(a.tissue), **values)
     source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
-    order = PlanRequest(*source, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, settings=settings)
+    order = PlanRequest(
+        *source, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, motion=a.motion, settings=settings
+    )
     text, damage = run_plan(order)
     print(text)
     return damage_code(damage)
