@@ -12,7 +12,7 @@ grid once, and interpolated: the motion asks for it in each tick, and needs no l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -230,12 +230,12 @@ class Envelope:
 
         Beside the grid the tissue goes on as at its edge; above and below it the distance is that of its last layer.
         """
-        scaled = self._nodes_from_surface
+        scaled = self.nodes_from_surface
         u = points @ scaled[:3, :3].T + scaled[:3, 3]
         return np.asarray(map_coordinates(self.distance, u.T, np.float64, 1, "nearest", prefilter=False))
 
     @property
-    def _nodes_from_surface(self) -> Array:
+    def nodes_from_surface(self) -> Array:
         """(4, 4), to numbers of nodes along z, y, x."""
         nodes = self.grid_from_surface[[2, 1, 0, 3]].copy()
         nodes[:3, 3] -= self.origin[::-1]
@@ -326,6 +326,22 @@ class TissueGuard:
 
     body: ToolBody
     envelope: Envelope  # in the surface frame
+    _quick: tuple[Array, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        centres, distance = self.body.groups.centres, self.envelope.distance
+        least = self.body.groups.radii + np.sqrt(0.75) * self.envelope.step  # farther than a place is from its node
+        most, strides = np.array(distance.shape) - 1, np.array([distance[0].size, distance.shape[2], 1])
+        quick = self.envelope.nodes_from_surface, centres, least, most, strides, distance.ravel()
+        object.__setattr__(self, "_quick", quick)
+
+    def clear(self, surface_from_nozzle: Array) -> bool:
+        """Whether the tool surely has room at a pose (4, 4), by the nodes nearest to its groups: in 20 microseconds."""
+        nodes_from_surface, centres, least, most, strides, distance = self._quick
+        nodes_from_nozzle = nodes_from_surface @ surface_from_nozzle
+        nodes = np.rint(centres @ nodes_from_nozzle[:3, :3].T + nodes_from_nozzle[:3, 3])
+        near = np.minimum(np.maximum(nodes, 0.0), most)
+        return not (distance[(near @ strides).astype(np.intp)] < least).any()
 
     def room(self, surface_from_nozzle: Array) -> tuple[float, str]:
         """The tool's least room, mm, at a pose (4, 4), and the part there: below 0 it is exact, above a lower bound."""

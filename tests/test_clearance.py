@@ -114,6 +114,21 @@ def test_room_has_the_sign_that_every_ball_of_the_tool_gives(seed: int) -> None:
     assert (part[whole < 0] == named[whole < 0]).all()
 
 
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000))
+def test_what_is_quickly_found_clear_has_room(seed: int) -> None:
+    guard, draw = (
+        TissueGuard(tool_body(SYRINGE, PARTS, 0.0, 1.0), tissue(hills(seed)[0], 20.0)),
+        np.random.default_rng(seed),
+    )
+    poses = se3.make(
+        se3.exp_rotation(draw.normal(size=(60, 3)) * 0.3), draw.uniform([-9, -9, -9], [39, 39, 40], (60, 3))
+    )
+    quick = np.array([guard.clear(pose) for pose in poses])
+    assert (rooms(guard.body, guard.envelope, poses, np.inf)[0][quick] >= 0).all()
+    assert quick.any() and not quick.all()
+
+
 def points_on(body_parts: tuple[ToolPart, ...], seed: int) -> Array:
     """Random places (N, 3) on the parts' surfaces."""
     draw, found = np.random.default_rng(seed), []

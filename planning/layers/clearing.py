@@ -274,7 +274,7 @@ def scanned_heights(scan: Scan, path: Path) -> HeightMap:
 def tissue_guard(scan: Scan, path: Path, body: ToolBody) -> TissueGuard:
     """What a live run keeps the tool out of: the scan around a path, both in one frame."""
     heights = scanned_heights(scan, path)
-    return TissueGuard(body, _over(heights, heights.heights, body.reach))
+    return TissueGuard(body, _over(heights, heights.heights, body.reach + heights.grid.step))  # that `clear` can tell
 
 
 def path_rooms(scan: Scan, path: Path, body: ToolBody) -> tuple[Array, list[str]]:

@@ -143,7 +143,10 @@ class Guard:
         if self._tissue is None or pose is None:
             return None
         surface_from_base = se3.inverse(pose.base_at(np.array([now + self._tick + self.lag]))[0])
-        after, part = self._tissue.room(surface_from_base @ nozzle_from_axes(self._arm, move.axes))
+        place = surface_from_base @ nozzle_from_axes(self._arm, move.axes)
+        if self._tissue.clear(place):
+            return None
+        after, part = self._tissue.room(place)
         if after >= 0 or after > self._tissue.room(surface_from_base @ nozzle_from_axes(self._arm, self._axes))[0]:
             return None
         return Breach(RefusalCode.CLEARANCE, -after, 0.0, f"the {part} would be {-after:.2f} mm in the tissue")
