@@ -265,7 +265,8 @@ def measured_amplitude(motion: str) -> float:
     places = read_pose_series(motion).trajectory.base_from_surface[:, :3, 3]
     if not len(places):
         raise InputError(motion, "poses", "none", "a trajectory of the surface")
-    off = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    ends = np.percentile(places, [100 - AMPLITUDE_SHARE, AMPLITUDE_SHARE], axis=0)
+    off = np.linalg.norm(places - ends.mean(axis=0), axis=1)
     amplitude, most = float(np.percentile(off, AMPLITUDE_SHARE)), max(row[2] for row in SETTING_RANGES[-1:])
     if not amplitude <= most:
         raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", f"{most:g} mm or less: of tissue, not of a camera")

@@ -189,6 +189,8 @@ def _bead_tilts(
     tilts = np.concatenate([tilt[station][:, None], tries], axis=1)
     fits = free(np.repeat(rows[station], tilts.shape[1]), tilts.reshape(-1, 2), SURPLUS).reshape(tilts.shape[:2])
     fits[:, 0] |= before[station] >= 0
+    if not fits.any():
+        return tilt, np.ones(len(tip), bool)
     chosen = _least_tilt(along[station], tilts, fits, limits)
     inside = chosen >= 0
     off = np.where(inside[:, None], tilts[np.arange(len(station)), chosen] - tilt[station], 0.0)
