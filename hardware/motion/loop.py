@@ -166,7 +166,7 @@ class MotionLoop:
         return DONE
 
     def _begins(self, now: float) -> float:
-        """For which instant, s, a tick is made at `now`: before it is due, when its move gets out of the arm's queue."""
+        """For which instant, s, a tick is made at `now`: before it is due, when its move leaves the arm's queue."""
         queued = now + self.arm.in_flight(now) - self.arm.profile.frame_time
         return max(now, min(self._schedule.due, queued))
 

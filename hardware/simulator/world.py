@@ -12,8 +12,8 @@ stopped; he puts material in and makes a dispenser ready that is not.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from ctypes import c_double
 from dataclasses import replace
 from logging import INFO, WARNING
@@ -205,14 +205,12 @@ class SimulatedWorld:
             *(self.motion, self.link, self, poses, self._orders, self._report),
             *(self.motion.homed, self._ticks, material),
         )
-        complete = False
         try:
             with suppress(_MotionKilledError):
                 loop.run(self._end)
             self._advance(self._end)  # of a motion that was killed
-            complete = True
         finally:
-            self._emit_rows(self._end if complete else min(self._end, self._time.now()))
+            self._emit_rows(self.ended)
 
     def every(self, period: float, action: Callable[[float], None]) -> None:
         """Do `action` every `period` s from the beginning on; it is given the instant, s."""
@@ -277,15 +275,21 @@ class SimulatedWorld:
         def until() -> float:
             return -math.inf if self._broken else min(past, self._end)
 
-        try:
+        with self._ending():
             for _ in self._events.run(until):
                 if self.pipeline.tracked > self._reported:
                     self._reported = self.pipeline.tracked
                     self._progress(self._reported, total)
-        except BaseException:  # nothing more is rendered while the loop stops its arm
-            self._broken = True
-            raise
         self._time.wait_until(instant)
+
+    @contextmanager
+    def _ending(self) -> Iterator[None]:
+        """What is raised meanwhile ends the run: nothing more is rendered while the loop stops its arm."""
+        try:
+            yield
+        except BaseException:
+            self._broken, self._end = True, self.ended
+            raise
 
     # -- what cameras see
 
@@ -353,12 +357,13 @@ class SimulatedWorld:
             self._commanded.add(tick.command, now)
             if progress.phase is PrintPhase.FINISHED:
                 self._end = min(self._end, now + RUN_OUT)
-        self._sink.tick(tick, progress)
-        for event in self.link.events():
-            level = INFO if event.state in (None, ArmState.ARMED, ArmState.DISARMED) else WARNING
-            self._sink.event(event.stamp, f"arm: {event.text}", level)
-        if now - self._rows_until >= ROW_BLOCK:
-            self._emit_rows(now)
+        with self._ending():
+            self._sink.tick(tick, progress)
+            for event in self.link.events():
+                level = INFO if event.state in (None, ArmState.ARMED, ArmState.DISARMED) else WARNING
+                self._sink.event(event.stamp, f"arm: {event.text}", level)
+            if now - self._rows_until >= ROW_BLOCK:
+                self._emit_rows(now)
 
     def _emit_rows(self, now: float) -> None:
         self._device.advance(self._time.now())
