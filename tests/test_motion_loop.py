@@ -20,9 +20,8 @@ from hardware.arm.device import BLIND_RESENDS, ArmState, LinkCode
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.motion.loop import CommandedPose, MotionLoop, Order, Tick, TickMotion
 from hardware.motion.step import MotionPlan, MotionReport, MotionStep, motion_process
-from hardware.process.clock import SimClock, WallClock
+from hardware.process.clock import Histogram, SimClock, WallClock
 from hardware.process.system import SharedLatest
-from hardware.process.ticks import Histogram
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move

@@ -166,7 +166,7 @@ def test_the_commands_say_where_the_tool_has_no_room(tmp_path: Path, capsys: pyt
     assert "nothing of it at the path" in capsys.readouterr().err
     other = written(tmp_path, scan_of(*DEEP)[0] + [0.0, 0, 9.0], scan_of(*DEEP)[1], "other.ply")
     assert main([*reach[:-1], str(other)]) == 1
-    assert "the needle at checkpoint" in capsys.readouterr().out
+    assert "too near to the tissue" in capsys.readouterr().out
 
 
 def sine(folder: Path, amplitude: float) -> Path:

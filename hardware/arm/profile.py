@@ -14,7 +14,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import ArmDriver, ByteListener
 from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
-from hardware.process.ticks import tick_in_step
+from hardware.process.clock import tick_in_step
 from perception.frames import SYRINGE, check_profile
 from planning.clearance import ToolPart
 from planning.command import MotionLimits

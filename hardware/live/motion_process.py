@@ -36,9 +36,8 @@ from hardware.live.records import (
 )
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import PrintMotion
-from hardware.process.clock import WallClock
+from hardware.process.clock import PoseLockedSchedule, WallClock
 from hardware.process.system import ask_for_real_time, set_up_process, take_messages
-from hardware.process.ticks import PoseLockedSchedule
 from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones

@@ -22,8 +22,8 @@ from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
 from hardware.motion.loop import DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
+from hardware.process.clock import Histogram
 from hardware.process.system import SharedLatest
-from hardware.process.ticks import Histogram
 from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
 from planning.clearance import TissueGuard
 from planning.material import Outlets

@@ -41,7 +41,7 @@ from hardware.motion.loop import CommandedPose
 from hardware.offline.track import FrameSetStep, region_search, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
-from hardware.process.clock import WallClock
+from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
     SharedLatest,
     ask_to_go_first,
@@ -50,7 +50,6 @@ from hardware.process.system import (
     settle_memory,
     signal_at_parents_end,
 )
-from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import FrameSet, PrintHead, Roi, region_since
 from perception.tracking.step import STAGES, TrackingStep

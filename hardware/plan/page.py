@@ -22,6 +22,7 @@ from planning.fill.bead import Bead
 from planning.layers.checkpoints import tool_rotations
 from planning.layers.grid import interpolate
 from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, Unscanned, seconds_to
+from planning.layers.wound import WoundFindings
 
 PICTURE_WIDTH, PICTURE_MARGIN, HEAD_HEIGHT, FOOT_HEIGHT = 940.0, 24.0, 34.0, 34.0  # px
 MAX_DRAWING_HEIGHT = 900.0  # px of the drawing
@@ -40,6 +41,7 @@ text { font: 13px "Inter", "Segoe UI", "DejaVu Sans", system-ui, sans-serif; fil
 .end { fill: #1c2430; stroke: #fff; stroke-width: 1.5; } .bar { stroke: #1c2430; stroke-width: 2; fill: none; }
 """
 TISSUE_COLOURS = ((0.16, 0.52, 0.72), (0.87, 0.56, 0.2), (0.33, 0.66, 0.45), (0.55, 0.42, 0.75), (0.8, 0.36, 0.26))
+SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 SURFACE_NODES = 120  # nodes along the longer side of the surfaces in the view
 PAGE_STYLE = """
 #plan-canvas { width: 100%; height: 560px; display: block; touch-action: none; cursor: grab; border-radius: 8px;
@@ -360,3 +362,10 @@ def unscanned_text(beads: Unscanned) -> str:
 
 def _place_text(place: Array) -> str:
     return "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*place)
+
+
+def volume_text(findings: WoundFindings) -> str:
+    """The volume, and its 95 % interval where the skin's place leaves it open."""
+    spread = SIGMA_95 * findings.volume_sigma
+    interval = f" (95 %: {max(findings.volume - spread, 0):.0f} to {findings.volume + spread:.0f})" if spread else ""
+    return f"{findings.volume:.0f} mm^3{interval}"

@@ -38,6 +38,7 @@ from hardware.plan.page import (
     tool_facts,
     tool_text,
     unscanned_text,
+    volume_text,
 )
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text
@@ -52,7 +53,7 @@ from planning.layers.plan import (
     total_of,
     unscanned_beads,
 )
-from planning.layers.wound import WoundFindings, WoundVolume
+from planning.layers.wound import WoundVolume
 from planning.motion.retime import run_times
 from planning.path import check_path
 from planning.placement import PathPlacement, placement_by_scan
@@ -72,7 +73,6 @@ LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
-SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
@@ -246,13 +246,6 @@ def findings_rows(plan: Plan) -> list[tuple[str, str]]:
         ("hidden under overhangs", f"{f.hidden:.1f} mm²"),
         ("tool off the normal, at worst, first and last layer", f"{low_tilt:.1f}°, {high_tilt:.1f}°"),
     ]
-
-
-def volume_text(findings: WoundFindings) -> str:
-    """The volume, and its 95 % interval where the skin's place leaves it open."""
-    spread = SIGMA_95 * findings.volume_sigma
-    interval = f" (95 %: {max(findings.volume - spread, 0):.0f} to {findings.volume + spread:.0f})" if spread else ""
-    return f"{findings.volume:.0f} mm^3{interval}"
 
 
 def notes_of(plan: Plan) -> list[str]:
