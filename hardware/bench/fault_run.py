@@ -22,7 +22,7 @@ from hardware.live.checklist import silence_text
 from hardware.motion.loop import Tick
 from hardware.offline.track import FrameSetStep
 from hardware.process.clock import SimClock
-from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner
+from hardware.process.faults import Fault
 from hardware.simulator.arm.settings import ReplyMode
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
@@ -80,7 +80,7 @@ class AxesOracle:
 
 MAIN_PERIOD = 0.02  # s between the main process's checks of the others
 START_HEIGHT = 3.0  # mm over its first checkpoint, where the nozzle begins
-FAULT_FREE_S, MAX_RUN_S = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
+MAX_RUN_S = 30.0  # of a run at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,45 +243,3 @@ class _ChangedStep:
 
     def idle(self) -> None:
         self._step.idle()
-
-
-FAULT_SPACING, FAULTS_A_RUN = 2.6, 7  # s from one fault to the next, and faults of a run
-MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to have an effect, short enough to be over before the next
-FAULT_AMOUNTS = {  # of what has one, uniform in the logarithm
-    (FaultPart.CAMERA, FaultKind.SLOW): (0.03, 0.3),  # s
-    (FaultPart.CAMERA, FaultKind.BUMP): (2.0, 10.0),  # mm: what is less is no harm to three cameras
-    (FaultPart.CLOCK, FaultKind.JUMP): (0.05, 5.0),  # s
-    (FaultPart.TRACKING, FaultKind.SLOW): (5.0, 60.0),  # %
-    (FaultPart.ARM, FaultKind.SLOW): (30.0, 90.0),  # %
-    (FaultPart.SURFACE, FaultKind.FAST): (30.0, 200.0),  # mm/s
-    (FaultPart.SURFACE, FaultKind.FOLD): (0.5, 5.0),  # mm
-}
-CAMPAIGN_KINDS = [key for key, spec in FAULT_SPECS.items() if FaultRunner.SIMULATE in spec.runners]
-ENDING_KINDS = [key for key in CAMPAIGN_KINDS if key[1] is FaultKind.KILL]  # after which a run cannot go on
-PASSING_KINDS = [key for key in CAMPAIGN_KINDS if key not in ENDING_KINDS]
-
-
-def draw_faults(seed: int, number: int) -> list[Fault]:
-    """The faults of a campaign's run; kinds take turns from run to run."""
-    rng = np.random.default_rng([seed, number, 83])
-    first = number * (FAULTS_A_RUN - 1)
-    keys = [PASSING_KINDS[k % len(PASSING_KINDS)] for k in range(first, first + FAULTS_A_RUN - 1)]
-    keys.append(ENDING_KINDS[number % len(ENDING_KINDS)])
-    return [_fault(key, FAULT_FREE_S + FAULT_SPACING * place, rng) for place, key in enumerate(keys)]
-
-
-def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generator) -> Fault:
-    def draw(low: float, high: float) -> float:
-        return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))), 3)
-
-    start = round(slot + float(rng.uniform(0.0, 0.4)), 3)
-    duration = draw(MIN_DURATION, MAX_DURATION)
-    amount = draw(*FAULT_AMOUNTS[key]) if key in FAULT_AMOUNTS else 0.0
-    if key == (FaultPart.CLOCK, FaultKind.JUMP):
-        amount *= float(rng.choice([-1.0, 1.0]))
-    if key[1] is FaultKind.KILL:
-        duration = np.inf
-    if key in ((FaultPart.ARM, FaultKind.DROP), (FaultPart.ARM, FaultKind.GARBLE)) and rng.random() < 0.5:
-        duration = 0.0
-    number = int(rng.integers(3)) if key[0] is FaultPart.CAMERA else 0
-    return Fault(*key, start, duration, amount, number, int(rng.integers(10**6)))

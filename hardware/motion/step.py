@@ -1,30 +1,22 @@
 """MotionStep: the newest surface pose in, the arm's next command out; no I/O and no clock of its own.
 
-The planner proposes a command and the guard passes it or turns it into a Hold; the arm's link encodes it.
-`motion_process` runs a MotionStep on an arm, without the recorder and the page of a live run. The motion's processes
-import this module: it must never load gtsam, cv2 or onnxruntime, as a call of gtsam was measured to stop every other
-thread for as long as it takes.
+The planner proposes a command and the guard passes it or turns it into a Hold; the arm's link encodes it. The motion's
+processes import this module: it must never load gtsam, cv2 or onnxruntime, as a call of gtsam was measured to stop
+every other thread for as long as it takes.
 """
 
 from __future__ import annotations
 
 import math
-import signal
-from collections import deque
 from collections.abc import Callable
 from ctypes import c_double
-from dataclasses import dataclass, field, replace
-from multiprocessing.connection import Connection
-from types import FrameType
+from dataclasses import replace
 
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.device import ArmEvent
-from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag, open_arm
-from hardware.motion.loop import MaterialControl, MotionLoop, Order, Tick
-from hardware.process.clock import Clock, WallClock
-from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
+from hardware.arm.profile import ArmProfile, measured_lag
+from hardware.motion.loop import MaterialControl
+from hardware.process.clock import Clock
 from planning.clearance import TissueGuard
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
@@ -203,76 +195,3 @@ class PrintMotion:
     def _prepare_material(self) -> None:
         if self._step is not None and self._material is not None and not self._step.progress.wanted:
             self._material.begin(self._step.progress.fraction, self._clock.now())
-
-
-MAX_REPORTED_EVENTS = 50
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionPlan:
-    """What is to be printed, and on which arm."""
-
-    path: Path
-    profile: ArmProfile
-    url: str  # of the arm's port, for pyserial
-    settings: LinkSettings = field(default_factory=LinkSettings)
-    real_time: bool = True  # ask for that priority
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionReport:
-    """The state of the motion process after a tick."""
-
-    tick: Tick
-    total: int  # checkpoints
-    events: tuple[ArmEvent, ...]  # the last ones
-    late: tuple[float, float, float]  # s, median, 99 % and largest lateness of all ticks so far
-    ticks: int
-    skipped: int  # ticks left out
-    stop: tuple[float, float] | None  # s, when the last one was decided and when it was on the wire
-    priority: str  # as the system granted it
-
-
-class _Orders:
-    """The orders received; QUIT where the other end is closed, or at SIGTERM and SIGINT."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._ended = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._end)
-
-    def __call__(self) -> list[Order]:
-        orders, closed = take_messages(self._connection)
-        self._ended |= closed
-        return [*orders, Order.QUIT] if self._ended else orders
-
-    def _end(self, number: int, frame: FrameType | None) -> None:
-        self._ended = True
-
-
-def motion_process(
-    plan: MotionPlan, poses: SharedLatest[SurfacePose], reports: SharedLatest[MotionReport], orders: Connection
-) -> None:
-    """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
-    clock, driver = WallClock(), open_arm(plan.url, plan.profile)
-    arm, motion = Arm(driver, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
-    priority = ask_for_real_time() if plan.real_time else "nothing asked for"
-    events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
-
-    loop: MotionLoop | None = None
-
-    def report(tick: Tick) -> None:
-        assert loop is not None
-        events.extend(arm.events())
-        late, total = loop.lateness, motion.progress.total
-        lateness, stop = (late.percentile(50), late.percentile(99), late.most), arm.stops[-1] if arm.stops else None
-        reports.put(MotionReport(tick, total, tuple(events), lateness, late.count, loop.skipped, stop, priority))
-
-    loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), report)
-    try:
-        loop.run()
-    finally:
-        loop = None  # report and loop refer to each other: the planner's solver would live until the process ends
-        arm.close()
-        driver.release()

@@ -100,7 +100,7 @@ class _Wire:
         pass
 
 
-class _Operator:
+class _SimulatedOperator:
     """Gives the orders that an operator gives. seen_to: s, at which he made a dispenser ready or put material in."""
 
     def __init__(self, motion: PrintMotion, material: MaterialControl) -> None:
@@ -187,7 +187,7 @@ class SimulatedWorld:
         material = self.dispensers.control
         material.begin(0.0, 0.0)
         self.motion = PrintMotion(profile, self._time, c_double(), material, lambda: self.link.lag)
-        self._operator = _Operator(self.motion, material)
+        self._operator = _SimulatedOperator(self.motion, material)
         self._rows_until, self._printed_until = 0.0, 0.0
         self._bead_end: Array | None = None  # (2,) where the last piece of bead ended
         self._end = scenario.seconds
