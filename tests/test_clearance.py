@@ -18,6 +18,7 @@ from hardware.arm.profile import ArmProfile
 from hardware.files.arm_file import arm_from_text, arm_text, read_arm, tool_body_of
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import tissue_from_text, tissue_text
+from hardware.motion.step import MotionStep
 from perception.frames import SYRINGE
 from planning.clearance import (
     BASE_MARGIN,
@@ -32,6 +33,7 @@ from planning.clearance import (
 from planning.command import MotionLimits, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.motion.guard import Guard
+from tests.moving import breathing, path_through, pose_at
 
 STEP = 0.5
 PARTS = (
@@ -310,3 +312,25 @@ def test_a_part_below_the_tip_and_a_mesh_that_is_not_there_are_refused(tmp_path:
 def test_the_arms_that_come_along_have_a_tool(name: str) -> None:
     body: ToolBody = tool_body_of(read_arm(f"data/arms/{name}.toml"))
     assert body.names[:2] == ("needle", "syringe") and len(body.balls.radii) > 500
+
+
+WAY = np.array([[0.0, 0, 1], [20, 0, 1], [20, 1, 1]])
+
+
+def test_a_motion_stands_before_a_wall_and_says_why() -> None:
+    """A path that runs into tissue, on a surface that breathes: the syringe, 4.8 mm wide, comes no nearer than it may."""
+    x = np.arange(121) * STEP - 30
+    wall = np.where(np.meshgrid(x, x)[0] > 12.0, 30.0, -1.0)
+    over = envelope_over(np.eye(4), np.array([-30.0, -30]), STEP, wall, 20.0)
+    motion = MotionStep(path_through(WAY, 8.0), tissue=TissueGuard(tool_body(SYRINGE, (), 0.0, 0.0), over))
+    instants = 10.0 + 0.02 * np.arange(500)
+    answers = [motion(pose_at(breathing, now), now) for now in instants.tolist()]
+    refused = [answer for answer in answers if isinstance(answer, Refusal)]
+    assert {answer.code for answer in refused} == {RefusalCode.CLEARANCE} and len(refused) > 50
+    assert all("the syringe would be" in answer.reason for answer in refused)
+    assert 4.0 < motion.progress.place < 12.0 - 4.8
+    free, last = MotionStep(path_through(WAY, 8.0)), 0.0
+    for now in instants.tolist():
+        free(pose_at(breathing, now), now)
+        last = free.progress.place
+    assert last > 20.0
