@@ -318,7 +318,7 @@ WAY = np.array([[0.0, 0, 1], [20, 0, 1], [20, 1, 1]])
 
 
 def test_a_motion_stands_before_a_wall_and_says_why() -> None:
-    """A path that runs into tissue, on a surface that breathes: the syringe, 4.8 mm wide, comes no nearer than it may."""
+    """A path that runs into tissue, on a surface that breathes: the syringe, 4.8 mm wide, stays off it."""
     x = np.arange(121) * STEP - 30
     wall = np.where(np.meshgrid(x, x)[0] > 12.0, 30.0, -1.0)
     over = envelope_over(np.eye(4), np.array([-30.0, -30]), STEP, wall, 20.0)
