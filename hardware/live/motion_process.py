@@ -34,6 +34,7 @@ from hardware.live.records import (
     StageTiming,
     WireEntry,
 )
+from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import PrintMotion
 from hardware.process.clock import PoseLockedSchedule, WallClock
@@ -86,7 +87,7 @@ class _TickReporter:
     """Times the way from frames to the wire, records what passes the port, and reports each tick."""
 
     def __init__(
-        self, channels: MotionChannels, sender: RecorderSender, ticks: PoseLockedSchedule, priority: str
+        self, channels: MotionChannels, sender: RecorderSender, ticks: PoseLockedSchedule, priority: str, trace: bool
     ) -> None:
         self._poses, self._reports, self._sender, self._ticks = channels.poses, channels.reports, sender, ticks
         self._clock, self._priority = WallClock(), priority
@@ -94,6 +95,8 @@ class _TickReporter:
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
         self._handover: PoseHandover | None = None  # the newest
         self._unsent = False  # whether no move made of that pose went out yet
+        self._lane = TraceLane(MOTION_LANE, self._clock) if trace else None
+        self._seen = math.nan  # s, when the handover was seen here
         self.loop: MotionLoop | None = None
         self.motion: PrintMotion | None = None
 
@@ -101,7 +104,7 @@ class _TickReporter:
         """The newest pose there is."""
         handover = self._poses.get()
         if handover is not self._handover:
-            self._handover, self._unsent = handover, True
+            self._handover, self._unsent, self._seen = handover, True, self._clock.now()
             if handover is not None:
                 self._ticks.arrived(handover.sent)
         return None if handover is None else handover.pose
@@ -118,6 +121,10 @@ class _TickReporter:
             self._unsent = False
             self.times.add(FRAMES_TO_WIRE_STAGE, now - self._handover.handed)
             self.times.add(EXPOSURE_TO_WIRE_STAGE, now - self._handover.pose.stamp)
+            if self._lane is not None and self.loop is not None:
+                begun, handover = max(self.loop.begun, self._seen), self._handover
+                told = ("handed over", handover.sent, self._seen), ("waits for its tick", self._seen, begun)
+                self._sender.put(self._lane.entry(handover.pose.stamp, [*told, (ON_WIRE, begun, now)]))
         self._sender.put(WireEntry(now, data, sent))
 
     def report(self, tick: Tick) -> None:
@@ -166,7 +173,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
-    reporter = _TickReporter(channels, sender, ticks, priority)
+    reporter = _TickReporter(channels, sender, ticks, priority, settings.trace)
     motion = PrintMotion(profile, clock, channels.place, material, reporter.arm_lag)
     orders = _OrderReceiver(channels, motion, ticks)
     driver = open_arm(channels.url, profile, reporter.bytes_passed)

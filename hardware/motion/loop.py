@@ -73,7 +73,10 @@ class Tick:
 
 
 class MotionLoop:
-    """One motion on one arm. lateness: of its ticks. skipped: ticks left out, as their time had passed."""
+    """One motion on one arm.
+
+    lateness: of its ticks. skipped: ticks left out, as their time had passed. begun: s, when the last one was.
+    """
 
     def __init__(
         self,
@@ -94,7 +97,7 @@ class MotionLoop:
         """
         self.motion, self.arm = motion, arm
         self.lateness = Histogram()
-        self.skipped = 0
+        self.skipped, self.begun = 0, math.nan
         self._clock, self._pose, self._orders, self._report, self._homed = clock, pose, orders, report, homed
         profile, settings = arm.profile, arm.settings
         self.material = material
@@ -171,7 +174,7 @@ class MotionLoop:
 
     def _tick(self, pose: SurfacePose | None, now: float, instant: float) -> None:
         """Make at `now`, s, the tick for `instant`, s."""
-        late = max(now - self._schedule.due, 0.0)
+        late, self.begun = max(now - self._schedule.due, 0.0), now
         self.lateness.add(late)
         frame = b""
         if recalled := self.arm.take_up() or self._refused:
