@@ -127,7 +127,7 @@ def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: flo
     at = height - 16
     keys = f"{bar:g} mm · beads at their true width · red: open · dashed: travel · green: start · black: end"
     keys += "" if layer.around.is_empty else " · brown: bump, gone round"
-    keys += " · white dots: left out, no room for the tool" if layer.left_out else ""
+    keys += " · white: no room for the tool" if layer.left_out else ""
     keys += "" if layer.over.is_empty else " · dotted: bump, gone over"
     return (
         f'<text x="{PICTURE_MARGIN}" y="21" font-weight="600">{escape(title)}</text>'
