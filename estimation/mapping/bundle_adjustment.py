@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from estimation import se3
-from estimation.mapping.local_surface import smooth_normals
+from estimation.mapping.triangulation import smooth_normals
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
 from estimation.pose_solver import PointTracks, PoseFit, project, solve_pose

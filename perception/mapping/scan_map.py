@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
+from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.scans.registration import Registration, register, register_near
 from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.triangulation import triangulate
 from perception.frames import Image
 from perception.lens import Lenses
 from perception.mapping.features import polygon_mask
