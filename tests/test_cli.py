@@ -205,6 +205,16 @@ def test_progress_on_a_terminal_is_one_line_that_changes() -> None:
     assert "track: 50 of 100 frame sets, 16.0/s, 3 s left" in text
 
 
+def test_the_time_left_is_not_reckoned_from_what_went_before_the_first_report() -> None:
+    now, stream = [0.0], StringIO()
+    with Progress("pre-render", "frame sets", lambda: now[0], stream) as progress:
+        now[0] = 20.0  # imports, a scene that is painted
+        for done in range(1, 22):
+            progress(done, 121)
+            now[0] += 0.5
+    assert stream.getvalue().splitlines()[-1] == "pre-render: 21 of 121 frame sets, 2.0/s, 50 s left"
+
+
 def test_progress_in_a_log_is_a_line_every_few_seconds() -> None:
     now, stream = [0.0], StringIO()
     with Progress("import", "images", lambda: now[0], stream) as progress:

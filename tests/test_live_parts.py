@@ -41,7 +41,6 @@ from hardware.live.prepared import (
     read_placement,
     write_placement,
 )
-from hardware.live.prerender import cached
 from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
 from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry, recorded_begin
@@ -55,6 +54,7 @@ from hardware.live.settings import (
 )
 from hardware.motion.loop import RecordedTick
 from hardware.process.faults import faults_from_texts
+from hardware.process.progress import cached
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet

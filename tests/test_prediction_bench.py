@@ -41,8 +41,8 @@ from hardware.bench.smoothing import (
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import main, subject_parser
 from hardware.files.folder_tables import write_tum
-from hardware.live.prerender import cached
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
+from hardware.process.progress import cached
 from perception import shipped_file
 from tests.slowly import slowly
 from tests.synthetic import write_session

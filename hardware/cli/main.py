@@ -23,7 +23,7 @@ from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Pars
 from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
-from hardware.process.progress import left_files_text, prepare_out, write_error_text
+from hardware.process.progress import cache_folder, left_files_text, prepare_out, write_error_text
 from hardware.process.system import fill_standard_streams, state_inputs
 from perception import named_path
 
@@ -147,8 +147,9 @@ def add_cache(commands: Commands) -> None:
         "cache",
         _run_cache,
         "how much rendered scenes take, and take them away",
-        "Tell where the scenes lie that `stillbed live --simulated` has rendered, and how large each is. They are\n"
-        "found again by what is in their files, and rendered anew where they are gone.",
+        "Tell where the scenes lie that `stillbed live --simulated` has rendered, and the pictures of `stillbed\n"
+        "simulate`, and how large each is. They are found again by what is in their files, and rendered anew where\n"
+        "they are gone.",
         "stillbed cache",
         "stillbed cache --clear",
     ).add_argument
@@ -156,7 +157,7 @@ def add_cache(commands: Commands) -> None:
 
 
 def _run_cache(a: argparse.Namespace) -> None:
-    from hardware.process.progress import cache_folder, clear_cache, count_text, folder_size, size_text
+    from hardware.process.progress import clear_cache, count_text, folder_size, size_text
 
     cache = cache_folder()
     if a.clear:
@@ -266,7 +267,7 @@ def _simulate(a: argparse.Namespace) -> int:
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)
-    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force, a.open)
+    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force, a.open, cache_folder())
     outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
     return 0 if outcome.met else FAILED

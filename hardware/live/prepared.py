@@ -14,7 +14,9 @@ from __future__ import annotations
 import math
 import re
 import shutil
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection
@@ -49,7 +51,7 @@ from hardware.live.settings import (
 )
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
-from hardware.process.progress import UNFINISHED, cache_error, cache_folder
+from hardware.process.progress import UNFINISHED, cache_error, cache_folder, cached
 from hardware.process.system import SPAWN, blocked_sigint
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
@@ -340,6 +342,10 @@ def _rendered(scenario: File, check_rig: Callable[[Rig], None]) -> File:
 
     check_rig: is shown its cameras before it is rendered. StillbedError for a scenario that makes no sense.
     """
+    with suppress(OSError):  # of a file that is not there; the process says it in words
+        if (there := cached(scenario, cache_folder())).ready:
+            return there.folder
+    print(f"{scenario.name}: its pictures are rendered once, and found again by the next run", file=sys.stderr)
     answer, theirs = SPAWN.Pipe(duplex=False)
     process = SPAWN.Process(target=_render, args=(scenario, check_rig, theirs))
     with blocked_sigint():  # it is ended from here, and says nothing of its own

@@ -42,6 +42,7 @@ from hardware.simulator.camera_pipeline import (
     EventQueue,
     Exposures,
     PictureRenderer,
+    PictureStore,
     PipelineSink,
 )
 from hardware.simulator.cameras import Shot, TrueCameras
@@ -140,11 +141,12 @@ class SimulatedWorld:
         clock: Clock,
         threads: int = 2,
         line: Callable[[bytes], bytes] = bytes,
+        store: PictureStore | None = None,
     ) -> None:
         """scene: the scenario's; beads are drawn into it. path: in the true surface frame. clock: for tracking times.
 
         exposures: filled with the shot of each picture, for a step that may know. line: carries bytes from the
-        motion to the arm, e.g. over a pty.
+        motion to the arm, e.g. over a pty. store: pictures of earlier runs.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
         self._truth, self._exposures = truth, exposures
@@ -155,7 +157,8 @@ class SimulatedWorld:
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
             encoding = scenario.sensor, scenario.jpeg_quality, scenario.seed
-            pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *encoding, threads, self._print_beads)
+            how = *encoding, threads, self._print_beads, store
+            pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *how)
         self._last_state: WorldState | None = None
         self._events = EventQueue()
         self._commanded = CommandedPose(profile)

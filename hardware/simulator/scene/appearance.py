@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from hashlib import sha256
 
 import cv2
 import numpy as np
@@ -205,6 +206,7 @@ class PrintedBeads:
         self._layers = layers
         self._under: tuple[Field, Field] | None = None  # the finest colour and relief as they were
         self._height = np.zeros((0, 0), np.float32)  # mm
+        self.laid = b""  # a hash of all beads so far, in their order
 
     def lay(self, xy_start: ArrayLike, xy_end: ArrayLike, width: float) -> None:
         """Lay a bead of `width` mm from one material point (2,) mm to another; off the texture nothing is laid.
@@ -212,6 +214,8 @@ class PrintedBeads:
         The same bead twice is one bead, and beads that join end to end are one bead.
         """
         layers = self._layers
+        ends = np.asarray([xy_start, xy_end], float)
+        self.laid = sha256(self.laid + ends.tobytes() + repr(width).encode()).digest()
         if self._under is None:
             self._under = layers.colour[0].copy(), layers.relief[0].copy()
             self._height = np.zeros(layers.size, np.float32)
