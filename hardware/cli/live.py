@@ -22,11 +22,19 @@ SETTINGS_FLAGS = (
     "jpeg_quality",
     "dispensers", "operator", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
+FLAG_NAMES = {  # of settings whose flag has another name
+    "unattended": "--yes", "page": "--no-page", "foxglove_port": "--foxglove", "page_certificate": "--page-cert",
+    "page_names": "--page-name",
+}  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
 NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
+LIVE_ALLOWED = (
+    "a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; "
+    "or --simulated data/live/small.toml --record run.mcap, to see a run without any device"
+)
 REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
@@ -151,17 +159,34 @@ def _run_live(a: argparse.Namespace) -> int:
         flags["region"] = read_region(a.region)
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
-    if a.resume is None:
-        settings = LiveSettings() if a.settings is None else read_settings(a.settings)
-        prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
-    elif a.settings is not None or a.record is not None:
+    if a.resume is not None and (a.settings is not None or a.record is not None):
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
-    else:
-        prepared = prepare_resumed(a.resume, flags, faults)
+    if a.resume is None and a.settings is None and a.rig is None and a.simulated is None:
+        raise wrong_option("session.toml", "missing", LIVE_ALLOWED)
+    try:
+        if a.resume is not None:
+            prepared = prepare_resumed(a.resume, flags, faults)
+        else:
+            settings = LiveSettings() if a.settings is None else read_settings(a.settings)
+            prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
+    except InputError as error:
+        raise _by_flag(error, [name for name, value in flags.items() if value is not None]) from None
     with Console(a.open) as console:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)
     return outcome.code
+
+
+def _by_flag(error: InputError, given: list[str]) -> InputError:
+    """The error with the flag's name where a flag gave the value, or where no file is there to name its key."""
+    from hardware.live.settings import SETTING_KEYS
+
+    for table, keys in SETTING_KEYS.items():
+        for key, setting in keys.items():
+            if error.what == f"{table}.{key}" and (setting.name in given or error.where == "command line"):
+                flag = FLAG_NAMES.get(setting.name, f"--{setting.name.replace('_', '-')}")
+                return wrong_option(flag, error.got, error.allowed)
+    return error
 
 
 def _run_init(a: argparse.Namespace) -> None:

@@ -183,9 +183,9 @@ def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fa
     assert settings.record is not None
     files = RunFiles(settings.record)
     if settings.record.exists() and not force:
-        raise InputError(settings.record, "--record", "a file that exists", "a new file, or --force")
+        raise InputError(where, "record.file", settings.record, "a new file, or --force: this one exists")
     if not settings.record.parent.is_dir():
-        raise InputError(settings.record, "--record", "no such folder", "a file in a folder that exists")
+        raise InputError(where, "record.file", settings.record, "a file in a folder that exists")
     prepared = _prepared(settings, files, None, faults, where)
     for file in (files.progress, files.surface):
         file.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ import importlib
 import math
 import signal
 import socket
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -331,7 +332,7 @@ class LiveRun:
                 self._channels.start.value = now
             self._log(stage_line(machine.stage, machine.reason))
             if machine.stage is RunStage.FIND:
-                self._console.say(checks_table(machine.checks))
+                self._console.say(checks_table(machine.checks, sys.stdout))
             elif machine.stage in (RunStage.CONFIRM, RunStage.READY):
                 key = "s: start" if machine.stage is RunStage.READY else self._confirm_key()
                 if self._asked is not machine.stage:

@@ -104,7 +104,15 @@ SETTING_KEYS: dict[str, dict[str, Field[Any]]] = {}  # table and key in the file
 for _setting in (each for each in fields(LiveSettings) if each.metadata):
     _table, _, _name = _setting.metadata["name"].partition(".")
     SETTING_KEYS.setdefault(_table, {})[_name] = _setting
+CAMERAS_ALLOWED = "one of rig (cameras, or a session) and simulated (a scenario)"
 FILE_HEADER = "# A live run of stillbed: `stillbed live session.toml`. Lines that begin with # are examples.\n"
+
+
+def key_of(setting: str) -> str:
+    """The "table.key" of a setting by its name."""
+    return next(
+        f"{table}.{key}" for table, keys in SETTING_KEYS.items() for key, s in keys.items() if s.name == setting
+    )
 
 
 def read_settings(file: Path) -> LiveSettings:
@@ -152,8 +160,12 @@ def parse_host_names(where: object, key: str, names: object) -> tuple[str, ...]:
 def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
     """The settings, with an arm; InputError names what is missing or out of range."""
     s = settings
+    for name in ("rig", "simulated", "model", "path", "scan", "profile", "dispensers"):
+        file = getattr(s, name)
+        if file is not None and not file.exists():
+            raise InputError(where, key_of(name), file, "a file that exists")
     if (s.rig is None) == (s.simulated is None):
-        raise InputError(where, "cameras", "both" if s.rig else "neither", "one of rig and simulated")
+        raise InputError(where, "cameras", "both" if s.rig else "neither", CAMERAS_ALLOWED)
     if s.path is None and s.simulated is None:
         raise InputError(where, "print.path", "missing", "the file of the checkpoints")
     if not s.arm and s.simulated is None:
@@ -178,10 +190,6 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
     _check_foxglove(s.foxglove_port, where)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
-    for name in ("rig", "simulated", "model", "path", "scan", "profile", "dispensers"):
-        file = getattr(s, name)
-        if file is not None and not file.exists():
-            raise InputError(where, name, file, "a file that exists")
     return replace(s, arm=s.arm or VIRTUAL_ARM)
 
 

@@ -23,6 +23,15 @@ def no_progress(done: int, total: int) -> None:
     """Show nothing."""
 
 
+GOOD, DOUBTFUL, BAD = 32, 33, 31  # colours of a terminal: green, yellow, red
+
+
+def painted(text: str, colour: int, stream: TextIO) -> str:
+    """A text in a colour where `stream` is a terminal and nobody has set NO_COLOR (no-color.org)."""
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty()
+    return text if plain else f"\x1b[{colour}m{text}\x1b[0m"
+
+
 class Progress:
     """Shows how far `what` is, at what rate, and how long the rest will take; call it with (done, total)."""
 
