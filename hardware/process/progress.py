@@ -60,6 +60,10 @@ class Progress:
         self._stream.flush()
         self._open = self._tty
 
+    def restart(self) -> None:
+        """The same work begins anew, as another pass over it."""
+        self._first = None
+
     def __enter__(self) -> Progress:
         return self
 
