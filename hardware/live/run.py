@@ -146,8 +146,8 @@ class LiveRun:
         self._statistics.update(now, machine.stage, reports, arm)
         self._statistics.add_true_error(self._view_builder.update(reports, self._profile))
         self._show_surface()
+        self._announce(now)  # before the view: a new stage is in this one
         self._show_view(now)
-        self._announce(now)
 
     def _requests_by_key(self, ready: Sequence[object]) -> list[OperatorRequest]:
         if self._console.file is None or self._console.file not in ready:
