@@ -274,7 +274,7 @@ def read_jointed_arm(arm: File) -> tuple[ArmProfile, JointModel]:
 
 def with_feasible_column(path: Path, reach: Reach) -> Path:
     """The path with the reach's tool spin and the column `feasible`, 1 or 0."""
-    column = np.where(reach.feasible, "1", "0")
+    column = reach.feasible.astype(np.int64)
     return replace(path, surface_from_nozzle=spin_path(path, reach.spin), extra={**path.extra, "feasible": column})
 
 
