@@ -52,6 +52,7 @@ ROOMS = (  # from the ground; a room imports rooms of earlier lines only, and no
     ("hardware.cli",),
 )
 OWNERS = {  # library: the files that may import it
+    "argcomplete": ("hardware/cli/main.py",),
     "aiohttp": ("hardware/live/fault_injection.py", "hardware/operator/*.py", "hardware/offline/viewer.py"),
     "cv2": (
         "perception/*.py",

@@ -116,8 +116,8 @@ class LiveRun:
         return outcome
 
     def _outcome(self) -> RunOutcome:
-        place = self._channels.place.value
-        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, self._signal, place)
+        ended = self._signal, self._channels.place.value, self._channels.link.pictures.get()
+        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *ended)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal that asks the run to end."""
