@@ -77,6 +77,12 @@ def add_live(commands: Commands) -> None:
     add("--operator", metavar="NAME", help="who runs it, as recording and reports keep it")
     port = "show the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
     add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
+    add(
+        "--trace",
+        type=Path,
+        metavar="X.json",
+        help="where each frame set's time went, for Perfetto; see stillbed trace",
+    )
     add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
     add("--no-page", action="store_true", help="without it")
@@ -109,6 +115,37 @@ def add_record(commands: Commands) -> None:
     add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
     add("--no-page", action="store_true", help="without a page")
     add("--force", action="store_true", help="overwrite the file")
+
+
+def add_trace(commands: Commands) -> None:
+    """Add the sub-command `trace`."""
+    add = commands.add(
+        "trace",
+        _run_trace,
+        "where the time of a live run's slowest frame sets went",
+        "Read the trace in the recording of a live run: how long frame sets took from their pixels in memory to the\n"
+        "first move on the wire, and what the processes did meanwhile, for all sets and for the slowest hundredth.",
+        "stillbed trace run.mcap",
+        "stillbed trace run.mcap -o run.json --page run.trace.html",
+    ).add_argument
+    add("record", type=Path, metavar="X.mcap", help="the recording of a live run")
+    add("-o", "--out", type=Path, metavar="X.json", help="write it for Perfetto (ui.perfetto.dev), chrome://tracing")
+    add("--page", type=Path, metavar="X.html", help="write a page: the causes, and the slowest sets as lanes")
+    add("--force", action="store_true", help="overwrite these files")
+
+
+def _run_trace(a: argparse.Namespace) -> None:
+    from hardware.live.trace import chrome_trace, read_trace, trace_page, trace_text
+
+    for flag, file in (("--out", a.out), ("--page", a.page)):
+        if file is not None and file.exists() and not a.force:
+            raise wrong_option(flag, file, "a new file, or --force")
+    trace = read_trace(a.record)
+    print(trace_text(trace))
+    if a.out is not None:
+        a.out.write_text(chrome_trace(trace), encoding="utf-8")
+    if a.page is not None:
+        a.page.write_text(trace_page(trace, a.record.stem), encoding="utf-8")
 
 
 def _run_record(a: argparse.Namespace) -> int:
@@ -154,7 +191,9 @@ def _run_live(a: argparse.Namespace) -> int:
 
     faults = faults_from_texts("command line", "--fault", a.fault)
     flags = {name: getattr(a, name) for name in SETTINGS_FLAGS}
-    flags |= {"unattended": a.yes, "page": False if a.no_page else None}
+    flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": True if a.trace else None}
+    if a.trace is not None and a.trace.exists() and not a.force:
+        raise wrong_option("--trace", a.trace, "a new file, or --force")
     if a.region is not None:
         flags["region"] = read_region(a.region)
     if a.page_name is not None:
@@ -174,6 +213,10 @@ def _run_live(a: argparse.Namespace) -> int:
     with Console(a.open) as console:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)
+    if a.trace is not None:
+        from hardware.live.trace import chrome_trace, read_trace
+
+        a.trace.write_text(chrome_trace(read_trace(prepared.files.record)), encoding="utf-8")
     return outcome.code
 
 

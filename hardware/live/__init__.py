@@ -3,5 +3,5 @@
 __all__ = [
     "camera_recording", "checklist", "fault_injection", "frame_source", "ipc", "motion_process", "outcome",
     "prepared", "prerender", "recorded_run", "recorder_process", "records", "run", "settings", "state_machine",
-    "tracking_process", "view",
+    "trace", "tracking_process", "view",
 ]  # fmt: skip
