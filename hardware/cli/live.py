@@ -22,10 +22,6 @@ SETTINGS_FLAGS = (
     "jpeg_quality",
     "dispensers", "operator", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
-FLAG_NAMES = {  # of settings whose flag has another name
-    "unattended": "--yes", "page": "--no-page", "foxglove_port": "--foxglove", "page_certificate": "--page-cert",
-    "page_names": "--page-name",
-}  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
@@ -185,7 +181,7 @@ def _run_live(a: argparse.Namespace) -> int:
     from hardware.files.region_table import read_region
     from hardware.live.prepared import prepare, prepare_resumed
     from hardware.live.run import LiveRun
-    from hardware.live.settings import LiveSettings, override_settings, parse_host_names, read_settings
+    from hardware.live.settings import LiveSettings, named_by_flag, override_settings, parse_host_names, read_settings
     from hardware.live.view import Console
     from hardware.process.faults import faults_from_texts
 
@@ -209,7 +205,7 @@ def _run_live(a: argparse.Namespace) -> int:
             settings = LiveSettings() if a.settings is None else read_settings(a.settings)
             prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
     except InputError as error:
-        raise _by_flag(error, [name for name, value in flags.items() if value is not None]) from None
+        raise named_by_flag(error, [name for name, value in flags.items() if value is not None]) from None
     with Console(a.open) as console:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)
@@ -218,18 +214,6 @@ def _run_live(a: argparse.Namespace) -> int:
 
         a.trace.write_text(chrome_trace(read_trace(prepared.files.record)), encoding="utf-8")
     return outcome.code
-
-
-def _by_flag(error: InputError, given: list[str]) -> InputError:
-    """The error with the flag's name where a flag gave the value, or where no file is there to name its key."""
-    from hardware.live.settings import SETTING_KEYS
-
-    for table, keys in SETTING_KEYS.items():
-        for key, setting in keys.items():
-            if error.what == f"{table}.{key}" and (setting.name in given or error.where == "command line"):
-                flag = FLAG_NAMES.get(setting.name, f"--{setting.name.replace('_', '-')}")
-                return wrong_option(flag, error.got, error.allowed)
-    return error
 
 
 def _run_init(a: argparse.Namespace) -> None:

@@ -15,6 +15,7 @@ import os
 import re
 import socket
 import ssl
+from collections.abc import Collection
 from dataclasses import Field, dataclass, field, fields, replace
 from ipaddress import ip_address
 from pathlib import Path
@@ -255,6 +256,24 @@ def _toml_value(value: object) -> str | None:
 def toml_string(text: str) -> str:
     """A text without control characters as TOML writes it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+FLAG_NAMES = {  # of settings whose flag has another name
+    "unattended": "--yes", "page": "--no-page", "foxglove_port": "--foxglove", "page_certificate": "--page-cert",
+    "page_names": "--page-name",
+}  # fmt: skip
+
+
+def named_by_flag(error: InputError, given: Collection[str]) -> InputError:
+    """The error with the flag's name where a flag gave the value, or where no file is there to name its key.
+
+    given: names of the settings that flags gave.
+    """
+    for name in (setting.name for keys in SETTING_KEYS.values() for setting in keys.values()):
+        if error.what == key_of(name) and (name in given or error.where == "command line"):
+            flag = FLAG_NAMES.get(name, f"--{name.replace('_', '-')}")
+            return InputError("command line", flag, error.got, error.allowed)
+    return error
 
 
 def override_settings(settings: LiveSettings, flags: dict[str, Any]) -> LiveSettings:
