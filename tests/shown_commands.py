@@ -18,6 +18,8 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "PATH.csv": "path.csv",
     "B.toml": "board.toml",
     "X.mcap": "run.mcap",
+    "X.json": "run.json",
+    "X.html": "run.trace.html",
     "X.dot": "window.dot",
     "FOLDER": "sessions/monday",
     "/dev/ttyUSB0": "./serving",

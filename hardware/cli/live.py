@@ -27,10 +27,8 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
 NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
-LIVE_ALLOWED = (
-    "a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; "
-    "or --simulated data/live/small.toml --record run.mcap, to see a run without any device"
-)
+LIVE_ALLOWED = "a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; or "
+LIVE_ALLOWED += "--simulated data/live/small.toml --record run.mcap, to see a run without any device"
 REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 

@@ -111,7 +111,7 @@ class SetWay:
 
 
 @dataclass(slots=True)
-class Trace:
+class RunTrace:
     """The trace of a run."""
 
     entries: list[TraceEntry] = field(default_factory=list)
@@ -148,11 +148,11 @@ class Trace:
         return sums
 
 
-def read_trace(record: Path) -> Trace:
+def read_trace(record: Path) -> RunTrace:
     """The trace in a recording; InputError where it holds none."""
     from hardware.recording.mcap_file import ChunkMessages, parse, walk
 
-    trace = Trace()
+    trace = RunTrace()
     for part in walk(record):
         for stored in part.messages if isinstance(part, ChunkMessages) else ():
             if stored.topic == TOPIC:
@@ -180,7 +180,7 @@ def slowest_sets(ways: Sequence[SetWay], share: float = SLOWEST_SHARE) -> list[S
     return ordered[: max(round(share * len(ordered)), 1)]
 
 
-def causes(trace: Trace, share: float = SLOWEST_SHARE) -> list[Cause]:
+def causes(trace: RunTrace, share: float = SLOWEST_SHARE) -> list[Cause]:
     """What was done on the sets' ways, by what the slowest share spent more on than all do."""
     ways = trace.ways
     slow = {way.stamp for way in slowest_sets(ways, share)} if ways else set()
@@ -194,7 +194,7 @@ def causes(trace: Trace, share: float = SLOWEST_SHARE) -> list[Cause]:
     return sorted(found, key=lambda cause: cause.usual - cause.slowest)
 
 
-def trace_text(trace: Trace) -> str:
+def trace_text(trace: RunTrace) -> str:
     """The percentiles of the ways and the causes of the slowest, as a table for a terminal."""
     ways = trace.ways
     if not ways:
@@ -208,7 +208,7 @@ def trace_text(trace: Trace) -> str:
     return "\n".join(lines)
 
 
-def chrome_trace(trace: Trace) -> str:
+def chrome_trace(trace: RunTrace) -> str:
     """The trace for Perfetto (ui.perfetto.dev) or chrome://tracing: a process a lane, instants in microseconds."""
     lanes = sorted({entry.lane for entry in trace.entries})
     first = min((span[1] for entry in trace.entries for span in entry.spans), default=0.0)
@@ -225,7 +225,7 @@ def chrome_trace(trace: Trace) -> str:
     return json.dumps({"displayTimeUnit": "ms", "traceEvents": events})
 
 
-def trace_page(trace: Trace, title: str) -> str:
+def trace_page(trace: RunTrace, title: str) -> str:
     """A page with the causes, and what each process did on the ways of the slowest sets."""
     from hardware.report.page import document, figures_table, section
 
@@ -239,30 +239,43 @@ def trace_page(trace: Trace, title: str) -> str:
             "Milliseconds a set, from its pixels in memory to the first move on the wire; processes work side by side.",
             figures_table(("what", "all sets", f"slowest {SLOWEST_SHARE:.0%}"), rows),
         ),
-        section("The slowest sets", "Each lane a process; the grey band is the set's way. Point at a bar.", charts),
+        section("The slowest sets", "Each lane a process; the grey band is the set's way.", _legend(trace) + charts),
     ]
     return document("trace", title, lead, body, "stillbed")
 
 
-COLOURS = ("#3d7edb", "#e07b39", "#3aa37b", "#b65fc4", "#c9a227", "#d1495b", "#5aa9c7", "#8d8d8d")
+COLOURS = (
+    *("#3d7edb", "#e07b39", "#3aa37b", "#b65fc4", "#c9a227", "#d1495b", "#5aa9c7", "#8d8d8d"),
+    *("#7a5c3e", "#1f4e8c", "#9bc53d", "#f19cbb", "#5f4bb6", "#00798c"),
+)
 
 
-def _lanes(trace: Trace, way: SetWay) -> str:
+def _colours(trace: RunTrace) -> dict[str, str]:
+    names = sorted({span[0] for entry in trace.entries for span in entry.spans})
+    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
+
+
+def _legend(trace: RunTrace) -> str:
+    keys = (f'<span style="color:{c}">■</span> {escape(name)}' for name, c in _colours(trace).items())
+    return f"<p>{', '.join(keys)}</p>"
+
+
+def _lanes(trace: RunTrace, way: SetWay) -> str:
     """What each process did on the way of one set, as SVG."""
     begin, end = way.handed - DRAWN_BEFORE_S, way.wired
     scale, lanes = CHART_PX / (end - begin), (TRACKING_LANE, MOTION_LANE, RECORDER_LANE)
     band = f'<rect x="{DRAWN_BEFORE_S * scale:.1f}" y="0" width="{(end - way.handed) * scale:.1f}" '
     parts = [f'{band}height="{LANE_PX * len(lanes)}" fill="#8883"/>']
-    names = sorted({span[0] for entry in trace.entries for span in entry.spans})
+    colours = _colours(trace)
     for entry in trace.entries:
         for name, start, stop in entry.spans:
             if stop <= begin or start >= end:
                 continue
             left, width = (max(start, begin) - begin) * scale, (min(stop, end) - max(start, begin)) * scale
-            row, colour = lanes.index(entry.lane), COLOURS[names.index(name) % len(COLOURS)]
+            row = lanes.index(entry.lane)
             text = escape(f"{entry.lane}: {name}, {1000 * (stop - start):.1f} ms")
             place = f'x="{left:.1f}" y="{row * LANE_PX + 1}" width="{max(width, 0.5):.1f}" height="{LANE_PX - 2}"'
-            parts.append(f'<rect {place} fill="{colour}"><title>{text}</title></rect>')
+            parts.append(f'<rect {place} fill="{colours[name]}"><title>{text}</title></rect>')
     text = f"stamp {way.stamp:.3f} s: {1000 * (way.wired - way.handed):.1f} ms; from above: {', '.join(lanes)}"
     size = f'viewBox="0 0 {CHART_PX} {LANE_PX * len(lanes)}" width="100%"'
     return f'<p>{escape(text)}</p><svg {size} role="img" aria-label="{escape(text)}">{"".join(parts)}</svg>'
