@@ -72,6 +72,7 @@ from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
 from tests.scans import body, height_field
 from tests.session_files import rig
+from tests.slowly import slowly
 
 THERE = available_cores()
 PROFILE = ArmProfile()
@@ -111,7 +112,7 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rig": None}, "one of rig and simulated"), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
+        ({"rig": None}, "one of rig (cameras, or a session) and simulated"), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
         ({"record": Path("x.bag")}, "ends in .mcap"), ({"lift": -1e-9}, "0 to 100 mm"),
         ({"lift": 100.1}, "0 to 100 mm"), ({"patience": 0.99}, "1 to 600 s"), ({"jpeg_quality": 101}, "0 to 100"),
         ({"page_port": -4}, "page.port = -4, allowed 1 to 65535, or 0"),
@@ -584,7 +585,7 @@ def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_a
     assert not (tmp_path / "cache" / "stillbed").exists() and files.progress.read_text() == "an earlier place"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
 def test_a_signal_while_a_scene_is_rendered_ends_it_at_once_and_leaves_nothing(tmp_path: Path, number: int) -> None:
     cache = tmp_path / "stillbed"
     (cache / "old-1.part-999999999").mkdir(parents=True)  # left by one that was killed
