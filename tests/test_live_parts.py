@@ -112,7 +112,7 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rig": None}, "one of rig (cameras, or a session) and simulated"), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
+        ({"rig": None}, "cameras = .neither."), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
         ({"record": Path("x.bag")}, "ends in .mcap"), ({"lift": -1e-9}, "0 to 100 mm"),
         ({"lift": 100.1}, "0 to 100 mm"), ({"patience": 0.99}, "1 to 600 s"), ({"jpeg_quality": 101}, "0 to 100"),
         ({"page_port": -4}, "page.port = -4, allowed 1 to 65535, or 0"),
