@@ -51,12 +51,12 @@ def test_with_nothing_wrong_every_printed_row_is_within_7_um(motion: list[object
 
 
 @pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
-def test_at_printing_speed_starting_and_stopping_cost_no_more_than_8_um(motion: list[object], tmp_path: Path) -> None:
+def test_at_printing_speed_starting_and_stopping_cost_no_more_than_9_um(motion: list[object], tmp_path: Path) -> None:
     file = write_scenario(tmp_path, IDEAL, motion=motion, seconds=3.0)
     log = heard(file).log
     distance = errors(file, log).distance
     assert inner(log).sum() > 1000
-    assert distance[inner(log)].max() < 0.005 and distance[log.extrude].max() < 0.008
+    assert distance[inner(log)].max() < 0.005 and distance[log.extrude].max() < 0.009
 
 
 def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
