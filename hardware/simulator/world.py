@@ -185,8 +185,7 @@ class SimulatedWorld:
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
             assert scene is not None
-            encoding = scenario.sensor, scenario.jpeg_quality, scenario.seed
-            how = *encoding, threads, self._print_beads, store
+            how = scenario.sensor, scenario.jpeg_quality, scenario.seed, threads, self._print_beads, store
             pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *how)
         self._last_state: WorldState | None = None
         self._commanded = CommandedPose(profile)

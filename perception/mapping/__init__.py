@@ -2,5 +2,5 @@
 
 __all__ = [
     "aliases", "alignment_kernels", "features", "first_map", "growth", "mapping", "masks", "matcher", "patches",
-    "scan_map", "verification",
+    "scan_map", "surface_heights", "verification",
 ]  # fmt: skip
