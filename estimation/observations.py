@@ -58,6 +58,9 @@ class Observations:
     sigma: Array  # (N,) px, one standard deviation per axis
     missed: MissedLandmarks = NOTHING_MISSED  # of the same frame set; not recorded
 
+    def __repr__(self) -> str:
+        return f"Observations({len(self)} tracks in {len(np.unique(self.camera))} cameras at {self.stamp:.3f} s)"
+
     def __len__(self) -> int:
         return len(self.camera)
 

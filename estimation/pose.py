@@ -152,6 +152,10 @@ class SurfacePose:
     forecast: Forecast | None = None  # where it is known better than by the twist
     local: LocalError | None = None  # what single places may be off by beyond all that; None: nothing
 
+    def __repr__(self) -> str:
+        place = " ".join(f"{value:.2f}" for value in self.base_from_surface[:3, 3])
+        return f"SurfacePose({self.state.value} at {self.stamp:.3f} s, at {place} mm)"
+
     @property
     def deformation(self) -> float:
         """Root mean square displacement of the landmarks, mm, that no rigid motion explains."""
@@ -282,6 +286,10 @@ class Trajectory:
     stamps: Array  # (N,) s, strictly increasing
     base_from_surface: Array  # (N, 4, 4) mm
     exact: bool  # a truth, not a measured reference
+
+    def __repr__(self) -> str:
+        seconds = float(self.stamps[-1] - self.stamps[0]) if len(self) else 0.0
+        return f"Trajectory({len(self)} poses over {seconds:.1f} s{', exact' if self.exact else ''})"
 
     def __len__(self) -> int:
         return len(self.stamps)

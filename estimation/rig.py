@@ -23,12 +23,18 @@ class Camera:
     base_from_camera: Array  # (4, 4) mm, x right, y down, z into the scene
     clock_offset: float = 0.0  # s, to be added to its stamps
 
+    def __repr__(self) -> str:
+        return f"Camera({self.name!r}, {self.size[0]} x {self.size[1]} px)"
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
     """The cameras, in the order by which observations number them."""
 
     cameras: tuple[Camera, ...]
+
+    def __repr__(self) -> str:
+        return f"Rig({', '.join(map(repr, self.cameras))})"
 
     def __len__(self) -> int:
         return len(self.cameras)

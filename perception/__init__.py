@@ -10,6 +10,8 @@ from pathlib import Path
 
 from estimation.errors import InputError
 
+__all__ = ["CLONE_DATA", "INSTALLED_DATA", "named_path", "shipped_file"]
+
 CLONE_DATA = Path(__file__).parents[1] / "data"
 INSTALLED_DATA = Path(sysconfig.get_path("data")) / "share/stillbed"
 

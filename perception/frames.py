@@ -32,6 +32,10 @@ class Frame:
     image: Image  # (H, W) grey or (H, W, 3) BGR
     by: StampedBy = ""
 
+    def __repr__(self) -> str:
+        h, w = self.image.shape[:2]
+        return f"Frame(camera {self.camera} at {self.stamp:.3f} s, {w} x {h} px)"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintHead:
@@ -48,6 +52,9 @@ class FrameSet:
     stamp: float  # s
     frames: tuple[Frame, ...]
     head: PrintHead | None = None  # the print head at that instant, where an arm is known
+
+    def __repr__(self) -> str:
+        return f"FrameSet(cameras {', '.join(str(frame.camera) for frame in self.frames)} at {self.stamp:.3f} s)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -236,8 +236,8 @@ def with_looks(path: Path, beads: int = 0) -> Path:
         ends = ends[np.append(np.arange(beads - 1, len(ends) - 1, beads), len(ends) - 1)] if len(ends) else ends
     else:
         ends = ends[np.append(path.layer[ends[1:]] != path.layer[ends[:-1]], True)] if len(ends) else ends
-    looks = np.full(len(path), "0")
-    looks[[0, *ends]] = "1"
+    looks = np.zeros(len(path), np.int64)
+    looks[[0, *ends]] = 1
     return replace(path, extra={**path.extra, "look": looks})
 
 

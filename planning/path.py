@@ -28,6 +28,9 @@ MAX_SPEED = 200.0  # mm/s: above, the unit is wrong (bioprinting is 1 to 30 mm/s
 MIN_TEMPERATURE, MAX_TEMPERATURE = -50.0, 500.0  # degrees C: far below and above any bio-ink or thermoplastic
 
 
+Column = NDArray[np.int64] | NDArray[np.float64] | NDArray[np.str_]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
     """N >= 2 checkpoints as parallel arrays.
@@ -42,10 +45,14 @@ class Path:
     temperature: Array  # (N,) degrees C
     layer: NDArray[np.int64]  # (N,)
     extrude: NDArray[np.bool_]  # (N,) whether it extrudes on the way to each checkpoint
-    extra: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # further named columns (N,)
+    extra: Mapping[str, Column] = field(default_factory=dict)  # further named columns (N,): numbers where all are
 
     def __len__(self) -> int:
         return len(self.speed)
+
+    def __repr__(self) -> str:
+        more = f", {', '.join(self.extra)}" if self.extra else ""
+        return f"Path({len(self)} checkpoints, {len(np.unique(self.layer))} layers{more})"
 
     @property
     def zone(self) -> Array:

@@ -148,7 +148,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed live session.toml": (PAGE, "the same in a folder, with more said"),
     "stillbed live monday/session.toml": (PAGE, MORE),
     "stillbed live --simulated data/scenarios/breathing_calm.toml --record run.mcap --yes": (
-        "stillbed live --simulated data/scenarios/breathing_calm.toml --record out/run.mcap",
+        "stillbed live --simulated data/live/small.toml --record out/run.mcap",
         "the same with an operator who says yes",
     ),
     "stillbed replay SESSION --path PATH.csv -o OUT": (

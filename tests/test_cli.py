@@ -21,7 +21,7 @@ from hardware.cli.main import main
 from hardware.files.pose_file import PoseWriter, read_poses
 from hardware.offline.track import follow
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, count_text, duration_text, left_files_text, prepare_out
+from hardware.process.progress import BAD, Progress, count_text, duration_text, left_files_text, painted, prepare_out
 from hardware.recording.session_reader import open_session
 from perception.frames import FrameSet
 from perception.tracking.step import STAGES, StepReport
@@ -206,6 +206,16 @@ def test_progress_on_a_terminal_is_one_line_that_changes() -> None:
     assert "track: 50 of 100 frame sets, 16.0/s, 3 s left" in text
 
 
+def test_the_time_left_is_not_reckoned_from_what_went_before_the_first_report() -> None:
+    now, stream = [0.0], StringIO()
+    with Progress("pre-render", "frame sets", lambda: now[0], stream) as progress:
+        now[0] = 20.0  # imports, a scene that is painted
+        for done in range(1, 22):
+            progress(done, 121)
+            now[0] += 0.5
+    assert stream.getvalue().splitlines()[-1] == "pre-render: 21 of 121 frame sets, 2.0/s, 50 s left"
+
+
 def test_progress_in_a_log_is_a_line_every_few_seconds() -> None:
     now, stream = [0.0], StringIO()
     with Progress("import", "images", lambda: now[0], stream) as progress:
@@ -225,3 +235,56 @@ def test_durations_are_said_as_people_do(seconds: float, words: str) -> None:
 
 def test_one_is_not_told_as_many() -> None:
     assert [count_text(n, "layer") for n in (0, 1, 2)] == ["0 layers", "1 layer", "2 layers"]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("simulat", ["'simulat' is none", "did you mean simulate?"]),
+        ("track x --outt y", ["stillbed track: unknown option --outt", "did you mean --out?"]),
+        ("plan --example forarm -o x.csv", ["--example", "did you mean forearm?"]),
+        ("simulate breathing_clam -o x", ["did you mean 'data/scenarios/breathing_calm.toml'?"]),
+        ("simulate data/scenarios/stil.toml -o x", ["did you mean 'data/scenarios/still.toml'?"]),
+        ("live", ["session.toml = 'missing'", "`stillbed init FOLDER`"]),
+        ("live --simulated data/live/smal.toml", ["--simulated = data/live/smal.toml"]),
+        ("live --simulated data/live/small.toml --record x.txt", ["command line: --record = x.txt"]),
+        ("live --rig data/live/small.toml", ["command line: --path = 'missing'"]),
+    ],
+)
+def test_what_is_wrong_on_a_command_line_is_named_as_it_was_given_with_what_was_meant(
+    line: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main(line.split())
+    except SystemExit as stopped:
+        code = int(stopped.code or 0)
+    told = capsys.readouterr().err
+    assert code == 2 and told.count("\n") == 1 and all(word in told for word in words), told
+
+
+def test_what_a_file_says_is_named_by_its_key_and_what_a_flag_says_by_the_flag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "session.toml"
+    lines = '[cameras]\nsimulated = "gone.toml"\n[record]\nfile = "run.mcap"\n'
+    file.write_text(lines)
+    assert main(["live", str(file)]) == 2
+    assert f"{file}: cameras.simulated = " in capsys.readouterr().err
+    assert main(["live", str(file), "--simulated", "gone.toml"]) == 2
+    assert "command line: --simulated = gone.toml" in capsys.readouterr().err
+
+
+def test_colours_are_for_terminals_whose_owner_has_not_refused_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert painted("bad", BAD, Terminal()) == "\x1b[31mbad\x1b[0m" and painted("bad", BAD, StringIO()) == "bad"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert painted("bad", BAD, Terminal()) == "bad"
+
+
+def test_a_shell_is_told_which_commands_and_options_there_are() -> None:
+    line = "stillbed live --page-a"
+    asked = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": " "}
+    command = f"{sys.executable} -m hardware.cli.main 8>&1 9>/dev/null"
+    run = subprocess.run(command, shell=True, env=os.environ | asked, capture_output=True, text=True, timeout=60)
+    assert run.stdout.strip() == "--page-address"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import runpy
@@ -117,6 +118,25 @@ def test_a_recording_is_made_ready_for_rerun(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)
 def test_each_example_is_shown_in_the_documents(file: Path) -> None:
     assert f"docs/examples/{file.name}" in (EXAMPLES.parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_from_its_first_cell_to_its_last(tmp_path: Path) -> None:
+    """In a process of its own, as a kernel would: it plans, prints in the simulator, tracks and plots."""
+    cells = json.loads((EXAMPLES / "first_steps.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert len(code) >= 5 and all(cell.get("outputs", []) == [] for cell in cells)
+    checks = "assert result.met or 'duty' in result.text; assert len(poses.stamps) > 80; assert printing.sum() > 500"
+    environment = os.environ | {
+        "PYTHONPATH": str(EXAMPLES.parents[1]),
+        "MPLBACKEND": "Agg",
+        "TMPDIR": str(tmp_path),
+        "XDG_CACHE_HOME": str(tmp_path),
+    }
+    program = "\n".join([*code, checks])
+    run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=280)
+    assert run.returncode == 0, run.stderr
+    assert (figure := next(tmp_path.glob("stillbed-*/figure.png"))).stat().st_size > 10_000, figure
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)

@@ -51,6 +51,7 @@ ROOMS = (  # from the ground; a room imports rooms of earlier lines only, and no
     ("hardware.cli",),
 )
 OWNERS = {  # library: the files that may import it
+    "argcomplete": ("hardware/cli/main.py",),
     "aiohttp": ("hardware/live/fault_injection.py", "hardware/operator/*.py", "hardware/offline/viewer.py"),
     "cv2": (
         "perception/*.py",
@@ -431,3 +432,16 @@ def is_defined(file: str, name: str) -> bool:
             return False
         body = getattr(node, "body", [])
     return True
+
+
+def test_each_package_says_what_is_public_in_it_and_has_it() -> None:
+    for file in (path for floor in FLOORS for path in (ROOT / floor).rglob("__init__.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        told = [n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"]
+        assert len(told) == 1, file
+        names = set(ast.literal_eval(told[0]))
+        inside = {path.stem for path in file.parent.glob("*.py")} | {
+            path.parent.name for path in file.parent.glob("*/__init__.py")
+        }
+        source = file.read_text(encoding="utf-8")
+        assert all(name in inside or re.search(rf"\b{name}\b(?!\")", source) for name in names), file

@@ -31,7 +31,6 @@ from hardware.files.path_file import ProgressWriter, read_progress, write_path, 
 from hardware.live.checklist import PrintTask, place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.ipc import schedule, turning_sets
-from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
 from hardware.live.prepared import (
     RunFiles,
     SurfacePlacement,
@@ -40,10 +39,18 @@ from hardware.live.prepared import (
     read_placement,
     write_placement,
 )
-from hardware.live.prerender import cached
 from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
-from hardware.live.records import BeginPrint, Entry, EventEntry, SetEntry, recorded_begin
+from hardware.live.records import (
+    FIRST_BIN_WIDTH,
+    TIMELINE_BINS,
+    BeginPrint,
+    Entry,
+    ErrorTimeline,
+    EventEntry,
+    SetEntry,
+    recorded_begin,
+)
 from hardware.live.settings import (
     LiveSettings,
     available_cores,
@@ -56,6 +63,7 @@ from hardware.motion.loop import RecordedTick
 from hardware.motion.step import LAG_STEP, PrintMotion
 from hardware.process.clock import SimClock
 from hardware.process.faults import faults_from_texts
+from hardware.process.progress import cached
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet
@@ -104,7 +112,7 @@ def test_what_a_run_used_is_read_back_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rig": None}, "one of rig and simulated"), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
+        ({"rig": None}, "cameras = .neither."), ({"path": None}, "print.path"), ({"arm": ""}, "arm.device"),
         ({"record": Path("x.bag")}, "ends in .mcap"), ({"lift": -1e-9}, "0 to 100 mm"),
         ({"lift": 100.1}, "0 to 100 mm"), ({"patience": 0.99}, "1 to 600 s"), ({"jpeg_quality": 101}, "0 to 100"),
         ({"page_port": -4}, "page.port = -4, allowed 1 to 65535, or 0"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64encode
 from dataclasses import replace
 from pathlib import Path
 from pathlib import Path as File
@@ -18,12 +19,21 @@ from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.live.checklist import FIRST_PICTURE_TIME, PrintTask, run_checks
 from hardware.live.outcome import HoldTotal, RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, RunFiles
-from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RecorderReport, RunReports, TrackingReport
+from hardware.live.records import (
+    TRACK_PLACES,
+    BeginPrint,
+    LiveMotionReport,
+    NozzleTrack,
+    PauseOrder,
+    RecorderReport,
+    RunReports,
+    TrackingReport,
+)
 from hardware.live.settings import LiveSettings
 from hardware.live.state_machine import RunStateMachine
 from hardware.live.view import ViewBuilder, stage_line
 from hardware.motion.loop import MaterialStatus, Order, Tick
-from hardware.operator.shared_state import OperatorRequest, Polygons
+from hardware.operator.shared_state import CameraPicture, OperatorRequest, PagePictures, Polygons
 from hardware.operator.view import (
     MAX_MOVE_DEG,
     MAX_MOVE_MM,
@@ -35,7 +45,7 @@ from hardware.operator.view import (
     Wish,
 )
 from hardware.process.progress import TimeLeft
-from hardware.report.report import bead_map
+from hardware.report.report import bead_map, track_map
 from planning.command import Hold
 from planning.path import PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
@@ -733,17 +743,36 @@ def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
     statistics.add_true_error(float("nan"))
     statistics.stretches[300:350] = 0.3
     prepared = replace(views_of(run, 2.5).prepared, files=RunFiles(tmp_path / "run.mcap"))
-    outcome = RunOutcome(prepared, run.conductor, statistics, run.seen, 0, 4.0).write()
+    seen = PagePictures(1.0, (CameraPicture("left", b"whole", near=b"near"), CameraPicture("right", b"whole")), None)
+    outcome = RunOutcome(prepared, run.conductor, statistics, run.seen, 0, 4.0, seen).write()
     assert outcome.result().report == str(tmp_path / "run.report.html")
     page = (tmp_path / "run.report.html").read_text(encoding="utf-8")
     rows = dict(re.findall(r"<tr[^>]*><td>([^<]*)</td><td>\d*</td><td>([\d.]+)</td></tr>", page))
     parts = ("pose is … s old", "paused by the operator", "material left", "on the way without material")
     assert [rows[name] for name in parts] == ["12.50", "2.50", "40.00", "5.00"]
     assert rows["since the approach"] == "60.00"
+    assert b64encode(b"near").decode() in page and "<figcaption>right</figcaption>" in page
     for words in ("true error, 95 % / largest", "printed by the runs before", "the beads from above", "var(--amber)"):
         assert words in page
     summary = json.loads((tmp_path / "run.summary.json").read_text())
     assert summary["true_error_mm"]["max"] == pytest.approx(0.199) and summary["printed_share"] > 0.5
+
+
+def test_the_track_of_the_nozzle_keeps_every_bead_apart_however_long_the_run() -> None:
+    track, laid = NozzleTrack(), 0.0
+    for bead in range(400):
+        for x in np.arange(0.0, 10.0, 0.1):
+            track.add(np.array([x, bead, 0.0]))
+        track.lift()
+        laid = bead
+    rows = track.places
+    cuts = np.isnan(rows[:, 0])
+    assert len(rows) <= TRACK_PLACES and cuts.sum() == laid and not (cuts[1:] & cuts[:-1]).any()
+    beads = np.split(rows, np.flatnonzero(cuts))
+    assert all(np.ptp(each[np.isfinite(each[:, 0]), 1]) == 0 for each in beads)
+    path = np.array([[0.0, 0, 0], [10, 0, 0], [10, 1, 0], [0, 1, 0]])
+    drawn = track_map(rows[:120], path, np.array([0, 1, 0, 1], bool))
+    assert drawn.count('class="estimate" d="') > 2 and drawn.count('class="aside" d="') >= 1
 
 
 def test_a_way_to_a_checkpoint_has_the_largest_error_of_all_stretches_on_it() -> None:

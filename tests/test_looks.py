@@ -69,10 +69,10 @@ def layers(count: int = 2, beads: int = 2) -> Path:
 
 def test_a_look_is_asked_for_before_all_and_after_each_layer_or_some_beads() -> None:
     path = layers(2, 3)
-    assert np.flatnonzero(with_looks(path).extra["look"] == "1").tolist() == [0, 5, 11]
-    assert np.flatnonzero(with_looks(path, 2).extra["look"] == "1").tolist() == [0, 3, 7, 11]
+    assert np.flatnonzero(with_looks(path).extra["look"] == 1).tolist() == [0, 5, 11]
+    assert np.flatnonzero(with_looks(path, 2).extra["look"] == 1).tolist() == [0, 3, 7, 11]
     divided = divide_path(with_looks(path), 1.0)
-    looks = np.flatnonzero(divided.extra["look"] == "1")
+    looks = np.flatnonzero(divided.extra["look"] == 1)
     assert np.allclose(divided.surface_from_nozzle[looks, :3, 3], path.surface_from_nozzle[[0, 5, 11], :3, 3])
 
 

@@ -268,7 +268,7 @@ def test_the_command_refuses_before_anything_starts(tmp_path: Path, capsys: pyte
     assert main([*run, "--page-address", "0.0.0.0"]) == 2
     assert main([*run, "--page-address", "0.0.0.0", "--page-name", "not a name"]) == 2
     said = capsys.readouterr().err.splitlines()
-    assert len(said) == 2 and "page.certificate = 'missing'" in said[0] and "--page-name" in said[1]
+    assert len(said) == 2 and "--page-cert = 'missing'" in said[0] and "--page-name" in said[1]
     assert not (tmp_path / "x.mcap").exists()
 
 

@@ -41,7 +41,11 @@ def wandering(seed: int, count: int = 12) -> Path:
         layer=draw.integers(0, 4, count),
         extrude=draw.random(count) < 0.7,
         material=np.array([f"gel {i % 3}" for i in range(count)]) if seed % 2 else draw.integers(0, 9, count),
-        extra={"wait_s": np.array([f"{v:.2f}" for v in draw.random(count)])},
+        extra={
+            "wait_s": draw.random(count),
+            "run": draw.integers(0, 9, count),
+            "note": np.array(["a", "0.5"] * count)[:count],
+        },
     )
 
 
@@ -55,7 +59,9 @@ def test_a_file_gives_the_path_back(tmp_path_factory: pytest.TempPathFactory, se
     assert np.array_equal(back.surface_from_nozzle[:, :3, 3], path.surface_from_nozzle[:, :3, 3])
     for name in ("speed", "material", "temperature", "layer", "extrude"):
         assert np.array_equal(getattr(back, name), getattr(path, name)), name
-    assert list(back.extra) == ["wait_s"] and np.array_equal(back.extra["wait_s"], path.extra["wait_s"])
+    assert list(back.extra) == list(path.extra)
+    for name, column in path.extra.items():  # numbers as numbers
+        assert back.extra[name].dtype.kind == column.dtype.kind and np.array_equal(back.extra[name], column), name
 
 
 def test_a_file_as_people_write_it(tmp_path: File) -> None:

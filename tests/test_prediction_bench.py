@@ -39,8 +39,8 @@ from hardware.bench.smoothing import (
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import subject_parser
 from hardware.files.folder_tables import write_tum
-from hardware.live.prerender import cached
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
+from hardware.process.progress import cached
 from perception import shipped_file
 from tests.campaigns import link as link_run
 from tests.campaigns.__main__ import main as campaigns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hardware.arm.profile import ARM_FROM_BENCH
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
 from hardware.files.path_file import read_path, write_path
+from hardware.offline.reach import reach_page
 from hardware.report.page import Plot
 from planning.kinematics import POSTURES, JointModel, nozzle_from_joints
 from planning.path import REACH_REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
@@ -105,10 +107,10 @@ def test_the_command_marks_the_path_and_what_can_be_printed(tmp_path: Path, caps
     assert "6 of 6 can be printed" in text and "NOMINAL" in text
     assert main([*command, "--surface", "580,0,50,0,0,0", "-o", str(tmp_path / "bad"), "--spin"]) == 1
     marked = read_path(tmp_path / "bad" / "path.csv").extra["feasible"]
-    assert 0 < (marked == "0").sum() <= 6
+    assert 0 < (marked == 0).sum() <= 6
     with (tmp_path / "bad" / "reach.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [row["feasible"] for row in rows] == marked.tolist()
+    assert [row["feasible"] for row in rows] == list(map(str, marked.tolist()))
     assert {row["reason"] for row in rows if row["feasible"] == "0"} <= set(REACH_REASONS[1:])
     assert "<svg" in (tmp_path / "bad" / "reach.html").read_text()
 
@@ -124,3 +126,20 @@ def test_a_dense_path_is_drawn_as_the_curve_that_it_is() -> None:
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 4.0  # px: no chord leaves the curve
     true = np.stack([plot.x(x), plot.y(y)], axis=1)
     assert points[[0, -1]] == pytest.approx(true[[0, -1]], abs=0.06)
+
+
+def test_the_page_draws_the_arm_and_its_limits_and_lists_what_cannot_be_printed_with_what_to_do(tmp_path: Path) -> None:
+    model, path = nominal(), raster(speed=5.0)
+    reach = reach_of(model, ARM_FROM_BENCH, path, STILL)
+    reason = np.zeros(len(path), np.int64)
+    reason[2:5] = REACH_REASONS.index("singular")
+    reason[5] = REACH_REASONS.index("too far")
+    layered = replace(path, layer=np.where(np.arange(len(path)) < 4, 0, 1))
+    text = reach_page("p.csv", "an arm", "words", layered, replace(reach, reason=reason), model)
+    rows = re.findall(r"<tr><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)", text)
+    assert [row[:3] for row in rows] == [
+        ("2 to 3", "0", "singular"), ("4", "1", "singular"), ("5", "1", "too far"),
+    ]  # fmt: skip
+    assert "--spin" in rows[0][3] and "--surface" in rows[2][3]
+    assert "from the side, mm" in text and "checkpoint 2: singular" in text and "limit 100" in text
+    assert "What cannot be printed" not in reach_page("p.csv", "an arm", "words", path, reach, model)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +25,12 @@ from hardware.files.folder_tables import read_tum
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import PoseTable, read_poses
 from hardware.offline.track import run_track
+from hardware.process.faults import faults_from_texts
 from hardware.recording.session_reader import open_session
+from hardware.simulator import camera_pipeline
+from hardware.simulator.camera_pipeline import PictureStore
 from hardware.simulator.scenario import read_scenario
+from hardware.simulator.scene.render import render
 from hardware.simulator.simulate import SimulationOptions, run_simulation
 from tests.nozzle_logs import read_nozzle
 from tests.test_viewers import placed, read
@@ -44,7 +50,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     file = write_scenario(folder, SMALL, FAULTY, motion=[BREATHING], seconds=1.0, seed=8, clearance_mm=0.4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1764150000")
-        run_simulation(file, folder / "one", SimulationOptions(threads=1))
+        run_simulation(file, folder / "one", SimulationOptions(threads=1, cache=folder / "cache"))
         yield folder
 
 
@@ -75,6 +81,50 @@ def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) 
     assert differing <= timed  # these tell how long it took
     assert same_columns(one / "tracking" / "poses.csv", two / "tracking" / "poses.csv")
     assert sum(name.endswith(".jpg") for name in names) > 40
+
+
+def test_pictures_of_an_earlier_run_are_found_again_and_no_others(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rendered: list[int] = []
+
+    def counting(*arguments: Any) -> Any:
+        rendered.append(len(arguments[1]))
+        return render(*arguments)
+
+    monkeypatch.setattr(camera_pipeline, "render", counting)
+    options = SimulationOptions(cache=recorded / "cache")
+    run_simulation(recorded / "scenario.toml", tmp_path / "again", options)
+    again, one = tmp_path / "again" / "session.mcap", recorded / "one" / "session.mcap"
+    assert not rendered and again.read_bytes() == one.read_bytes()
+    later = faults_from_texts("test", "fault", ["camera1 black at 0.5s"])
+    run_simulation(recorded / "scenario.toml", tmp_path / "covered", replace(options, faults=later))
+    whole = sum(file.suffix == ".jpg" for file in (recorded / "one" / "session").rglob("*"))
+    assert 5 < sum(rendered) < 0.9 * whole  # what is black, and what the nozzle does because of it
+
+
+def test_a_store_of_pictures_that_another_run_writes_or_that_is_damaged_is_done_without(tmp_path: Path) -> None:
+    file = write_scenario(tmp_path, IDEAL)
+    one, other = PictureStore(file, tmp_path / "cache"), PictureStore(file, tmp_path / "cache")
+    one.put(b"1", ("jpeg", b"picture"))
+    other.put(b"2", ("jpeg", b"lost"))
+    assert other.get(b"2") is None
+    other.close()
+    one.close()
+    for run in range(3):
+        later = PictureStore(file, tmp_path / "cache")
+        assert (later.get(b"1") if run == 0 else b"") is not None
+        later.put(b"%d" % (run + 5), ("jpeg", b""))
+        later.finish()
+        later.close()
+    last = PictureStore(file, tmp_path / "cache")
+    assert [last.get(key) is not None for key in (b"1", b"5", b"6", b"7")] == [False, False, True, True]
+    last.close()
+    (last.folder / "pictures.db").write_bytes(b"no database" * 1000)
+    damaged = PictureStore(file, tmp_path / "cache")
+    damaged.put(b"1", ("jpeg", b""))
+    assert damaged.get(b"1") is None
+    damaged.close()
 
 
 @pytest.mark.slow

@@ -219,8 +219,8 @@ def test_a_file_says_what_the_motion_takes_the_dispenser_for(tmp_path: File) -> 
 
 def test_pieces_of_a_way_share_its_volume_and_the_first_has_its_rest() -> None:
     path = path_through(np.array([[0.0, 0, 0], [4, 0, 0], [4, 6, 0]]))
-    extra = {"volume_mm3": np.array(["0", "2", "6"]), "wait_s": np.array(["0", "0", "3"])}
+    extra = {"volume_mm3": np.array([0, 2, 6]), "wait_s": np.array([0.0, 0.0, 3.0])}
     fine = divide_path(replace(path, extra=extra), 1.0)
-    assert fine.extra["volume_mm3"].astype(float).sum() == pytest.approx(8.0)
+    assert fine.extra["volume_mm3"].sum() == pytest.approx(8.0)
     assert bead_areas(fine)[1:].tolist() == pytest.approx([0.5] * 4 + [1.0] * 6)
-    assert fine.extra["wait_s"].tolist() == [*["0"] * 5, "3", *["0"] * 5]
+    assert fine.extra["wait_s"].tolist() == [*[0.0] * 5, 3.0, *[0.0] * 5]

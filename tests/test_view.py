@@ -32,6 +32,7 @@ from hardware.operator.settings import OperatorSettings
 from hardware.recording.recorder import Recorder
 from hardware.report.evaluation import calibration_words
 from perception.frames import Frame
+from planning.command import Hold, Move
 from tests.browser import Browser, axe_findings
 from tests.moving import raster
 from tests.recorded import pose, whole_recording
@@ -75,6 +76,28 @@ def address(playback: Playback) -> Iterator[str]:
         task.cancel()
         loop.call_soon_threadsafe(loop.stop)
         thread.join(5)
+
+
+def test_holds_stages_and_the_log_of_a_run_are_shown_at_their_instants(recording: Path, tmp_path: Path) -> None:
+    """A recording with commands and a log, whose stamps begin far from zero."""
+    path = tmp_path / "told.mcap"
+    stamps = 5000.0 + np.arange(10) / 10
+    with Recorder(path, rig(2)) as recorder:
+        for number, stamp in enumerate(stamps):
+            for camera in range(2):
+                recorder.write(Frame(camera, float(stamp), image(camera, number)))
+            if number == 3:
+                recorder.event(float(stamp), "print")
+            if number == 5:
+                recorder.write(Hold(float(stamp), 0.02, "pose is 0.4 s old"))
+            if number == 8:
+                recorder.write(Move(float(stamp), np.zeros(6), 5.0, 3, False))
+                recorder.event(float(stamp), "stopped: by the operator")
+    shown = open_playback(path)
+    assert [bool(why) for why in shown.held] == [False] * 5 + [True] * 3 + [False] * 2
+    told = json.loads(session_text(shown))
+    assert told["stages"] == [[0.3, "print"], [0.8, "stopped"]]
+    assert told["events"][1] == [0.8, "stopped: by the operator"] and told["held"][6] == "pose is 0.4 s old"
 
 
 def got(address: str, **headers: str) -> bytes:

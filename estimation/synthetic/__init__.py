@@ -3,3 +3,5 @@
 `synthetic_world("breathing", noise=0.25, seed=3)` of `estimation.synthetic.world` makes one in a line, as pytest's
 fixture of the same name does. Nothing is drawn as a picture: a world gives what a matcher would make of the pictures.
 """
+
+__all__ = ["follow", "movements", "plugin", "waveforms", "world"]

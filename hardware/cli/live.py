@@ -27,6 +27,8 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
 NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
+LIVE_ALLOWED = "a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; or "
+LIVE_ALLOWED += "--simulated data/live/small.toml --record run.mcap, to see a run without any device"
 REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
@@ -177,7 +179,7 @@ def _run_live(a: argparse.Namespace) -> int:
     from hardware.files.region_table import read_region
     from hardware.live.prepared import prepare, prepare_resumed
     from hardware.live.run import LiveRun
-    from hardware.live.settings import LiveSettings, override_settings, parse_host_names, read_settings
+    from hardware.live.settings import LiveSettings, named_by_flag, override_settings, parse_host_names, read_settings
     from hardware.live.view import Console
     from hardware.process.faults import faults_from_texts
 
@@ -190,13 +192,18 @@ def _run_live(a: argparse.Namespace) -> int:
         flags["region"] = read_region(a.region)
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
-    if a.resume is None:
-        settings = LiveSettings() if a.settings is None else read_settings(a.settings)
-        prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
-    elif a.settings is not None or a.record is not None:
+    if a.resume is not None and (a.settings is not None or a.record is not None):
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
-    else:
-        prepared = prepare_resumed(a.resume, flags, faults)
+    if a.resume is None and a.settings is None and a.rig is None and a.simulated is None:
+        raise wrong_option("session.toml", "missing", LIVE_ALLOWED)
+    try:
+        if a.resume is not None:
+            prepared = prepare_resumed(a.resume, flags, faults)
+        else:
+            settings = LiveSettings() if a.settings is None else read_settings(a.settings)
+            prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
+    except InputError as error:
+        raise named_by_flag(error, [name for name, value in flags.items() if value is not None]) from None
     with Console(a.open) as console:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)

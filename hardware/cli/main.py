@@ -23,7 +23,7 @@ from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Pars
 from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
-from hardware.process.progress import left_files_text, prepare_out, write_error_text
+from hardware.process.progress import BAD, cache_folder, left_files_text, painted, prepare_out, write_error_text
 from hardware.process.system import fill_standard_streams, state_inputs
 from perception import named_path
 
@@ -125,7 +125,7 @@ def _run_doctor(a: argparse.Namespace) -> int:
     if a.json:
         print(json.dumps({name: [asdict(check) for check in part] for name, part in parts.items()}, indent=2))
     else:
-        print("\n\n".join(f"{name}\n{checks_table(tuple(part))}" for name, part in parts.items() if part))
+        print("\n\n".join(f"{name}\n{checks_table(tuple(part), sys.stdout)}" for name, part in parts.items() if part))
         print(f"\n{_verdict_text(verdicts, broken)}")
     return FAILED if CheckVerdict.FAIL in verdicts else 0
 
@@ -147,8 +147,9 @@ def add_cache(commands: Commands) -> None:
         "cache",
         _run_cache,
         "how much rendered scenes take, and take them away",
-        "Tell where the scenes lie that `stillbed live --simulated` has rendered, and how large each is. They are\n"
-        "found again by what is in their files, and rendered anew where they are gone.",
+        "Tell where the scenes lie that `stillbed live --simulated` has rendered, and the pictures of `stillbed\n"
+        "simulate`, and how large each is. They are found again by what is in their files, and rendered anew where\n"
+        "they are gone.",
         "stillbed cache",
         "stillbed cache --clear",
     ).add_argument
@@ -156,7 +157,7 @@ def add_cache(commands: Commands) -> None:
 
 
 def _run_cache(a: argparse.Namespace) -> None:
-    from hardware.process.progress import cache_folder, clear_cache, count_text, folder_size, size_text
+    from hardware.process.progress import clear_cache, count_text, folder_size, size_text
 
     cache = cache_folder()
     if a.clear:
@@ -176,7 +177,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     0, 1 where a simulation misses its limits, 2 for wrong input (one line on stderr), 130 after Ctrl-C.
     """
     fill_standard_streams()
-    arguments = parser().parse_args(argv)
+    commands = parser()
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word may be
+        import argcomplete
+
+        argcomplete.autocomplete(commands)
+    arguments = commands.parse_args(argv)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
     state_inputs(input_files(arguments))
     code: int | None = None
@@ -191,7 +197,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
         nameless = isinstance(error, OSError) and error.filename is None and error.strerror
-        print(f"stillbed: {write_error_text(error, out) if nameless else error_text(error)}", file=sys.stderr)
+        words = write_error_text(error, out) if nameless else error_text(error)
+        print(f"stillbed: {painted(words, BAD, sys.stderr)}", file=sys.stderr)
         if out is not None and not was_there:
             with suppress(OSError):
                 out.rmdir()  # made for what was not done; what holds anything stays
@@ -266,7 +273,7 @@ def _simulate(a: argparse.Namespace) -> int:
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)
-    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force, a.open)
+    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force, a.open, cache_folder())
     outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
     return 0 if outcome.met else FAILED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import inspect
 import math
 import re
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from estimation.errors import InputError, StillbedError
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress
+from hardware.process.progress import BAD, Progress, painted
 
 if TYPE_CHECKING:
     from hardware.arm.profile import ArmProfile
@@ -24,16 +25,37 @@ MODEL_HELP = "the network that finds the wound: your own, of stillbed train, or 
 FAILED = 1  # exit code where a command ran, and its result is not good enough
 WRONG_INPUT = 2  # exit code
 INTERRUPTED = 130  # exit code that a shell expects after Ctrl-C
+WRONG_CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")  # as argparse says it
 USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of the docstring
 
 
 class Parser(argparse.ArgumentParser):
     """Reports a wrong command line in one line, as all wrong input, and refers to --help."""
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As its base does; an option that a command does not know is told first, with the one that is near."""
+        known, takes_rest = list(self._option_string_actions), any(a.nargs == argparse.REMAINDER for a in self._actions)
+        for word in () if self._subparsers is not None or takes_rest else args or ():
+            name = word.partition("=")[0]
+            if word == "--":
+                break
+            if name.startswith("--") and not any(each.startswith(name) for each in known):  # a beginning will do
+                self.error(f"unknown option {name}{near_text(name, known)}")
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         """Print the line, and exit."""
-        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        if (choice := WRONG_CHOICE.search(message)) is not None:  # all the others stand in the help
+            known = re.findall(r"'([^']+)'", choice[2])
+            message = f"{message[: choice.start()]}{choice[1]!r} is none{near_text(choice[1], known)}"
+        print(f"{self.prog}: {painted(message, BAD, sys.stderr)}; see {self.prog} --help", file=sys.stderr)
         sys.exit(WRONG_INPUT)
+
+
+def near_text(word: str, known: Sequence[str]) -> str:
+    """What was meant by a word, if one that is known is near; else ""."""
+    near = difflib.get_close_matches(word.partition("=")[0], known, 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 class Commands:
@@ -57,10 +79,13 @@ class Commands:
 
 
 def error_text(error: Exception) -> str:
-    """The message of an error; of a system error with a file, the file first."""
+    """The message of an error, of a system error with a file the file first, and what may have been meant by a name."""
+    from hardware.process.checks import near_file_text
+
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror.lower()}"
-    return str(error)
+        return f"{error.filename}: {error.strerror.lower()}{near_file_text(error.filename)}"
+    near = near_file_text(error.got, error.where) if isinstance(error, InputError) else ""
+    return f"{error}{near}"
 
 
 def wrong_option(option: str, got: object, allowed: str) -> InputError:

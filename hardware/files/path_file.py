@@ -37,7 +37,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process import checks
 from planning.clearance import Balls, Envelope, TissueGuard, ToolBody
-from planning.path import Path, PrintProgress, ProgressMark, check_path, fingerprint, resume_fraction
+from planning.path import Column, Path, PrintProgress, ProgressMark, check_path, fingerprint, resume_fraction
 
 POSE_COLUMNS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 SPEED_COLUMNS = {"speed_mm_s": 1.0, "speed_mm_min": 1 / 60}  # column: mm/s of its unit
@@ -73,7 +73,7 @@ def _path_from_rows(file: File, rows: list[checks.CsvRow]) -> Path:
         temperature=numbers["temperature_c"],
         layer=_whole(file, lines, "layer", words.get("layer", ["0"] * len(lines))),
         extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), flags=True) == 1,
-        extra={name: np.array(words[name]) for name in words if name not in (*PATH_HEADER, *SPEED_COLUMNS)},
+        extra={name: _further(words[name]) for name in words if name not in (*PATH_HEADER, *SPEED_COLUMNS)},
     )
     named = {"speed": speed_column, "temperature": "temperature_c"}
     check_path(path, file, lines, {value: (column, words[column]) for value, column in named.items()})
@@ -96,10 +96,33 @@ def path_text(path: Path) -> str:
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([*PATH_HEADER, *path.extra])
+    further = [_cells(column) for column in path.extra.values()]
     for i, row in enumerate(numbers):
         rest = [path.material[i], repr(float(path.temperature[i])), path.layer[i], int(path.extrude[i])]
-        writer.writerow([*(repr(float(v)) for v in row), *rest, *(column[i] for column in path.extra.values())])
+        writer.writerow([*(repr(float(v)) for v in row), *rest, *(column[i] for column in further)])
     return stream.getvalue()
+
+
+def _further(words: list[str]) -> Column:
+    """A further column: whole numbers, numbers, or text where any word is none."""
+    try:
+        whole = np.array([int(word) for word in words], np.int64)
+        if [str(number) for number in whole.tolist()] == words:
+            return whole
+    except (ValueError, OverflowError):
+        pass
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        return np.array(words)
+    return numbers if np.isfinite(numbers).all() else np.array(words)
+
+
+def _cells(column: Column) -> list[str]:
+    """The cells of a further column, every number with the digits that give it back."""
+    if column.dtype.kind == "f":
+        return [repr(number).removesuffix(".0") for number in column.tolist()]
+    return [str(value) for value in column.tolist()]
 
 
 def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], dict[str, list[str]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path as File
+from typing import TextIO
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from hardware.arm.device import ArmState
 from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, RunReports, TrackingReport
 from hardware.operator.view import MAX_MOVE_DEG, MAX_MOVE_MM, Check, CheckVerdict, MoveRequest
-from hardware.process.progress import count_text
+from hardware.process.progress import BAD, DOUBTFUL, GOOD, count_text, painted
 from planning.clearance import GUARD_TOUCH, TissueGuard
 from planning.command import AXIS_MARGIN, JOINT_MARGIN
 from planning.kinematics import axes_from_nozzle, joints_from_axes
@@ -27,6 +28,7 @@ MAX_PICTURE_AGE = 1.0  # s: a camera whose pictures are older does not deliver a
 FIRST_PICTURE_TIME = 30.0  # s in which first pictures come where all is well, on two busy cores
 USUAL_START = "10 to 30 s are usual"
 PASS, FAIL, BUSY, WARN = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.BUSY, CheckVerdict.WARN
+VERDICT_COLOURS = {PASS: GOOD, WARN: DOUBTFUL, FAIL: BAD}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,11 +236,14 @@ def _recorder_check(report: RecorderReport | None) -> Check:
     return Check("recording", PASS, "it writes")
 
 
-def checks_table(checks: tuple[Check, ...]) -> str:
-    """The check as a table for a terminal."""
+def checks_table(checks: tuple[Check, ...], stream: TextIO | None = None) -> str:
+    """The check as a table. stream: where it is written to, in colours if that is a terminal."""
     width = max(len(check.name) for check in checks)
     lines = []
     for check in checks:
         remedy = f": {check.remedy}" if check.remedy and check.verdict is not PASS else ""
-        lines.append(f"  {check.name:<{width}}  {check.verdict.value:<4}  {check.found}{remedy}")
+        verdict = f"{check.verdict.value:<4}"
+        if stream is not None and check.verdict in VERDICT_COLOURS:
+            verdict = painted(verdict, VERDICT_COLOURS[check.verdict], stream)
+        lines.append(f"  {check.name:<{width}}  {verdict}  {check.found}{remedy}")
     return "\n".join(lines)

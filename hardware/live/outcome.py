@@ -19,8 +19,15 @@ from estimation import se3
 from estimation.se3 import Array
 from hardware.live.checklist import checks_table
 from hardware.live.prepared import Prepared
-from hardware.live.records import RunReports, StageHistograms, StageTiming
+from hardware.live.records import (
+    ErrorTimeline,
+    NozzleTrack,
+    RunReports,
+    StageHistograms,
+    StageTiming,
+)
 from hardware.live.state_machine import RunStateMachine
+from hardware.operator.shared_state import PagePictures
 from hardware.operator.view import HoldRow, RunResult, RunStage
 from hardware.process.clock import Histogram
 from hardware.process.system import provenance
@@ -28,8 +35,6 @@ from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.path import PrintPhase, way_lengths
 
-TIMELINE_BINS = 600  # an even number: two bins become one
-FIRST_BIN_WIDTH = 0.1  # s of a bin at first
 _NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 MAX_REASONS = 40  # kinds of holds that are counted apart
 OTHER_REASONS = "other reasons"
@@ -39,41 +44,8 @@ MAX_TICK_GAP = 0.5  # s from tick to tick that is counted: nobody knows what hap
 MAX_SHOWN_HOLDS = 12  # reasons on the page's end, the longest first
 EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
 BEADS_CAPTION = "The path from above, by the largest predicted error of each stretch while material left."
+TRACK_CAPTION = "Where the nozzle was led on the surface while material left, as it was tracked, over the path."
 TIMELINE_CAPTION = "Predicted, the largest of each moment while material left, over the seconds since the approach."
-
-
-class ErrorTimeline:
-    """The predicted error over a run, in bins that become twice as long whenever all are full.
-
-    width: s of each bin.
-    error: (TIMELINE_BINS,) mm, the largest predicted in each while material left, NaN where none did.
-    held: (TIMELINE_BINS,) s for which the nozzle was held.
-    """
-
-    def __init__(self) -> None:
-        self.width = FIRST_BIN_WIDTH
-        self.error = np.full(TIMELINE_BINS, np.nan)
-        self.held = np.zeros(TIMELINE_BINS)
-        self._begun = nan
-        self._last = 0
-
-    @property
-    def stamps(self) -> Array:
-        """(N,) s since the first tick, the middles of the bins so far."""
-        return np.asarray((np.arange(self._last + 1) + 0.5) * self.width, float)
-
-    def add(self, stamp: float, error: float, held: float) -> None:
-        """A tick at `stamp`, s, with its predicted error, mm or NaN, and the s for which it was held."""
-        if np.isnan(self._begun):
-            self._begun = stamp
-        while (stamp - self._begun) / self.width >= TIMELINE_BINS:
-            half = np.full(TIMELINE_BINS // 2, np.nan), np.zeros(TIMELINE_BINS // 2)
-            self.error = np.concatenate([np.fmax(self.error[::2], self.error[1::2]), half[0]])
-            self.held = np.concatenate([self.held[::2] + self.held[1::2], half[1]])
-            self.width *= 2
-        self._last = max(0, int((stamp - self._begun) / self.width))
-        self.error[self._last] = np.fmax(self.error[self._last], error)
-        self.held[self._last] += held
 
 
 @dataclass(slots=True)
@@ -101,6 +73,7 @@ class RunStatistics:
     ink: float = 0.0  # mm^3 that the dispensers were told
     stretches: Array = field(default_factory=lambda: np.full(STRETCHES, np.nan))  # mm, largest error of each
     timeline: ErrorTimeline = field(default_factory=ErrorTimeline)
+    track: NozzleTrack = field(default_factory=NozzleTrack)  # on the surface, while material left
     _updated: float = nan
     _ticked: float = nan
     _sets: int = 0
@@ -165,6 +138,8 @@ class RunStatistics:
                 error = self._error(reports, command, arm)
                 at = min(int(progress.fraction / max(progress.total - 1, 1) * STRETCHES), STRETCHES - 1)
                 self.stretches[at] = np.fmax(self.stretches[at], error)
+        else:
+            self.track.lift()
         self.timeline.add(self._ticked, error, step if reason else 0.0)
 
     def _error(self, reports: RunReports, move: Move, arm: SimpleArm) -> float:
@@ -173,6 +148,7 @@ class RunStatistics:
         if (pose := reports.tracking.pose) is None:
             return nan
         then = pose.predict(max(move.stamp, pose.stamp), onwards=False)
+        self.track.add((se3.inverse(then.base_from_surface) @ nozzle_from_axes(arm, move.axes))[:3, 3])
         nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
         error = float(then.error_at(nozzle[None, :3, 3])[0])
         self.errors.add(error)
@@ -190,6 +166,7 @@ class RunOutcome:
     reports: RunReports
     signal: int  # that ended it, 0 without
     fraction: float  # place on the path, counted in checkpoints, NaN before any
+    pictures: PagePictures | None = None  # the last that a window of the page was shown
     written: bool = False  # whether the report is
 
     @property
@@ -358,6 +335,8 @@ class RunOutcome:
             row_of_tiles(tiles),
             section("Error at the nozzle", TIMELINE_CAPTION, drawn),
             section("Beads", BEADS_CAPTION, beads),
+            *self._track_section(),
+            *self._picture_section(),
             section("How long each stage took", "Milliseconds.", timings),
             section("Holds", "Why the nozzle stood, and all other time since the approach began.", reasons),
             section("Stages", "Of the run.", figures_table(("stage", "s"), stages)),
@@ -366,6 +345,25 @@ class RunOutcome:
         ]
         lead = f"{self.machine.ended}. {'. '.join(self.prepared.notes)}"
         return document("live run", self.prepared.files.record.stem, lead, body, "stillbed")
+
+    def _track_section(self) -> list[str]:
+        """The way of the nozzle over the surface, where it printed and the place of the path is known."""
+        from hardware.report.page import section
+        from hardware.report.report import track_map
+
+        track, placed = self.statistics.track.places, self.machine.placed_path
+        if placed is None or not len(track):
+            return []
+        drawn = track_map(track, placed.path.surface_from_nozzle[:, :3, 3], placed.path.extrude)
+        return [section("Nozzle track", TRACK_CAPTION, drawn)]
+
+    def _picture_section(self) -> list[str]:
+        from hardware.report.page import camera_pictures, section
+
+        if self.pictures is None or not self.pictures.pictures:
+            return []
+        shown = camera_pictures([(each.camera, each.near or each.jpeg) for each in self.pictures.pictures])
+        return [section("What the cameras saw", "As the page showed it last.", shown)]
 
     def _other_times(self) -> list[list[str]]:
         """Rows of the time that is no hold, and of the sum."""

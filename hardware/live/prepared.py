@@ -14,7 +14,9 @@ from __future__ import annotations
 import math
 import re
 import shutil
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection
@@ -49,7 +51,7 @@ from hardware.live.settings import (
 )
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
-from hardware.process.progress import UNFINISHED, cache_error, cache_folder
+from hardware.process.progress import UNFINISHED, cache_error, cache_folder, cached
 from hardware.process.system import SPAWN, blocked_sigint
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
@@ -181,9 +183,9 @@ def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fa
     assert settings.record is not None
     files = RunFiles(settings.record)
     if settings.record.exists() and not force:
-        raise InputError(settings.record, "--record", "a file that exists", "a new file, or --force")
+        raise InputError(where, "record.file", settings.record, "a new file, or --force: this one exists")
     if not settings.record.parent.is_dir():
-        raise InputError(settings.record, "--record", "no such folder", "a file in a folder that exists")
+        raise InputError(where, "record.file", settings.record, "a file in a folder that exists")
     prepared = _prepared(settings, files, None, faults, where)
     for file in (files.progress, files.surface):
         file.unlink(missing_ok=True)
@@ -251,7 +253,7 @@ def _prepared(
         path = read_path(rendered / "path.csv") if settings.path is None else path
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
-    if "look" in path.extra and (path.extra["look"] != "0").any():
+    if "look" in path.extra and (path.extra["look"] != 0).any():
         raise InputError(named, "column look", "1", "left out, or 0: a live run cannot look at what it laid")
     task = PrintTask(
         path=path,
@@ -344,6 +346,10 @@ def _rendered(scenario: File, check_rig: Callable[[Rig], None]) -> File:
 
     check_rig: is shown its cameras before it is rendered. StillbedError for a scenario that makes no sense.
     """
+    with suppress(OSError):  # of a file that is not there; the process says it in words
+        if (there := cached(scenario, cache_folder())).ready:
+            return there.folder
+    print(f"{scenario.name}: its pictures are rendered once, and found again by the next run", file=sys.stderr)
     answer, theirs = SPAWN.Pipe(duplex=False)
     process = SPAWN.Process(target=_render, args=(scenario, check_rig, theirs))
     with blocked_sigint():  # it is ended from here, and says nothing of its own

@@ -7,11 +7,9 @@ prints are not in the pictures, as nobody knows beforehand where they will be.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import sys
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +23,16 @@ from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.path_file import read_path, write_path
 from hardware.process.clock import WallClock
 from hardware.process.faults import FaultPart
-from hardware.process.progress import UNFINISHED, Progress, cache_error, clear_unfinished, folder_size, size_text
+from hardware.process.progress import (
+    UNFINISHED,
+    PrerenderedSession,
+    Progress,
+    cache_error,
+    cached,
+    clear_unfinished,
+    folder_size,
+    size_text,
+)
 from hardware.recording.recorder import Recorder
 from hardware.simulator.arm.settings import write_virtual_arm
 from hardware.simulator.cameras import Shot
@@ -37,46 +44,7 @@ from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport, report_without_offsets
 
-CACHE_VERSION = "4"  # of what the cache holds: another one is rendered anew
 STAMP_DIGITS = 9  # of a truth's stamp: exposures of one instant are one
-
-
-class PrerenderedSession:
-    """A pre-rendered session in its cache folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.session = folder / "session.mcap"  # pictures, with exact truth
-        self.path = folder / "path.csv"  # checkpoints in the true surface frame
-        self.arm = folder / "arm.toml"  # what the motion knows of the arm
-
-
-def cached(file: Path, cache: Path, seconds: float | None = None) -> PrerenderedSession:
-    """Where the session of a scenario lies or will lie; another text of it, or of what it names, is another folder.
-
-    seconds: of its beginning, None for all of it.
-    """
-    text = file.read_bytes() + _named_bytes(file) + CACHE_VERSION.encode()
-    text += b"" if seconds is None else f"{seconds:g} s".encode()
-    return PrerenderedSession(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
-
-
-def _named_bytes(file: Path) -> bytes:
-    """The bytes of the files that a scenario names: path, rig, arm, each after its length; none of a missing one."""
-    import tomllib
-
-    try:
-        table = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return b""
-    parts = [table.get(name) for name in ("rig", "arm")]
-    named = [table.get("path"), *(part.get("file") for part in parts if isinstance(part, dict))]
-    text = b""
-    for name in named:
-        with suppress(OSError):
-            data = b"" if not isinstance(name, str) else (file.parent / name).read_bytes()
-            text += f"{len(data)} ".encode() + data
-    return text
 
 
 def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None = None) -> PrerenderedSession:
@@ -93,7 +61,7 @@ def prerender(file: Path, cache: Path, threads: int = 2, seconds: float | None =
     rendered = cached(file, cache, seconds)
     beside = rendered.folder.with_name(f"{rendered.folder.name}{UNFINISHED}{os.getpid()}")
     try:
-        if (rendered.folder / "scenario").exists():
+        if rendered.ready:
             return rendered
         clear_unfinished(cache)
         beside.mkdir(parents=True)

@@ -299,6 +299,76 @@ def recorded_begin(order: BeginPrint, dispensers: str = "") -> tuple[dict[str, s
     return texts, used
 
 
+TIMELINE_BINS = 600  # an even number: two bins become one
+FIRST_BIN_WIDTH = 0.1  # s of a bin at first
+
+
+class ErrorTimeline:
+    """The predicted error over a run, in bins that become twice as long whenever all are full.
+
+    width: s of each bin.
+    error: (TIMELINE_BINS,) mm, the largest predicted in each while material left, NaN where none did.
+    held: (TIMELINE_BINS,) s for which the nozzle was held.
+    """
+
+    def __init__(self) -> None:
+        self.width = FIRST_BIN_WIDTH
+        self.error = np.full(TIMELINE_BINS, np.nan)
+        self.held = np.zeros(TIMELINE_BINS)
+        self._begun = nan
+        self._last = 0
+
+    @property
+    def stamps(self) -> Array:
+        """(N,) s since the first tick, the middles of the bins so far."""
+        return np.asarray((np.arange(self._last + 1) + 0.5) * self.width, float)
+
+    def add(self, stamp: float, error: float, held: float) -> None:
+        """A tick at `stamp`, s, with its predicted error, mm or NaN, and the s for which it was held."""
+        if np.isnan(self._begun):
+            self._begun = stamp
+        while (stamp - self._begun) / self.width >= TIMELINE_BINS:
+            half = np.full(TIMELINE_BINS // 2, np.nan), np.zeros(TIMELINE_BINS // 2)
+            self.error = np.concatenate([np.fmax(self.error[::2], self.error[1::2]), half[0]])
+            self.held = np.concatenate([self.held[::2] + self.held[1::2], half[1]])
+            self.width *= 2
+        self._last = max(0, int((stamp - self._begun) / self.width))
+        self.error[self._last] = np.fmax(self.error[self._last], error)
+        self.held[self._last] += held
+
+
+TRACK_STEP, TRACK_PLACES = 0.2, 8000  # mm between places at first, and how many are kept
+
+
+class NozzleTrack:
+    """Where the tip was on the surface while material left; when it is full every second place goes."""
+
+    def __init__(self) -> None:
+        self._rows: list[Array] = []
+        self._step, self._lifted = TRACK_STEP, True
+
+    @property
+    def places(self) -> Array:
+        """(N, 3) mm, a row of NaN between two beads."""
+        return np.array(self._rows).reshape(-1, 3)
+
+    def add(self, place: Array) -> None:
+        """The tip is at `place` (3,), mm, and material leaves."""
+        if self._lifted and self._rows:
+            self._rows.append(np.full(3, np.nan))
+        if self._lifted or float(np.linalg.norm(place - self._rows[-1])) >= self._step:
+            self._rows.append(place)
+        self._lifted = False
+        if len(self._rows) > TRACK_PLACES:
+            self._step *= 2
+            keep = [k % 2 == 0 or not np.isfinite(row[0]) for k, row in enumerate(self._rows[:-1])]
+            self._rows = [*(row for row, kept in zip(self._rows, keep, strict=False) if kept), self._rows[-1]]
+
+    def lift(self) -> None:
+        """No material leaves."""
+        self._lifted = True
+
+
 class CommandedHead:
     """Where the print head should be, by the newest commands of the motion process."""
 

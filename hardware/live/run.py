@@ -10,6 +10,7 @@ import importlib
 import math
 import signal
 import socket
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -115,8 +116,8 @@ class LiveRun:
         return outcome
 
     def _outcome(self) -> RunOutcome:
-        place = self._channels.place.value
-        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, self._signal, place)
+        ended = self._signal, self._channels.place.value, self._channels.link.pictures.get()
+        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *ended)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal that asks the run to end."""
@@ -145,8 +146,8 @@ class LiveRun:
         self._statistics.update(now, machine.stage, reports, arm)
         self._statistics.add_true_error(self._view_builder.update(reports, self._profile))
         self._show_surface()
+        self._announce(now)  # before the view: a new stage is in this one
         self._show_view(now)
-        self._announce(now)
 
     def _requests_by_key(self, ready: Sequence[object]) -> list[OperatorRequest]:
         if self._console.file is None or self._console.file not in ready:
@@ -331,7 +332,7 @@ class LiveRun:
                 self._channels.start.value = now
             self._log(stage_line(machine.stage, machine.reason))
             if machine.stage is RunStage.FIND:
-                self._console.say(checks_table(machine.checks))
+                self._console.say(checks_table(machine.checks, sys.stdout))
             elif machine.stage in (RunStage.CONFIRM, RunStage.READY):
                 key = "s: start" if machine.stage is RunStage.READY else self._confirm_key()
                 if self._asked is not machine.stage:

@@ -15,6 +15,7 @@ import os
 import re
 import socket
 import ssl
+from collections.abc import Collection
 from dataclasses import Field, dataclass, field, fields, replace
 from ipaddress import ip_address
 from pathlib import Path
@@ -105,7 +106,15 @@ SETTING_KEYS: dict[str, dict[str, Field[Any]]] = {}  # table and key in the file
 for _setting in (each for each in fields(LiveSettings) if each.metadata):
     _table, _, _name = _setting.metadata["name"].partition(".")
     SETTING_KEYS.setdefault(_table, {})[_name] = _setting
+CAMERAS_ALLOWED = "one of rig (cameras, or a session) and simulated (a scenario)"
 FILE_HEADER = "# A live run of stillbed: `stillbed live session.toml`. Lines that begin with # are examples.\n"
+
+
+def key_of(setting: str) -> str:
+    """The "table.key" of a setting by its name."""
+    return next(
+        f"{table}.{key}" for table, keys in SETTING_KEYS.items() for key, s in keys.items() if s.name == setting
+    )
 
 
 def read_settings(file: Path) -> LiveSettings:
@@ -153,8 +162,12 @@ def parse_host_names(where: object, key: str, names: object) -> tuple[str, ...]:
 def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
     """The settings, with an arm; InputError names what is missing or out of range."""
     s = settings
+    for name in ("rig", "simulated", "model", "path", "scan", "profile", "dispensers"):
+        file = getattr(s, name)
+        if file is not None and not file.exists():
+            raise InputError(where, key_of(name), file, "a file that exists")
     if (s.rig is None) == (s.simulated is None):
-        raise InputError(where, "cameras", "both" if s.rig else "neither", "one of rig and simulated")
+        raise InputError(where, "cameras", "both" if s.rig else "neither", CAMERAS_ALLOWED)
     if s.path is None and s.simulated is None:
         raise InputError(where, "print.path", "missing", "the file of the checkpoints")
     if not s.arm and s.simulated is None:
@@ -179,10 +192,6 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
     _check_foxglove(s.foxglove_port, where)
     if not 0 <= s.page_port <= MAX_PORT:
         raise InputError(where, "page.port", s.page_port, f"1 to {MAX_PORT}, or 0: any that is free")
-    for name in ("rig", "simulated", "model", "path", "scan", "profile", "dispensers"):
-        file = getattr(s, name)
-        if file is not None and not file.exists():
-            raise InputError(where, name, file, "a file that exists")
     return replace(s, arm=s.arm or VIRTUAL_ARM)
 
 
@@ -247,6 +256,24 @@ def _toml_value(value: object) -> str | None:
 def toml_string(text: str) -> str:
     """A text without control characters as TOML writes it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+FLAG_NAMES = {  # of settings whose flag has another name
+    "unattended": "--yes", "page": "--no-page", "foxglove_port": "--foxglove", "page_certificate": "--page-cert",
+    "page_names": "--page-name",
+}  # fmt: skip
+
+
+def named_by_flag(error: InputError, given: Collection[str]) -> InputError:
+    """The error with the flag's name where a flag gave the value, or where no file is there to name its key.
+
+    given: names of the settings that flags gave.
+    """
+    for name in (setting.name for keys in SETTING_KEYS.values() for setting in keys.values()):
+        if error.what == key_of(name) and (name in given or error.where == "command line"):
+            flag = FLAG_NAMES.get(name, f"--{name.replace('_', '-')}")
+            return InputError("command line", flag, error.got, error.allowed)
+    return error
 
 
 def override_settings(settings: LiveSettings, flags: dict[str, Any]) -> LiveSettings:

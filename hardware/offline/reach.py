@@ -16,7 +16,8 @@ from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, far_limits_text, un
 from hardware.files.arm_file import read_arm, tool_body_of
 from hardware.files.mesh_file import read_mesh
 from hardware.files.path_file import read_path, write_path
-from hardware.process.progress import duration_text, prepare_out
+from hardware.process.clock import WallClock
+from hardware.process.progress import Progress, duration_text, prepare_out
 from hardware.report.page import (
     MAX_LINE_POINTS,
     Plot,
@@ -29,10 +30,12 @@ from hardware.report.page import (
     spanning,
 )
 from planning.clearance import BASE_MARGIN
-from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
+from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel, link_chain
 from planning.layers.clearing import path_rooms
 from planning.motion.retime import run_times
 from planning.path import (
+    MIN_SHOULDER_DISTANCE,
+    MIN_SINGULAR_ANGLE,
     REACH_REASONS,
     TISSUE,
     Path,
@@ -46,20 +49,95 @@ from planning.path import (
 from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
 
 PAGE_WIDTH_PX = 900
-PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS = "estimate", "off", "aside"  # classes of report.css
+PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS, TRUTH_CLASS = "estimate", "off", "aside", "truth"  # of report.css
 
 
-def reach_page(path_name: str, arm: str, text: str, path: Path, reach: Reach) -> str:
-    """The whole page as HTML. text: the answer as the terminal has it."""
+REMEDIES = {  # by REACH_REASONS
+    "too far": "bring the surface nearer to the arm (--surface), or allow it more room (limits in the arm file)",
+    "joint range": "let the tool spin (--spin), take the better posture, or turn the surface",
+    "singular": "let the tool spin (--spin), or lay the surface elsewhere or a little tilted",
+    "joint speed": "print slower there (speed_mm_s of the path), or keep the surface calmer",
+    REACH_REASONS[TISSUE]: "plan with --arm, which tilts the tool or leaves the bead out; or a longer needle",
+}
+ARM_WIDTH_PX, ARM_HEIGHT_PX = 440, 300  # of a picture of the arm, two of which stand side by side
+MAX_STRETCHES = 60  # of red checkpoints that are listed; the table reach.csv has all
+
+
+def reach_page(
+    path_name: str, arm: str, text: str, path: Path, reach: Reach, model: JointModel | UrdfKinematics | None = None
+) -> str:
+    """The whole page as HTML. text: the answer as the terminal has it. model: of the arm that is drawn."""
     good, count = int(reach.feasible.sum()), len(reach.reason)
     rows = [[name, str(int((reach.reason == i).sum()))] for i, name in enumerate(REACH_REASONS)]
-    body = [
-        section("From above", "The checkpoints in the surface frame, mm.", _above(path, reach)),
-        section("Along the path", "The worst over where the surface may be; by checkpoint.", _along(reach)),
+    body = [section("From above", "The checkpoints in the surface frame, mm.", _above(path, reach))]
+    if isinstance(model, JointModel) and np.isfinite(reach.joints).all(axis=1).any():
+        words = "Its links at the first checkpoint, and at the worst one; the arm's own frame, mm."
+        body.append(section("The arm", words, _arm_picture(model, reach)))
+    words = "The worst over where the surface may be; by checkpoint. Dashed: what it must stay above, or below."
+    body += [
+        section("Along the path", words, _along(reach)),
         section("Why", "Checkpoints by what the arm lacks there.", figures_table(("", "checkpoints"), rows)),
-        section("In words", "As in the terminal.", f"<pre>{escape(text)}</pre>"),
     ]
+    if good < count:
+        head = ("checkpoints", "layer", "what is wrong", "what to do")
+        body.append(
+            section("What cannot be printed", "In the order of the path.", figures_table(head, _red(path, reach)))
+        )
+    body.append(section("In words", "As in the terminal.", f"<pre>{escape(text)}</pre>"))
     return document("reach", path_name, f"{arm}: {good} of {count} checkpoints can be printed.", body, "stillbed reach")
+
+
+def _red(path: Path, reach: Reach) -> list[list[str]]:
+    """Rows of stretches of checkpoints with one layer and one reason: which, the layer, the reason, the remedy."""
+    same = (np.diff(reach.reason) == 0) & (np.diff(path.layer) == 0)
+    first = np.concatenate([[0], np.flatnonzero(~same) + 1])
+    last = np.append(first[1:] - 1, len(reach.reason) - 1)
+    rows = []
+    for a, b in zip(first.tolist(), last.tolist(), strict=True):
+        if reason := int(reach.reason[a]):
+            which = str(a) if a == b else f"{a} to {b}"
+            rows.append([which, str(path.layer[a]), REACH_REASONS[reason], REMEDIES[REACH_REASONS[reason]]])
+    more = len(rows) - MAX_STRETCHES
+    return rows if more <= 0 else [*rows[:MAX_STRETCHES], [f"and {more} stretches more", "", "", "see reach.csv"]]
+
+
+def _arm_picture(model: JointModel, reach: Reach) -> str:
+    """The links from the side that shows them, and from above, at the first checkpoint and at the worst."""
+    known = np.flatnonzero(np.isfinite(reach.joints).all(axis=1))
+    red = known[~reach.feasible[known]]
+    worst = int((red if len(red) else known)[0])
+    if not len(red):  # the nearest to an end of a range
+        worst = int(known[np.argmin(np.where(np.isfinite(reach.bound[known]), reach.bound[known], np.inf))])
+    shown = {int(known[0]): PRINTABLE_CLASS, worst: BLOCKED_CLASS if len(red) else TRUTH_CLASS}
+    places = {k: np.vstack([np.zeros((1, 3)), link_chain(model, reach.joints[k])[:, :3, 3]]) for k in shown}
+    every = np.concatenate(list(places.values()))
+    forward = every[np.argmax(np.hypot(every[:, 0], every[:, 1])), :2]
+    forward = forward / max(float(np.hypot(*forward)), 1e-9)
+    plots = []
+    views = {
+        "from the side, mm": np.array([[*forward, 0.0], [0.0, 0.0, 1.0]]),
+        "from above, mm": np.eye(3)[:2],
+    }
+    for label, axes in views.items():
+        x, y = axes @ every.T
+        half = max(float(np.ptp(x)), 1.6 * float(np.ptp(y)), 1.0) * 0.55
+        middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
+        span = (float(middle[0] - half), float(middle[0] + half))
+        plot = Plot(ARM_WIDTH_PX, ARM_HEIGHT_PX, span, _square(span, float(middle[1])), label=label)
+        for k, style in shown.items():
+            across, up = axes @ places[k].T
+            plot.way(across, up, style)
+            plot.dots(across, up, style, 3.5)
+        plots.append(plot.svg())
+    keys = [line_key(style, f"checkpoint {k}: {REACH_REASONS[reach.reason[k]]}") for k, style in shown.items()]
+    return f'{legend(keys)}<div class="two">{"".join(plots)}</div>'
+
+
+def _square(span: tuple[float, float], middle: float) -> tuple[float, float]:
+    """The y of a picture of ARM_WIDTH_PX x ARM_HEIGHT_PX whose scale is that of x."""
+    wide, tall = ARM_WIDTH_PX - Plot.left - Plot.right, ARM_HEIGHT_PX - Plot.top - Plot.bottom
+    half = (span[1] - span[0]) / 2 * tall / wide
+    return middle - half, middle + half
 
 
 def _above(path: Path, reach: Reach) -> str:
@@ -80,15 +158,20 @@ def _above(path: Path, reach: Reach) -> str:
 
 
 def _along(reach: Reach) -> str:
+    angle = float(np.rad2deg(MIN_SINGULAR_ANGLE))
     curves = {
-        "to the end of a joint's range, degrees": np.rad2deg(reach.bound),
-        "to a singular wrist, degrees": np.rad2deg(reach.wrist),
-        "to a singular elbow, degrees": np.rad2deg(reach.elbow),
-        "of a joint's speed, %": 100 * reach.speed,
+        "to the end of a joint's range, degrees": (np.rad2deg(reach.bound), 0.0),
+        "to a singular wrist, degrees": (np.rad2deg(reach.wrist), angle),
+        "to a singular elbow, degrees": (np.rad2deg(reach.elbow), angle),
+        "wrist to the first axis, mm": (reach.shoulder, MIN_SHOULDER_DISTANCE),
+        "of a joint's speed, %": (100 * reach.speed, 100.0),
     }
     plots, span = [], (0.0, float(max(len(reach.speed) - 1, 1)))
-    for label, values in curves.items():
-        plot = Plot(PAGE_WIDTH_PX, 130, span, spanning([values, np.zeros(1)]), label=label)
+    for label, (values, limit) in curves.items():
+        if not np.isfinite(values).any():
+            continue
+        plot = Plot(PAGE_WIDTH_PX, 130, span, spanning([values, np.array([0.0, 1.05 * limit])]), label=label)
+        plot.level(limit, f"limit {limit:g}", "limit")
         plot.line(np.arange(len(values), dtype=float), values, PRINTABLE_CLASS)
         plots.append(plot.svg())
     return "".join(plots)
@@ -130,17 +213,27 @@ def run_reach(
     checkpoints = read_path(path)
     if out is not None:
         prepare_out(out, force)
-    model, motion, reach = _evaluated(checkpoints, arm, question)
-    best, profile, scan = None, read_arm(arm), _scan_of(path, question)
-    reach, met = _with_tissue(reach, checkpoints, profile, scan, question)
-    if isinstance(model, JointModel):
-        best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
-    seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
+    with Progress("reach", "steps", WallClock().now) as progress:
+        progress.note = "joints and speeds of each checkpoint, wherever the surface moves to"
+        progress(0, 4)
+        model, motion, reach = _evaluated(checkpoints, arm, question)
+        best, profile, scan = None, read_arm(arm), _scan_of(path, question)
+        progress.note = "the tool beside the tissue"
+        progress(1, 4)
+        reach, met = _with_tissue(reach, checkpoints, profile, scan, question)
+        progress.note = "other postures"
+        progress(2, 4)
+        if isinstance(model, JointModel):
+            best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
+        progress.note = "how long it takes"
+        progress(3, 4)
+        seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
     text = reach_text(model, reach, best, question, seconds)
     text = "\n".join(filter(None, [text, met, far_limits_text(profile.limits), unreached_limits_text(profile)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
-        (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
+        page = reach_page(path.name, model.name, text, checkpoints, reach, model)
+        (out / "reach.html").write_text(page, encoding="utf-8")
     return ReachAnswer(text, bool(reach.feasible.all()))
 
 
@@ -217,7 +310,7 @@ def read_jointed_arm(arm: File) -> tuple[ArmProfile, JointModel]:
 
 def with_feasible_column(path: Path, reach: Reach) -> Path:
     """The path with the reach's tool spin and the column `feasible`, 1 or 0."""
-    column = np.where(reach.feasible, "1", "0")
+    column = reach.feasible.astype(np.int64)
     return replace(path, surface_from_nozzle=spin_path(path, reach.spin), extra={**path.extra, "feasible": column})
 
 

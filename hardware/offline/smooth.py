@@ -36,7 +36,7 @@ from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import finite
 
 SUMMARY_FILE = "summary.json"
-EXPECTED_PASSES = 12  # of a long recording, by which the time left is estimated
+LAST_PASS = "covariances"  # how many there are before it, nobody knows: each tells how far it is itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +95,16 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 def _solve(session: Session, tracks: SessionTracks, options: SmoothOptions, stream: TextIO | None) -> Smoothed:
     passes = 0
-    with Progress("smooth", "frame sets, passes taken together,", WallClock().now, stream) as progress:
+    with Progress("smooth", "frame sets", WallClock().now, stream) as progress:
 
         def report(what: str, done: int, total: int) -> None:
             nonlocal passes
-            progress(passes * total + done, max(EXPECTED_PASSES, passes + 2) * total)
-            passes += done == total
+            progress.note = f"pass {passes + 1}: {what}"
+            if done < total or what == LAST_PASS:
+                progress(done, total)
+            if done == total:
+                passes += 1
+                progress.restart()
 
         prior = REFINED_PRIOR if options.refine else CalibrationPrior()
         return smooth(session.rig, tracks.observations, start=tracks.start, prior=prior, progress=report)

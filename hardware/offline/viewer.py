@@ -30,12 +30,14 @@ from hardware.files.path_file import read_path
 from hardware.files.session import FrameReader, Session, damage_text
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series
 from hardware.operator.broadcast import pictures_bytes, scene_text, text
-from hardware.operator.process import THUMBNAIL_QUALITY, THUMBNAIL_WIDTH
+from hardware.operator.process import THUMBNAIL_QUALITY, THUMBNAIL_WIDTH, CameraShot, Crop, crop_around
 from hardware.operator.server import CONTENT_TYPES, page_files
 from hardware.operator.settings import AccessControl, OperatorSettings, check_settings, response_headers
 from hardware.operator.shared_state import CameraPicture, PagePictures, PageScene, scene_from
-from hardware.operator.view import Activity, MotionView, TrackingView, tracking_from_pose
+from hardware.operator.view import Activity, MotionView, RunStage, TrackingView, tracking_from_pose
 from hardware.process.progress import open_in_browser
+from hardware.recording.mcap_file import ChunkMessages, FileMetadata, epoch_of, walk
+from hardware.recording.ros_messages import LOG, unpacked
 from hardware.recording.session_reader import (
     open_session,
     read_commands,
@@ -46,7 +48,7 @@ from hardware.recording.session_reader import (
 )
 from hardware.report.evaluation import associate
 from perception.frames import Frame, FrameSet, frame_set, mean_stamp
-from planning.command import Move
+from planning.command import Command, Move
 from planning.path import Path as Toolpath
 
 MIN_SURFACE_TRACKS = 12  # tracks that make a surface worth showing
@@ -66,6 +68,8 @@ class Playback:
     tracks: tuple[Observations | None, ...]  # K
     fraction: Array  # (K,) place on the path, counted in checkpoints; NaN where nothing was commanded
     off: Array  # (K,) mm from the truth, aligned at the first pose; NaN without one
+    held: tuple[str, ...]  # K, why the nozzle was held at each; "" where it was not
+    events: tuple[tuple[float, str], ...]  # s and words of the run's log, in their order
     scene: PageScene
 
     def __len__(self) -> int:
@@ -108,7 +112,9 @@ def open_playback(path: Path, poses: str | None = None, toolpath: Path | None = 
     off = _off(stamps, shown, session)
     path_shown = _toolpath(session) if toolpath is None else read_path(toolpath)
     scene = scene_from(session.rig, path_shown, _surface(session.rig, shown, tracks))
-    return Playback(session, source, stamps, shown, tracks, _fraction(session, stamps), off, scene)
+    commands = list(read_commands(session.path)) if session.path.is_file() else []
+    done = _fraction(commands, stamps), off, _held(commands, stamps), _events(session.path)
+    return Playback(session, source, stamps, shown, tracks, *done, scene)
 
 
 def _poses(session: Session, named: str | None) -> tuple[list[SurfacePose], str]:
@@ -180,17 +186,37 @@ def _toolpath(session: Session) -> Toolpath | None:
     return None
 
 
-def _fraction(session: Session, stamps: Array) -> Array:
+def _fraction(commands: list[Command], stamps: Array) -> Array:
     """(K,) the checkpoint that the arm was last sent to; NaN before the first move."""
     out = np.full(len(stamps), np.nan)
-    if not session.path.is_file():
-        return out
-    moves = [(c.stamp, c.checkpoint) for c in read_commands(session.path) if isinstance(c, Move)]
+    moves = [(c.stamp, c.checkpoint) for c in commands if isinstance(c, Move)]
     if moves:
         when, where = np.array(sorted(moves), float).T
         last = np.searchsorted(when, stamps, side="right") - 1
         out[last >= 0] = where[last[last >= 0]]
     return out
+
+
+def _held(commands: list[Command], stamps: Array) -> tuple[str, ...]:
+    """Why the nozzle was held at each of the stamps (K,), s, by the last command before it; "" where it was not."""
+    ordered = sorted(commands, key=lambda command: command.stamp)
+    last = np.searchsorted([command.stamp for command in ordered], stamps, side="right") - 1
+    return tuple("" if k < 0 else ordered[k].reason for k in last.tolist())
+
+
+def _events(path: Path) -> tuple[tuple[float, str], ...]:
+    """Stamps, s, and words of a recording's log; none of a folder's."""
+    epoch, found = 0, list[tuple[float, str]]()
+    for part in walk(path) if path.is_file() else ():
+        if isinstance(part, FileMetadata):
+            epoch = epoch_of(part.table) or 0
+        elif isinstance(part, ChunkMessages):
+            for log in (unpacked(LOG, each.data) for each in part.messages if each.topic == "/events"):
+                found.append(((log.stamp.sec * 1_000_000_000 + log.stamp.nanosec - epoch) / 1e9, log.msg))
+    return tuple(sorted(found))
+
+
+STAGES = {stage.value for stage in RunStage}  # as the log tells them, alone or before a colon
 
 
 class PictureReader:
@@ -200,6 +226,7 @@ class PictureReader:
         self._playback, self._lock = playback, Lock()
         self._reader: FrameReader | None = None
         self._next = 0
+        self._crops: dict[int, Crop | None] = {}  # of each camera, as it was last
 
     def __call__(self, k: int) -> PagePictures:
         """The pictures of frame set k; InputError where one cannot be read."""
@@ -209,9 +236,16 @@ class PictureReader:
         cameras = self._playback.session.rig.cameras
         pictures = []
         for frame in frames.frames:
-            jpeg = small_jpeg(frame.image, THUMBNAIL_WIDTH, THUMBNAIL_QUALITY)
+            name, jpeg = cameras[frame.camera].name, small_jpeg(frame.image, THUMBNAIL_WIDTH, THUMBNAIL_QUALITY)
             pixels = np.zeros((0, 2)) if seen is None else seen.pixels[seen.camera == frame.camera]
-            pictures.append(CameraPicture(cameras[frame.camera].name, jpeg, (), pixels))
+            outline = tuple(r.polygon for r in self._playback.session.roi if r.camera == frame.camera)
+            shot = CameraShot(name, frame.image, outline if not len(pixels) else (), pixels)
+            crop, near = crop_around(shot, self._crops.get(frame.camera)), b""
+            self._crops[frame.camera] = crop
+            if crop is not None:  # the wound, pixel by pixel
+                x, y, width, height = crop
+                near = small_jpeg(frame.image[y : y + height, x : x + width], width, THUMBNAIL_QUALITY)
+            pictures.append(CameraPicture(name, jpeg, (), pixels, near, crop))
         return PagePictures(frames.stamp, tuple(pictures), None if pose is None else pose.base_from_surface)
 
     def _read(self, k: int) -> FrameSet:
@@ -313,6 +347,13 @@ def session_text(playback: Playback) -> str:
         places=[None if np.isnan(place[0]) else np.round(place, 4) for place in playback.places],
         states=["" if pose is None else pose.state for pose in playback.poses],
         off=playback.off,
+        held=playback.held,
+        events=[[round(stamp - playback.stamps[0], 3), words] for stamp, words in playback.events],
+        stages=[
+            [round(stamp - playback.stamps[0], 3), name]
+            for stamp, words in playback.events
+            if (name := words.partition(":")[0]) in STAGES
+        ],
     )
     return f'{whole[:-1]},"scene":{scene_text(playback.scene)}}}'
 

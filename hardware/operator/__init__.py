@@ -3,3 +3,5 @@
 The run puts views, a scene and pictures into shared memory and takes requests out of it; it never waits for the page,
 and the page cannot reach it in any other way. Whatever happens to the page and its windows, the run goes on.
 """
+
+__all__ = ["broadcast", "demo", "overlays", "process", "server", "settings", "shared_state", "view"]

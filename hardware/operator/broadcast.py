@@ -171,6 +171,7 @@ class Broadcast:
         self.gone, self.refused = False, 0
         self.view_text, self.scene_text, self.pictures_bytes, self.sheet_bytes = "null", "", b"", b""
         self.news = asyncio.Event()  # set, and replaced, when there is something new
+        self.asked = asyncio.Event()  # something was asked of the run: its answer is looked for more often
 
     def update(self, now: float, watched: bool) -> None:
         """Take what is new at `now`, s; pictures only where they are watched."""

@@ -37,6 +37,7 @@ from hardware.process.clock import WallClock
 
 STATUS_PULSE = 0.25  # s: so often a window is sent how old everything is, even if nothing is new
 LINK_POLL_PERIOD = 0.04  # s: how soon what the run puts out is noticed
+HURRY_PERIOD, HURRY_TIME = 0.005, 0.3  # s: how soon, and for how long, after something was asked: a stop is followed
 SHUTDOWN_DELAY = 0.2  # s in which the windows show that the run is gone
 MAX_DROPPED_MESSAGES = 400  # messages beyond what is allowed, after which a window is closed
 MAX_OTHER_CONNECTIONS = 32  # connections that are no windows: a browser keeps six
@@ -98,6 +99,7 @@ class WindowSession:
                 words = f"{error.what} = {error.got}, allowed {error.allowed}"
         if not words and (number := self._link.ask(ask.wish, ask.turn, ask.move, outline)) is None:
             words = "the run has not yet taken what was asked before"
+        self._newest.asked.set()
         self._replies.append(text(kind="asked", tag=ask.tag, wish=ask.wish, number=number, words=words))
         self._newest.wake()
 
@@ -159,10 +161,23 @@ class WindowSession:
             while self._replies:
                 await self._put(self._replies.popleft())
             await self._put(self._status())
-            await asyncio.wait_for(self._shown.wait(), self._limits.patience)
+            await asyncio.wait_for(self._until_shown(), self._limits.patience)
             if not self._replies:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(news.wait(), STATUS_PULSE)
+
+    async def _until_shown(self) -> None:
+        """Wait until the window has shown the bundle; a new turn, such as a stop, is sent at once all the same."""
+        shown, turn = asyncio.create_task(self._shown.wait()), getattr(self._newest.view, "turn", 0)
+        try:
+            while not shown.done():
+                news = asyncio.create_task(self._newest.news.wait())
+                await asyncio.wait({shown, news}, return_when=asyncio.FIRST_COMPLETED)
+                news.cancel()
+                if not shown.done() and turn != (turn := getattr(self._newest.view, "turn", 0)):
+                    await self._put(self._status())
+        finally:
+            shown.cancel()
 
     def _status(self) -> str:
         age = self._newest.age(self._clock.now())
@@ -199,7 +214,7 @@ class OperatorServer:
         self._headers = {**response_headers(settings, port), "Server": "stillbed"}
         self._windows: dict[WindowSession, asyncio.BaseTransport | None] = {}
         self._files = page_files()
-        self.broadcast = Broadcast(link)
+        self.broadcast, self._hurry_until = Broadcast(link), 0.0
 
     def application(self) -> web.Application:
         """The routes, all behind the check of requests."""
@@ -219,7 +234,19 @@ class OperatorServer:
             own = set(self._windows.values())
             for handler in [each for each in connections() if each.transport not in own][:-MAX_OTHER_CONNECTIONS]:
                 handler.force_close()
-            await asyncio.sleep(LINK_POLL_PERIOD)
+            await self._wait(self._clock.now())
+
+    async def _wait(self, now: float) -> None:
+        """Wait until it is time to look again."""
+        asked = self.broadcast.asked
+        if asked.is_set():
+            asked.clear()
+            self._hurry_until = now + HURRY_TIME
+        if now < self._hurry_until:
+            await asyncio.sleep(HURRY_PERIOD)
+            return
+        with suppress(TimeoutError):
+            await asyncio.wait_for(asked.wait(), LINK_POLL_PERIOD)
 
     def last_update(self) -> None:
         """Show the run's last view, and that it is gone."""
@@ -257,6 +284,7 @@ class OperatorServer:
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         number = self._link.requests.ask(Wish.STOP, 0)
+        self.broadcast.asked.set()
         return web.Response(text=f"{number}\n", headers=self._headers)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:

@@ -44,12 +44,15 @@ TISSUE_COLOURS = ((0.16, 0.52, 0.72), (0.87, 0.56, 0.2), (0.33, 0.66, 0.45), (0.
 SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 SURFACE_NODES = 120  # nodes along the longer side of the surfaces in the view
 PAGE_STYLE = """
-#plan-canvas { width: 100%; height: 560px; display: block; touch-action: none; cursor: grab; border-radius: 8px;
+#plan-canvas { width: 100%; height: 560px; display: block; touch-action: pan-y; cursor: grab; border-radius: 8px;
   background: linear-gradient(#eef2f5, #d9e0e6); }
 @media (prefers-color-scheme: dark) { #plan-canvas { background: linear-gradient(#2a323b, #171c22); } }
 .plan-bar { display: flex; flex-wrap: wrap; gap: 6px 16px; align-items: center; font-size: 13.5px; margin-top: 10px; }
 .plan-bar input[type=range] { flex: 1 1 320px; } .plan-bar label { color: var(--soft); white-space: nowrap; }
 #plan-words { font-size: 13.5px; color: var(--soft); margin-top: 6px; font-variant-numeric: tabular-nums; }
+#plan-legend span { display: inline-flex; align-items: center; gap: 6px; }
+#plan-legend i { width: 18px; height: 8px; border-radius: 4px; }
+#plan-legend i.travel { height: 0; border-radius: 0; border-top: 2px dashed #d6006c; }
 .plan-bar button { font: inherit; padding: 3px 12px; border-radius: 8px; border: 1px solid var(--grey);
   background: var(--card); color: var(--ink); cursor: pointer; }
 .layer-picture svg { width: 100%; height: auto; border-radius: 8px; } .layer-picture { margin-top: 12px; }
@@ -58,10 +61,11 @@ PAGE_STYLE = """
 .sideways td { white-space: nowrap; padding: 5px 7px; } .sideways th { padding: 4px 7px; }
 """
 VIEW_CONTROLS = """<canvas id="plan-canvas" role="img" aria-label="the beads in three dimensions"></canvas>
+<div class="plan-bar" id="plan-legend"></div>
 <div class="plan-bar"><input id="plan-at" type="range" min="0" value="0" aria-label="printed up to">
 <button id="plan-step" type="button">next layer</button><button id="plan-top" type="button">from above</button></div>
 <div class="plan-bar"><label><input id="plan-alone" type="checkbox"> this layer alone</label>
-<label><input id="plan-travels" type="checkbox"> travels</label>
+<label><input id="plan-travels" type="checkbox" checked> travels</label>
 <label><input id="plan-bed" type="checkbox" checked> wound bed</label>
 <label><input id="plan-skin" type="checkbox"> restored skin</label>
 <label><input id="plan-tool" type="checkbox" checked> tool</label></div><div id="plan-words"></div>"""
@@ -193,7 +197,10 @@ def page_text(
         body.append(f"<section><h2>Look at this before printing</h2>{notes}</section>")
     script = (files("hardware.plan") / "view.js").read_text(encoding="utf-8")
     view = f'<script type="application/json" id="plan-data">{_data(plan)}</script><script>{script}</script>'
-    help_text = "Drag to turn, shift and drag to move, wheel to come nearer. The slider prints as far as it is moved."
+    help_text = (
+        "Drag to turn, shift and drag to move, wheel to come nearer. By touch one finger turns it or scrolls the page, "
+        "two come nearer and tilt. The slider prints as far as it is moved."
+    )
     body.append(section("The beads", help_text, VIEW_CONTROLS + view))
     body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
     if pictures:
@@ -269,6 +276,7 @@ def _data(plan: Plan) -> str:
     """The checkpoints and surfaces for the view, as JSON."""
     points = plan.points
     names = list(dict.fromkeys(layer.slab.tissue.name for layer in plan.stack.layers))
+    inks = dict((layer.slab.tissue.name, layer.slab.tissue.material) for layer in plan.stack.layers).items()
     up = tool_rotations(points.tilt, 0.0)[:, :, 2]
     data: dict[str, Any] = {
         "tip": _base64(points.tip, "<f4"),
@@ -280,6 +288,9 @@ def _data(plan: Plan) -> str:
         "layers": len(plan.stack.layers),
         "names": [layer.slab.tissue.name for layer in plan.stack.layers],
         "paints": TISSUE_COLOURS,
+        "legend": [
+            [f"{name}: {material_text(material)}", names.index(name) % len(TISSUE_COLOURS)] for name, material in inks
+        ],
         "paint_of": [names.index(layer.slab.tissue.name) % len(TISSUE_COLOURS) for layer in plan.stack.layers],
         "low": points.tip.min(axis=0).tolist(),
         "high": points.tip.max(axis=0).tolist(),

@@ -97,18 +97,32 @@
     }
     return shape(out);
   }
+  const DASHES = 12; // of one way: lines of WebGL are a pixel wide and have no dashes of their own
   function travels() {
-    const out = new Float32Array(hops[count] * 2 * STRIDE);
+    const out = new Float32Array(hops[count] * 2 * DASHES * STRIDE);
     let o = 0;
     for (let i = 1; i < count; i++) {
       if (extrude[i]) continue;
-      for (const p of [3 * (i - 1), 3 * i]) {
-        out.set([tip[p], tip[p + 1], tip[p + 2], 0, 0, 1, 0.85, 0.51, 0.14, 1, 2], o);
+      for (let k = 0; k < 2 * DASHES; k++) {
+        const share = (k + (k % 2 ? -0.2 : 0.2)) / (2 * DASHES - 1), a = 3 * (i - 1), b = 3 * i;
+        const at = [0, 1, 2].map((j) => tip[a + j] + share * (tip[b + j] - tip[a + j]));
+        out.set([...at, 0, 0, 1, 0.84, 0, 0.42, 1, 2], o);
         o += STRIDE;
       }
     }
     return shape(out);
   }
+  function legend() {
+    const made = plan.legend.map(([words, paint]) => [words, "background:rgb(" + plan.paints[paint].map((v) => Math.round(255 * v)) + ")", ""]);
+    for (const [words, style, kind] of [...made, ["travel, nothing is printed", "", "travel"]]) {
+      const key = document.createElement("span"), swatch = document.createElement("i");
+      swatch.style.cssText = style;
+      swatch.className = kind;
+      key.append(swatch, words);
+      document.getElementById("plan-legend").append(key);
+    }
+  }
+  legend();
   function surface(sheet, paint) {
     if (!sheet) return null;
     const z = new Float32Array(bytes(sheet.heights)), w = sheet.columns, h = sheet.rows, out = [];
@@ -207,7 +221,7 @@
     gl.disable(gl.BLEND);
     if (boxes.bed.checked) draw(bed, gl.TRIANGLES, 0, bed ? bed.count : 0);
     draw(beads, gl.TRIANGLES, 6 * drawn[first], 6 * (drawn[end] - drawn[first]));
-    if (boxes.travels.checked) draw(ways, gl.LINES, 2 * hops[first], 2 * (hops[end] - hops[first]));
+    if (boxes.travels.checked) draw(ways, gl.LINES, 2 * DASHES * hops[first], 2 * DASHES * (hops[end] - hops[first]));
     if (boxes.tool.checked) {
       gl.bindBuffer(gl.ARRAY_BUFFER, cone.data);
       gl.bufferData(gl.ARRAY_BUFFER, tool(i), gl.DYNAMIC_DRAW);
@@ -237,27 +251,40 @@
   at.addEventListener("input", refresh);
   for (const name in boxes) boxes[name].addEventListener("change", refresh);
   window.addEventListener("resize", refresh);
-  let held = null;
-  canvas.addEventListener("pointerdown", (e) => { held = e; canvas.setPointerCapture(e.pointerId); });
-  canvas.addEventListener("pointerup", () => { held = null; });
+  const held = new Map(); // pointers that are down; a finger that goes up or down scrolls the page (touch-action: pan-y)
+  const apart = () => {
+    const [a, b] = [...held.values()];
+    return Math.hypot(a.x - b.x, a.y - b.y);
+  };
+  canvas.addEventListener("pointerdown", (e) => {
+    held.set(e.pointerId, { x: e.clientX, y: e.clientY, button: e.button });
+    canvas.setPointerCapture(e.pointerId);
+  });
+  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => held.delete(e.pointerId));
   canvas.addEventListener("pointermove", (e) => {
-    if (!held) return;
-    const dx = e.clientX - held.clientX, dy = e.clientY - held.clientY;
-    if (e.shiftKey || held.button === 2) {
+    const one = held.get(e.pointerId);
+    if (!one) return;
+    const dx = e.clientX - one.x, dy = e.clientY - one.y, before = held.size === 2 ? apart() : 0;
+    [one.x, one.y] = [e.clientX, e.clientY];
+    if (before > 0) near(before / Math.max(apart(), 1));
+    if (e.shiftKey || one.button === 2) {
       const scale = eye.far * 0.62 / canvas.clientHeight;
       eye.x += dx * scale; eye.y -= dy * scale;
     } else {
       eye.turn -= dx * 0.008;
       eye.tilt = Math.min(Math.max(eye.tilt + dy * 0.008, -0.2), Math.PI / 2);
     }
-    held = { clientX: e.clientX, clientY: e.clientY, button: held.button };
     refresh();
   });
+  function near(times) {
+    eye.far = Math.min(Math.max(eye.far * times, 0.05 * size), 6 * size);
+    refresh();
+  }
+  canvas.addEventListener("touchmove", (e) => e.touches.length > 1 && e.preventDefault(), { passive: false });
   canvas.addEventListener("contextmenu", (e) => e.preventDefault());
   canvas.addEventListener("wheel", (e) => {
     e.preventDefault();
-    eye.far = Math.min(Math.max(eye.far * Math.exp(e.deltaY * 0.001), 0.05 * size), 6 * size);
-    refresh();
+    near(Math.exp(e.deltaY * 0.001));
   }, { passive: false });
   document.getElementById("plan-top").addEventListener("click", () => { eye.turn = 0; eye.tilt = Math.PI / 2; refresh(); });
   document.getElementById("plan-step").addEventListener("click", () => {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import difflib
 import io
+import itertools
 import json
 import tomllib
 from collections.abc import Collection, Iterable
@@ -15,6 +16,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from perception import CLONE_DATA, INSTALLED_DATA
 
 Table = dict[str, Any]
 CsvRow = tuple[int, list[str]]  # line number and words
@@ -85,6 +87,35 @@ def one_of_text(word: str, known: Collection[str]) -> str:
     near = difflib.get_close_matches(word, known, 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return f"one of {', '.join(known)}{hint}"
+
+
+MAX_NAMES = 2000  # of a folder that are compared with a name that is not in it
+
+
+def near_file_text(*names: object) -> str:
+    """What may have been meant by the first of some names, if that is a file's and there is none; else ""."""
+    for name in names:
+        path = Path(str(name))
+        try:
+            if path.exists():
+                continue
+            beside = list(itertools.islice(path.parent.iterdir(), MAX_NAMES)) if path.parent.is_dir() else []
+        except (OSError, ValueError):  # a name that no file can have
+            continue
+        if path.name == str(name) == path.stem:  # a word: no file's name, but perhaps a scenario's
+            beside = []
+        near = difflib.get_close_matches(path.name, [each.name for each in beside], 1)
+        found = str(path.parent / near[0]) if near else _shipped_scenario(path.stem)
+        if found:
+            return f"; did you mean {found!r}?"
+    return ""
+
+
+def _shipped_scenario(stem: str) -> str:
+    """A scenario that comes with stillbed whose name is near, as `named_path` finds it; else ""."""
+    places = (place / "scenarios" for place in (CLONE_DATA, INSTALLED_DATA))
+    near = difflib.get_close_matches(stem, [each.stem for place in places for each in place.glob("*.toml")], 1, 0.8)
+    return f"data/scenarios/{near[0]}.toml" if near else ""
 
 
 def tables(where: object, key: str, value: object) -> list[Table]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -20,6 +23,15 @@ def no_progress(done: int, total: int) -> None:
     """Show nothing."""
 
 
+GOOD, DOUBTFUL, BAD = 32, 33, 31  # colours of a terminal: green, yellow, red
+
+
+def painted(text: str, colour: int, stream: TextIO) -> str:
+    """A text in a colour where `stream` is a terminal and nobody has set NO_COLOR (no-color.org)."""
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty()
+    return text if plain else f"\x1b[{colour}m{text}\x1b[0m"
+
+
 class Progress:
     """Shows how far `what` is, at what rate, and how long the rest will take; call it with (done, total)."""
 
@@ -28,22 +40,29 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._tty = self._stream.isatty()
         self._every = 0.1 if self._tty else 5.0  # s between lines
-        self._start = now()
-        self._reported = self._start
+        self._reported = now()
+        self._first: tuple[float, int] | None = None  # when the first report came, and how much was done by then
         self.note = ""  # behind the figures
         self._open = False  # whether an unfinished line stands on the terminal
 
     def __call__(self, done: int, total: int) -> None:
         """Report, unless the last report was a moment ago and the work is not done."""
         now = self._now()
+        if self._first is None:  # what went before was warming up: its time tells nothing about the rest
+            self._first = now, done
         if now - self._reported < self._every and done != total:
             return
         self._reported = now
         note = f"; {self.note}" if self.note else ""
-        text = progress_line(self._what, self._unit, done, total, now - self._start) + note
+        begun, before = self._first
+        text = progress_line(self._what, self._unit, done, total, now - begun, before) + note
         self._stream.write(f"\r\x1b[K{text}" if self._tty else f"{text}\n")
         self._stream.flush()
         self._open = self._tty
+
+    def restart(self) -> None:
+        """The same work begins anew, as another pass over it."""
+        self._first = None
 
     def __enter__(self) -> Progress:
         return self
@@ -59,9 +78,9 @@ class Progress:
             self._open = False
 
 
-def progress_line(what: str, unit: str, done: int, total: int, elapsed: float) -> str:
-    """One line: `done` of `total` after `elapsed` s."""
-    rate = done / elapsed if elapsed > 0 else 0.0
+def progress_line(what: str, unit: str, done: int, total: int, elapsed: float, before: int = 0) -> str:
+    """One line: `done` of `total`, of which all but the first `before` took `elapsed` s."""
+    rate = (done - before) / elapsed if elapsed > 0 else 0.0
     text = f"{what}: {done}" + (f" of {total}" if total else "") + f" {unit}"
     if rate > 0:
         text += f", {rate:.1f}/s"
@@ -174,6 +193,55 @@ def write_error_text(error: Exception, out: Path | None) -> str:
 def cache_folder() -> Path:
     """Where it is, as the XDG rules have it; it may not be there yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"
+
+
+CACHE_VERSION = "5"  # of what the cache holds: another one is rendered anew
+
+
+def content_of(file: Path) -> bytes:
+    """The bytes of a scenario and of all files that it names, each after its length.
+
+    Files that cannot be read are left out: whoever renders the scenario says so.
+    """
+    parts = [file.read_bytes()]
+    with suppress(ValueError):
+        for name in _texts(tomllib.loads(parts[0].decode("utf-8-sig"))):
+            with suppress(OSError, ValueError):  # most texts name no file
+                parts.append((file.parent / name).read_bytes())
+    return b"".join(b"%d " % len(part) + part for part in parts)
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All texts in a table, in its order."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, (dict, list)):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts(each)
+
+
+class PrerenderedSession:
+    """A pre-rendered session in its cache folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.session = folder / "session.mcap"  # pictures, with exact truth
+        self.path = folder / "path.csv"  # checkpoints in the true surface frame
+        self.arm = folder / "arm.toml"  # what the motion knows of the arm
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is there, whole."""
+        return (self.folder / "scenario").exists()
+
+
+def cached(file: Path, cache: Path, seconds: float | None = None) -> PrerenderedSession:
+    """Where the session of a scenario lies or will lie; another text of it, or of what it names, is another folder.
+
+    seconds: of its beginning, None for all of it.
+    """
+    text = content_of(file) + CACHE_VERSION.encode() + (b"" if seconds is None else f"{seconds:g} s".encode())
+    return PrerenderedSession(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
 
 
 UNFINISHED = ".part-"  # in the name of a folder that is being written, before the number of its process

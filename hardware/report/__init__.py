@@ -1,1 +1,3 @@
 """Pages, charts and figures that all reports share, and the evaluation of a trajectory."""
+
+__all__ = ["evaluation", "page", "report"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -283,3 +284,18 @@ def ribbon(edges: Array, styles: Sequence[str], titles: Sequence[str], x: tuple[
             )
             start = i
     return f'<svg class="plot" viewBox="0 0 {width} 24" role="img" aria-label="states over time">{"".join(parts)}</svg>'
+
+
+def data_url(data: bytes) -> str:
+    """A PNG or JPEG as an address that holds it."""
+    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def camera_pictures(pictures: Iterable[tuple[str, bytes]]) -> str:
+    """Pictures side by side, each with its camera's name."""
+    figures = "".join(
+        f'<figure><img alt="{escape(name)}" src="{data_url(data)}"/><figcaption>{escape(name)}</figcaption></figure>'
+        for name, data in pictures
+    )
+    return f'<div class="pictures">{figures}</div>'

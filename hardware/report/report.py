@@ -339,3 +339,27 @@ def bead_map(points: Array, extrude: Mask, errors: Array, limit: float) -> str:
         page.legend(shown)
         + f'<svg class="plot" {box} role="img" aria-label="the beads from above">{"".join(parts)}</svg>'
     )
+
+
+TRACK_HEIGHT = 420  # px
+
+
+def track_map(track: Array, path: Array, extrude: Mask) -> str:
+    """A way (N, 3) mm, rows of NaN between its pieces, over the beads of a path (M, 3), from above, equal scales."""
+    both = np.concatenate([path, track[np.isfinite(track[:, 0])]])
+    low, high = both[:, :2].min(axis=0), both[:, :2].max(axis=0)
+    wide = PAGE_CHART_WIDTH - page.Plot.left - page.Plot.right
+    tall = TRACK_HEIGHT - page.Plot.top - page.Plot.bottom
+    scale = 1.06 * max((high[0] - low[0]) / wide, (high[1] - low[1]) / tall, 1e-3)
+    x, y = ((m - scale * n / 2, m + scale * n / 2) for m, n in zip((low + high) / 2, (wide, tall), strict=True))
+    plot = page.Plot(PAGE_CHART_WIDTH, TRACK_HEIGHT, x, y, label="from above, mm")
+    for way, style in ((np.where(_beads(extrude)[:, None], path, np.nan), "aside"), (track, "estimate")):
+        for part in page.stretches(np.isfinite(way[:, 0])):
+            plot.way(way[part, 0], way[part, 1], style)
+    keys = [page.line_key("estimate", "the nozzle"), page.line_key("aside", "the path's beads")]
+    return page.legend(keys) + plot.svg()
+
+
+def _beads(extrude: Mask) -> Mask:
+    """(N,) the checkpoints at which a bead is or begins."""
+    return np.asarray(extrude | np.append(extrude[1:], False))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import heapq
+import sqlite3
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from logging import WARNING
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -23,6 +28,7 @@ from hardware.files.images import decode, encode
 from hardware.offline.track import FrameSetStep
 from hardware.process.clock import Clock, SimClock
 from hardware.process.faults import Fault, FaultPart, WorkRates, fault_rng, faults_striking
+from hardware.process.progress import content_of, folder_size, size_text
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras, garble
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.appearance import Sensor
@@ -103,6 +109,89 @@ def draw_glare(image: Image, box: tuple[Array, Array], share: float, rng: np.ran
     return np.asarray(np.clip(image + cv2.GaussianBlur(light, (0, 0), 3.0), 0, 255), np.uint8)
 
 
+RENDERER = Path(__file__).parent / "scene"  # its files make what a picture shows
+KEPT_RUNS = 2  # whose pictures are kept: two ways to track one scene in turn find theirs again
+PUTS = 60  # pictures from commit to commit: of a run that is killed no more are lost
+
+
+class PictureStore:
+    """Encoded pictures of one scenario from earlier runs, in a file of the cache, by all that they show.
+
+    Where the nozzle went another way than in those runs, or the code that renders is another, nothing is found, and
+    pictures are rendered. So is all where the file cannot be written, or another run writes it.
+    """
+
+    def __init__(self, scenario: Path, cache: Path) -> None:
+        made_by = [each.read_bytes() for each in sorted(RENDERER.glob("*.py"))]
+        text = [content_of(scenario), *made_by, np.__version__.encode(), cv2.__version__.encode()]
+        name = hashlib.sha256(b"".join(b"%d " % len(part) + part for part in text)).hexdigest()[:12]
+        self.folder = cache / f"{scenario.stem}-{name}-pictures"
+        self._kept = self._run = 0
+        self._base: sqlite3.Connection | None = None
+        with suppress(OSError, sqlite3.Error):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "scenario").write_text(str(scenario.resolve()), encoding="utf-8")
+            self._base = sqlite3.connect(self.folder / "pictures.db", timeout=0)
+            self._base.execute(
+                "CREATE TABLE IF NOT EXISTS picture (key BLOB PRIMARY KEY, run INT, kind TEXT, data BLOB)"
+            )
+            self._run = 1 + (self._base.execute("SELECT MAX(run) FROM picture").fetchone()[0] or 0)
+
+    def get(self, key: bytes) -> tuple[str, bytes] | None:
+        """Format and bytes of a picture; None where there is none."""
+        row = self._do("SELECT kind, data FROM picture WHERE key = ?", key)
+        if row is not None:
+            self._do("UPDATE picture SET run = ? WHERE key = ?", self._run, key)
+        return None if row is None else (str(row[0]), bytes(row[1]))
+
+    def put(self, key: bytes, picture: tuple[str, bytes]) -> None:
+        """Keep a picture."""
+        self._do("INSERT OR REPLACE INTO picture VALUES (?, ?, ?, ?)", key, self._run, *picture)
+        self._kept += 1
+        if self._base is not None and self._kept % PUTS == 0:
+            with suppress(sqlite3.Error):
+                self._base.commit()
+
+    def finish(self) -> None:
+        """The run is over: what neither it nor the one before looked at goes."""
+        self._do("DELETE FROM picture WHERE run <= ?", self._run - KEPT_RUNS)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._base is not None:
+            with suppress(sqlite3.Error):
+                self._base.commit()
+            self._base.close()
+        if self._kept:
+            print(f"pictures are kept in {self.folder}: {size_text(folder_size(self.folder))}", file=sys.stderr)
+
+    def _do(self, text: str, *values: object) -> Any:
+        """The first row of what a statement gives; None without one, and of a file that cannot be used."""
+        if self._base is None:
+            return None
+        try:
+            return self._base.execute(text, values).fetchone()
+        except sqlite3.Error:  # another run writes it, or the disk is full
+            self._base.close()
+            self._base = None
+            return None
+
+
+def picture_key(shot: Shot, instant: WorldState, camera: Camera, scene: Scene) -> bytes:
+    """A hash of all in a picture that the scenario alone does not say."""
+    words: list[object] = [shot.camera, shot.number, shot.picture, shot.fate, shot.covered, scene.deformation]
+    words += [instant.stamp, instant.exposure, instant.strain, instant.gain]
+    arrays = [
+        instant.base_from_surface,
+        instant.twist,
+        instant.base_from_nozzle,
+        camera.base_from_camera,
+        camera.matrix,
+    ]
+    parts = [repr(words).encode(), scene.laid, *(b"" if array is None else array.tobytes() for array in arrays)]
+    return hashlib.sha256(b"".join(b"%d " % len(part) + part for part in parts)).digest()
+
+
 NOISE_STREAM, DAMAGE_STREAM = 5, 6  # streams of random numbers of one picture
 
 
@@ -122,10 +211,11 @@ class PictureRenderer:
         seed: int,
         threads: int,
         print_beads: Callable[[float], None] = lambda until: None,
+        store: PictureStore | None = None,
     ) -> None:
-        """print_beads: brings the scene's printed material up to an instant, s."""
+        """print_beads: brings the scene's printed material up to an instant, s. store: pictures of earlier runs."""
         self._scene, self._true_cameras, self._sensor, self._quality = scene, true_cameras, sensor, jpeg_quality
-        self._seed, self._threads, self._print_beads = seed, threads, print_beads
+        self._seed, self._threads, self._print_beads, self._store = seed, threads, print_beads, store
         self._waiting: list[tuple[Shot, WorldState]] = []  # exposed and not yet rendered
         self._done: dict[tuple[int, int], tuple[str, bytes]] = {}
 
@@ -141,8 +231,20 @@ class PictureRenderer:
             while self._waiting:
                 batch = {pair[0].camera: pair for pair in reversed(self._waiting)}  # the first of each camera
                 self._waiting = [pair for pair in self._waiting if pair is not batch[pair[0].camera]]
-                self._render(*zip(*batch.values(), strict=True))
+                missing = [pair for pair in batch.values() if not self._found(*pair)]
+                if missing:
+                    self._render(*zip(*missing, strict=True))
         return self._done.pop(key)
+
+    def _found(self, shot: Shot, instant: WorldState) -> bool:
+        """Take a picture from the store, if it is there."""
+        picture = None if self._store is None else self._store.get(self._key(shot, instant))
+        if picture is not None:
+            self._done[shot.camera, shot.number] = picture
+        return picture is not None
+
+    def _key(self, shot: Shot, instant: WorldState) -> bytes:
+        return picture_key(shot, instant, self._true_cameras(shot), self._scene)
 
     def _render(self, shots: Sequence[Shot], instants: Sequence[WorldState]) -> None:
         cameras = [self._true_cameras(shot) for shot in shots]
@@ -153,10 +255,12 @@ class PictureRenderer:
                 images[i] = cover_wound(images[i], camera, instant.base_from_surface, shot.covered)
         with ThreadPoolExecutor(self._threads) as pool:
             encoded = list(pool.map(lambda image: encode(image, self._quality), images))
-        for shot, (kind, data) in zip(shots, encoded, strict=True):
+        for shot, instant, (kind, data) in zip(shots, instants, encoded, strict=True):
             if shot.fate is Fate.GARBLED:
                 data = garble(data, self._rng(DAMAGE_STREAM, shot.camera, shot.number))
             self._done[shot.camera, shot.number] = kind, data
+            if self._store is not None:
+                self._store.put(self._key(shot, instant), (kind, data))
 
     def _rng(self, stream: int, camera: int, number: int) -> np.random.Generator:
         """A picture's own random numbers: they depend on nothing but its camera and number."""

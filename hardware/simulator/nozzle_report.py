@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -84,7 +83,7 @@ def bead_picture(result: NozzleResult, layer: int, width: float) -> str:
     times = max(1, -(-MIN_PICTURE_PX // max(planned.shape)))
     size = (planned.shape[1] * times, planned.shape[0] * times)
     planned, deposited = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR) for m in (planned, deposited))
-    data = _data_url(_png(cell_kinds(planned, deposited), np.maximum(planned, deposited)))
+    data = page.data_url(_png(cell_kinds(planned, deposited), np.maximum(planned, deposited)))
     box = f'width="{view.width:g}" height="{view.scale * (view.high[1] - view.low[1]):.1f}"'
     plan = view.pixels(line.points)
     pieces = np.flatnonzero(line.printed & (line.layer == deposit.layers[layer]))
@@ -376,13 +375,5 @@ def _holds(result: NozzleResult) -> str:
 def _camera_pictures(result: NozzleResult) -> str:
     if not result.run.pictures:
         return ""
-    figures = "".join(
-        f'<figure><img alt="{escape(name)}" src="{_data_url(data)}"/><figcaption>{escape(name)}</figcaption></figure>'
-        for name, data in result.run.pictures
-    )
-    return page.section("What the cameras saw", "One instant of the run.", f'<div class="pictures">{figures}</div>')
-
-
-def _data_url(data: bytes) -> str:
-    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+    shown = page.camera_pictures(result.run.pictures)
+    return page.section("What the cameras saw", "One instant of the run.", shown)

@@ -40,7 +40,7 @@ from hardware.process.system import provenance
 from hardware.report.evaluation import Evaluation, evaluate, write_summary
 from hardware.report.report import write_report
 from hardware.simulator.arm.ports import PtyLink
-from hardware.simulator.camera_pipeline import Exposures
+from hardware.simulator.camera_pipeline import Exposures, PictureStore
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras
 from hardware.simulator.deposit import join_logs, planned_line
 from hardware.simulator.nozzle_report import nozzle_page
@@ -181,6 +181,7 @@ class SimulationOptions:
     pty: bool = False  # send the arm's bytes through a pseudo-terminal
     force: bool = False  # write into a folder that is not empty
     open: bool = False  # open the page that shows it in a browser
+    cache: Path | None = None  # where pictures of earlier runs are found, and those of this one kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,9 +240,13 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
             if options.open:
                 open_in_browser(folder.watch.page.resolve().as_uri())
             loop = step, exposures, folder, WallClock(), options.threads, line
-            world = SimulatedWorld(scenario, scene, path, truth, *loop)
+            kept = options.cache if scenario.tracking.pictures else None
+            store = None if kept is None else stack.enter_context(closing(PictureStore(file, kept)))
+            world = SimulatedWorld(scenario, scene, path, truth, *loop, store)
             try:
                 world.run(progress)
+                if store is not None:
+                    store.finish()
             finally:
                 skipped = world.pipeline.skipped
                 told_outside = world.told_outside

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
@@ -312,21 +311,13 @@ def divide_path(path: Path, piece: float) -> Path:
     extra = {name: column[source] for name, column in path.extra.items()}
     number = np.concatenate([[0], *(np.arange(n) for n in counts)])  # of a piece on its way
     if "wait_s" in extra:  # at the beginning of the way
-        extra["wait_s"] = np.where(number == 0, extra["wait_s"], "0")
+        extra["wait_s"] = np.where(number == 0, extra["wait_s"], np.zeros((), extra["wait_s"].dtype))
     if "look" in extra:  # at the end
-        extra["look"] = np.where(np.append(source[1:] != source[:-1], True), extra["look"], "0")
-    if "volume_mm3" in extra:
-        extra["volume_mm3"] = _divided(extra["volume_mm3"], np.concatenate([[1], np.repeat(counts, counts)]))
+        last = np.append(source[1:] != source[:-1], True)
+        extra["look"] = np.where(last, extra["look"], np.zeros((), extra["look"].dtype))
+    if "volume_mm3" in extra and extra["volume_mm3"].dtype.kind in "if":  # whoever reads a text says what is wrong
+        extra["volume_mm3"] = extra["volume_mm3"] / np.concatenate([[1], np.repeat(counts, counts)])
     return replace(path, surface_from_nozzle=cut, extra=extra, **columns)
-
-
-def _divided(column: NDArray[np.str_], counts: NDArray[np.int64]) -> NDArray[np.str_]:
-    """Numbers as texts (N,), each by its count (N,); what is no number stays, for whoever reads it to say so."""
-    divided = column.astype("U32")
-    for i in np.flatnonzero(counts > 1).tolist():
-        with suppress(ValueError):
-            divided[i] = repr(float(column[i]) / int(counts[i]))
-    return np.asarray(divided)
 
 
 NEWTON_STEPS = 12  # from the mean plane onto the surface; a wound takes four

@@ -44,6 +44,7 @@ from hardware.simulator.camera_pipeline import (
     EventQueue,
     Exposures,
     PictureRenderer,
+    PictureStore,
     PipelineSink,
 )
 from hardware.simulator.cameras import Shot, TrueCameras
@@ -160,11 +161,12 @@ class SimulatedWorld:
         clock: Clock,
         threads: int = 2,
         line: Callable[[bytes], bytes] = bytes,
+        store: PictureStore | None = None,
     ) -> None:
         """scene: the scenario's, None without pictures; beads are drawn into it. path: in the true surface frame.
 
         exposures: filled with the shot of each picture, for a step that may know. clock: for tracking times. line:
-        carries bytes from the motion to the arm, e.g. over a pty.
+        carries bytes from the motion to the arm, e.g. over a pty. store: pictures of earlier runs.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
         self._step = step
@@ -182,8 +184,8 @@ class SimulatedWorld:
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
             assert scene is not None
-            encoding = scenario.sensor, scenario.jpeg_quality, scenario.seed
-            pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *encoding, threads, self._print_beads)
+            how = scenario.sensor, scenario.jpeg_quality, scenario.seed, threads, self._print_beads, store
+            pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *how)
         self._last_state: WorldState | None = None
         self._commanded = CommandedPose(profile)
         head = self._commanded.at if scenario.nozzle else lambda stamp: None

@@ -8,3 +8,5 @@ Written from the thesis's text. Where text, equations and Appendix A's program p
 taken and named in the docstring of what it concerns. What the thesis leaves to its segmentation network, where the
 surface is in every image, is told for the first images only and carried along by the features.
 """
+
+__all__ = ["camera", "step"]

@@ -6,3 +6,5 @@ from typing import Literal, get_args
 
 PatternKind = Literal["zigzag", "raster", "contour", "spiral", "hybrid", "best"]
 PATTERN_KINDS: tuple[PatternKind, ...] = get_args(PatternKind)
+
+__all__ = ["PATTERN_KINDS", "PatternKind", "bead", "fill", "rings", "spiral"]

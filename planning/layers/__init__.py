@@ -4,3 +4,5 @@ Frames: the scan's own coordinates are the `surface` frame. `plane` has its orig
 the mean normal of the skin there, and x as near to the scan's x as that allows; heights are z over it. `chart` is the
 plane stretched so that lengths along the skin are true: beads are laid in it, mm.
 """
+
+__all__ = ["checkpoints", "grid", "outline", "plan", "repair", "skin", "slicing", "wound"]

@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from planning.fill.bead import Bead
 from planning.layers.grid import Chart, Grid, Mask, gradient, interpolate, smoothed
 from planning.layers.slicing import LayerStack
-from planning.path import MIN_SPACING, Path
+from planning.path import MIN_SPACING, Column, Path
 
 Index = NDArray[np.int64]
 MIN_SPACING_SHARE = 0.25  # of the spacing: nearer checkpoints than that are not set for the surface's sake
@@ -310,7 +310,7 @@ def path_from(points: Checkpoints, ground: TipSurface, spin: float) -> Path:
         temperature=np.array([t.temperature for t in tissues])[layer],
         layer=layer,
         extrude=points.extrude[apart],
-        extra={name: _number_texts(values[apart], digits) for name, values, digits in extra},
+        extra={name: _rounded(values[apart], digits) for name, values, digits in extra},
     )
 
 
@@ -320,9 +320,6 @@ def _materials(names: Sequence[str], layer: Index) -> NDArray[np.int64] | NDArra
     return np.array(names)[layer]
 
 
-def _number_texts(values: Array, digits: int) -> NDArray[np.str_]:
-    """Numbers as text of so many digits; each different one is written once."""
-    scale = 10**digits
-    whole, number = np.unique(np.rint(values * scale).astype(np.int64), return_inverse=True)
-    texts = [f"{v / scale:.{digits}f}".rstrip("0").rstrip(".") if digits else str(v) for v in whole.tolist()]
-    return np.array(texts)[number]
+def _rounded(values: Array, digits: int) -> Column:
+    """Numbers to so many digits after the point, whole ones where there are none."""
+    return np.rint(values).astype(np.int64) if digits == 0 else np.asarray(np.round(values, digits) + 0.0)

@@ -10,7 +10,7 @@ const WAY = 4000; // points of the trajectory that are drawn
 const AXES = ["#c8553d", "#4c9a6a", "#2a6f97"]; // of the surface frame: x, y, z
 const GIVEN = { truth: "Truth", reference: "Reference" }; // poses that nobody estimated have no state
 const by = (id) => document.getElementById(id);
-const state = { session: null, k: 0, wanted: -1, busy: false, seen: null, poses: null, first: null, playing: false, begun: 0, from: 0, chosen: null };
+const state = { session: null, k: 0, wanted: -1, busy: false, seen: null, poses: null, first: null, playing: false, begun: 0, from: 0, chosen: null, near: true };
 const panes = new Panes(by("pictures"), choose);
 
 class Film extends SceneView {
@@ -66,6 +66,7 @@ async function begin() {
   document.querySelector("[data-tile=off]").hidden = !session.truth || Boolean(GIVEN[session.source]);
   document.querySelector("[data-tile=off] span").textContent = `off the ${session.truth}`;
   document.querySelector("[data-tile=place_on_path]").hidden = !session.scene.checkpoint.length;
+  by("told").hidden = !session.events.length && !session.held.some((each) => each);
   go(Math.max(0, session.states.findIndex((s) => s)));
 }
 
@@ -95,7 +96,9 @@ async function fetchNewest() {
       state.seen = await said.json();
       show();
       if (!pictures.ok) throw new Error(await pictures.text());
-      state.poses = (await panes.show(await pictures.arrayBuffer())).base_from_surface;
+      const head = await panes.show(await pictures.arrayBuffer());
+      state.poses = head.base_from_surface;
+      by("closer").hidden = !head.pictures.some((each) => each.near);
       refresh();
       alarm("");
     } catch (error) {
@@ -138,7 +141,25 @@ function show() {
   put("tracks", tracking ? String(tracking.tracks) : "–", "");
   put("off", figure(off, 3), "mm");
   put("place_on_path", fraction === null ? "–" : String(Math.floor(fraction) + 1), "");
+  tell();
   refresh();
+}
+
+// the hold, the stage, and the last lines of the run's log until the instant that is shown
+function tell() {
+  const { stamps, held, events, stages } = state.session, now = stamps[state.k];
+  const before = (all) => all.filter(([t]) => t <= now), stage = before(stages).pop();
+  const lines = [held[state.k] && `held: ${held[state.k]}`, stage && `stage: ${stage[1]}`].filter(Boolean).map((words) => {
+    const line = document.createElement("b");
+    line.textContent = `${words}  `;
+    return line;
+  });
+  const said = before(events).slice(-2).reverse().map(([t, words]) => {
+    const line = document.createElement("div");
+    line.textContent = `${t.toFixed(2)} s  ${words}`;
+    return line;
+  });
+  by("told").replaceChildren(...lines, ...said);
 }
 
 let due = false;
@@ -149,7 +170,7 @@ function refresh() {
     due = false;
     const seen = state.seen, fraction = seen && seen.fraction !== null ? seen.fraction : -1;
     const nozzle = seen && seen.motion && seen.motion.base_from_nozzle;
-    if (state.session) for (const each of panes.values()) each.draw(state.session.scene, state.poses, fraction, nozzle, false);
+    if (state.session) for (const each of panes.values()) each.draw(state.session.scene, state.poses, fraction, nozzle, state.near);
     space.draw(seen, fraction);
     timeline.draw(state.k);
   });
@@ -200,6 +221,20 @@ document.addEventListener("keydown", (e) => {
   e.preventDefault();
   act();
 });
+by("closer").addEventListener("click", (e) => {
+  const button = e.target.closest("[data-near]");
+  if (!button) return;
+  state.near = button.dataset.near === "yes";
+  for (const each of by("closer").children) each.setAttribute("aria-pressed", String(each === button));
+  refresh();
+});
+for (const button of document.querySelectorAll("[data-zoom]")) {
+  button.addEventListener("click", () => {
+    if (state.session) timeline.zoom(Number(button.dataset.zoom), state.session.stamps[state.k]);
+    refresh();
+  });
+}
+timeline.changed = refresh;
 timeline.chosen = (k) => {
   play(false);
   go(k);

@@ -22,13 +22,17 @@ export class Line {
     let before = Promise.resolve();
     socket.addEventListener("message", (event) => {
       this.heard = performance.now();
-      before = before.then(() => this.take(socket, event.data)).catch((error) => console.error(error));
+      // words are shown at once, and overtake pictures that are being decoded; acknowledged in their order
+      const message = typeof event.data === "string" ? JSON.parse(event.data) : event.data;
+      const shown = message instanceof ArrayBuffer ? before.then(() => this.hear(message)) : this.now(message);
+      before = Promise.all([before, shown]).then(() => this.acknowledge(socket, message)).catch((error) => console.error(error));
     });
     socket.addEventListener("close", () => setTimeout(() => this.open(), AGAIN));
   }
-  async take(socket, data) {
-    const message = typeof data === "string" ? JSON.parse(data) : data;
-    await this.hear(message);
+  async now(message) {
+    return this.hear(message);
+  }
+  acknowledge(socket, message) {
     if (message.bundle && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ shown: message.bundle }));
   }
   // send a region, corners by camera, drawn under the turn that was shown; its tag, or null where there is no connection

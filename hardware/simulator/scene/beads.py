@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from hashlib import sha256
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,6 +57,7 @@ class PrintedBeads:
         self._box: tuple[int, int, int, int] | None = None  # x0, y0, x1, y1 texels that hold gel
         self._stamp = -math.inf  # s, of the fields
         self.version = 0  # of the heights
+        self.laid = b""  # a hash of all that was laid so far, in its order
 
     def lay(self, xy_start: ArrayLike, xy_end: ArrayLike, width: float) -> None:
         """Lay a bead of `width` mm from one material point (2,) mm to another; off the texture nothing is laid.
@@ -63,6 +65,7 @@ class PrintedBeads:
         The same bead twice is one bead, and beads that join end to end are one bead.
         """
         layers = self._layers
+        self._note(np.asarray([xy_start, xy_end], float), np.array([width]))
         self._begin()
         scale, ox, oy = layers.offsets(0)
         start, end = (np.asarray(p, float) * scale + (ox, oy) for p in (xy_start, xy_end))
@@ -81,6 +84,7 @@ class PrintedBeads:
     def flow(self, pieces: GelPieces, now: float) -> None:
         """Let gel leave the needle, and what lies there sag, until `now`, s; off the texture nothing is laid."""
         assert self.gel is not None
+        self._note(pieces.start, pieces.end, pieces.volume, pieces.area, np.array([now]))
         self._begin()
         fade = math.exp(-(now - self._stamp) / self.gel.sag_time) if math.isfinite(self._stamp) else 0.0
         self._stamp = now
@@ -120,6 +124,9 @@ class PrintedBeads:
     def volume(self) -> float:
         """All gel that lies on the scene, mm^3."""
         return float(self._height.sum(dtype=float)) * self._layers.texel**2
+
+    def _note(self, *laid: Array) -> None:
+        self.laid = sha256(b"".join([self.laid, *(np.ascontiguousarray(each).tobytes() for each in laid)])).digest()
 
     def _begin(self) -> None:
         if self._under is None:

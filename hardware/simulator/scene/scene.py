@@ -86,6 +86,11 @@ class Scene:
         """What was printed on it."""
         return self._get_painted().ink
 
+    @property
+    def laid(self) -> bytes:
+        """A hash of what was printed on it, without painting it; empty before the first bead."""
+        return b"" if self._painted is None else self._painted.ink.laid
+
     def _get_painted(self) -> PaintedScene:
         with self._lock:
             if self._painted is None:
