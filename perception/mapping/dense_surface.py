@@ -46,9 +46,11 @@ class DenseSurface:
     """A lattice of nodes on the surface, surface frame."""
 
     points: Array  # (H, W, 3) mm; rows run along y and columns along x
+    normals: Array  # (H, W, 3) unit, towards the cameras
     sigma: Array  # (H, W) mm along the normal, one standard deviation
     colours: NDArray[np.uint8]  # (H, W, 3) BGR
     seen: Mask  # (C, H, W) by which cameras
+    wanted: Mask  # (H, W) inside the region
     sure: Mask  # (H, W) whether the surface was found there
 
 
@@ -81,7 +83,13 @@ MIN_SCATTER = 0.05  # of evened pictures: sensors are not better
 HIDDEN_MM, HIDDEN_CELL_PX = 1.5, 4  # behind another part of the surface in the same cell of a picture
 DIRECTION_SIGMA_MM = 3.0  # over which normals are averaged that nodes move along
 MAX_JUMP_MM = 0.4  # from the median around, beyond which a height is a wrong match
-FLAT_WINDOW, FLAT_SIGMAS = 1.5, 1.0  # nodes; a surface that bends by less than its error there is smoothed
+# By the errors on rendered bodies, wet and dry: windows overlap, so that noise is a part of what one of them says; where
+# the surface bends within a window by so much, it is off by as much.
+NOISE_SHARE, BEND_SHARE, BEND_WINDOW = 0.16, 1.0, 1.5  # share, share, nodes
+MIN_SIGMA_MM, MAX_SIGMA_MM = 0.005, 0.4  # of poses and lenses at best; beyond, the surface is not known
+MIN_SEEN_WEIGHT = 0.2  # of all a camera's pictures: it sees the node
+RIM_NODES = 3  # beside which windows would reach beyond the lattice
+MIN_PART = 0.05  # of the largest connected part: smaller ones float
 LINEAR_LIGHT = (np.arange(256) ** 2 / 255).astype(np.float32)  # displays' values are about the square root of light
 
 
@@ -183,16 +191,28 @@ class DenseFit:
     def _finished(self, points: Array, directions: Array, within: Mapping[int, Array]) -> DenseSurface:
         sums = self._sums(points, directions)
         heights = np.einsum("hwi,hwi->hw", points, directions).astype(np.float32)
-        noise = 1 / np.sqrt(sums.information + 1e-6)
-        bend = heights - _blur(heights, FLAT_WINDOW)
-        self.debug = noise, bend
-        points = points 
+        bend = _blur((heights - _blur(heights, BEND_WINDOW)) ** 2, BEND_WINDOW)
+        noise = NOISE_SHARE**2 / (sums.information + 1e-6)
+        sigma = np.sqrt(noise + BEND_SHARE**2 * bend + MIN_SIGMA_MM**2)
         camera = np.array([view.camera for view in self._views])
-        seen = np.stack([sums.weights[camera == c].sum(0) > 0.2 for c in range(len(self._lenses.rig))])
-        sigma = noise
-        sure = seen.sum(0) >= 2
+        seen = np.stack([sums.weights[camera == c].sum(0) > MIN_SEEN_WEIGHT for c in range(len(self._lenses.rig))])
+        wanted = self._wanted(points, within)
+        wanted[:RIM_NODES] = wanted[-RIM_NODES:] = wanted[:, :RIM_NODES] = wanted[:, -RIM_NODES:] = False
+        sure = _without_floaters((seen.sum(0) >= 2) & (sigma < MAX_SIGMA_MM) & wanted)
+        colours = self._colours(points, sums.weights)
         self._progress(1.0)
-        return DenseSurface(points, sigma, self._colours(points, sums.weights), seen, sure)
+        return DenseSurface(points, _normals(points, 1.0), sigma, colours, seen, wanted, sure)
+
+    def _wanted(self, points: Array, within: Mapping[int, Array]) -> Mask:
+        """Which nodes (H, W) lie inside all polygons, as the first instant's pictures show them."""
+        first, wanted = min(view.instant for view in self._views), np.ones(points.shape[:2], bool)
+        for n, view in enumerate(self._views):
+            if view.instant == first and view.camera in within:
+                size = self._lenses.rig.cameras[view.camera].size
+                mask = polygon_mask(size, within[view.camera])
+                u, v = self._pixels(n, points)[0]
+                wanted &= cv2.remap(mask, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+        return wanted
 
     def _colours(self, points: Array, weights: Float32) -> NDArray[np.uint8]:
         total = np.zeros((*points.shape[:2], 3), np.float32)
@@ -206,12 +226,11 @@ class DenseFit:
 
     def _pixels(self, n: int, nodes: Array) -> tuple[Float32, Mask]:
         """Where a picture shows nodes (H, W, 3): (2, H, W) px, and whether the lens can (H, W)."""
-        view, lens = self._views[n], self._lenses.rig.cameras[self._views[n].camera]
+        view = self._views[n]
         inner = se3.inverse(view.surface_from_camera).astype(np.float32)
         x, y, z = inner[:3, :3] @ nodes.reshape(-1, 3).T.astype(np.float32) + inner[:3, 3:]
         depth = np.maximum(z, 1e-3)
         imaged, inside = self._lenses.bend(view.camera, x / depth, y / depth, z)
-        assert not lens.matrix[0, 1]
         return imaged.astype(np.float32).reshape(2, *nodes.shape[:2]), inside.reshape(nodes.shape[:2])
 
     def _look(self, n: int, pixels: Float32, level: int = 0) -> Float32:
@@ -337,3 +356,11 @@ def _without_spikes(points: Array, directions: Array) -> Array:
     off = height - cv2.medianBlur(height, 5)
     off = np.where(np.abs(off) > MAX_JUMP_MM, off, 0) / np.maximum(directions[..., 2], 0.3)
     return np.asarray(points - off[..., None] * directions)
+
+
+def _without_floaters(sure: Mask) -> Mask:
+    """The nodes without small parts that are connected to nothing."""
+    count, part, stats, _ = cv2.connectedComponentsWithStats(sure.astype(np.uint8), connectivity=4)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    kept = 1 + np.flatnonzero(areas >= MIN_PART * areas.max(initial=0)) if count > 1 else np.zeros(0, int)
+    return np.asarray(np.isin(part, kept))

@@ -219,14 +219,19 @@ def _lattice(low: Array, high: Array, step: float) -> Array:
 
 
 def _initial_heights(points: Array, low: Array, high: Array) -> Float32:
-    """Heights on a coarse lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
+    """Heights on a coarse lattice by the landmarks (N, 3)."""
     flat = _lattice(low, high, GUESS_SIGMA_MM / 2)
-    away = points[None, :, :2] - flat.reshape(-1, 1, 2)
+    return heights_near(points, flat.reshape(-1, 2)).reshape(flat.shape[:2]).astype(np.float32)
+
+
+def heights_near(points: Array, flat: Array) -> Array:
+    """Heights (N,) at places (N, 2) by a plane through the points (M, 3) around each, the nearer the more."""
+    away = points[None, :, :2] - flat[:, None]
     weight = np.exp(-(away**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
     design = np.concatenate([np.ones((*away.shape[:2], 1)), away / GUESS_SIGMA_MM], 2)
     normal = np.einsum("nmi,nm,nmj->nij", design, weight, design, optimize=True) + 1e-4 * np.eye(3)
     right = np.einsum("nmi,nm->ni", design, weight * points[:, 2])
-    return np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2]).astype(np.float32)
+    return np.asarray(np.linalg.solve(normal, right[..., None])[:, 0, 0])
 
 
 def _transformed(transform: Array, nodes: Array) -> Array:
