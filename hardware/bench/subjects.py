@@ -26,6 +26,7 @@ RENDERED = (
     *("still", *BREATHING, "shaking_table_0_5_hz", "steps_300um"),
     *("turns", "hand", "camera_lost", "clock_offsets", "wet_glare", "deformation"),
 )  # scenarios
+BODIES = ("chest", "forearm", "foot")  # that the simulator has
 MAPS = ("told", "seen")  # whose map the estimator has: the world's own, or one that it made
 MADE = (
     "flat patch, shaking table",
@@ -198,10 +199,14 @@ _SUBJECTS = (
         _option("--processes", type=_positive, default=2, help="that share the scenes (default: 2)"),
     ),
     _subject("plan", "fill", "a whole plan of a large wound: time, memory, coverage, ink")(
-        _option("--body", choices=("forearm", "chest", "foot"), default="forearm", help="default forearm")
+        _option("--body", choices=BODIES, default="forearm", help="default forearm")
     ),
     _subject("registration", "mapping", "a scan laid into the first pictures: error and verdict")(
         _number("--seeds", 2, "N", "bodies of each kind; default 2")
+    ),
+    _subject("scan", "mapping", "what the cameras scan themselves, wet and dry, off the true surface")(
+        _option("--bodies", nargs="+", choices=BODIES, default=BODIES, metavar="NAME", help=f"of {', '.join(BODIES)}"),
+        _number("--sets", 6, "N", "frame sets that are fused; default 6"),
     ),
     _subject("prediction", "prediction", "where a breathing chest will be, 100 to 500 ms ahead")(
         _option(

@@ -8,22 +8,25 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
+from estimation.mapping.bundle_adjustment import single_fit
+from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Rig
-from estimation.scans.scan import Scan, cast_rays, face_areas
+from estimation.rig import Rig, ideal_pixels
+from estimation.scans.scan import Scan, face_areas, lattice_triangles, picture_of_scan
 from estimation.se3 import Array
+from estimation.surface_map import SurfaceMap
 from hardware.files.mesh_file import write_scan
 from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
 from hardware.live.frame_source import LiveCameraSource, SourceEnded
@@ -37,12 +40,13 @@ from hardware.process.system import SharedLatest
 from hardware.report.page import document, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
-from perception.mapping.dense_surface import DenseFit, DenseSurface, SurfaceView
+from perception.mapping.dense_surface import DenseFit, DenseSurface, SurfaceView, camera_place
 from perception.mapping.scan_map import LATTICE_MARGIN_MM, heights_near, node_size
 
 MAX_SETS = 40  # frame sets that are fused: more take longer and are hardly better
 MAX_FIND_TIME = 20.0  # s in which the surface is found, of recorded or real time
 MAX_NODES = 120_000  # of the lattice: a larger surface gets a coarser one
+MIN_OWN_TRACKS, MAX_OFFSET_PX = 20, 0.5  # of a camera whose own pose is asked; px it may stand off the joint one
 MIN_TRACKED_SETS = 2  # whose poses agree: fewer are no scan
 GUESS_ROWS = 2000  # places at a time: a row holds every landmark
 PICTURE_WAIT = 0.5  # s of a wait for live pictures
@@ -83,7 +87,7 @@ class SurfaceScan:
     scan: Scan  # of its sure nodes
     nodes: NDArray[np.int64]  # (V,) of the lattice, row by row, that are vertices
     rig: Rig
-    base_from_surface: Array  # (4, 4) at the first of the fused frame sets
+    first: SurfacePose  # of the first of the fused frame sets
     sets: int
     seconds: float  # s that the fit took
 
@@ -102,8 +106,8 @@ class SurfaceScan:
         """What was scanned and how well, in words."""
         median, high = np.percentile(self.sigma, [50, 95])
         return (
-            f"{self.area / 100:.1f} cm² scanned from {self.sets} frame sets, {self.coverage:.0%} of the region; standard "
-            f"deviation {median:.3f} mm (median), {high:.3f} mm (95 %); fused in {duration_text(self.seconds)}"
+            f"{self.area / 100:.1f} cm² scanned from {self.sets} frame sets, {self.coverage:.0%} of the region; "
+            f"standard deviation {median:.3f} mm (median), {high:.3f} mm (95 %); fused in {duration_text(self.seconds)}"
         )
 
     @property
@@ -229,11 +233,13 @@ def scan_surface(
             try:
                 for number, frames in enumerate(source.frame_sets, 1):
                     pose = step(frames)
-                    step.idle()
                     progress.note = pose.reason or f"{len(taken)} of {sets} instants"
                     progress(number, 0)
-                    if not taken.add(frames, pose, np.nan_to_num(step.last.offsets)):
+                    if not taken.add(
+                        frames, pose, partial(exposed_poses, source.rig, step.map, step.last.observations, pose)
+                    ):
                         break
+                    step.idle()
             except KeyboardInterrupt:
                 if len(taken) < MIN_TRACKED_SETS:
                     raise
@@ -252,14 +258,27 @@ class TrackedFrames:
 
     frames: FrameSet
     pose: SurfacePose
-    offsets: Array  # (C,) s that each camera exposes later than stamped
+    exposed: Mapping[int, Array]  # (4, 4) base_from_surface at each camera's own exposure
 
-    def surface_from_camera(self, rig: Rig, number: int) -> Array:
-        """(4, 4) mm of the camera of a frame, at its exposure."""
-        frame = self.frames.frames[number]
-        late = frame.stamp + self.offsets[frame.camera] - self.pose.stamp
-        base_from_surface = self.pose.base_from_surface @ se3.exp(late * self.pose.twist)
-        return np.asarray(se3.inverse(base_from_surface) @ rig.cameras[frame.camera].base_from_camera)
+
+def exposed_poses(
+    rig: Rig, surface_map: SurfaceMap | None, tracks: Observations, pose: SurfacePose
+) -> dict[int, Array]:
+    """base_from_surface (4, 4) by camera: the joint pose, or the camera's own where its tracks contradict that.
+
+    Cameras that are not exposed together see a moving surface at different places; a pose of one alone is known worse.
+    """
+    found, landmarks = {}, np.zeros((0, 3)) if surface_map is None else surface_map.points
+    for c, camera in enumerate(rig.cameras):
+        found[c] = joint = pose.base_from_surface
+        if (tracks.camera == c).sum() < MIN_OWN_TRACKS:
+            continue
+        own = single_fit(rig, landmarks, tracks, c, joint).base_from_surface
+        seen = landmarks[tracks.track[tracks.camera == c]]
+        here, there = (ideal_pixels(camera, se3.transform_points(each, seen))[0] for each in (joint, own))
+        if np.median(np.linalg.norm(here - there, axis=1)) > MAX_OFFSET_PX:
+            found[c] = own
+    return found
 
 
 class _Taken:
@@ -275,7 +294,7 @@ class _Taken:
     def __len__(self) -> int:
         return len(self._bins)
 
-    def add(self, frames: FrameSet, pose: SurfacePose, offsets: Array) -> bool:
+    def add(self, frames: FrameSet, pose: SurfacePose, exposed: Callable[[], Mapping[int, Array]]) -> bool:
         """Take a frame set where its pose is good; whether more are wanted."""
         self._first = frames.stamp if self._first is None else self._first
         self.why = pose.reason or self.why
@@ -288,7 +307,7 @@ class _Taken:
             return False
         before = self._bins.get(part)
         if before is None or self._worth(frames, pose) > self._worth(before.frames, before.pose):
-            self._bins[part] = TrackedFrames(frames, pose, offsets)
+            self._bins[part] = TrackedFrames(frames, pose, exposed())
         return True
 
     @staticmethod
@@ -312,9 +331,9 @@ def fuse(
     clock = WallClock()
     start = clock.now()
     views = [
-        SurfaceView(frame.camera, instant, frame.image, tracked.surface_from_camera(rig, number))
+        SurfaceView(c, instant, frame.image, se3.inverse(tracked.exposed[c]) @ rig.cameras[c].base_from_camera)
         for instant, tracked in enumerate(chosen)
-        for number, frame in enumerate(tracked.frames.frames)
+        for c, frame in ((frame.camera, frame) for frame in tracked.frames.frames)
     ]
     lenses, cameras = Lenses(rig), sorted({view.camera for view in views})
     margin = np.array([LATTICE_MARGIN_MM, LATTICE_MARGIN_MM])
@@ -330,21 +349,11 @@ def fuse(
     sizes = [camera.size for camera in rig.cameras]
     within = region_polygons(tuple(replace(each, stamp=-np.inf) for each in roi), chosen[0].frames, sizes)
     surface = DenseFit(lenses, views, progress)(low, high, step, guess, within if isinstance(within, dict) else {})
-    return scan_of(surface, rig, first, len(chosen), clock.now() - start)
-
-
-def scan_of(surface: DenseSurface, rig: Rig, base_from_surface: Array, sets: int, seconds: float) -> SurfaceScan:
-    """The mesh of a surface's sure nodes; StillbedError where there are none."""
-    number = np.arange(surface.sure.size).reshape(surface.sure.shape)
-    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]))
-    triangles = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
-    triangles = triangles[surface.sure.ravel()[triangles].all(1)]
+    used, triangles = lattice_triangles(surface.sure)
     if not len(triangles):
         raise StillbedError("no part of the surface was seen alike by two cameras")
-    used, triangles = np.unique(triangles, return_inverse=True)
-    triangles = triangles.reshape(-1, 3)
     scan = Scan(surface.points.reshape(-1, 3)[used], triangles, surface.normals.reshape(-1, 3)[used])
-    return SurfaceScan(surface, scan, used, rig, base_from_surface, sets, seconds)
+    return SurfaceScan(surface, scan, used, rig, chosen[0].pose, len(chosen), clock.now() - start)
 
 
 # -- report
@@ -367,30 +376,29 @@ TILTS_DEG, TURNS = (
 def scan_page(scanned: SurfaceScan, name: str) -> str:
     """The report as one HTML page."""
     sigma, surface = scanned.sigma, scanned.surface
-    pictures = "".join(_figure(title, view_of(scanned, np.array(way))) for title, way in VIEWS)
-    limits = np.percentile(sigma, [50, 95, 100])
-    rows = [(camera.name, f"{_share(surface.seen[c], surface)}") for c, camera in enumerate(scanned.rig.cameras)]
+    pictures = "".join(
+        _figure(title, picture_of_scan(scanned.scan, scanned.colours, np.array(way), VIEW_PIXELS)[..., ::-1])
+        for title, way in VIEWS
+    )
+    limits = np.percentile(sigma, [50, 95])
+    rows = [(camera.name, _share(surface.seen[c], surface)) for c, camera in enumerate(scanned.rig.cameras)]
     rows += [("two cameras or more", _share(surface.seen.sum(0) >= 2, surface)), ("scanned", f"{scanned.coverage:.0%}")]
     shade = np.clip(surface.sigma / (2 * WEAK_SIGMA_MM), 0, 1)[::-1, :, None]
     colours = np.array([150.0, 110, 60]) * (1 - shade) + np.array([40.0, 60, 220]) * shade  # BGR: blue to red
     colours[~surface.sure[::-1]] = 255
     explained = "White was not seen by two cameras alike, or lies outside the region, and is open in the mesh."
+    known = f"Standard deviation across the surface, blue: 0, red: {2 * WEAK_SIGMA_MM:g} mm. {explained}"
+    tiles = (f"{scanned.area / 100:.1f}", "cm²", "scanned"), (f"{scanned.coverage:.0%}", "", "of the region")
+    sigmas = zip(limits, ("median", "95 %"), strict=True)
     body = [
-        row_of_tiles([
-            tile(f"{scanned.area / 100:.1f}", "cm²", "scanned"),
-            tile(f"{scanned.coverage:.0%}", "", "of the region"),
-            tile(f"{limits[0]:.3f}", "mm", "standard deviation, median"),
-            tile(f"{limits[1]:.3f}", "mm", "standard deviation, 95 %"),
-        ]),
-        section("The scan", "As it would look in plain light, from three sides.", f'<div class="tiles">{pictures}</div>'),
-        section(
-            "How well it is known",
-            f"Standard deviation across the surface, blue: 0, red: {2 * WEAK_SIGMA_MM:g} mm. {explained}",
-            _figure("from above", np.asarray(colours, np.uint8)),
+        row_of_tiles(
+            [tile(*t) for t in (*tiles, *((f"{v:.3f}", "mm", f"standard deviation, {w}") for v, w in sigmas))]
         ),
+        section("The scan", "In plain light, from three sides.", f'<div class="tiles">{pictures}</div>'),
+        section("How well it is known", known, _figure("from above", np.asarray(colours, np.uint8))),
         section("Who saw it", "Share of the region that each camera shows.", figures_table(("camera", "share"), rows)),
         section("Where to put a camera", camera_advice(scanned), ""),
-    ]  # fmt: skip
+    ]
     return document("scan", name, scanned.words + ".", body, name)
 
 
@@ -406,48 +414,17 @@ def _figure(title: str, image: NDArray[np.uint8]) -> str:
     return f'<figure style="margin:0">{picture}<figcaption class="caption">{title}</figcaption></figure>'
 
 
-def view_of(scanned: SurfaceScan, way: Array) -> NDArray[np.uint8]:
-    """A picture (H, W, 3) BGR of the mesh as seen from far away in direction `way` (3,), surface frame."""
-    z = way / np.linalg.norm(way)
-    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.5 else [0.0, 0.0, 1.0], z)
-    x /= np.linalg.norm(x)
-    axes, points = np.stack([x, np.cross(z, x), z]), scanned.scan.vertices
-    low, high = (f(points @ axes.T, axis=0) for f in (np.min, np.max))
-    lines = np.linspace(-0.52, 0.52, VIEW_PIXELS) * (high - low)[:2].max()
-    u, v = np.meshgrid(lines, -lines)
-    middle = (low + high) / 2
-    flat = np.column_stack([(u + middle[0]).ravel(), (v + middle[1]).ravel(), np.full(u.size, high[2] + 1)])
-    hits = cast_rays(scanned.scan, flat @ axes, np.broadcast_to(-z, (u.size, 3)))
-    image = np.full((u.size, 3), 255.0)
-    light = np.array([-0.4, 0.3, 0.87]) @ axes
-    near = cKDTree(points).query(hits.points[hits.hit])[1]
-    shade = 0.45 + 0.6 * np.clip(hits.normals[hits.hit] @ light, 0, 1)
-    image[hits.hit] = np.clip(scanned.colours[near, ::-1] * shade[:, None], 0, 255)
-    return np.asarray(image.reshape(VIEW_PIXELS, VIEW_PIXELS, 3), np.uint8)
-
-
 def camera_advice(scanned: SurfaceScan) -> str:
     """Where another camera would show most of what is open or known badly, in words; base frame."""
-    surface = scanned.surface
+    surface, cameras = scanned.surface, scanned.rig.cameras
     weak = surface.wanted & (~surface.sure | (surface.sigma > WEAK_SIGMA_MM))
     share = weak.sum() / max(1, surface.wanted.sum())
     if share < WEAK_SHARE:
         return "No further camera is needed: nearly all of the region is known well."
-    points = se3.transform_points(scanned.base_from_surface, surface.points[weak])
-    normals = surface.normals[weak] @ scanned.base_from_surface[:3, :3].T
-    middle, stands = points.mean(0), np.stack([c.base_from_camera[:3, 3] for c in scanned.rig.cameras])
-    away = float(np.median(np.linalg.norm(stands - middle, axis=1)))
-    looks = (stands - middle) / np.linalg.norm(stands - middle, axis=1, keepdims=True)
-    tilt, turn = np.meshgrid(np.radians(TILTS_DEG), np.linspace(0, 2 * np.pi, TURNS, endpoint=False))
-    ways = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], -1).reshape(-1, 3)
-    ways = ways @ scanned.base_from_surface[:3, :3].T
-    apart = np.degrees(np.arccos(np.clip(ways @ looks.T, -1, 1)).min(1))
-    worth = np.clip(ways @ normals.T, 0, 1).mean(1) * np.minimum(1, apart / MIN_APART_DEG)
-    best = int(worth.argmax())
-    x, y, z = middle + away * ways[best]
-    near = scanned.rig.cameras[int((ways[best] @ looks.T).argmax())].name
+    place, near, apart = camera_place(surface, weak, scanned.first.base_from_surface, scanned.rig)
+    x, y, z = place
     return (
         f"{share:.0%} of the region is open or known to no better than {WEAK_SIGMA_MM:g} mm. A camera at "
-        f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base frame, {apart[best]:.0f} degrees from {near} as seen from there, "
-        f"would show it best."
+        f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base frame, {apart:.0f} degrees from {cameras[near].name} as seen from "
+        f"there, would show it best."
     )

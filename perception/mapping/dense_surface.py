@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.se3 import Array
+from estimation.rig import Rig
+from estimation.se3 import Array, Mask
 from perception.frames import Image, parallel_map
 from perception.lens import Lenses
 from perception.mapping.features import polygon_mask
 
 Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,16 +56,17 @@ class DenseSurface:
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A search up and down the normals."""
+    """A search up and down the normals; lengths in finest nodes."""
 
-    width: float  # of a node, in finest ones
-    reach: float  # mm up and down
-    step: float  # mm between heights
+    width: float  # of a node
+    reach: float  # up and down
+    step: float  # between heights
     instants: int  # whose pictures are used: more cost time and find the same
 
 
-# first how deep a wound is, then its walls, each time in windows on what was found before
-SWEEPS = (Sweep(2.0, 8.0, 0.4, 2), Sweep(1.5, 1.6, 0.2, 2), Sweep(1.0, 0.8, 0.1, 2), Sweep(1.0, 0.6, 0.1, 2))
+# All lengths are in finest nodes, which are a pixel of the sharpest camera: near cameras know a surface better.
+# First how deep a wound is (8 mm before cameras 400 mm away), then its walls, in windows on what was found before:
+SWEEPS = (Sweep(2.0, 22.0, 1.1, 2), Sweep(1.5, 4.4, 0.55, 2), Sweep(1.0, 2.2, 0.275, 2), Sweep(1.0, 1.65, 0.275, 2))
 FIT_ROUNDS = 4  # of least squares: more move the surface by less than its error
 SWEEP_WINDOW, FIT_WINDOW = 1.0, 1.3  # nodes, one sigma of the windows in which pictures are compared
 EVEN_WINDOW = 3.0  # nodes over which brightness and contrast are evened out: they differ by camera
@@ -75,21 +76,22 @@ TRUST_POWER = 4  # by which the channel counts more whose best correlation is hi
 BENDING_COST, MAX_BENDING_COST = 0.1, 0.6  # of a slope of 1 between neighbours, and the most: a rim may be steep
 MIN_FACING = 0.15  # cosine of the viewing angle below which a camera sees too little of a node
 SATURATED_GREY = 250  # where a picture tells nothing
-PROBE_MM = 0.05  # up and down, by which pictures' change with height is taken: a tenth of a pixel
-MAX_STEP_MM = 0.3  # a round's: the windows lie on the surface to so much
+PROBE = 0.14  # nodes up and down, by which pictures' change with height is taken: a tenth of a pixel
+MAX_STEP = 0.8  # nodes, a round's: the windows lie on the surface to so much
 WIDE_WINDOW, WIDE_SHARE = 4.0, 0.02  # nodes, and share of a wider window's say: it decides where there is no texture
 OUTLIER_SIGMAS = 1.5  # of the pictures' scatter, from which a picture counts by its distance only
 MIN_SCATTER = 0.05  # of evened pictures: sensors are not better
-HIDDEN_MM, HIDDEN_CELL_PX = 1.5, 4  # behind another part of the surface in the same cell of a picture
-DIRECTION_SIGMA_MM = 3.0  # over which normals are averaged that nodes move along
-MAX_JUMP_MM = 0.4  # from the median around, beyond which a height is a wrong match
-# By the errors on rendered bodies, wet and dry: windows overlap, so that noise is a part of what one of them says; where
-# the surface bends within a window by so much, it is off by as much.
+HIDDEN_NODES, HIDDEN_CELL_PX = 4.0, 4  # nodes behind another part of the surface in the same cell of a picture
+DIRECTION_WINDOW = 8.0  # nodes over which normals are averaged that nodes move along
+MAX_JUMP = 1.1  # nodes from the median around, beyond which a height is a wrong match
+# By the errors on rendered bodies, wet and dry: windows overlap, so that noise is a part of what one says; where the
+# surface bends within a window by so much, it is off by as much.
 NOISE_SHARE, BEND_SHARE, BEND_WINDOW = 0.16, 1.0, 1.5  # share, share, nodes
-MIN_SIGMA_MM, MAX_SIGMA_MM = 0.005, 0.4  # of poses and lenses at best; beyond, the surface is not known
+MIN_SIGMA, MAX_SIGMA = 0.014, 1.1  # nodes: of poses and lenses at best; beyond, the surface is not known
+MAX_NOISE = 0.3  # nodes: a plain patch, where the surface would float
 MIN_SEEN_WEIGHT = 0.2  # of all a camera's pictures: it sees the node
 RIM_NODES = 3  # beside which windows would reach beyond the lattice
-MIN_PART = 0.05  # of the largest connected part: smaller ones float
+MIN_PART, MIN_WIDTH_NODES = 0.05, 5  # of the largest connected part, and nodes: smaller and thinner ones float
 LINEAR_LIGHT = (np.arange(256) ** 2 / 255).astype(np.float32)  # displays' values are about the square root of light
 
 
@@ -110,6 +112,7 @@ class DenseFit:
     ) -> None:
         """progress: called with the share that is done."""
         self._lenses, self._views, self._progress = lenses, tuple(views), progress
+        self._node = 1.0  # mm, of a finest one
         self._levels = [parallel_map(_channels, [view.image for view in views])]
         self._levels.append(parallel_map(cv2.pyrDown, self._levels[-1]))
         self._bright = parallel_map(_saturated, [view.image for view in views])
@@ -122,38 +125,40 @@ class DenseFit:
         guess: heights (N,) at (N, 2), mm, to begin with. within: polygon (N, 2) px by camera, in pictures of the first
         instant, beyond which nothing is wanted.
         """
-        points, rounds = np.zeros((0, 0, 3)), len(SWEEPS) + FIT_ROUNDS + 1
+        self._node, points, rounds = step, np.zeros((0, 0, 3)), len(SWEEPS) + FIT_ROUNDS + 1
         for number, sweep in enumerate(SWEEPS):
             points = _resized(points, low, high, sweep.width * step, guess)
-            points = self._swept(points, sweep, sweep.width * step)
+            points = self._swept(points, sweep)
             self._progress((number + 1) / rounds)
-        directions = _normals(points, DIRECTION_SIGMA_MM / step)
+        directions = _normals(points, DIRECTION_WINDOW)
         for number in range(FIT_ROUNDS):
             sums = self._sums(points, directions)
-            off = np.clip(-sums.slope / (sums.information + 1e-6), -MAX_STEP_MM, MAX_STEP_MM)
-            points = _without_spikes(points + off[..., None] * directions, directions)
+            most = MAX_STEP * step
+            off = np.clip(-sums.slope / (sums.information + 1e-6), -most, most)
+            points = _without_spikes(points + off[..., None] * directions, directions, MAX_JUMP * step)
             self._progress((len(SWEEPS) + number + 1) / rounds)
         return self._finished(points, directions, within)
 
     # -- sweeping
 
-    def _swept(self, points: Array, sweep: Sweep, step: float) -> Array:
+    def _swept(self, points: Array, sweep: Sweep) -> Array:
         """The points (H, W, 3) where pictures correlate best up or down."""
-        directions, level = _normals(points, DIRECTION_SIGMA_MM / step), int(sweep.width > 1)
-        heights = np.arange(-sweep.reach, sweep.reach + sweep.step / 2, sweep.step)
+        directions, level = _normals(points, DIRECTION_WINDOW / sweep.width), int(sweep.width > 1)
+        reach = sweep.reach * self._node
+        heights = np.arange(-sweep.reach, sweep.reach + sweep.step / 2, sweep.step) * self._node
         instants = sorted({view.instant for view in self._views})
         number = np.linspace(0, len(instants) - 1, min(sweep.instants, len(instants))).astype(int)
         chosen = {instants[i] for i in number}
         views = [n for n, view in enumerate(self._views) if view.instant in chosen]
         pairs = [(a, b) for a, b in combinations(views, 2) if self._views[a].instant == self._views[b].instant]
         seen = {n: self._facing(n, points, directions) for n in views}
-        ways = {n: [self._pixels(n, points + h * directions)[0] for h in (-sweep.reach, 0, sweep.reach)] for n in views}
+        ways = {n: [self._pixels(n, points + h * directions)[0] for h in (-reach, 0, reach)] for n in views}
         count = sum(seen[a] * seen[b] for a, b in pairs) + np.float32(1e-6)
 
         def score(height: float) -> Float32:
             even, power = {}, {}
             for n in views:
-                look = self._look(n, _on_way(ways[n], height / sweep.reach), level)
+                look = self._look(n, _on_way(ways[n], height / reach), level)
                 even[n] = _evened(look, seen[n])[0] * (seen[n] > 0)[..., None]
                 power[n] = _blur(even[n] * even[n], SWEEP_WINDOW)
             total = np.zeros_like(even[views[0]])
@@ -165,20 +170,21 @@ class DenseFit:
         scores = np.stack(parallel_map(score, heights), 2)  # (H, W, D, K)
         trust = scores.max(2, keepdims=True) ** TRUST_POWER + 1e-6
         cost = 1 - (trust * scores).sum(3) / trust.sum(3)
-        best = _lowest(_semi_global(cost, sweep.step / step), heights).astype(np.float32)
+        best = _lowest(_semi_global(cost, sweep.step / sweep.width), heights).astype(np.float32)
         return np.asarray(points + cv2.medianBlur(best, 5)[..., None] * directions)
 
     # -- fitting
 
     def _sums(self, points: Array, directions: Array) -> _Sums:
         normals = _normals(points, 1.0)
-        up, down = points + PROBE_MM * directions, points - PROBE_MM * directions
+        probe = PROBE * self._node
+        up, down = points + probe * directions, points - probe * directions
 
         def look(n: int) -> tuple[Float32, Float32, Float32]:
             weight = self._facing(n, points, normals)
             value, above, below = (self._look(n, self._pixels(n, nodes)[0]) for nodes in (points, up, down))
             even, contrast, sums = _evened(value, weight)
-            slope = (above - below) / np.float32(2 * PROBE_MM)
+            slope = (above - below) / np.float32(2 * probe)
             slope = (slope - _blur(weight[..., None] * slope, EVEN_WINDOW) / sums) / contrast
             return even, slope, weight
 
@@ -193,12 +199,13 @@ class DenseFit:
         heights = np.einsum("hwi,hwi->hw", points, directions).astype(np.float32)
         bend = _blur((heights - _blur(heights, BEND_WINDOW)) ** 2, BEND_WINDOW)
         noise = NOISE_SHARE**2 / (sums.information + 1e-6)
-        sigma = np.sqrt(noise + BEND_SHARE**2 * bend + MIN_SIGMA_MM**2)
+        sigma = np.sqrt(noise + BEND_SHARE**2 * bend + (MIN_SIGMA * self._node) ** 2)
         camera = np.array([view.camera for view in self._views])
         seen = np.stack([sums.weights[camera == c].sum(0) > MIN_SEEN_WEIGHT for c in range(len(self._lenses.rig))])
         wanted = self._wanted(points, within)
         wanted[:RIM_NODES] = wanted[-RIM_NODES:] = wanted[:, :RIM_NODES] = wanted[:, -RIM_NODES:] = False
-        sure = _without_floaters((seen.sum(0) >= 2) & (sigma < MAX_SIGMA_MM) & wanted)
+        known = (sigma < MAX_SIGMA * self._node) & (noise < (MAX_NOISE * self._node) ** 2)
+        sure = _without_floaters(known & (seen.sum(0) >= 2) & wanted)
         colours = self._colours(points, sums.weights)
         self._progress(1.0)
         return DenseSurface(points, _normals(points, 1.0), sigma, colours, seen, wanted, sure)
@@ -250,7 +257,7 @@ class DenseFit:
         cells = [(np.clip(p, 0, most - 1) // HIDDEN_CELL_PX).astype(int) for p, most in ((v, h), (u, w))]
         nearest = np.full((h // HIDDEN_CELL_PX + 1, w // HIDDEN_CELL_PX + 1), np.inf)
         np.minimum.at(nearest, tuple(cells), np.where(inside, distance, np.inf))
-        inside &= distance < nearest[tuple(cells)] + HIDDEN_MM
+        inside &= distance < nearest[tuple(cells)] + HIDDEN_NODES * self._node
         bright = cv2.remap(self._bright[n], u, v, cv2.INTER_LINEAR)
         return np.where(inside & (bright == 0), facing, 0).astype(np.float32)
 
@@ -351,16 +358,40 @@ def _normals(points: Array, sigma: float) -> Array:
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
 
 
-def _without_spikes(points: Array, directions: Array) -> Array:
+def _without_spikes(points: Array, directions: Array, most: float) -> Array:
     height = points[..., 2].astype(np.float32)
     off = height - cv2.medianBlur(height, 5)
-    off = np.where(np.abs(off) > MAX_JUMP_MM, off, 0) / np.maximum(directions[..., 2], 0.3)
+    off = np.where(np.abs(off) > most, off, 0) / np.maximum(directions[..., 2], 0.3)
     return np.asarray(points - off[..., None] * directions)
 
 
 def _without_floaters(sure: Mask) -> Mask:
-    """The nodes without small parts that are connected to nothing."""
-    count, part, stats, _ = cv2.connectedComponentsWithStats(sure.astype(np.uint8), connectivity=4)
+    """The nodes without thin parts, and small ones that are connected to nothing."""
+    wide = cv2.morphologyEx(
+        sure.astype(np.uint8), cv2.MORPH_OPEN, np.ones((MIN_WIDTH_NODES, MIN_WIDTH_NODES), np.uint8)
+    )
+    count, part, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=4)
     areas = stats[1:, cv2.CC_STAT_AREA]
     kept = 1 + np.flatnonzero(areas >= MIN_PART * areas.max(initial=0)) if count > 1 else np.zeros(0, int)
     return np.asarray(np.isin(part, kept))
+
+
+MIN_APART_DEG = 20.0  # between two cameras: nearer ones tell little about depth
+TILTS_DEG, TURNS = (0.0, 20.0, 40.0, 60.0), 12  # places of a camera that are tried, off the normal and round it
+
+
+def camera_place(surface: DenseSurface, weak: Mask, base_from_surface: Array, rig: Rig) -> tuple[Array, int, float]:
+    """Where (3,) mm, base frame, another camera as far away as the others sees nodes `weak` (H, W) best; and which camera
+    is nearest, and how far apart they stand as seen from the surface, degrees."""
+    points = se3.transform_points(base_from_surface, surface.points[weak])
+    normals = surface.normals[weak] @ base_from_surface[:3, :3].T
+    middle, stands = points.mean(0), np.stack([camera.base_from_camera[:3, 3] for camera in rig.cameras])
+    distance = np.linalg.norm(stands - middle, axis=1)
+    looks = (stands - middle) / distance[:, None]
+    tilt, turn = np.meshgrid(np.radians(TILTS_DEG), np.linspace(0, 2 * np.pi, TURNS, endpoint=False))
+    ways = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], -1).reshape(-1, 3)
+    ways = ways @ base_from_surface[:3, :3].T
+    apart = np.degrees(np.arccos(np.clip(ways @ looks.T, -1, 1)))
+    worth = np.clip(ways @ normals.T, 0, 1).mean(1) * np.minimum(1, apart.min(1) / MIN_APART_DEG)
+    best = int(worth.argmax())
+    return middle + float(np.median(distance)) * ways[best], int(apart[best].argmin()), float(apart[best].min())
