@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.mapping.triangulation import triangulated_map
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.synthetic.follow import Follower
-from estimation.triangulation import triangulated_map
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import frame_from_command
 from hardware.files.path_file import read_path

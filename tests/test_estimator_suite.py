@@ -15,13 +15,13 @@ import pytest
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.mapping.triangulation import triangulated_map
 from estimation.observations import Observations
 from estimation.online import fit
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.synthetic.follow import Follower, FollowResult, Mapping, first_map, follow
 from estimation.synthetic.world import World, synthetic_world
-from estimation.triangulation import triangulated_map
 from hardware.bench.estimator import nees, pool_errors
 from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
 from planning.command import MotionLimits

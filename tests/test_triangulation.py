@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.mapping.local_surface import MIN_SURFACE_POINTS, RaySurfaceHits, meet_rays, smooth_normals
+from estimation.mapping.triangulation import (
+    MIN_SURFACE_POINTS,
+    RaySurfaceHits,
+    epipolar_distance,
+    meet_rays,
+    rays,
+    smooth_normals,
+    triangulate,
+    updated_by_looks,
+)
 from estimation.online.fit import UNCERTAIN_MM, MapError
 from estimation.pose_solver import project
 from estimation.rig import ideal_pixels
@@ -17,7 +26,6 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals
 from estimation.synthetic.movements import patch
 from estimation.synthetic.world import BASE_FROM_REST, WOUND_CENTRE, arc_rig
-from estimation.triangulation import epipolar_distance, rays, triangulate, updated_by_looks
 
 RIG = arc_rig()
 seeds = st.integers(0, 10_000)

@@ -9,13 +9,13 @@ import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.mapping.triangulation import rays, triangulate, triangulated_map
 from estimation.observations import Observations
 from estimation.pose import Trajectory
 from estimation.pose_solver import INLIER_WEIGHT, PointTracks, solve_pose
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
-from estimation.triangulation import rays, triangulate, triangulated_map
 
 MIN_SIGMA_PX = 0.1  # alignment claims less on clean images, but interpolation and lens model err by it
 FIT_INTERVAL_S = 0.1  # between frame sets that are fitted one by one; the joint solution finds the way between them

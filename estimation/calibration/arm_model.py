@@ -16,10 +16,10 @@ import numpy as np
 from estimation import se3
 from estimation.calibration.lens_model import lens_of, project_lens
 from estimation.errors import InputError
+from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, distort
 from estimation.runtime import compiled
 from estimation.se3 import Array, Index, Mask
-from estimation.triangulation import triangulate
 
 Kinematics = Callable[[Array], Array]  # arm_from_nozzle (N, 4, 4) mm at axes (N, 6), by the arm's own model
 

@@ -12,6 +12,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.mapping.bundle_adjustment import AdjustedMap
 from estimation.mapping.refiner import Refiner
+from estimation.mapping.triangulation import TriangulatedMap, triangulated_map
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator
 from estimation.online.surface_state import StateSettings
@@ -20,7 +21,6 @@ from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array, Mask
 from estimation.synthetic.world import SYNTHETIC_WORLD, World
-from estimation.triangulation import TriangulatedMap, triangulated_map
 
 MIN_FRAME_SETS = StateSettings().first + 3  # the map's, those averaged into the first pose, and two to be judged
 Mapping = Literal["told", "seen"]  # the world's own map, or one triangulated from the first frame set and refined

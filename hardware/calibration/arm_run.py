@@ -23,9 +23,9 @@ from estimation import se3
 from estimation.calibration.arm_fit import ArmUnknowns, TouchFit, fit_touches
 from estimation.calibration.arm_model import SetPoint
 from estimation.errors import InputError
+from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.triangulation import triangulate
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, open_arm
 from hardware.arm.s6h4d import S6H4D

@@ -54,7 +54,8 @@ def add_live(commands: Commands) -> None:
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
-    add("--scan", type=named_path, metavar="SCAN.ply", help="scan of the surface, in the frame of the path")
+    what = 'scan of the surface, in the frame of the path; or "from the cameras", which then scan it before the run'
+    add("--scan", type=named_path, metavar="SCAN.ply", help=what)
     add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
     add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="what lets material out; else nothing does")
@@ -168,6 +169,7 @@ def add_init(commands: Commands) -> None:
 
 
 def _run_live(a: argparse.Namespace) -> int:
+    from hardware.cli.plan import scanned_settings
     from hardware.files.region_table import read_region
     from hardware.live.prepared import prepare, prepare_resumed
     from hardware.live.run import LiveRun
@@ -184,7 +186,9 @@ def _run_live(a: argparse.Namespace) -> int:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is None:
         settings = LiveSettings() if a.settings is None else read_settings(a.settings)
-        prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
+        where = a.settings or "command line"
+        settings = scanned_settings(override_settings(settings, flags), where, a.force)
+        prepared = prepare(settings, where, a.force, faults)
     elif a.settings is not None or a.record is not None:
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
     else:

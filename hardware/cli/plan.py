@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from estimation.errors import StillbedError
+from estimation.errors import InputError, StillbedError
 from hardware.cli.parser import FAILED, MODEL_HELP, Commands, damage_code, not_negative, wrong_option
 from perception import named_path
 
 if TYPE_CHECKING:
+    from hardware.live.settings import LiveSettings
     from perception.wound.segmentation import Segmenter
 
 PLAN_TEXT = """\
@@ -309,3 +311,33 @@ def _run_train(arguments: argparse.Namespace) -> None:
     from hardware.simulator.scene.render import wound_view
 
     print(run_train(arguments, wound_view))
+
+
+def scanned_settings(settings: LiveSettings, where: object, force: bool) -> LiveSettings:
+    """The settings of a run that scans for itself, with the scan that its cameras make now and the path planned on it.
+
+    Both stand beside the recording. Without a path it is planned with `plan`'s defaults, and at a terminal the operator
+    says whether those layers are to be printed. InputError, StillbedError where that is not said.
+    """
+    from hardware.live.settings import FROM_CAMERAS, check_settings
+    from hardware.live.surface_scan import ScanOrder, run_scan
+    from hardware.plan.order import PlanRequest
+    from hardware.plan.run import run_plan
+
+    if settings.scan is None or settings.scan.name != FROM_CAMERAS:
+        return settings
+    source, record = settings.simulated or settings.rig, settings.record
+    check_settings(replace(settings, scan=None, path=settings.path or source), where)
+    assert source is not None and record is not None
+    if record.exists() and not force:
+        raise InputError(record, "--record", "a file that exists", "a new file, or --force")
+    scan, path = (record.with_name(f"{record.stem}.{name}") for name in ("scan.ply", "path.csv"))
+    print(run_scan(ScanOrder(source, scan, region=settings.region, force=True)), flush=True)
+    if settings.path is not None:
+        return replace(settings, scan=scan)
+    print(run_plan(PlanRequest(path, scan, force=True))[0], flush=True)
+    if not settings.unattended and sys.stdin.isatty():
+        answer = input(f"The layers are in {path.with_suffix('.html')}. Are they to be printed? yes or no: ")
+        if answer.strip().lower() not in ("y", "yes"):
+            raise StillbedError(f"not printed, as you said. The plan is kept: {path}, on {scan}")
+    return replace(settings, scan=scan, path=path)

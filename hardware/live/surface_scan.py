@@ -7,7 +7,6 @@ taken (`perception.mapping.dense_surface`). The scan stands in the surface frame
 from __future__ import annotations
 
 import base64
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,13 +19,11 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
-from estimation.mapping.bundle_adjustment import single_fit
-from estimation.observations import Observations
+from estimation.mapping.bundle_adjustment import exposed_poses
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Rig, ideal_pixels
+from estimation.rig import Rig
 from estimation.scans.scan import Scan, face_areas, lattice_triangles, picture_of_scan
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap
 from hardware.files.mesh_file import write_scan
 from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
 from hardware.live.frame_source import LiveCameraSource, SourceEnded
@@ -35,7 +32,7 @@ from hardware.offline.track import region_search, tracker
 from hardware.operator.shared_state import DrawnRegion
 from hardware.process.checks import read_toml
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, cache_folder, duration_text
+from hardware.process.progress import Progress, cache_folder, duration_text, write_atomically
 from hardware.process.system import SharedLatest
 from hardware.report.page import document, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
@@ -46,7 +43,6 @@ from perception.mapping.scan_map import LATTICE_MARGIN_MM, heights_near, node_si
 MAX_SETS = 40  # frame sets that are fused: more take longer and are hardly better
 MAX_FIND_TIME = 20.0  # s in which the surface is found, of recorded or real time
 MAX_NODES = 120_000  # of the lattice: a larger surface gets a coarser one
-MIN_OWN_TRACKS, MAX_OFFSET_PX = 20, 0.5  # of a camera whose own pose is asked; px it may stand off the joint one
 MIN_TRACKED_SETS = 2  # whose poses agree: fewer are no scan
 GUESS_ROWS = 2000  # places at a time: a row holds every landmark
 PICTURE_WAIT = 0.5  # s of a wait for live pictures
@@ -146,21 +142,12 @@ def run_scan(order: ScanOrder, stream: TextIO | None = None) -> str:
     order = check_scan(order)
     with open_source(order) as source:
         scanned = scan_surface(source, order.sets, order.seconds, order.region, stream)
-    write(order.out, lambda file: write_scan(
+    write_atomically(order.out, lambda file: write_scan(
         file, scanned.scan.vertices, scanned.scan.triangles, scanned.colours, scanned.sigma
     ))  # fmt: skip
-    write(order.report, lambda file: file.write_text(scan_page(scanned, order.source.name), encoding="utf-8"))
+    page = scan_page(scanned, order.source.name)
+    write_atomically(order.report, lambda file: file.write_text(page, encoding="utf-8"))
     return f"{scanned.words}\n{camera_advice(scanned)}\nscan: {order.out}\nreport: {order.report}"
-
-
-def write(file: Path, body: Callable[[Path], object]) -> None:
-    """Write a file under another name first, then rename it: there is never half of one."""
-    part = file.with_name(file.name + ".part")
-    try:
-        body(part)
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 # -- pictures
@@ -236,7 +223,9 @@ def scan_surface(
                     progress.note = pose.reason or f"{len(taken)} of {sets} instants"
                     progress(number, 0)
                     if not taken.add(
-                        frames, pose, partial(exposed_poses, source.rig, step.map, step.last.observations, pose)
+                        frames,
+                        pose,
+                        partial(exposed_poses, source.rig, step.map, step.last.observations, pose.base_from_surface),
                     ):
                         break
                     step.idle()
@@ -259,26 +248,6 @@ class TrackedFrames:
     frames: FrameSet
     pose: SurfacePose
     exposed: Mapping[int, Array]  # (4, 4) base_from_surface at each camera's own exposure
-
-
-def exposed_poses(
-    rig: Rig, surface_map: SurfaceMap | None, tracks: Observations, pose: SurfacePose
-) -> dict[int, Array]:
-    """base_from_surface (4, 4) by camera: the joint pose, or the camera's own where its tracks contradict that.
-
-    Cameras that are not exposed together see a moving surface at different places; a pose of one alone is known worse.
-    """
-    found, landmarks = {}, np.zeros((0, 3)) if surface_map is None else surface_map.points
-    for c, camera in enumerate(rig.cameras):
-        found[c] = joint = pose.base_from_surface
-        if (tracks.camera == c).sum() < MIN_OWN_TRACKS:
-            continue
-        own = single_fit(rig, landmarks, tracks, c, joint).base_from_surface
-        seen = landmarks[tracks.track[tracks.camera == c]]
-        here, there = (ideal_pixels(camera, se3.transform_points(each, seen))[0] for each in (joint, own))
-        if np.median(np.linalg.norm(here - there, axis=1)) > MAX_OFFSET_PX:
-            found[c] = own
-    return found
 
 
 class _Taken:

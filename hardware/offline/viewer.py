@@ -20,11 +20,11 @@ from aiohttp import web
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
+from estimation.mapping.triangulation import triangulated_map
 from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.triangulation import triangulated_map
 from hardware.files.images import small_jpeg
 from hardware.files.path_file import read_path
 from hardware.files.session import FrameReader, Session, damage_text

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.forecast.predictor import Predictor
+from estimation.mapping.triangulation import TriangulatedMap
 from estimation.observations import Observations, no_observations
 from estimation.pose import SurfacePose, TrackState, Trajectory, identity_pose
 from estimation.rig import Rig
@@ -27,7 +28,6 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import Follower
 from estimation.synthetic.world import project_landmarks, undistorting
-from estimation.triangulation import TriangulatedMap
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import read_poses

@@ -380,17 +380,20 @@ MIN_APART_DEG = 20.0  # between two cameras: nearer ones tell little about depth
 TILTS_DEG, TURNS = (0.0, 20.0, 40.0, 60.0), 12  # places of a camera that are tried, off the normal and round it
 
 
-def camera_place(surface: DenseSurface, weak: Mask, base_from_surface: Array, rig: Rig) -> tuple[Array, int, float]:
-    """Where (3,) mm, base frame, another camera as far away as the others sees nodes `weak` (H, W) best; and which camera
-    is nearest, and how far apart they stand as seen from the surface, degrees."""
-    points = se3.transform_points(base_from_surface, surface.points[weak])
-    normals = surface.normals[weak] @ base_from_surface[:3, :3].T
+def camera_place(surface: DenseSurface, weak: Mask, pose: Array, rig: Rig) -> tuple[Array, int, float]:
+    """Where (3,) mm, base frame, another camera as far away as the others sees nodes `weak` (H, W) best; which camera
+    is nearest to it, and how far apart they stand as seen from the surface, degrees.
+
+    pose: base_from_surface (4, 4).
+    """
+    points = se3.transform_points(pose, surface.points[weak])
+    normals = surface.normals[weak] @ pose[:3, :3].T
     middle, stands = points.mean(0), np.stack([camera.base_from_camera[:3, 3] for camera in rig.cameras])
     distance = np.linalg.norm(stands - middle, axis=1)
     looks = (stands - middle) / distance[:, None]
     tilt, turn = np.meshgrid(np.radians(TILTS_DEG), np.linspace(0, 2 * np.pi, TURNS, endpoint=False))
     ways = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], -1).reshape(-1, 3)
-    ways = ways @ base_from_surface[:3, :3].T
+    ways = ways @ pose[:3, :3].T
     apart = np.degrees(np.arccos(np.clip(ways @ looks.T, -1, 1)))
     worth = np.clip(ways @ normals.T, 0, 1).mean(1) * np.minimum(1, apart.min(1) / MIN_APART_DEG)
     best = int(worth.argmax())

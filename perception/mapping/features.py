@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.mapping.triangulation import epipolar_distance, rays
 from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.triangulation import epipolar_distance, rays
 from perception.frames import Image
 from perception.lens import Lenses, undistort
 from perception.mapping.patches import Pyramid

@@ -17,11 +17,10 @@ from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from estimation import se3
-from estimation.mapping.local_surface import smooth_normals
+from estimation.mapping.triangulation import epipolar_distance, rays, smooth_normals, triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
-from estimation.triangulation import epipolar_distance, rays, triangulate
 from perception.lens import Lenses, undistort
 from perception.mapping.features import Features, ImageMask, corners, matched_spots, polygon_mask, sift
 from perception.mapping.masks import trackable

@@ -2,7 +2,7 @@
 
 Two cameras find them as the first map was found, begun at the landmarks that both see. Cameras stand 36 to 84 degrees
 apart, so a steep side, or anything while the others are covered, is seen by one camera: there landmarks are put where
-its rays meet the known surface, continued by the local fit (`estimation.mapping.local_surface`). What that fit does not
+its rays meet the known surface, continued by the local fit (`estimation.mapping.triangulation`). What that fit does not
 know of a depth is in the covariance, and later views from elsewhere reduce it. All stay on probation until a later
 frame set shows that they move with the surface: a drape beside a wound looks as good, but stays where it is.
 """
@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import of_frame
-from estimation.mapping.local_surface import meet_rays
 from estimation.mapping.refiner import MIN_TRACK_SIGMA_PX
+from estimation.mapping.triangulation import meet_rays, rays, updated_by_looks
 from estimation.observations import Observations
 from estimation.pose_solver import project
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, Warp, joined_map
-from estimation.triangulation import rays, updated_by_looks
 from perception.frames import Image
 from perception.lens import Lenses, undistort
 from perception.mapping.features import Features, ImageMask, corners, sift

@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
+from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.scans.registration import Registration, register, register_near
 from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.triangulation import triangulate
 from perception.frames import Image
 from perception.lens import Lenses
 from perception.mapping.features import polygon_mask
@@ -198,7 +198,8 @@ def relief_points(
     finest = node_size(lenses, cameras, centre)
     points = first.map.points
     low, high = np.percentile(points[:, :2], [1, 99], axis=0) + np.array([[-LATTICE_MARGIN_MM], [LATTICE_MARGIN_MM]])
-    heights, relief, sure = _initial_heights(points, low, high), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
+    flat, relief, sure = _lattice(low, high, GUESS_SIGMA_MM / 2), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
+    heights = heights_near(points, flat.reshape(-1, 2)).reshape(flat.shape[:2]).astype(np.float32)
     for width in NODE_WIDTHS:
         flat = _lattice(low, high, width * finest)
         resized = np.asarray(cv2.resize(heights, flat.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
@@ -216,12 +217,6 @@ def relief_points(
 def _lattice(low: Array, high: Array, step: float) -> Array:
     x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
     return np.stack(np.meshgrid(x, y), -1)
-
-
-def _initial_heights(points: Array, low: Array, high: Array) -> Float32:
-    """Heights on a coarse lattice by the landmarks (N, 3)."""
-    flat = _lattice(low, high, GUESS_SIGMA_MM / 2)
-    return heights_near(points, flat.reshape(-1, 2)).reshape(flat.shape[:2]).astype(np.float32)
 
 
 def heights_near(points: Array, flat: Array) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.batch.smoothed import Smoothed
 from estimation.mapping.bundle_adjustment import single_fit
-from estimation.mapping.local_surface import smooth_normals
+from estimation.mapping.triangulation import smooth_normals
 from estimation.observations import Observations, no_observations
 from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import Rig
