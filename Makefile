@@ -38,13 +38,13 @@ bench: $(STAMP)
 	$(BIN)/stillbed bench --all
 
 outages: $(STAMP)
-	$(BIN)/stillbed bench outages --count 1000 --seed 1 -o out/outages --force
+	$(BIN)/python -m tests.campaigns outages --count 1000 --seed 1 -o out/outages --force
 
 faults: $(STAMP)
-	$(BIN)/stillbed bench faults --count 10000 --seed 1 --jobs 2 --log out/faults.csv -o out/faults --force
+	$(BIN)/python -m tests.campaigns faults --count 10000 --seed 1 --jobs 2 --log out/faults.csv -o out/faults --force
 
 fuzz: $(STAMP)
-	$(BIN)/stillbed bench fuzz --count 1000000 --jobs 2 --log out/fuzz.csv -o out/fuzz --force
+	$(BIN)/python -m tests.campaigns fuzz --count 1000000 --jobs 2 --log out/fuzz.csv -o out/fuzz --force
 
 deceit: $(STAMP)
 	$(BIN)/python -m tests.campaigns.deceit --count 200 --seed 1 --jobs 2 --sheets -o out/deceit

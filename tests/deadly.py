@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from hardware.bench.campaigns.fuzz_process import Reader
+from tests.campaigns.fuzz_process import Reader
 
 
 def deadly_readers() -> dict[str, Reader]:

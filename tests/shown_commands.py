@@ -18,6 +18,8 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "PATH.csv": "path.csv",
     "B.toml": "board.toml",
     "X.mcap": "run.mcap",
+    "X.json": "run.json",
+    "X.html": "run.trace.html",
     "X.dot": "window.dot",
     "FOLDER": "sessions/monday",
     "/dev/ttyUSB0": "./serving",
@@ -75,8 +77,6 @@ WALKED = "tests/test_first_print.py runs it as it stands"
 VIRTUAL = "stillbed calibrate arm --virtual --places 5 --swing-s 2 --record try -o arm.toml"
 LINES = "stillbed calibrate dispenser dispenser.toml --virtual --lines 2 --record lines"
 WAVED = "stillbed calibrate cameras live.toml --board board.toml -o rig.toml --seconds 8 --no-page"
-FAULTS = "stillbed bench faults --count 1 --jobs 2 --log faults.csv -o out/faults"
-OUTAGES = "stillbed bench outages --count 1 --processes 1"
 INSTALLS = "makes an environment and runs what else is tested; that the target can be made is looked at"
 INSTEAD = {  # (what is run in its place, why)
     "stillbed bench arm-calibration": ("stillbed bench arm-calibration --rendered 0 --runs 1", LONG),
@@ -95,18 +95,9 @@ INSTEAD = {  # (what is run in its place, why)
         LONG,
     ),
     "stillbed bench estimator --soak 3 --maps seen": ("stillbed bench estimator --soak 0.001 --maps seen", LONG),
-    "stillbed bench faults": (FAULTS, LONG),
-    "stillbed bench faults --count 10000 --jobs 2 --log faults.csv -o out/faults": (FAULTS, LONG),
-    "stillbed bench faults --count 42 --seed 1": (FAULTS, LONG),
-    "stillbed bench faults --count 5663 --seed 1": (FAULTS, LONG),
-    "stillbed bench faults --count 10000 --jobs 2 --log faults.csv": (FAULTS, LONG),
     "stillbed bench fill CSV ...": ("stillbed bench fill contour.csv --count 2", LONG),
     "stillbed bench wounds": ("stillbed bench wounds --count 1", LONG),
-    "stillbed bench fuzz --count 1000000": ("stillbed bench fuzz --count 50", LONG),
-    "stillbed bench fuzz --count 20000": ("stillbed bench fuzz --count 50", LONG),
     "stillbed bench latency": ("stillbed bench latency sessions/monday", LONG),
-    "stillbed bench link --hours 24 --commands 0": ("stillbed bench link --hours 0.005 --commands 0", LONG),
-    "stillbed bench link --only guard --commands 1000000": ("stillbed bench link --only guard --commands 300", LONG),
     "stillbed bench live": (LIVE, STARTED),
     "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21": (KILLED, STARTED),
     "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21 --scenario data/live/small.toml": (KILLED, STARTED),
@@ -115,8 +106,6 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench loop": (LOOP, LONG),
     "stillbed bench loop -o OUT": (LOOP, LONG),
     "stillbed bench map": ("stillbed bench map --seconds 2", LONG),
-    "stillbed bench outages": (OUTAGES, LONG),
-    "stillbed bench outages --count 1000 --seed 1": (OUTAGES, LONG),
     "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
     "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 2", LONG),
     "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),

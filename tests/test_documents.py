@@ -13,6 +13,7 @@ import pytest
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import main, parser, subject_parser
 from tests.api_links import broken_links
+from tests.campaigns.__main__ import CAMPAIGNS
 from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
 from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 
@@ -35,6 +36,16 @@ def test_each_command_that_is_shown_is_taken_with_its_values() -> None:
     assert len(texts) > 30
     for text in texts:
         take(shlex.split(text)[1:])
+
+
+def test_each_campaign_that_is_named_is_taken_with_its_values() -> None:
+    texts = [ROOT / "Makefile", *DOCUMENTS]
+    named = [
+        line for file in texts for line in re.findall(r"-m tests\.campaigns (\w[^`#\n]*)", file.read_text("utf-8"))
+    ]
+    assert len(named) > 8
+    for words in map(shlex.split, named):
+        subject_parser(words[0], CAMPAIGNS[words[0]]).parse_args(words[1:])
 
 
 def take(words: list[str]) -> None:

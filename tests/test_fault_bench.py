@@ -16,13 +16,20 @@ import pytest
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.bench import fault_run
-from hardware.bench.campaigns import faults
-from hardware.bench.campaigns.faults import (
+from hardware.bench.fault_run import FaultRun, FaultRunRecord, Statement, prepare_scenario
+from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, fault_from_text
+from hardware.simulator.deposit import NozzleLog
+from tests.campaigns import faults
+from tests.campaigns.faults import (
+    CAMPAIGN_KINDS,
+    FAULT_SPACING,
+    FAULTS_A_RUN,
     MAX_DETECTION,
     MAX_ERROR_MM,
     MAX_RECOVERY,
     FaultRow,
     append_log,
+    draw_faults,
     fault_figures,
     fault_page,
     judge_fault,
@@ -30,18 +37,6 @@ from hardware.bench.campaigns.faults import (
     read_log,
     run_faults,
 )
-from hardware.bench.fault_run import (
-    CAMPAIGN_KINDS,
-    FAULT_SPACING,
-    FAULTS_A_RUN,
-    FaultRun,
-    FaultRunRecord,
-    Statement,
-    draw_faults,
-    prepare_scenario,
-)
-from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, fault_from_text
-from hardware.simulator.deposit import NozzleLog
 
 SCENARIOS = Path(__file__).parents[1] / "data" / "scenarios"
 STAMPS, ROWS = np.arange(0.0, 8.0, 0.02), np.arange(0.001, 8.0, 0.001)

@@ -48,7 +48,6 @@ ROOMS = (  # from the ground; a room imports rooms of earlier lines only, and no
     ("hardware.simulator",),
     ("hardware.live", "hardware.calibration", "hardware.plan"),
     ("hardware.bench",),
-    ("hardware.bench.campaigns",),
     ("hardware.cli",),
 )
 OWNERS = {  # library: the files that may import it
@@ -56,7 +55,6 @@ OWNERS = {  # library: the files that may import it
     "cv2": (
         "perception/*.py",
         "hardware/bench/estimator.py",  # OpenCV's own pose, to compare with
-        "hardware/bench/outage_run.py",  # what becomes of pictures in an outage
         "hardware/cameras/capture.py",  # VideoCapture: devices, streams, files, and their controls
         "hardware/cameras/inspection.py",  # draws the preview
         "hardware/files/images.py",

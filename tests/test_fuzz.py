@@ -14,10 +14,13 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, FrameStream, decode
-from hardware.bench.campaigns import fuzz
-from hardware.bench.campaigns import fuzz_process as fuzz_try
-from hardware.bench.campaigns.fuzz import PATH_TEXT, readers
-from hardware.bench.campaigns.fuzz_process import (
+from hardware.operator.broadcast import parse_message
+from hardware.process.checks import read_toml
+from hardware.process.faults import fault_from_text
+from tests.campaigns import fuzz
+from tests.campaigns import fuzz_process as fuzz_try
+from tests.campaigns.fuzz import PATH_TEXT, readers
+from tests.campaigns.fuzz_process import (
     Block,
     Reader,
     ReaderSum,
@@ -28,9 +31,6 @@ from hardware.bench.campaigns.fuzz_process import (
     read_log,
     run_tasks,
 )
-from hardware.operator.broadcast import parse_message
-from hardware.process.checks import read_toml
-from hardware.process.faults import fault_from_text
 from tests.deadly import deadly_readers
 
 READERS = readers()

@@ -15,7 +15,10 @@ from estimation.errors import InputError
 from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import Warp
-from hardware.bench.campaigns.guard import (
+from planning.command import MAX_FLOW, Command, Hold, MotionLimits, Move, Refusal, RefusalCode
+from planning.kinematics import SimpleArm, joints_from_axes
+from planning.motion.guard import Guard
+from tests.campaigns.guard import (
     SURFACE_REST,
     GuardRules,
     jointed_rules,
@@ -23,9 +26,6 @@ from hardware.bench.campaigns.guard import (
     random_log,
     simple_rules,
 )
-from planning.command import MAX_FLOW, Command, Hold, MotionLimits, Move, Refusal, RefusalCode
-from planning.kinematics import SimpleArm, joints_from_axes
-from planning.motion.guard import Guard
 from tests.slowly import slowly
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit

@@ -16,6 +16,7 @@ from estimation.se3 import Array
 from estimation.synthetic.movements import ComposedMotion
 from estimation.synthetic.world import BASE_FROM_REST
 from hardware.arm.profile import ArmProfile, placed
+from hardware.process.clock import SimClock
 from hardware.simulator.arm.settings import SerialWire
 from hardware.simulator.camera_pipeline import ARRIVAL_EVENT, EXPOSURE_EVENT, POSE_EVENT, TICK_EVENT, EventQueue
 from hardware.simulator.truth import Truth, TruthLog, row_instants
@@ -154,7 +155,7 @@ RANKS = (ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT)
 
 @given(st.lists(st.tuples(st.sampled_from([0.0, 0.02, 0.04, 1.5]), st.sampled_from(RANKS))))
 def test_actions_come_by_instant_then_rank_then_in_the_order_they_were_put(entries: list[tuple[float, int]]) -> None:
-    agenda, done = EventQueue(), list[tuple[float, int, int]]()
+    agenda, done = EventQueue(SimClock()), list[tuple[float, int, int]]()
     for i, (instant, rank) in enumerate(entries):
         agenda.at(instant, rank, lambda now, i=i, rank=rank: done.append((now, rank, i)))
     instants = list(agenda.run(lambda: np.inf))
@@ -167,7 +168,7 @@ def test_a_pose_that_becomes_known_on_a_tick_is_known_to_it() -> None:
 
 
 def test_what_is_due_at_the_end_or_later_is_not_done() -> None:
-    agenda, done = EventQueue(), list[float]()
+    agenda, done = EventQueue(SimClock()), list[float]()
     for instant in (0.0, 1.0, 2.0):
         agenda.at(instant, TICK_EVENT, done.append)
     assert list(agenda.run(lambda: 1.0)) == [0.0] and done == [0.0]
@@ -176,7 +177,7 @@ def test_what_is_due_at_the_end_or_later_is_not_done() -> None:
 
 
 def test_an_action_may_put_others_and_end_the_run() -> None:
-    agenda, end, done = EventQueue(), [10.0], list[float]()
+    agenda, end, done = EventQueue(SimClock()), [10.0], list[float]()
 
     def tick(now: float) -> None:
         done.append(now)

@@ -31,7 +31,6 @@ from hardware.files.path_file import ProgressWriter, read_progress, write_path, 
 from hardware.live.checklist import PrintTask, place_path, raised_path
 from hardware.live.frame_source import RING_SLOTS, FrameRing, RingSource, SourceEnded
 from hardware.live.ipc import schedule, turning_sets
-from hardware.live.motion_process import LAG_STEP, LiveMotion
 from hardware.live.outcome import FIRST_BIN_WIDTH, TIMELINE_BINS, ErrorTimeline
 from hardware.live.prepared import (
     RunFiles,
@@ -54,6 +53,8 @@ from hardware.live.settings import (
     settings_text,
 )
 from hardware.motion.loop import RecordedTick
+from hardware.motion.step import LAG_STEP, PrintMotion
+from hardware.process.clock import SimClock
 from hardware.process.faults import faults_from_texts
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
@@ -458,8 +459,8 @@ def test_a_lag_that_is_learned_anew_during_a_run_is_recorded_and_replayed_byte_b
     lags = {0: 0.076, 40: 0.05, 41: 0.02, 80: float("nan"), 90: 0.0205}
     now_known = lags[0]
     begin = BeginPrint(raster(), replace(PROFILE, lag=0.076 + PROFILE.frame_time), 0.0, {}, "x")
-    motion = LiveMotion(PROFILE, c_double(), None, lambda: now_known)
-    motion.begin(begin)
+    motion = PrintMotion(PROFILE, SimClock(), c_double(), None, lambda: now_known)
+    motion.begin(begin.path, begin.profile, begin.start, begin.outlets)
     changed, frames = [], []
     with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
         for name, text in input_texts(begin.path, begin.profile).items():
@@ -478,8 +479,8 @@ def test_a_lag_that_is_learned_anew_during_a_run_is_recorded_and_replayed_byte_b
     assert [k for k, _ in changed] == [40, 41] and LAG_STEP > 0.001
     replayed = [tick.frame for tick in replay_run(tmp_path / "x.mcap")]
     assert replayed == frames == [tick.recorded for tick in replay_run(tmp_path / "x.mcap")]
-    unchanged = LiveMotion(PROFILE, c_double(), None, lambda: 0.076)
-    unchanged.begin(begin)
+    unchanged = PrintMotion(PROFILE, SimClock(), c_double(), None, lambda: 0.076)
+    unchanged.begin(begin.path, begin.profile, begin.start, begin.outlets)
     others = [
         frame_from_command(unchanged(pose_at(breathing, t), t), PROFILE.dialect) for t in 10 + 0.02 * np.arange(120)
     ]

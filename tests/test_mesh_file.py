@@ -20,7 +20,6 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.scans.scan import Scan, ScanIndex, face_areas, face_normals
 from estimation.se3 import Array
-from hardware.bench.campaigns.fuzz import GLTF_TEXT, OFF_TEXT, PCD_HEADER
 from hardware.files import mesh_file
 from hardware.files.mesh_file import MeshFile, write_ply
 from hardware.files.mesh_file import read_mesh as read_mesh_apart
@@ -28,6 +27,7 @@ from hardware.files.mesh_file import read_raw_mesh as read_raw_mesh_apart
 from hardware.files.mesh_reader import MAX_LINE_BYTES, MAX_MESH_ROWS, STL_HEADER_BYTES, MeshReader, RawMesh, _ending
 from hardware.plan.order import in_mm
 from tests import scans
+from tests.campaigns.fuzz import GLTF_TEXT, OFF_TEXT, PCD_HEADER
 from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
 
 BALL = scans.ball(30.0, 12)

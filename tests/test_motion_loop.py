@@ -18,8 +18,9 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import BLIND_RESENDS, ArmState, LinkCode
 from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.bench.link import MotionPlan, MotionReport, motion_process
 from hardware.motion.loop import CommandedPose, MotionLoop, Order, Tick, TickMotion
-from hardware.motion.step import MotionPlan, MotionReport, MotionStep, motion_process
+from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.system import SharedLatest
 from hardware.process.ticks import Histogram

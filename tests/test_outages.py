@@ -17,18 +17,17 @@ from estimation.pose_solver import SharedFit
 from estimation.se3 import Array
 from estimation.synthetic.follow import Follower, first_map
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
-from hardware.bench.campaigns.outages import judge_outage, outage_figures, outage_table, scene_jobs
-from hardware.bench.outage_run import (
-    FRAME_RATE_HZ,
+from hardware.bench.estimator import FRAME_RATE_HZ, make_pictures
+from perception.frames import Image
+from tests.campaigns.outage_run import (
     Outage,
     OutageKind,
     Spoiler,
     TrackedStretch,
     WatchedOutage,
     draw_outage,
-    make_pictures,
 )
-from perception.frames import Image
+from tests.campaigns.outages import judge_outage, outage_figures, outage_table, scene_jobs
 from tests.slowly import slowly
 from tests.test_estimator import begun, lively, look, run_skewed, stamps, step
 

@@ -14,8 +14,6 @@ from estimation.pose import Trajectory
 from estimation.synthetic.world import arc_rig
 from hardware.arm.driver import G1
 from hardware.arm.protocol import encode
-from hardware.bench.campaigns import link as link_run
-from hardware.bench.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from hardware.bench.prediction import (
     POINTS_AROUND,
     PREDICTION_HORIZONS,
@@ -39,11 +37,14 @@ from hardware.bench.smoothing import (
     smooth_rendered,
 )
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import main, subject_parser
+from hardware.cli.main import subject_parser
 from hardware.files.folder_tables import write_tum
 from hardware.live.prerender import cached
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
 from perception import shipped_file
+from tests.campaigns import link as link_run
+from tests.campaigns.__main__ import main as campaigns
+from tests.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from tests.slowly import slowly
 from tests.synthetic import write_session
 from tests.virtual_arm import HOME
@@ -198,6 +199,6 @@ def test_faults_come_in_order_and_the_motion_begins_at_home() -> None:
 
 
 def test_the_command_prints_its_table(capsys: pytest.CaptureFixture[str], short: None) -> None:
-    assert main(["bench", "link", "--hours", "0.001", "--commands", "300"]) == 0
+    assert campaigns(["link", "--hours", "0.001"]) == campaigns(["guard", "--commands", "300"]) == 0
     text = capsys.readouterr().out
     assert "commands that found the queue full" in text and "that break a limit and passed" in text

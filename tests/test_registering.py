@@ -20,8 +20,14 @@ from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.scene.shape import Deformation, Shape, Wound, body, cylinder, flat
-from hardware.simulator.truth import Truth, divide_path, drape_path
-from hardware.simulator.world import MIN_REGISTRATION_TRACKS, surface_points, truth_from_estimate
+from hardware.simulator.truth import (
+    MIN_REGISTRATION_TRACKS,
+    Truth,
+    divide_path,
+    drape_path,
+    surface_points,
+    truth_from_estimate,
+)
 from planning.path import check_path, way_lengths
 from tests.moving import path_through, raster
 

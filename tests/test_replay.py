@@ -116,7 +116,8 @@ def test_the_two_files_say_the_same(tmp_path: Path) -> None:
     commands: list[Command] = []
     with CommandWriter(tmp_path) as writer:
         for _, command in replay(poses(breathing, 10.0), MotionStep(raster())):
-            writer.write(command, frame_from_command(command))
+            writer.write(command)
+            writer.send(frame_from_command(command))
             commands.append(command)
             assert (tmp_path / "frames.bin").stat().st_size == 48 * len(commands)  # nothing is kept back
     rows, frames = read(tmp_path)

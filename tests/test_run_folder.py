@@ -14,11 +14,13 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.arm.device import DONE, ArmState, ArmStatus
 from hardware.files.arm_file import read_arm
 from hardware.files.folder_tables import SessionFolderWriter, read_tum
 from hardware.files.images import encode
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import read_poses
+from hardware.motion.loop import Tick
 from hardware.recording.session_reader import open_session
 from hardware.simulator.cameras import Fate, Shot
 from hardware.simulator.deposit import planned_line
@@ -68,8 +70,15 @@ def feed(folder: RunFolder, count: int, offset: float = 0.0) -> None:
             folder.picture(shot(camera, number, offset), *picture(camera, number))
         stamp = 0.1 + number / 10
         folder.pose(frames(stamp), pose(stamp), report(stamp), 0.01)
-        folder.command(move(stamp, number > 3), progress(), bytes(48), b"")
+        folder.tick(tick(move(stamp, number > 3)), progress())
+        folder.wire(stamp, bytes(48), True)
         folder.rows(part(log, slice(100 * number + 1, 100 * number + 101)))
+
+
+def tick(command: Command) -> Tick:
+    nowhere = np.zeros(6)
+    status = ArmStatus(command.stamp, ArmState.ARMED, "", nowhere, None, 0.0, 0.0, 0.0, 0.0, 0, 1, 0, 0)
+    return Tick(command.stamp, command, bytes(48), 0.0, status, DONE)
 
 
 def frames(stamp: float) -> FrameSet:
@@ -161,7 +170,7 @@ def test_the_pictures_to_show_are_of_the_printing_where_there_is_one(tmp_path: P
         assert folder.pictures == {c: picture(c, 2)[1] for c in range(3)}
         folder.command(move(0.4, True), progress(), bytes(48), b"")
         folder.picture(shot(0, 3), *picture(0, 3))
-        folder.command(Hold(0.5, 0.001, "blind"), progress(), bytes(48), b"")
+        folder.tick(tick(Hold(0.5, 0.001, "blind")), progress())
         folder.picture(shot(0, 4), *picture(0, 4))
         assert folder.pictures[0] == picture(0, 3)[1]
 
@@ -192,7 +201,7 @@ def test_changes_of_state_and_holds_are_told_once_each(tmp_path: Path) -> None:
             folder.pose(frames(0.1 + i), pose(0.1 + i, state), report(0.1 + i), 0.0)
         commands: list[Command] = [move(0.1, True), *(Hold(0.2 + i, 0.001, "blind") for i in range(3)), move(4.0, True)]
         for command in [*commands, Hold(5.0, 0.001, "blind")]:
-            folder.command(command, progress(), bytes(48), b"")
+            folder.tick(tick(command), progress())
     state_words = [text.split(":")[0] for text in told if not text.startswith("hold")]
     assert state_words == [s.value for s in (TrackState.TRACKING, TrackState.LOST, TrackState.TRACKING)]
     assert [text for text in told if text.startswith("hold")] == ["hold: blind"] * 2

@@ -11,8 +11,10 @@ import pytest
 import perception as shipped
 from estimation.errors import InputError
 from hardware.bench.subjects import SUBJECTS
+from hardware.cli.main import subject_parser
 from perception import named_path, shipped_file
 from tests.audit import NOBODY, NONE, SOME, main, told
+from tests.campaigns.__main__ import CAMPAIGNS
 from tests.hazard_table import DOCUMENT, document, failed, hazards, missing
 
 ROOT = Path(__file__).parents[1]
@@ -98,12 +100,16 @@ def test_every_hazard_has_a_control_and_tests_that_are_there() -> None:
         assert not missing(each.tests), each.id
 
 
-def test_every_figure_is_measured_by_a_subject_of_the_bench() -> None:
+def test_every_figure_is_measured_by_a_bench_or_a_campaign() -> None:
     for each in hazards():
         assert bool(each.figure) == bool(each.command), each.id
         if each.command:
-            program, verb, subject = each.command.split()[:3]
-            assert (program, verb) == ("stillbed", "bench") and subject in SUBJECTS, each.id
+            words = each.command.split()
+            if words[:2] == ["stillbed", "bench"]:
+                subject_parser(words[2], SUBJECTS[words[2]]).parse_args(words[3:])
+            else:
+                assert words[:3] == ["python", "-m", "tests.campaigns"], each.id
+                subject_parser(words[3], CAMPAIGNS[words[3]]).parse_args(words[4:])
 
 
 def test_a_test_that_is_not_there_or_skipped_or_failed_is_found(tmp_path: Path) -> None:

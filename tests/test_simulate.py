@@ -15,6 +15,8 @@ from estimation.errors import InputError
 from estimation.online.surface_state import StateSettings
 from estimation.rig import pixels_from_points
 from estimation.synthetic.world import BASE_FROM_REST
+from hardware.arm.driver import G1, Pause
+from hardware.arm.protocol import decode
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
 from hardware.files.folder_tables import read_tum
@@ -153,7 +155,11 @@ def test_poses_are_those_of_the_told_surface_and_tracked(recorded: Path) -> None
 def test_the_frames_that_were_sent_are_those_of_the_commands(recorded: Path) -> None:
     out = recorded / "one"
     commands = out.joinpath("commands.csv").read_text().splitlines()[1:]
-    assert out.joinpath("frames.bin").stat().st_size == 48 * len(commands)
+    data, moves = out.joinpath("frames.bin").read_bytes(), [row for row in commands if ",move," in row]
+    frames = [decode(data[i : i + 48]) for i in range(0, len(data), 48)]
+    sent = iter([frame.axes[0] for frame in frames if isinstance(frame, G1)])
+    assert all(any(abs(x - float(row.split(",")[2])) < 1e-4 for x in sent) for row in moves)  # in their order
+    assert isinstance(frames[-1], Pause)  # the arm is stopped at the end
     table = read_nozzle(out / "nozzle.csv")
     assert np.allclose(table.stamps, np.arange(1, 1001) / 1000, atol=1e-9) and table.extrude.any()
 

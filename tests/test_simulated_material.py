@@ -115,12 +115,12 @@ def test_a_valve_gives_what_it_gives() -> None:
 
 
 def test_a_line_that_takes_nothing_stops_the_print_and_it_goes_on() -> None:
-    world, sink = printed(tuple(LATE.items()), ("dispenser block at 0.65s for 0.6s",))
+    world, sink = printed(tuple(LATE.items()), ("dispenser block at 0.65s for 1.5s",))
     model = world.dispensers.models[0]
     assert len(model.closed_itself) == 1 and 0.65 < model.closed_itself[0] < 0.8
     reasons = {command.reason for command in sink.commands}
     assert any("dispenser is failed: its line took nothing" in reason for reason in reasons)
-    assert sink.progress[-1].fraction == 3.0 and sink.log.flow[sink.log.stamps > 2.0].max() > 5.0
+    assert sink.progress[-1].fraction == 3.0 and sink.log.flow[sink.log.stamps > 2.5].max() > 5.0
 
 
 def test_a_hold_in_the_middle_of_a_bead_closes_at_once() -> None:

@@ -10,13 +10,17 @@ import pytest
 
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST as BASE_FROM_REST
+from hardware.arm.driver import Pause
+from hardware.arm.protocol import encode
+from hardware.motion.loop import Tick
+from hardware.process.ticks import EASE_RANGE
 from hardware.simulator.deposit import NozzleLog
 from hardware.simulator.nozzle_error import nozzle_lag
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.shape import Deformation
 from hardware.simulator.world import RUN_OUT
 from planning.command import TICK_FRACTION
-from planning.path import PrintPhase
+from planning.path import PrintPhase, PrintProgress
 from tests.slowly import slowly
 from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
 
@@ -31,18 +35,19 @@ def difference(log: NozzleLog) -> Array:
     return np.asarray((log.base_from_nozzle - log.base_from_target)[:, :3, 3])
 
 
+UNEVEN = 0.0015  # s by which ticks are off even instants while they fall into step with the poses
 EARLY = (1 - TICK_FRACTION) * 0.02  # s by which a move ends before the next begins, and the nozzle is ahead
 
 
 @pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
-def test_with_nothing_wrong_every_printed_row_is_within_5_um(motion: list[object], tmp_path: Path) -> None:
+def test_with_nothing_wrong_every_printed_row_is_within_7_um(motion: list[object], tmp_path: Path) -> None:
     write_path(tmp_path / "path.csv", [[-0.1, 0, 0], [0.1, 0, 0]], speed=0.2)  # no faster: starting is an error too
     file = write_scenario(tmp_path, IDEAL, motion=motion, seconds=9.5)
     log = heard(file).log
     assert log.extrude.sum() > 900
-    assert errors(file, log).distance[log.extrude].max() < 0.005
+    assert errors(file, log).distance[log.extrude].max() < 0.007
     turning = np.linalg.norm([4.0, -3.0, 5.0]) if motion == [TURNING] else 0.0  # deg/s
-    assert np.rad2deg(errors(file, log).angle[log.extrude].max()) < 0.001 + EARLY * turning
+    assert np.rad2deg(errors(file, log).angle[log.extrude].max()) < 0.001 + (EARLY + UNEVEN) * turning
 
 
 @pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
@@ -91,7 +96,7 @@ def test_an_unknown_delay_costs_speed_times_delay(change: dict[str, object], del
 )
 def test_what_the_loop_knows_of_costs_nothing_at_constant_speed(change: dict[str, object], tmp_path: Path) -> None:
     log = heard(write_scenario(tmp_path, IDEAL, change, motion=[STEADY], seconds=5.0)).log
-    assert np.linalg.norm(difference(log)[inner(log)], axis=1).max() < 0.005
+    assert np.linalg.norm(difference(log)[inner(log)], axis=1).max() < 0.007
 
 
 @pytest.mark.parametrize("offset", [0.016, *slowly(-0.016)])
@@ -165,9 +170,8 @@ def test_a_pose_is_known_no_sooner_than_exposure_transport_and_processing_allow(
     cameras = {"start_s": 0.1, "exposure_s": 0.01, "transport_s": 0.1}
     sink = heard(write_scenario(tmp_path, IDEAL, {"cameras": cameras, "tracking": {"processing_s": 0.033}}))
     known = 0.1 + 0.005 + 0.1 + 0.033
-    ticks = np.arange(100) * 0.02
-    assert sink.commands[0].stamp == pytest.approx(ticks[ticks >= known][0])
-    assert np.allclose(np.diff([c.stamp for c in sink.commands]), 0.02)
+    assert known <= sink.commands[0].stamp < known + 0.02
+    assert np.diff([c.stamp for c in sink.commands]).mean() == pytest.approx(0.02, rel=EASE_RANGE[1])
     assert set(sink.log.reason[sink.log.stamps <= sink.commands[0].stamp]) == {"no surface is followed yet"}
 
 
@@ -213,13 +217,15 @@ def test_the_line_carries_every_frame_to_the_arm(tmp_path: Path) -> None:
     world = world_of(read_scenario(write_scenario(tmp_path, IDEAL)), sink := Heard(), line)
     world.run()
     assert b"".join(passed) == sink.sent
-    assert len(sink.sent) == 48 * len(sink.commands)
-    assert world.arm.frames == len(sink.commands)
+    sent = [sink.sent[i : i + 48] for i in range(0, len(sink.sent), 48)]
+    others = iter(sent)
+    assert all(tick.frame in others for tick in sink.ticks if tick.frame)  # in their order
+    assert world.arm.frames == len(sent) > 80 and sent[-1] == encode(Pause())  # it is stopped at the end
 
 
 def test_what_the_arm_answers_reaches_the_sink(tmp_path: Path) -> None:
     sink = heard(write_scenario(tmp_path, IDEAL, {"arm": {"replies": "stream", "reply_period_s": 0.05}}))
-    assert len(sink.received) == pytest.approx(27 * 2.0 / 0.05, abs=27)
+    assert len(sink.received) == pytest.approx(27 * 2.1 / 0.05, abs=27 * 3)
 
 
 def with_faults(folder: Path, *faults: str) -> tuple[Heard, NozzleLog]:
@@ -255,7 +261,7 @@ def test_a_lost_frame_is_an_error_for_a_moment(tmp_path: Path) -> None:
     late = log.stamps[inner(log) & (distance > 0.05)]
     assert 1.0 <= late[0] < 1.1
     assert 0.05 < distance[inner(log)].max() < 0.25  # a tick of 5 mm/s is 0.1 mm
-    assert len(sink.sent) == 48 * len(sink.commands)
+    assert all(len(tick.frame) == 48 for tick in sink.ticks[1:])  # the link cannot know
 
 
 def test_a_garbled_frame_does_not_end_the_run(tmp_path: Path) -> None:
@@ -314,10 +320,10 @@ def test_cut_short_the_rows_until_then_are_given_out(tmp_path: Path) -> None:
 
 def test_cut_short_within_a_tick_the_rows_until_then_are_given_out(tmp_path: Path) -> None:
     class Interrupting(Heard):
-        def command(self, *told: object) -> None:
+        def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
             if len(self.commands) == 40:
                 raise KeyboardInterrupt
-            super().command(*told)
+            super().tick(tick, progress)
 
     scenario = replace(read_scenario(write_scenario(tmp_path, IDEAL)), seconds=2.0)
     world = world_of(scenario, sink := Interrupting())

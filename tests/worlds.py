@@ -15,6 +15,7 @@ from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.files.path_file import read_path
+from hardware.motion.loop import Tick
 from hardware.process.clock import SimClock
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
@@ -54,6 +55,7 @@ class Heard:
         self.pictures: list[tuple[Shot, str, bytes]] = []
         self.frames: list[FrameSet] = []
         self.poses: list[SurfacePose] = []
+        self.ticks: list[Tick] = []
         self.commands: list[Command] = []
         self.progress: list[PrintProgress] = []
         self.heads: list[tuple[float, PrintHead]] = []
@@ -72,11 +74,20 @@ class Heard:
         self.frames.append(frames)
         self.poses.append(pose)
 
-    def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
-        self.commands.append(command)
-        self.progress.append(progress)
-        self.sent += frame
-        self.received += received
+    def given(self, pose: SurfacePose) -> None:
+        pass
+
+    def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
+        if progress is not None:
+            self.ticks.append(tick)
+            self.commands.append(tick.command)
+            self.progress.append(progress)
+
+    def wire(self, stamp: float, data: bytes, sent: bool) -> None:
+        if sent:
+            self.sent += data
+        else:
+            self.received += data
 
     def rows(self, log: NozzleLog) -> None:
         self.logs.append(log)

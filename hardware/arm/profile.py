@@ -14,6 +14,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import ArmDriver, ByteListener
 from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
+from hardware.process.ticks import tick_in_step
 from perception.frames import SYRINGE, check_profile
 from planning.command import MotionLimits
 from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
@@ -93,6 +94,15 @@ def at_baud(profile: ArmProfile, baud: int) -> ArmProfile:
     """
     wire = FRAME_LENGTH * BITS_PER_BYTE / baud if baud > 0 else 0.0
     return replace(profile, baud=baud, tick=max(profile.tick, wire), lag=profile.lag - profile.frame_time + wire)
+
+
+def in_step(profile: ArmProfile, interval: float) -> ArmProfile:
+    """The profile with a tick that is in step with poses `interval` s apart, if that is not much shorter than its own.
+
+    NaN where nobody knows the interval. No tick is shorter than two frames on the wire.
+    """
+    shortest = max(profile.tick / 2, 2 * profile.frame_time)
+    return replace(profile, tick=tick_in_step(profile.tick, interval, shortest))
 
 
 def measured_lag(profile: ArmProfile, lag: float) -> float:

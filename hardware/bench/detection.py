@@ -2,7 +2,7 @@
 
 `cameras`: frames that jitter, skip and carry offsets, put into sets as they arrive; what a frame costs.
 `bumps`: cameras bumped and lenses turned by little before a breathing surface, and neither. Tracks are drawn, not
-rendered: an hour of them passes in minutes. What bumps do in pictures, `bench outages` shows.
+rendered: an hour of them passes in minutes. What bumps do in pictures, `python -m tests.campaigns outages` shows.
 `steps`: how soon a movement of 300 um or 0.1 degree is flagged, and how often one that never was. Noise is that of fits
 to synthetic tracks at rest, which is linear in them: a white part, and one that lasts. Poses are drawn with it, so that
 an hour costs half a minute; the detector is the tracker's own.

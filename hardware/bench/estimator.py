@@ -1,7 +1,7 @@
 """Subjects `estimator` and `consistency`: are errors near their lower bound, and as large as the covariance says?
 
 `estimator` follows tracks of synthetic worlds, beside the Cramer-Rao bound and OpenCV's solvePnP, and soaks.
-`consistency` follows pictures: loops of the outages' scenes (outage_run.py), shown with fresh noise each time round.
+`consistency` follows pictures: loops of rendered scenes, shown with fresh noise each time round.
 Its errors are those after the constant transform at the first TRACKING pose; nothing is fitted over the run.
 """
 
@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,16 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from estimation.rig import Camera
+from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import FollowResult, Mapping, follow, follow_steps
-from estimation.synthetic.world import World, synthetic_world
+from estimation.synthetic.world import BASE_FROM_REST, World, arc_rig, synthetic_world
 from hardware.bench.figures import CONSISTENT_NEES, INSIDE_95, Figure, Target, at_least, at_most, rms, with_progress
-from hardware.bench.outage_run import FRAME_RATE_HZ, make_pictures
 from hardware.process.clock import CpuClock
-from hardware.simulator.scene.scene import rois
+from hardware.simulator.scene.appearance import Appearance
+from hardware.simulator.scene.scene import Scene, rois
+from hardware.simulator.scene.shape import Wound, cylinder, with_wound
+from hardware.simulator.watched_arm import PictureLoop, closed_motion
 from perception.frames import Frame, FrameSet
 from perception.tracking.step import TrackingStep
 
@@ -345,3 +348,34 @@ def consistency_figures(name: str, runs: list[SceneRun]) -> list[Figure]:
         Figure(f"{name}: claim of an axis", 1000 * sigma, "um"),
         Figure(f"{name}: measured", 100 * float(np.mean([r.share for r in runs])), "%", at_least(99)),
     ]
+
+
+FRAME_RATE_HZ = 30.0
+MOTION_SETS = 96  # frame sets of the motion's loop: a breath of 3.2 s
+LOOP_WOUND = Wound((40.0, 28.0))
+FAR_POSE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePictures:
+    """The pictures of one scene for all stretches."""
+
+    seed: int
+    rig: Rig
+    scene: Scene
+    near: PictureLoop  # of the motion at one place
+
+    @cached_property
+    def far(self) -> PictureLoop:
+        """And at another, rendered when it is needed first."""
+        return PictureLoop(self.scene, self.rig, self.near.poses @ FAR_POSE, self.seed + 1)
+
+
+def make_pictures(seed: int, period: int = MOTION_SETS, rig: Rig | None = None) -> ScenePictures:
+    """Render the loop of one scene, `period` frame sets, some 10 s for the default."""
+    rng = np.random.default_rng([seed, 61])
+    rig = arc_rig(size=(640, 360), focal=560.0) if rig is None else rig
+    shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), LOOP_WOUND, seed)
+    scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=seed)
+    poses = closed_motion(period, BASE_FROM_REST, rng, lively=period / MOTION_SETS)  # of one speed for any period
+    return ScenePictures(seed, rig, scene, PictureLoop(scene, rig, poses, seed))

@@ -7,7 +7,7 @@ arms the arm again where it was stopped.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path as File
 
@@ -16,31 +16,29 @@ import numpy as np
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
-from hardware.arm.link import Arm
-from hardware.arm.profile import LinkSettings
-from hardware.arm.s6h4d import S6H4D
+from hardware.arm.profile import in_step
 from hardware.files.path_file import read_path
 from hardware.live.checklist import silence_text
-from hardware.motion.loop import MotionLoop, Order, Tick
-from hardware.motion.step import MotionStep
+from hardware.motion.loop import Tick
+from hardware.offline.track import FrameSetStep
 from hardware.process.clock import SimClock
-from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner, faults_striking
-from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults, VirtualDevice
+from hardware.process.faults import Fault
 from hardware.simulator.arm.settings import ReplyMode
-from hardware.simulator.camera_pipeline import CameraPipeline, EventQueue, Exposures
+from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
-from hardware.simulator.deposit import NozzleLog
-from hardware.simulator.material import DispensedMotion, SimulatedDispenser, SimulatedDispensers
+from hardware.simulator.deposit import NozzleLog, join_logs
+from hardware.simulator.material import SimulatedDispenser
 from hardware.simulator.scenario import Scenario, TrackingSettings, read_scenario
 from hardware.simulator.scenario_tables import bare_scene
 from hardware.simulator.scene.shape import Shape
 from hardware.simulator.simulate import LandmarkTracker
-from hardware.simulator.truth import Truth, TruthLog, disturbed_motion, drape_path, fold_deformation, row_instants
+from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_deformation
+from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet
+from perception.tracking.step import StepReport
 from planning.command import MotionLimits, Move
 from planning.kinematics import axes_from_nozzle
-from planning.path import Path, PrintPhase
+from planning.path import Path, PrintProgress
 
 AXES_LIMITS = "speed", "acceleration", "jerk", "jump", "turn"
 LIMIT_SLACK = 1.001  # a sample counts as over a limit from 0.1 % on
@@ -80,12 +78,9 @@ class AxesOracle:
         self.worst = np.maximum(self.worst, np.where(np.isfinite(shares), shares, np.inf))
 
 
-POLL_PERIOD = 0.005  # s between polls of the line
 MAIN_PERIOD = 0.02  # s between the main process's checks of the others
 START_HEIGHT = 3.0  # mm over its first checkpoint, where the nozzle begins
-WATCHED_AFTER_KILL = 1.5  # s that the rest of the world goes on without the motion
-ORDER_PERIOD = 0.3  # s between an operator's orders
-FAULT_FREE_S, MAX_RUN_S = 3.0, 30.0  # s: nothing goes wrong until then; of a run at most
+MAX_RUN_S = 30.0  # of a run at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +103,9 @@ def prepare_scenario(file: File) -> PreparedScenario:
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, shape.surface_from_grid)
     tracking = TrackingSettings(pictures=False, tracks=True)
     answering = replace(scenario.arm, replies=ReplyMode.STREAM)
-    plain = replace(scenario, tracking=tracking, arm=answering, known_rig=scenario.rig, seconds=MAX_RUN_S)
-    return PreparedScenario(plain, shape, truth, path)
+    profile = in_step(scenario.profile, scenario.cameras.period)
+    plain = replace(scenario, tracking=tracking, arm=answering, known_rig=scenario.rig, profile=profile)
+    return PreparedScenario(replace(plain, seconds=MAX_RUN_S, nozzle=False, beads=False), shape, truth, path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,149 +135,75 @@ class FaultRunRecord:
     seen_to: list[float] = field(default_factory=list)  # s, at which an operator made a dispenser ready again
 
 
-class _KilledError(Exception):
-    """The motion process has ended."""
-
-
-class _NoSink:
-    """Takes what cameras and tracker produce, and does nothing with it."""
-
-    picture = head = pose = event = staticmethod(lambda *data, **named: None)
-
-
 class FaultRun:
     """One run with faults, from the first frame until the path is printed, the motion is killed, or `MAX_RUN_S`."""
 
     def __init__(
-        self, on: PreparedScenario, faults: Sequence[Fault], seed: int, dispenser: SimulatedDispenser | None = None
+        self,
+        on: PreparedScenario,
+        faults: Sequence[Fault],
+        seed: int,
+        dispenser: SimulatedDispenser | None = None,
+        change: Callable[[SurfacePose], SurfacePose] | None = None,
     ) -> None:
-        """dispenser: instead of the scenario's own."""
-        self._events, self._clock = EventQueue(), SimClock()
-        scenario = replace(on.scenario, faults=tuple(faults), seed=seed)
+        """dispenser: instead of the scenario's own. change: what the motion is given in place of each pose."""
         fold = fold_deformation("faults", on.truth.deformation, faults)
         deformation, strain = (on.truth.deformation, on.truth.strain) if fold is None else fold
         motion = disturbed_motion(on.truth.motion, faults)
-        self._truth = replace(on.truth, motion=motion, deformation=deformation, strain=strain)
+        truth = replace(on.truth, motion=motion, deformation=deformation, strain=strain)
+        # home is over the first checkpoint: the way there is not what is judged
+        over = on.path.surface_from_nozzle[:1].copy()
+        over[:, :3, 3] += START_HEIGHT * over[:, :3, 2]
+        arm = on.scenario.profile.arm
+        home = axes_from_nozzle(arm, truth.base_from_surface(np.zeros(1)) @ over)[0]
+        profile = replace(on.scenario.profile, arm=replace(arm, home=home))
+        dispenser = on.scenario.dispenser if dispenser is None else dispenser
+        scenario = replace(on.scenario, faults=tuple(faults), seed=seed, profile=profile, dispenser=dispenser)
         shots: Exposures = {}
 
         def shot(camera: int, stamp: float) -> Shot:
             return shots[camera, stamp]
 
-        step = LandmarkTracker(scenario.rig, scenario.known_rig, self._truth, on.shape, shot, seed)
-        self._cameras = CameraPipeline(scenario, self._events, step, shots, _NoSink(), SimClock(), self._receive_pose)
-        # home is over the first checkpoint: the way there is not what is judged
-        over = on.path.surface_from_nozzle[:1].copy()
-        over[:, :3, 3] += START_HEIGHT * over[:, :3, 2]
-        arm = scenario.profile.arm
-        home = axes_from_nozzle(arm, self._truth.base_from_surface(np.zeros(1)) @ over)[0]
-        self._profile = replace(scenario.profile, arm=replace(arm, home=home))
-        self._virtual = VirtualArm(scenario.arm, self._profile.dialect, home, faults, self._profile.baud)
-        self._device = VirtualDevice(self._virtual, self._clock, self._profile.baud)
-        self._arm = Arm(S6H4D(self._device, self._profile), self._profile, 0.0, LinkSettings(poll=POLL_PERIOD))
-        self._faults = faults
-        dispenser = scenario.dispenser if dispenser is None else dispenser
-        self._dispensers = SimulatedDispensers(on.path, dispenser, self._clock, faults, scenario.path)
-        self._dispensers.control.begin(0.0, 0.0)
-        motion_step = MotionStep(on.path, self._profile, outlets=self._dispensers.outlets)
-        self._motion = DispensedMotion(motion_step, self._dispensers.control)
-        self._truth_log = TruthLog(on.path, scenario.true_arm, self._truth, self._profile.tick, self._profile.lag)
-        self._hangs = faults_striking(faults, FaultPart.MOTION)
-        self._pose: SurfacePose | None = None
-        self._order_at, self._stands = -np.inf, False
-        self._interval = scenario.cameras.period
+        step: FrameSetStep = LandmarkTracker(scenario.rig, scenario.known_rig, truth, on.shape, shot, seed)
+        if change is not None:
+            step = _ChangedStep(step, change)
+        self._world = SimulatedWorld(scenario, None, on.path, truth, step, shots, self, SimClock())
+        self._world.every(MAIN_PERIOD, self._look_at_others)
+        self._profile, self._interval = profile, scenario.cameras.period
         self._ticked = self._posed = np.inf  # s, the last tick of the motion and pose of the tracking
-        self._main_check = 0.0  # s, the main process's next check
-        self._oracle, self._sent_at = AxesOracle(home, self._profile.limits, self._profile.tick), -np.inf
-        self._record = FaultRunRecord()
+        self._pose: SurfacePose | None = None  # the newest that the motion was given
+        self._oracle, self._sent_at = AxesOracle(home, profile.limits, profile.tick), -np.inf
+        self._record, self._logs = FaultRunRecord(), list[NozzleLog]()
 
     def __call__(self) -> FaultRunRecord:
         """Run it."""
-        self._cameras.begin()
-        material, poses = self._dispensers.control, lambda: self._pose
-        loop = MotionLoop(self._motion, self._arm, self, poses, self._orders, self._note, material=material)
-        try:
-            loop.run(MAX_RUN_S)
-        except _KilledError:
-            self._device.faults = PortFaults(away=[(self._clock.now(), np.inf)])
-            self._advance(self._clock.now() + WATCHED_AFTER_KILL)
-        record = self._record
-        record.ended = self._clock.now()
-        self._virtual.advance(record.ended)
-        self._dispensers.advance(record.ended)
-        times = row_instants(0.0, record.ended)
-        record.log = self._truth_log.rows(times, self._virtual.axes_at, self._dispensers.flow)
-        record.seen_to = self._motion.seen_to
-        record.told_outside = self._dispensers.told_outside(record.ended, self._left_alone)
-        record.left_open = self._dispensers.open_after(self._left_alone, record.ended)
+        world, record = self._world, self._record
+        world.run()
+        record.ended, record.log, record.seen_to = world.ended, join_logs(self._logs), world.seen_to
+        record.told_outside, record.left_open = world.told_outside, world.left_open
         record.over = int(self._oracle.over.sum())
         return record
 
-    @property
-    def _left_alone(self) -> list[tuple[float, float]]:
-        """From, until, s: when nobody could tell a dispenser anything."""
-        lines = faults_striking(self._faults, FaultPart.DISPENSER)
-        return [(fault.start, min(fault.end, MAX_RUN_S)) for fault in (*lines, *self._hangs)]
+    def _look_at_others(self, now: float) -> None:
+        """What a live run's main process notices of the others."""
+        motion = silence_text("motion", self._ticked, self._profile.tick, now)
+        if text := motion or silence_text("tracking", self._posed, self._interval, now):
+            self._record.timeouts.append(Statement(now, text, False, False, now))
 
-    # -- the clock of the motion: while it waits, the rest of the world goes on
+    # -- what the world tells
 
-    def now(self) -> float:
-        """Instant, s."""
-        return self._clock.now()
+    def given(self, pose: SurfacePose) -> None:
+        """The motion was given a pose."""
+        self._pose, self._posed = pose, self._world.now()
 
-    def wait_until(self, instant: float) -> None:
-        """Let the world go on until `instant`, s, or for as long as the motion hangs."""
-        if self._arm.state is not ArmState.ARMED:
-            self._dispensers.forbid(self._clock.now())
-        self._advance(instant)
-        for fault in self._hangs:
-            if fault.covers(self._clock.now()):
-                if fault.kind is FaultKind.KILL or fault.end >= MAX_RUN_S:
-                    self._dispensers.cut()
-                    raise _KilledError
-                self._advance(fault.end)
-        if self._motion.progress.phase is PrintPhase.FINISHED:
-            raise _KilledError
-
-    def _advance(self, instant: float) -> None:
-        while self._main_check <= instant:
-            self._pass(self._main_check)
-            # what a live run's main process notices of the others
-            motion = silence_text("motion", self._ticked, self._profile.tick, self._main_check)
-            if text := motion or silence_text("tracking", self._posed, self._interval, self._main_check):
-                self._record.timeouts.append(Statement(self._main_check, text, False, False, self._main_check))
-            self._main_check += MAIN_PERIOD
-        self._pass(instant)
-
-    def _pass(self, instant: float) -> None:
-        for _ in self._events.run(lambda: instant):
-            pass
-        self._clock.wait_until(instant)
-
-    # -- what the motion is given, and what it does
-
-    def _receive_pose(self, pose: SurfacePose, frames: FrameSet, report: object) -> None:
-        self._pose, self._posed = pose, self._clock.now()
-
-    def _orders(self) -> list[Order]:
-        """An operator's: the arm stands at home, is armed once there is a pose, and again where it was stopped."""
-        now = self._clock.now()
-        if not self._stands:
-            self._stands = True
-            return [Order.AT_HOME]
-        if self._pose is None or self._pose.state is not TrackState.TRACKING or now < self._order_at + ORDER_PERIOD:
-            return []
-        self._order_at = now
-        return [Order.ARM] if self._arm.state in (ArmState.STOPPED, ArmState.DISARMED) else []
-
-    def _note(self, tick: Tick) -> None:
-        record, pose = self._record, self._pose
-        self._ticked = self._clock.now()
+    def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
+        """A tick was made, and how far the print is by it."""
+        record, pose, link = self._record, self._pose, self._world.link
+        self._ticked = self._world.now()
         anew = bool(record.statements) and record.statements[-1].hold is not LinkCode.STOPPED
         if tick.status.state is ArmState.STOPPED and (not record.stopped or (anew and tick.stamp > record.stopped[-1])):
             record.stopped.append(tick.stamp)
-        self._truth_log.write(tick.command, self._motion.progress)
-        self._dispensers.note(tick.command, self._profile.tick)
-        if tick.stamp - self._sent_at > 1.5 * self._profile.tick or self._arm.travels:
+        if tick.stamp - self._sent_at > 1.5 * self._profile.tick or link.travels:
             self._oracle.rest()  # a tick that sends nothing, just after one that did, is no rest yet
         if tick.recalled is not None:
             self._oracle.stands(tick.recalled.stands)
@@ -293,48 +215,31 @@ class FaultRun:
         if pose is not None:
             reservation = pose.reason or ("" if pose.state is TrackState.TRACKING else pose.state.value)
             pose_stamp = pose.stamp
-        text, own = tick.command.reason or reservation, self._arm.travels or tick.hold is LinkCode.RECALLED
+        text, own = tick.command.reason or reservation, link.travels or tick.hold is LinkCode.RECALLED
         moving = isinstance(tick.command, Move)
         record.statements.append(Statement(tick.stamp, text, moving, own, pose_stamp, tick.hold))
 
+    def rows(self, log: NozzleLog) -> None:
+        """The next rows of the truth at the nozzle."""
+        self._logs.append(log)
 
-FAULT_SPACING, FAULTS_A_RUN = 2.6, 7  # s from one fault to the next, and faults of a run
-MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to have an effect, short enough to be over before the next
-FAULT_AMOUNTS = {  # of what has one, uniform in the logarithm
-    (FaultPart.CAMERA, FaultKind.SLOW): (0.03, 0.3),  # s
-    (FaultPart.CAMERA, FaultKind.BUMP): (2.0, 10.0),  # mm: what is less is no harm to three cameras
-    (FaultPart.CLOCK, FaultKind.JUMP): (0.05, 5.0),  # s
-    (FaultPart.TRACKING, FaultKind.SLOW): (5.0, 60.0),  # %
-    (FaultPart.ARM, FaultKind.SLOW): (30.0, 90.0),  # %
-    (FaultPart.SURFACE, FaultKind.FAST): (30.0, 200.0),  # mm/s
-    (FaultPart.SURFACE, FaultKind.FOLD): (0.5, 5.0),  # mm
-}
-CAMPAIGN_KINDS = [key for key, spec in FAULT_SPECS.items() if FaultRunner.SIMULATE in spec.runners]
-ENDING_KINDS = [key for key in CAMPAIGN_KINDS if key[1] is FaultKind.KILL]  # after which a run cannot go on
-PASSING_KINDS = [key for key in CAMPAIGN_KINDS if key not in ENDING_KINDS]
+    def _ignore(self, *data: object, **named: object) -> None:
+        pass
+
+    picture = head = pose = event = wire = registered = _ignore
 
 
-def draw_faults(seed: int, number: int) -> list[Fault]:
-    """The faults of a campaign's run; kinds take turns from run to run."""
-    rng = np.random.default_rng([seed, number, 83])
-    first = number * (FAULTS_A_RUN - 1)
-    keys = [PASSING_KINDS[k % len(PASSING_KINDS)] for k in range(first, first + FAULTS_A_RUN - 1)]
-    keys.append(ENDING_KINDS[number % len(ENDING_KINDS)])
-    return [_fault(key, FAULT_FREE_S + FAULT_SPACING * place, rng) for place, key in enumerate(keys)]
+class _ChangedStep:
+    """A tracking step whose poses are changed."""
 
+    def __init__(self, step: FrameSetStep, change: Callable[[SurfacePose], SurfacePose]) -> None:
+        self._step, self._change = step, change
+        self.last: StepReport
 
-def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generator) -> Fault:
-    def draw(low: float, high: float) -> float:
-        return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))), 3)
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        pose = self._change(self._step(frames))
+        self.last = self._step.last
+        return pose
 
-    start = round(slot + float(rng.uniform(0.0, 0.4)), 3)
-    duration = draw(MIN_DURATION, MAX_DURATION)
-    amount = draw(*FAULT_AMOUNTS[key]) if key in FAULT_AMOUNTS else 0.0
-    if key == (FaultPart.CLOCK, FaultKind.JUMP):
-        amount *= float(rng.choice([-1.0, 1.0]))
-    if key[1] is FaultKind.KILL:
-        duration = np.inf
-    if key in ((FaultPart.ARM, FaultKind.DROP), (FaultPart.ARM, FaultKind.GARBLE)) and rng.random() < 0.5:
-        duration = 0.0
-    number = int(rng.integers(3)) if key[0] is FaultPart.CAMERA else 0
-    return Fault(*key, start, duration, amount, number, int(rng.integers(10**6)))
+    def idle(self) -> None:
+        self._step.idle()

@@ -31,7 +31,7 @@ from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.bench import figures
-from hardware.bench.fault_run import FaultRun, PreparedScenario, prepare_scenario
+from hardware.bench.fault_run import FaultRun, prepare_scenario
 from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
 from hardware.bench.planner import LATE_DISPENSER, LED, NOT_LED, BeadsPrint, bead_figures, print_beads
 from hardware.bench.subjects import BREATHING
@@ -42,7 +42,6 @@ from hardware.report.report import HALF_CHART_WIDTH
 from hardware.simulator.nozzle_report import ends_chart
 from hardware.simulator.scenario import read_scenario
 from perception import shipped_file
-from perception.frames import FrameSet
 
 LONGEST_LAGS = (0.5, 1.0, 2.0, 4.0)  # s
 FORGETTING_FACTORS = (0.995, 0.9995)  # a sample
@@ -304,17 +303,6 @@ MOTION_INPUTS: dict[str, Callable[[], PoseChange]] = {
 }
 
 
-class LoopRun(FaultRun):
-    """A print without faults in which the motion is given changed poses."""
-
-    def __init__(self, on: PreparedScenario, change: PoseChange, seed: int) -> None:
-        super().__init__(on, (), seed)
-        self._change = change
-
-    def _receive_pose(self, pose: SurfacePose, frames: FrameSet, report: object) -> None:
-        super()._receive_pose(self._change(pose), frames, report)
-
-
 def run_loop(options: argparse.Namespace) -> list[Figure]:
     """Print every scenario in every way; with an output folder, the errors over time as a page."""
     if options.seed < 0:
@@ -331,7 +319,7 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
 
 def _print_case(seed: int, scenario: str, way: str) -> Print:
     prepared = prepare_scenario(shipped_file("scenarios", f"{scenario}.toml"))
-    log = LoopRun(prepared, MOTION_INPUTS[way](), seed)().log
+    log = FaultRun(prepared, (), seed, change=MOTION_INPUTS[way]())().log
     assert log is not None
     error = np.linalg.norm((log.base_from_nozzle - log.base_from_target)[:, :3, 3], axis=1)
     return Print(log.stamps, np.where(log.extrude, error, np.nan))

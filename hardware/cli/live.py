@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, arm_profile, positive, wrong_option
+from hardware.cli.parser import (
+    FAILED,
+    MODEL_HELP,
+    REGION_HELP,
+    Commands,
+    add_fault,
+    arm_profile,
+    positive,
+    wrong_option,
+)
 from hardware.process.clock import WallClock
 from perception import named_path
 
@@ -27,7 +36,6 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
 NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
-REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
 
@@ -70,6 +78,12 @@ def add_live(commands: Commands) -> None:
     add("--operator", metavar="NAME", help="who runs it, as recording and reports keep it")
     port = "show the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
     add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
+    add(
+        "--trace",
+        type=Path,
+        metavar="X.json",
+        help="where each frame set's time went, for Perfetto; see stillbed trace",
+    )
     add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
     add("--no-page", action="store_true", help="without it")
@@ -104,35 +118,35 @@ def add_record(commands: Commands) -> None:
     add("--force", action="store_true", help="overwrite the file")
 
 
-def add_scan(commands: Commands) -> None:
-    """Add the sub-command `scan`."""
+def add_trace(commands: Commands) -> None:
+    """Add the sub-command `trace`."""
     add = commands.add(
-        "scan",
-        _run_scan,
-        "scan the surface with the calibrated cameras themselves",
-        "Scan the surface with the calibrated cameras: it is tracked for a breath, and pictures of some instants are\n"
-        "fused into a mesh with colour and a standard deviation a vertex, in the surface frame of that session. What\n"
-        "two cameras do not see alike stays open. X.html beside it shows it from three sides, says how much of the\n"
-        "region was seen and how well, and where to put another camera. Ctrl-C fuses what was seen until then.",
-        "stillbed scan rig.toml -o wound.ply",
-        "stillbed scan try.mcap -o wound.ply --sets 12",
-        "stillbed scan data/scenarios/breathing_calm.toml -o wound.ply",
+        "trace",
+        _run_trace,
+        "where the time of a live run's slowest frame sets went",
+        "Read the trace in the recording of a live run: how long frame sets took from their pixels in memory to the\n"
+        "first move on the wire, and what the processes did meanwhile, for all sets and for the slowest hundredth.",
+        "stillbed trace run.mcap",
+        "stillbed trace run.mcap -o run.json --page run.trace.html",
     ).add_argument
-    what = "rig.toml or session.toml of live cameras, a scenario.toml, a session folder or an .mcap file"
-    add("source", type=named_path, metavar="RIG_OR_SESSION", help=what)
-    add("-o", "--out", type=Path, required=True, metavar="X.ply", help="file to write, with X.html beside it")
-    add("--sets", type=int, default=6, metavar="N", help="instants whose pictures are fused, 2 to 40; default 6")
-    add("--seconds", type=positive, default=4.0, metavar="S", help="in which they are taken; default 4, a breath")
-    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
-    add("--force", action="store_true", help="overwrite the files")
+    add("record", type=Path, metavar="X.mcap", help="the recording of a live run")
+    add("-o", "--out", type=Path, metavar="X.json", help="write it for Perfetto (ui.perfetto.dev), chrome://tracing")
+    add("--page", type=Path, metavar="X.html", help="write a page: the causes, and the slowest sets as lanes")
+    add("--force", action="store_true", help="overwrite these files")
 
 
-def _run_scan(a: argparse.Namespace) -> None:
-    from hardware.files.region_table import ANY_REGION, read_region
-    from hardware.live.surface_scan import ScanOrder, run_scan
+def _run_trace(a: argparse.Namespace) -> None:
+    from hardware.live.trace import chrome_trace, read_trace, trace_page, trace_text
 
-    region = ANY_REGION if a.region is None else read_region(a.region)
-    print(run_scan(ScanOrder(a.source, a.out, a.sets, a.seconds, region, a.force)))
+    for flag, file in (("--out", a.out), ("--page", a.page)):
+        if file is not None and file.exists() and not a.force:
+            raise wrong_option(flag, file, "a new file, or --force")
+    trace = read_trace(a.record)
+    print(trace_text(trace))
+    if a.out is not None:
+        a.out.write_text(chrome_trace(trace), encoding="utf-8")
+    if a.page is not None:
+        a.page.write_text(trace_page(trace, a.record.stem), encoding="utf-8")
 
 
 def _run_record(a: argparse.Namespace) -> int:
@@ -179,7 +193,9 @@ def _run_live(a: argparse.Namespace) -> int:
 
     faults = faults_from_texts("command line", "--fault", a.fault)
     flags = {name: getattr(a, name) for name in SETTINGS_FLAGS}
-    flags |= {"unattended": a.yes, "page": False if a.no_page else None}
+    flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": True if a.trace else None}
+    if a.trace is not None and a.trace.exists() and not a.force:
+        raise wrong_option("--trace", a.trace, "a new file, or --force")
     if a.region is not None:
         flags["region"] = read_region(a.region)
     if a.page_name is not None:
@@ -196,6 +212,10 @@ def _run_live(a: argparse.Namespace) -> int:
     with Console(a.open) as console:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)
+    if a.trace is not None:
+        from hardware.live.trace import chrome_trace, read_trace
+
+        a.trace.write_text(chrome_trace(read_trace(prepared.files.record)), encoding="utf-8")
     return outcome.code
 
 

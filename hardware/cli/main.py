@@ -18,9 +18,9 @@ from estimation.errors import StillbedError
 from hardware.bench.subjects import SUBJECTS, Subject, Subjects
 from hardware.cli.calibrate import add_calibrate
 from hardware.cli.dispenser import add_dispenser
-from hardware.cli.live import add_arm, add_cameras, add_init, add_live, add_record, add_scan
+from hardware.cli.live import add_arm, add_cameras, add_init, add_live, add_record, add_trace
 from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Parser, add_fault, error_text, wrong_option
-from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
+from hardware.cli.plan import add_plan, add_reach, add_scan, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
 from hardware.process.progress import left_files_text, prepare_out, write_error_text
@@ -75,7 +75,7 @@ def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS) -> N
 
 def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
     """The options of one subject: where to save, and its own."""
-    parser = Parser(prog=f"stillbed bench {name}", description=subject.summary)
+    parser = Parser(prog=f"{subject.program} {name}", description=subject.summary)
     parser.add_argument("-o", "--out", type=Path, help="folder for figures.json and figures.csv, new or empty")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     subject.add_options(parser)
@@ -220,9 +220,8 @@ def parser() -> Parser:
     commands = Commands(top, "COMMAND")
     for add in (
         _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_scan, add_plan, add_live,
-        add_record,
-        add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras, add_import, add_export,
-        add_train, add_bench, add_doctor, add_cache,
+        add_record, add_trace, add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras, add_import,
+        add_export, add_train, add_bench, add_doctor, add_cache,
     ):  # fmt: skip
         add(commands)
     return top

@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError, StillbedError
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, damage_code, not_negative, wrong_option
+from hardware.cli.parser import (
+    FAILED,
+    MODEL_HELP,
+    REGION_HELP,
+    Commands,
+    damage_code,
+    not_negative,
+    positive,
+    wrong_option,
+)
 from perception import named_path
 
 if TYPE_CHECKING:
@@ -311,6 +320,37 @@ def _run_train(arguments: argparse.Namespace) -> None:
     from hardware.simulator.scene.render import wound_view
 
     print(run_train(arguments, wound_view))
+
+
+def add_scan(commands: Commands) -> None:
+    """Add the sub-command `scan`."""
+    add = commands.add(
+        "scan",
+        _run_scan,
+        "scan the surface with the calibrated cameras themselves",
+        "Scan the surface with the calibrated cameras: it is tracked for a breath, and pictures of some instants are\n"
+        "fused into a mesh with colour and a standard deviation a vertex, in the surface frame of that session. What\n"
+        "two cameras do not see alike stays open. X.html beside it shows it from three sides, says how much of the\n"
+        "region was seen and how well, and where to put another camera. Ctrl-C fuses what was seen until then.",
+        "stillbed scan rig.toml -o wound.ply",
+        "stillbed scan try.mcap -o wound.ply --sets 12",
+        "stillbed scan data/scenarios/breathing_calm.toml -o wound.ply",
+    ).add_argument
+    what = "rig.toml or session.toml of live cameras, a scenario.toml, a session folder or an .mcap file"
+    add("source", type=named_path, metavar="RIG_OR_SESSION", help=what)
+    add("-o", "--out", type=Path, required=True, metavar="X.ply", help="file to write, with X.html beside it")
+    add("--sets", type=int, default=6, metavar="N", help="instants whose pictures are fused, 2 to 40; default 6")
+    add("--seconds", type=positive, default=4.0, metavar="S", help="in which they are taken; default 4, a breath")
+    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--force", action="store_true", help="overwrite the files")
+
+
+def _run_scan(a: argparse.Namespace) -> None:
+    from hardware.files.region_table import ANY_REGION, read_region
+    from hardware.live.surface_scan import ScanOrder, run_scan
+
+    region = ANY_REGION if a.region is None else read_region(a.region)
+    print(run_scan(ScanOrder(a.source, a.out, a.sets, a.seconds, region, a.force)))
 
 
 def scanned_settings(settings: LiveSettings, where: object, force: bool) -> LiveSettings:

@@ -8,18 +8,14 @@ from __future__ import annotations
 import math
 import signal
 from collections import deque
-from collections.abc import Callable
-from ctypes import c_double
-from dataclasses import replace
 from logging import WARNING
 from types import FrameType
 
 from estimation.errors import StillbedError
 from estimation.pose import SurfacePose
-from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings, measured_lag, open_arm
+from hardware.arm.profile import LinkSettings, open_arm
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared
@@ -38,113 +34,16 @@ from hardware.live.records import (
     StageTiming,
     WireEntry,
 )
+from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
-from hardware.motion.step import MotionStep
+from hardware.motion.step import PrintMotion
 from hardware.process.clock import WallClock
 from hardware.process.system import ask_for_real_time, set_up_process, take_messages
 from hardware.process.ticks import PoseLockedSchedule
-from planning.command import Command, Hold
-from planning.path import Path, PrintProgress
+from planning.path import Path
 
-PAUSED_REASON = "paused by the operator"
-WAITING_REASON = "no path was confirmed yet"
 MAX_REPORTED_EVENTS = 50  # the last ones
-LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
-
-
-class LiveMotion:
-    """The motion of a live run: holds until a path is begun, then a MotionStep that can be paused, or begun at home.
-
-    Where material cannot flow, the nozzle waits above the surface as in a pause.
-
-    last: the last command.
-    asked: whether planner and guard made it.
-    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
-    waits: whether they were told to wait above the surface.
-    material_in: whether the material that was wanted was put in since this was last reset.
-    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
-        tick, so that a replay is equal byte by byte.
-    """
-
-    last: Command
-
-    def __init__(
-        self,
-        profile: ArmProfile,
-        place: c_double,
-        material: MaterialControl | None = None,
-        measured: Callable[[], float] = lambda: math.nan,
-    ) -> None:
-        """measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps."""
-        self._profile, self._place, self._material, self._measured = profile, place, material, measured
-        self.waits = self.material_in = False
-        self._step: MotionStep | None = None
-        self._order: BeginPrint | None = None
-        self.paused = self.asked = False
-        self.begun = self.lag = math.nan
-
-    def begin(self, order: BeginPrint) -> None:
-        """Print this path from now on."""
-        self._order = order
-        self._make(order.start)
-
-    def homed(self) -> None:
-        """Begin anew at the same place of the path, as the arm stands at home."""
-        if self._step is not None:
-            self._make(self._step.progress.fraction)
-
-    def resume(self) -> None:
-        """Go on after a pause, with the dispenser made ready again."""
-        self.paused = False
-        self._prepare_material()
-
-    def put_in(self) -> None:
-        """The operator has put in the material that was wanted."""
-        if self._step is not None and self._step.progress.wanted:
-            self._step.material_in()
-            self.material_in = True
-            self._prepare_material()
-
-    def recalled(self, place: Array, stands: Array) -> None:
-        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
-        if self._step is not None:
-            self._step.recalled(place, stands)
-
-    @property
-    def progress(self) -> PrintProgress | None:
-        """How far the print is; None before a path was begun."""
-        return None if self._step is None else self._step.progress
-
-    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
-        """The command of the tick at `now`, s."""
-        self.asked = self._step is not None
-        if self._step is None:
-            self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
-            return self.last
-        dry = "" if self._material is None else self._material.reason
-        self._step.paused = self.waits = self.paused or bool(dry)
-        measured = self._measured()
-        lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
-        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
-        if not math.isnan(self.lag):
-            self._step.lag = lag
-        self.last = self._step(pose, now)
-        if self.waits and isinstance(self.last, Hold):
-            self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
-        self._place.value = self._step.progress.fraction
-        return self.last
-
-    def _make(self, start: float) -> None:
-        assert self._order is not None
-        self._step = MotionStep(self._order.path, self._order.profile, start, self._order.outlets)
-        self._place.value = self.begun = start
-        self.material_in = False
-        self._prepare_material()
-
-    def _prepare_material(self) -> None:
-        if self._step is not None and self._material is not None and not self._step.progress.wanted:
-            self._material.begin(self._step.progress.fraction, WallClock().now())
 
 
 class _OrderReceiver:
@@ -153,7 +52,7 @@ class _OrderReceiver:
     alone: whether the process that gives the orders is gone. fingerprint: of the path that was begun, "" before.
     """
 
-    def __init__(self, channels: MotionChannels, motion: LiveMotion, ticks: PoseLockedSchedule) -> None:
+    def __init__(self, channels: MotionChannels, motion: PrintMotion, ticks: PoseLockedSchedule) -> None:
         self._connection, self._requests, self._motion, self._ticks = channels.orders, channels.requests, motion, ticks
         self._last_stop = channels.requests.last_stop
         self.alone, self.fingerprint = False, ""
@@ -171,7 +70,7 @@ class _OrderReceiver:
                 orders.append(order)
             elif isinstance(order, BeginPrint):
                 self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
-                self._motion.begin(order)
+                self._motion.begin(order.path, order.profile, order.start, order.outlets)
             elif order is PauseOrder.MATERIAL_IN:
                 self._motion.put_in()
             elif order is PauseOrder.RESUME:
@@ -189,7 +88,7 @@ class _TickReporter:
     """Times the way from frames to the wire, records what passes the port, and reports each tick."""
 
     def __init__(
-        self, channels: MotionChannels, sender: RecorderSender, ticks: PoseLockedSchedule, priority: str
+        self, channels: MotionChannels, sender: RecorderSender, ticks: PoseLockedSchedule, priority: str, trace: bool
     ) -> None:
         self._poses, self._reports, self._sender, self._ticks = channels.poses, channels.reports, sender, ticks
         self._clock, self._priority = WallClock(), priority
@@ -197,14 +96,16 @@ class _TickReporter:
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
         self._handover: PoseHandover | None = None  # the newest
         self._unsent = False  # whether no move made of that pose went out yet
+        self._lane = TraceLane(MOTION_LANE, self._clock) if trace else None
+        self._seen = math.nan  # s, when the handover was seen here
         self.loop: MotionLoop | None = None
-        self.motion: LiveMotion | None = None
+        self.motion: PrintMotion | None = None
 
     def newest_pose(self) -> SurfacePose | None:
         """The newest pose there is."""
         handover = self._poses.get()
         if handover is not self._handover:
-            self._handover, self._unsent = handover, True
+            self._handover, self._unsent, self._seen = handover, True, self._clock.now()
             if handover is not None:
                 self._ticks.arrived(handover.sent)
         return None if handover is None else handover.pose
@@ -221,6 +122,10 @@ class _TickReporter:
             self._unsent = False
             self.times.add(FRAMES_TO_WIRE_STAGE, now - self._handover.handed)
             self.times.add(EXPOSURE_TO_WIRE_STAGE, now - self._handover.pose.stamp)
+            if self._lane is not None and self.loop is not None:
+                begun, handover = max(self.loop.begun, self._seen), self._handover
+                told = ("handed over", handover.sent, self._seen), ("waits for its tick", self._seen, begun)
+                self._sender.put(self._lane.entry(handover.pose.stamp, [*told, (ON_WIRE, begun, now)]))
         self._sender.put(WireEntry(now, data, sent))
 
     def report(self, tick: Tick) -> None:
@@ -269,8 +174,8 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
-    reporter = _TickReporter(channels, sender, ticks, priority)
-    motion = LiveMotion(profile, channels.place, material, reporter.arm_lag)
+    reporter = _TickReporter(channels, sender, ticks, priority, settings.trace)
+    motion = PrintMotion(profile, clock, channels.place, material, reporter.arm_lag)
     orders = _OrderReceiver(channels, motion, ticks)
     driver = open_arm(channels.url, profile, reporter.bytes_passed)
     try:

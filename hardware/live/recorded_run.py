@@ -142,7 +142,8 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     frames = other = 0
     with CommandWriter(out) as writer:
         for tick in _replay_ticks(run, inputs, record):
-            writer.write(tick.command, tick.frame)
+            writer.write(tick.command)
+            writer.send(tick.frame)
             frames += 1
             other += tick.frame != tick.recorded
     return ReplayCount(frames, other, run.damage)

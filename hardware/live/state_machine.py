@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from math import inf, isnan, nan
 
 from hardware.arm.device import ArmState
-from hardware.arm.profile import measured_lag
+from hardware.arm.profile import in_step, measured_lag
 from hardware.live.checklist import (
     PlacedPath,
     PrintTask,
@@ -36,7 +36,6 @@ from hardware.operator.view import (
     Wish,
     refusal,
 )
-from hardware.process.ticks import tick_in_step
 from planning.path import PrintPhase
 from planning.placement import PathPlacement
 
@@ -326,9 +325,7 @@ class RunStateMachine:
         self._begun = True
         task, profile, status = self.task, self.placed_path.profile, motion.tick.status
         path = self.placed_path.path if task.lift is None else raised_path(self.placed_path.path, task.lift)
-        lag = measured_lag(task.profile, status.lag)
-        tick = tick_in_step(profile.tick, interval, max(profile.tick / 2, 2 * profile.frame_time))
-        profile = replace(profile, lag=lag, tick=tick)
+        profile = replace(in_step(profile, interval), lag=measured_lag(task.profile, status.lag))
         return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint)]
 
     def _follow_print(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:

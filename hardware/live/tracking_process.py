@@ -19,15 +19,13 @@ from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.runtime import use_one_arena
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile
 from hardware.files.mesh_file import read_mesh
 from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
-from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
+from hardware.live.frame_source import CommandedHead, FrameSource, LiveCameraSource, RingSource, TimedFrameSet
 from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
-    LiveMotionReport,
     PoseEntry,
     PoseHandover,
     ScanEntry,
@@ -37,13 +35,12 @@ from hardware.live.records import (
     TrackingChannels,
     TrackingReport,
 )
-from hardware.motion.loop import CommandedPose
+from hardware.live.trace import QUEUE_STAGE, TRACKING_LANE, TraceLane, in_turn
 from hardware.offline.track import FrameSetStep, region_search, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock
 from hardware.process.system import (
-    SharedLatest,
     ask_to_go_first,
     pipe_closed,
     set_up_process,
@@ -52,7 +49,7 @@ from hardware.process.system import (
 )
 from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
-from perception.frames import FrameSet, PrintHead, Roi, region_since
+from perception.frames import FrameSet, Roi, region_since
 from perception.tracking.step import STAGES, TrackingStep
 from perception.tracking.wound_step import RegionTrackingStep
 from planning.placement import (
@@ -70,7 +67,7 @@ MAP_REFRESH_SETS = 15  # sets between two looks at the map for the page
 SHOWN_LANDMARKS = 300  # landmarks that the page shows, about
 INTERVAL_WINDOW = 31  # intervals between sets from which that of the cameras is estimated: a second of them
 HISTOGRAM_PERIOD = 30.0  # s between histograms in the recording
-EXPOSURE_STAGE, QUEUE_STAGE = "exposure to frames handed over", "frames wait for the tracker"
+EXPOSURE_STAGE = "exposure to frames handed over"
 TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
 TRUE_PLACE = "placed in the true frame of the simulated world"
@@ -150,8 +147,9 @@ class _TrackingLoop:
     ) -> None:
         self._prepared, self._channels, self._sender = prepared, channels, sender
         self._clock, self.times = WallClock(), StageHistograms()
-        self._commanded_head = _CommandedHead(channels.motion, prepared.task.profile)
+        self._commanded_head = CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
+        self._lane = TraceLane(TRACKING_LANE, self._clock) if prepared.settings.trace else None
         self._source: FrameSource
         self._step: TrackingStep | RegionTrackingStep
         self._outline: SurfaceOutline
@@ -263,9 +261,15 @@ class _TrackingLoop:
         self._show(frames, pose)
         self._record_region(frames.stamp)
         self._record(arrived, frames, pose)
+        told = self._clock.now()
         self._step.idle()
         self._source.learn(self._step.last.offsets)
-        self.times.add(AFTER_POSE_STAGE, self._clock.now() - sent)
+        ready = self._clock.now()
+        self.times.add(AFTER_POSE_STAGE, ready - sent)
+        if self._lane is not None:
+            waited, last = (QUEUE_STAGE, arrived.handed, start), ("map and idle work", told, ready)
+            stages = in_turn(start, STAGES, self._step.last.seconds)
+            self._sender.put(self._lane.entry(pose.stamp, [waited, *stages, ("page and record", sent, told), last]))
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""
@@ -382,19 +386,3 @@ class _TrackingLoop:
             self._histograms_recorded = now
             for entry in self.times.entries(now):
                 self._sender.put(entry)
-
-
-class _CommandedHead:
-    """Where the print head should be, by the newest commands of the motion process."""
-
-    def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
-        self._reports, self._commanded = reports, CommandedPose(profile)
-        self._last = -np.inf
-
-    def at(self, stamp: float) -> PrintHead | None:
-        """The head at `stamp`, s; commands between two looks are on a straight line, 40 ms at most."""
-        report = self._reports.get()
-        if report is not None and report.tick.stamp > self._last and report.progress is not None:
-            self._last = report.tick.stamp
-            self._commanded.add(report.tick.command, self._last)
-        return self._commanded.at(stamp)

@@ -74,7 +74,10 @@ class Tick:
 
 
 class MotionLoop:
-    """One motion on one arm. lateness: of its ticks. skipped: ticks left out, as their time had passed."""
+    """One motion on one arm.
+
+    lateness: of its ticks. skipped: ticks left out, as their time had passed. begun: s, when the last one was.
+    """
 
     def __init__(
         self,
@@ -95,7 +98,7 @@ class MotionLoop:
         """
         self.motion, self.arm = motion, arm
         self.lateness = Histogram()
-        self.skipped = 0
+        self.skipped, self.begun = 0, math.nan
         self._clock, self._pose, self._orders, self._report, self._homed = clock, pose, orders, report, homed
         profile, settings = arm.profile, arm.settings
         self.material = material
@@ -120,9 +123,10 @@ class MotionLoop:
                 pose = self._pose()
                 if now >= schedule.opens(pose is not self._last_pose):
                     self._last_pose = pose
-                    self._tick(pose, now, max(now, schedule.due))
+                    self._tick(pose, now, self._begins(now))
                     self.skipped += schedule.advance(self._clock.now())
-                self._clock.wait_until(min(schedule.due, self._clock.now() + self._poll_period))
+                switch = math.inf if self.material is None else self.material.due
+                self._clock.wait_until(min(schedule.due, switch, self._clock.now() + self._poll_period))
         finally:
             if self.material is not None:
                 self.material.off(self._clock.now())
@@ -164,9 +168,14 @@ class MotionLoop:
             self._homing = True
         return DONE
 
+    def _begins(self, now: float) -> float:
+        """For which instant, s, a tick is made at `now`: before it is due, when its move leaves the arm's queue."""
+        queued = now + self.arm.in_flight(now) - self.arm.profile.frame_time
+        return max(now, min(self._schedule.due, queued))
+
     def _tick(self, pose: SurfacePose | None, now: float, instant: float) -> None:
-        """Make at `now`, s, the tick for `instant`, s, which is later where its pose came early."""
-        late = max(now - self._schedule.due, 0.0)
+        """Make at `now`, s, the tick for `instant`, s."""
+        late, self.begun = max(now - self._schedule.due, 0.0), now
         self.lateness.add(late)
         frame = b""
         if recalled := self.arm.take_up() or self._refused:
@@ -296,6 +305,11 @@ class MaterialControl:
         flow = f"{self._told:.3g} mm^3/s" if current.profile.metered else "on"
         text = f"{self._material} by {current.profile.name}: {flow if self._told else 'off'}"
         return MaterialStatus(reason or text, not reason, failed)
+
+    @property
+    def due(self) -> float:
+        """When a switch is due that was asked for, s; infinite without one."""
+        return math.inf if self._pending is None else self._pending[0]
 
     def begin(self, place: float, now: float) -> None:
         """Make the dispenser ready whose material comes next at `place`, in checkpoints, and close the others."""

@@ -1,27 +1,22 @@
 """MotionStep: the newest surface pose in, the arm's next command out; no I/O and no clock of its own.
 
-The planner proposes a command and the guard passes it or turns it into a Hold; the arm's link encodes it.
-`motion_process` runs a MotionStep on an arm, without the recorder and the page of a live run. The motion's processes
-import this module: it must never load gtsam, cv2 or onnxruntime, as a call of gtsam was measured to stop every other
-thread for as long as it takes.
+The planner proposes a command and the guard passes it or turns it into a Hold; the arm's link encodes it. The motion's
+processes import this module: it must never load gtsam, cv2 or onnxruntime, as a call of gtsam was measured to stop
+every other thread for as long as it takes.
 """
 
 from __future__ import annotations
 
-import signal
-from collections import deque
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
-from types import FrameType
+import math
+from collections.abc import Callable
+from ctypes import c_double
+from dataclasses import replace
 
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.device import ArmEvent
-from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
-from hardware.motion.loop import MotionLoop, Order, Tick
-from hardware.process.clock import WallClock
-from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
+from hardware.arm.profile import ArmProfile, measured_lag
+from hardware.motion.loop import MaterialControl
+from hardware.process.clock import Clock
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
@@ -87,74 +82,105 @@ class MotionStep:
         return self._planner.progress
 
 
-MAX_REPORTED_EVENTS = 50
+PAUSED_REASON = "paused by the operator"
+WAITING_REASON = "no path was confirmed yet"
+LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionPlan:
-    """What is to be printed, and on which arm."""
+class PrintMotion:
+    """The motion of a print: holds until a path is begun, then a MotionStep that can be paused, or begun at home.
 
-    path: Path
-    profile: ArmProfile
-    url: str  # of the arm's port, for pyserial
-    settings: LinkSettings = field(default_factory=LinkSettings)
-    real_time: bool = True  # ask for that priority
+    Where material cannot flow, the nozzle waits above the surface as in a pause.
 
+    last: the last command.
+    asked: whether planner and guard made it.
+    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
+    waits: whether they were told to wait above the surface.
+    material_in: whether the material that was wanted was put in since this was last reset.
+    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
+        tick, so that a replay is equal byte by byte.
+    """
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionReport:
-    """The state of the motion process after a tick."""
+    last: Command
 
-    tick: Tick
-    total: int  # checkpoints
-    events: tuple[ArmEvent, ...]  # the last ones
-    late: tuple[float, float, float]  # s, median, 99 % and largest lateness of all ticks so far
-    ticks: int
-    skipped: int  # ticks left out
-    stop: tuple[float, float] | None  # s, when the last one was decided and when it was on the wire
-    priority: str  # as the system granted it
+    def __init__(
+        self,
+        profile: ArmProfile,
+        clock: Clock,
+        place: c_double,
+        material: MaterialControl | None = None,
+        measured: Callable[[], float] = lambda: math.nan,
+    ) -> None:
+        """clock: of the loop. place: kept up to date, in checkpoints.
 
+        measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
+        """
+        self._profile, self._clock, self._place = profile, clock, place
+        self._material, self._measured = material, measured
+        self.waits = self.material_in = False
+        self._step: MotionStep | None = None
+        self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
+        self.paused = self.asked = False
+        self.begun = self.lag = math.nan
 
-class _Orders:
-    """The orders received; QUIT where the other end is closed, or at SIGTERM and SIGINT."""
+    def begin(self, path: Path, profile: ArmProfile, start: float, outlets: Outlets) -> None:
+        """Print this path, surface frame, from now on. start: place on it, in checkpoints."""
+        self._begin = lambda place: MotionStep(path, profile, place, outlets)
+        self._make(start)
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._ended = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._end)
+    def homed(self) -> None:
+        """Begin anew at the same place of the path, as the arm stands at home."""
+        if self._step is not None:
+            self._make(self._step.progress.fraction)
 
-    def __call__(self) -> list[Order]:
-        orders, closed = take_messages(self._connection)
-        self._ended |= closed
-        return [*orders, Order.QUIT] if self._ended else orders
+    def resume(self) -> None:
+        """Go on after a pause, with the dispenser made ready again."""
+        self.paused = False
+        self._prepare_material()
 
-    def _end(self, number: int, frame: FrameType | None) -> None:
-        self._ended = True
+    def put_in(self) -> None:
+        """The operator has put in the material that was wanted."""
+        if self._step is not None and self._step.progress.wanted:
+            self._step.material_in()
+            self.material_in = True
+            self._prepare_material()
 
+    def recalled(self, place: Array, stands: Array) -> None:
+        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
+        if self._step is not None:
+            self._step.recalled(place, stands)
 
-def motion_process(
-    plan: MotionPlan, poses: SharedLatest[SurfacePose], reports: SharedLatest[MotionReport], orders: Connection
-) -> None:
-    """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
-    clock, driver = WallClock(), open_arm(plan.url, plan.profile)
-    arm, motion = Arm(driver, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
-    priority = ask_for_real_time() if plan.real_time else "nothing asked for"
-    events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
+    @property
+    def progress(self) -> PrintProgress | None:
+        """How far the print is; None before a path was begun."""
+        return None if self._step is None else self._step.progress
 
-    loop: MotionLoop | None = None
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The command of the tick at `now`, s."""
+        self.asked = self._step is not None
+        if self._step is None:
+            self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
+            return self.last
+        dry = "" if self._material is None else self._material.reason
+        self._step.paused = self.waits = self.paused or bool(dry)
+        measured = self._measured()
+        lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
+        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
+        if not math.isnan(self.lag):
+            self._step.lag = lag
+        self.last = self._step(pose, now)
+        if self.waits and isinstance(self.last, Hold):
+            self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
+        self._place.value = self._step.progress.fraction
+        return self.last
 
-    def report(tick: Tick) -> None:
-        assert loop is not None
-        events.extend(arm.events())
-        late, total = loop.lateness, motion.progress.total
-        lateness, stop = (late.percentile(50), late.percentile(99), late.most), arm.stops[-1] if arm.stops else None
-        reports.put(MotionReport(tick, total, tuple(events), lateness, late.count, loop.skipped, stop, priority))
+    def _make(self, start: float) -> None:
+        assert self._begin is not None
+        self._step = self._begin(start)
+        self._place.value = self.begun = start
+        self.material_in = False
+        self._prepare_material()
 
-    loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), report)
-    try:
-        loop.run()
-    finally:
-        loop = None  # report and loop refer to each other: the planner's solver would live until the process ends
-        arm.close()
-        driver.release()
+    def _prepare_material(self) -> None:
+        if self._step is not None and self._material is not None and not self._step.progress.wanted:
+            self._material.begin(self._step.progress.fraction, self._clock.now())

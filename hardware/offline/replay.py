@@ -125,11 +125,14 @@ class CommandWriter(ExitStack):
         self._csv = csv.writer(self._table, lineterminator="\n")
         self._csv.writerow(COMMAND_COLUMNS)
 
-    def write(self, command: Command, frame: bytes) -> None:
-        """Write one tick and flush both files."""
+    def write(self, command: Command) -> None:
+        """Write what one tick commanded."""
         self._csv.writerow(_row(command))
-        self._frames.write(frame)
         self._table.flush()
+
+    def send(self, data: bytes) -> None:
+        """Write bytes that went to the arm."""
+        self._frames.write(data)
         self._frames.flush()
 
 
@@ -180,7 +183,8 @@ def replay_session(
         motion, saved = MotionStep(checkpoints, profile, start), ProgressFile(out / "progress.toml", checkpoints)
         moves = ticks = 0
         for _, command in replay(poses, motion, hangs=faults_striking(faults, FaultPart.MOTION)):
-            writer.write(command, frame_from_command(command, profile.dialect))
+            writer.write(command)
+            writer.send(frame_from_command(command, profile.dialect))
             moves, ticks = moves + isinstance(command, Move), ticks + 1
             saved.write(motion.progress)
     return moves, ticks - moves

@@ -1,8 +1,9 @@
 """When the ticks of a motion are due, how late they come, and how evenly the machine works.
 
 Cameras give a pose each 33 ms. Ticks that run freely beside them leave each pose waiting for half a tick on average.
-Locked to the poses, a tick comes shortly after its pose, or as soon as the pose is there; planner and guard still get
-the instant at which it was due, so the arm's motion stays even. The arm does a tick's move in `tick` s. The time
+Locked to the poses, a tick comes shortly after its pose, or as soon as the pose is there; planner and guard get the
+instant at which its move will begin, which is even as long as the arm's queue holds. The arm does a tick's move in
+`tick` s. The time
 between two ticks may be a little longer, never shorter, as the arm's queue would fill up. So a locked tick is one per
 cent shorter than its share of the time between two poses (`tick_in_step`), which leaves room to correct the phase.
 

@@ -241,6 +241,10 @@ class Recorder:
         message = {"stamp": stamp, "stage": stage, "width": width, "counts": counts.tolist(), "most": most}
         self._message("/latency", stamp, message)
 
+    def trace(self, stamp: float, message: Message) -> None:
+        """Write what a process did of the frame set at `stamp`, s, as `hardware/live/trace.py` has it."""
+        self._message("/trace", stamp, message)
+
     def attach(self, name: str, data: bytes) -> None:
         """Keep a file of the run in the recording, as text."""
         self._guarded(lambda: self._writer.add_attachment(name, "text/plain", data))

@@ -21,7 +21,7 @@ from estimation.rig import Camera, pixels_from_points
 from estimation.se3 import Array
 from hardware.files.images import decode, encode
 from hardware.offline.track import FrameSetStep
-from hardware.process.clock import Clock
+from hardware.process.clock import Clock, SimClock
 from hardware.process.faults import Fault, FaultPart, WorkRates, fault_rng, faults_striking
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras, garble
 from hardware.simulator.scenario import Scenario
@@ -38,7 +38,9 @@ ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT = range(4)  # what goes fi
 class EventQueue:
     """A queue of actions by instant; what falls on one instant goes by rank, then in the order in which it came."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: SimClock) -> None:
+        """clock: is moved on to each instant."""
+        self._clock = clock
         self._heap: list[tuple[float, int, int, Action]] = []
         self._count = 0
 
@@ -51,6 +53,7 @@ class EventQueue:
         """Do everything due before `until()`, s, in order; gives each instant after what happened at it."""
         while self._heap and self._heap[0][0] < until():
             instant, _, _, action = heapq.heappop(self._heap)
+            self._clock.wait_until(instant)
             action(instant)
             yield instant
 

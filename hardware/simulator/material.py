@@ -25,14 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.dispenser.dispenser import DispenserProfile, Dispensers, check_path_materials
 from hardware.dispenser.line_dispenser import LineDispenser
 from hardware.dispenser.messages import PRESETS
 from hardware.files.dispenser_file import DispenserSettings, outlets_from, read_dispensers
 from hardware.motion.loop import MaterialControl
-from hardware.motion.step import MotionStep
 from hardware.process import checks
 from hardware.process.clock import Clock
 from hardware.process.faults import Fault
@@ -40,8 +38,7 @@ from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort
 from hardware.simulator.truth import FlowAt
 from planning.command import Command, Move
 from planning.material import Outlets
-from planning.motion.planner import PAUSED
-from planning.path import Path, PrintProgress
+from planning.path import Path
 
 TRUTH_KEYS = {  # key in a table [dispenser]: field of VirtualDispenserSettings
     **{"on_dead_time_s": "on_dead_time", "on_lag_s": "on_lag", "off_dead_time_s": "off_dead_time"},
@@ -52,7 +49,6 @@ IDEAL = VirtualDispenserSettings(on_dead_time=0.0, on_lag=0.0, off_dead_time=0.0
 METERED_ON = "ON {flow_mm3_s}"  # in the language of `arduino`
 ROUNDING = 1e-9  # s: what is shorter is the rounding of an instant
 ANSWER_TIME = 0.01  # s after a line is whole again, within which it is looked at and told
-SEEN_TO_AFTER = 0.3  # s until an operator makes a dispenser ready that is not, and tries again
 PRESET = "arduino"
 
 
@@ -256,39 +252,3 @@ def flow_from_told(told: Sequence[tuple[float, float]], truth: VirtualDispenserS
     for stamp, flow in told:
         model.obey(flow, stamp)
     return lambda instants, needed: model.flow_at(instants)
-
-
-class DispensedMotion:
-    """A motion that waits above the surface while material cannot flow, and an operator who sees to that.
-
-    seen_to: instants, s, at which the operator made a dispenser ready again.
-    """
-
-    def __init__(self, step: MotionStep, control: MaterialControl) -> None:
-        self._step, self._control = step, control
-        self.seen_to: list[float] = []
-        self._dry_since = -math.inf
-
-    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
-        """The command of the tick at `now`, s."""
-        dry = self._control.reason
-        self._dry_since = self._dry_since if dry else now
-        wanted = bool(self._step.progress.wanted)
-        if wanted:
-            self._step.material_in()
-        if wanted or (dry and now >= self._dry_since + SEEN_TO_AFTER):
-            self.seen_to.append(now)
-            self._dry_since = now
-            self._control.begin(self._step.progress.fraction, now)
-        self._step.paused = bool(dry)
-        command = self._step(pose, now)
-        return replace(command, reason=dry) if dry and command.reason in ("", PAUSED) else command
-
-    def recalled(self, place: Array, stands: Array) -> None:
-        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
-        self._step.recalled(place, stands)
-
-    @property
-    def progress(self) -> PrintProgress:
-        """How far the print is."""
-        return self._step.progress

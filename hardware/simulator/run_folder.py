@@ -29,6 +29,7 @@ from hardware.files.arm_file import write_arm
 from hardware.files.folder_tables import SessionFolderWriter, rows_from_trajectory
 from hardware.files.pose_file import PoseWriter
 from hardware.files.session import row_from_head
+from hardware.motion.loop import Tick
 from hardware.offline.replay import CommandWriter
 from hardware.process.clock import utc_now
 from hardware.recording.recorder import Recorder
@@ -38,7 +39,7 @@ from hardware.simulator.nozzle_error import nozzle_errors
 from hardware.simulator.scenario import Scenario
 from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport, TrackingStep
-from planning.command import Command, Move
+from planning.command import Move
 from planning.path import PrintProgress
 
 WATCH_INTERVAL = 0.5  # s of the run between two pictures
@@ -294,15 +295,25 @@ class RunFolder:
         if self._session is not None:
             self._session[1].show_path(self._posed, self._line_points, self._line.knots)
 
-    def command(self, command: Command, progress: PrintProgress, frame: bytes, received: bytes) -> None:
-        """A command was sent, how far the print is by it, and what came from the arm since the last."""
-        self._commands.write(command, frame)
+    def wire(self, stamp: float, data: bytes, sent: bool) -> None:
+        """Bytes passed the arm's port, to the arm or from it."""
+        if sent:
+            self._commands.send(data)
+        if self._session is not None:
+            (self._session[1].sent if sent else self._session[1].received)(stamp, data)
+
+    def given(self, pose: SurfacePose) -> None:
+        """A pose has reached the motion; it is written when it is made."""
+
+    def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
+        """A tick was made, and how far the print is by it; None before the path was placed."""
+        if progress is None:
+            return
+        command = tick.command
+        self._commands.write(command)
         if self._session is not None:
             recorder = self._session[1]
             recorder.write(command)
-            recorder.sent(command.stamp, frame)
-            if received:
-                recorder.received(command.stamp, received)
             recorder.progress(command.stamp, progress.place)
         reason = command.reason
         if reason and reason != self._reason:

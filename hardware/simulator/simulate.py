@@ -28,6 +28,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import Follower
 from estimation.synthetic.world import project_landmarks, undistorting
+from hardware.arm.profile import in_step
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import read_poses
@@ -199,7 +200,8 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
         raise InputError("command line", "--threads", options.threads, ">= 1")
     scenario = read_scenario(file, options.trace)
     check_faults(options.faults, FaultRunner.SIMULATE, "command line", "--fault", len(scenario.rig))
-    scenario = replace(scenario, faults=(*scenario.faults, *options.faults))
+    profile = in_step(scenario.profile, scenario.cameras.period)
+    scenario = replace(scenario, faults=(*scenario.faults, *options.faults), profile=profile)
     path = read_path(scenario.path)
     scene = scene_from_table(scenario.file, scenario.scene, scenario.file.parent, scenario.seed)
     _check_pairs(scenario, scene)

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.observations import Observations
+from estimation.pose import SurfacePose
+from estimation.pose_solver import PointTracks, solve_pose
+from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.process.faults import Fault, FaultKind, FaultPart, fault_rng, faults_striking
 from hardware.simulator.deposit import NozzleLog, planned_line
@@ -315,3 +319,59 @@ def _divided(column: NDArray[np.str_], counts: NDArray[np.int64]) -> NDArray[np.
         with suppress(ValueError):
             divided[i] = repr(float(column[i]) / int(counts[i]))
     return np.asarray(divided)
+
+
+NEWTON_STEPS = 12  # from the mean plane onto the surface; a wound takes four
+SLOPE_STEP = 1e-3  # mm, for the slope along the surface
+MAX_RAY_MISS = 1e-3  # mm between ray and surface: such a track does not lie on it
+MIN_REGISTRATION_TRACKS = 12
+
+
+def truth_from_estimate(
+    pose: SurfacePose, observations: Observations, rigs: tuple[Rig, Rig], truth: Truth, shape: Shape, exposed: Array
+) -> Array | None:
+    """truth_surface_from_estimated_surface (4, 4) from one frame set; None where too few tracks lie on the surface.
+
+    Without a scan the tracker chooses its own surface frame, and the path must be registered to it. Live, an operator
+    does that. Here every track is cast along its true ray onto the true surface, and the pose of these points is solved
+    with the cameras and pixels that the tracker has. Calibration errors are in both poses and stay in the error.
+
+    rigs: the true one and the one that the tracker has. exposed: (C,) s, when each camera truly took its picture.
+    """
+    true_rig, known_rig = rigs
+    points, hit = surface_points(observations, true_rig, truth, shape, exposed)
+    if hit.sum() < MIN_REGISTRATION_TRACKS:
+        return None
+    start = truth.base_from_surface(np.array([pose.stamp]))[0]
+    tracks = PointTracks.of(observations.only(hit), points[hit])
+    solved = solve_pose(known_rig, tracks, start, tolerance=1e-9, iterations=20)
+    return np.asarray(se3.inverse(solved.base_from_surface) @ pose.base_from_surface)
+
+
+def surface_points(
+    observations: Observations, rig: Rig, truth: Truth, shape: Shape, exposed: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (N, 3) mm of the undeformed surface under each track's pixel, and whether (N,) the ray truly meets one."""
+    camera, amount = observations.camera, truth.amount(exposed)[observations.camera]
+    base_from_camera = np.stack([c.base_from_camera for c in rig.cameras])[camera]
+    surface_from_camera = se3.inverse(truth.base_from_surface(exposed)[camera]) @ base_from_camera
+    matrices = rig.matrices[camera]
+    focal, centre = matrices[:, [0, 1], [0, 1]], matrices[:, :2, 2]
+    rays = np.column_stack([(observations.pixels - centre) / focal, np.ones(len(observations))])
+    rays = (surface_from_camera[:, :3, :3] @ rays[..., None])[..., 0]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    origin = surface_from_camera[:, :3, 3]
+
+    def off(xy: Array) -> Array:  # (N, 3) mm, from the ray to the surface point
+        points = shape.points(xy)
+        from_origin = points + truth.displacement(points, amount) - origin
+        return np.asarray(from_origin - np.sum(from_origin * rays, 1, keepdims=True) * rays)
+
+    up, middle = shape.surface_from_grid[:3, 2], shape.surface_from_grid[:3, 3]
+    reach = ((middle - origin) @ up) / (rays @ up)
+    xy = shape.material(origin + reach[:, None] * rays)
+    for _ in range(NEWTON_STEPS):
+        now = off(xy)
+        slope = np.stack([(off(xy + SLOPE_STEP * axis) - now) / SLOPE_STEP for axis in np.eye(2)], -1)  # (N, 3, 2)
+        xy = xy - (np.linalg.pinv(slope) @ now[..., None])[..., 0]
+    return shape.points(xy), shape.covers(xy) & (np.linalg.norm(off(xy), axis=1) < MAX_RAY_MISS)

@@ -89,6 +89,7 @@ class VirtualPort:
         taken = len(data)
         if device.listener is not None:
             device.listener.from_host(data)
+        data = device.line(data)
         if faults.noise_out and rng.random() < faults.noise_out:
             place = rng.integers(taken + 1)
             data = data[:place] + rng.bytes(1) + data[place:]
@@ -99,7 +100,7 @@ class VirtualPort:
     def read(self) -> bytes:
         """What the arm has sent, and noise."""
         device, now = self._device, self._device.here()
-        self._deliver(now)
+        self.deliver(now)
         data = device.arm.transmit(now)
         noise = device.rng.poisson(device.faults.noise * (now - self._looked)) if device.faults.noise else 0
         self._looked = now
@@ -115,10 +116,11 @@ class VirtualPort:
 
     def close(self) -> None:
         """Let go; what is not through the wire is lost."""
-        self._deliver(self._device.clock.now())
+        self.deliver(self._device.clock.now())
         self._under_way.clear()
 
-    def _deliver(self, now: float) -> None:
+    def deliver(self, now: float) -> None:
+        """Let the arm receive what is through the wire at `now`, s."""
         while self._under_way and self._under_way[0][0] <= now:
             arrival, data = self._under_way.popleft()
             self._device.receive(data, arrival)
@@ -135,16 +137,25 @@ class VirtualDevice:
         faults: PortFaults | None = None,
         seed: int = 0,
         listener: LineListener | None = None,
+        line: Callable[[bytes], bytes] = bytes,
     ) -> None:
-        """listener: is told all that passes."""
+        """listener: is told all that passes. line: carries bytes to the arm, e.g. over a pty."""
         self.arm, self.clock, self.baud = arm, clock, baud
         self.faults = PortFaults() if faults is None else faults
         self.rng = np.random.default_rng(seed)
-        self.listener = listener
+        self.listener, self.line = listener, line
+        self._port: VirtualPort | None = None  # the last one opened
 
     def __call__(self) -> VirtualPort:
         """Open it; UnpluggedError while it is away."""
-        return VirtualPort(self)
+        self._port = VirtualPort(self)
+        return self._port
+
+    def advance(self, now: float) -> None:
+        """Let the time of wire and arm pass until `now`, s."""
+        if self._port is not None:
+            self._port.deliver(now)
+        self.arm.advance(max(now, self.arm.now))
 
     def here(self) -> float:
         """The instant, s; UnpluggedError while the device is away."""

@@ -1,4 +1,4 @@
-"""`stillbed bench faults`: seeded faults across the scenarios, in virtual time, and a verdict on each.
+"""`python -m tests.campaigns faults`: seeded faults across the scenarios, in virtual time, and a verdict on each.
 
 A run is a print of one scenario with seven faults, one after the other; the last one ends it. `--log` records the
 verdicts; runs that are in it already are left out, so that a campaign may be done in parts.
@@ -23,15 +23,58 @@ from numpy.typing import NDArray
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.bench import figures
-from hardware.bench.fault_run import FAULT_FREE_S, FAULTS_A_RUN, FaultRun, FaultRunRecord, draw_faults, prepare_scenario
+from hardware.bench.fault_run import FaultRun, FaultRunRecord, prepare_scenario
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress, workers
 from hardware.process.clock import ProcessorClock
-from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, fault_from_text
+from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner, fault_from_text
 from hardware.report.page import Plot, document, figures_table, section
 from hardware.simulator.deposit import NozzleLog
 from perception import shipped_file
 
 RowFlags = NDArray[np.bool_]
+
+FAULT_FREE_S = 3.0  # nothing goes wrong until then
+FAULT_SPACING, FAULTS_A_RUN = 2.6, 7  # s from one fault to the next, and faults of a run
+MIN_DURATION, MAX_DURATION = 0.15, 1.0  # s: long enough to have an effect, short enough to be over before the next
+FAULT_AMOUNTS = {  # of what has one, uniform in the logarithm
+    (FaultPart.CAMERA, FaultKind.SLOW): (0.03, 0.3),  # s
+    (FaultPart.CAMERA, FaultKind.BUMP): (2.0, 10.0),  # mm: what is less is no harm to three cameras
+    (FaultPart.CLOCK, FaultKind.JUMP): (0.05, 5.0),  # s
+    (FaultPart.TRACKING, FaultKind.SLOW): (5.0, 60.0),  # %
+    (FaultPart.ARM, FaultKind.SLOW): (30.0, 90.0),  # %
+    (FaultPart.SURFACE, FaultKind.FAST): (30.0, 200.0),  # mm/s
+    (FaultPart.SURFACE, FaultKind.FOLD): (0.5, 5.0),  # mm
+}
+CAMPAIGN_KINDS = [key for key, spec in FAULT_SPECS.items() if FaultRunner.SIMULATE in spec.runners]
+ENDING_KINDS = [key for key in CAMPAIGN_KINDS if key[1] is FaultKind.KILL]  # after which a run cannot go on
+PASSING_KINDS = [key for key in CAMPAIGN_KINDS if key not in ENDING_KINDS]
+
+
+def draw_faults(seed: int, number: int) -> list[Fault]:
+    """The faults of a campaign's run; kinds take turns from run to run."""
+    rng = np.random.default_rng([seed, number, 83])
+    first = number * (FAULTS_A_RUN - 1)
+    keys = [PASSING_KINDS[k % len(PASSING_KINDS)] for k in range(first, first + FAULTS_A_RUN - 1)]
+    keys.append(ENDING_KINDS[number % len(ENDING_KINDS)])
+    return [_fault(key, FAULT_FREE_S + FAULT_SPACING * place, rng) for place, key in enumerate(keys)]
+
+
+def _fault(key: tuple[FaultPart, FaultKind], slot: float, rng: np.random.Generator) -> Fault:
+    def draw(low: float, high: float) -> float:
+        return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))), 3)
+
+    start = round(slot + float(rng.uniform(0.0, 0.4)), 3)
+    duration = draw(MIN_DURATION, MAX_DURATION)
+    amount = draw(*FAULT_AMOUNTS[key]) if key in FAULT_AMOUNTS else 0.0
+    if key == (FaultPart.CLOCK, FaultKind.JUMP):
+        amount *= float(rng.choice([-1.0, 1.0]))
+    if key[1] is FaultKind.KILL:
+        duration = np.inf
+    if key in ((FaultPart.ARM, FaultKind.DROP), (FaultPart.ARM, FaultKind.GARBLE)) and rng.random() < 0.5:
+        duration = 0.0
+    number = int(rng.integers(3)) if key[0] is FaultPart.CAMERA else 0
+    return Fault(*key, start, duration, amount, number, int(rng.integers(10**6)))
+
 
 MAX_ERROR_MM = 1.0  # mm: the largest error that a print may have while it extrudes
 USUAL_ERROR_FACTOR = 1.5  # times the run's largest error before its first fault: what the scenario has anyway

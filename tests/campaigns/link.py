@@ -1,6 +1,6 @@
-"""`stillbed bench link`: the arm's line with everything going wrong, in virtual and in real time, and the guard.
+"""`python -m tests.campaigns link`: the arm's line in virtual time with everything going wrong.
 
-Virtual time passes in runs of ten minutes that take turns in what goes wrong.
+Runs of ten minutes take turns in what goes wrong. `stillbed bench link` is the same in real time.
 """
 
 from __future__ import annotations
@@ -12,26 +12,29 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm import protocol
-from hardware.arm.device import BY_OPERATOR, ArmState
+from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings, at_baud
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
 from hardware.arm.s6h4d import S6H4D
 from hardware.bench.figures import Figure, at_most, milliseconds, with_progress
+from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import Interval, PortFaults, VirtualDevice
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
-from planning.command import Move, feed_for
+from planning.command import Command, Move, feed_for
 
 RUN_SECONDS = 600.0  # of one run
 MAX_STALL = 0.6  # s of a stall
 DETECTABLE_STALL = 0.2  # s: the shortest stall that answers 50 ms apart show before it is over
 REST_AFTER_FRAME = 0.055  # s after the last frame by which nothing may be under way: 50 ms, and a poll of the line
 POLL_INTERVAL = 0.005  # s
+MIN_WAIT = 1e-4  # s in which a host looks again where nothing is to be waited for
 HOME_AXES = ArmProfile().arm.home
 RECENT_FRAMES = 400  # frames and answers that may still arrive
 OBEYING, STALLING, LOSSY = ANSWER_MODES = "obeying", "stalling", "losing frames"  # of the arm
@@ -151,48 +154,59 @@ class LinkRun:
         self._stalls = windows(rng, 30.0, MAX_STALL)  # of the host's loop
         self._arm = Arm(S6H4D(device, profile), profile, 0.0, LinkSettings(poll=POLL_INTERVAL))
         self._phase, self._last_frame, self._frames, self._stops = 0.0, -1.0, 0, 0
+        self._next_order, self._next_stop = 0.0, float(rng.exponential(10.0))  # s
 
     def run(self) -> None:
         """Let the time pass."""
-        arm, clock = self._arm, self._clock
-        period = arm.profile.tick * (1 + arm.settings.ease)
-        due, order, stop = 0.0, 0.0, float(self._rng.exponential(10.0))
-        while (now := clock.now()) < RUN_SECONDS:
-            if self._stalls and now >= self._stalls[0][0]:
-                clock.wait_until(self._stalls.pop(0)[1])
-                now = clock.now()
-            arm.poll(now)
-            if now >= due:
-                self._tick(now)
-                due = max(due + period, now)
-            if now >= stop and arm.state is ArmState.ARMED and not arm.travels:
-                arm.stop(BY_OPERATOR, now)
-                stop = now + float(self._rng.exponential(10.0))
-            if now >= order and arm.state in (ArmState.STOPPED, ArmState.DISARMED):
-                # an operator says where the arm stands if it does not, arms it, sends it back to the print
-                if arm.target is None and arm.status(now).answered is None:
-                    self._virtual.advance(now)
-                    arm.stand(self._virtual.axes_at(np.array([now]))[0], now)
-                if arm.arm(now) == "":
-                    arm.go(goal_at(self._phase), now)
-                order = now + 0.3
-            self._count(now)
-            clock.wait_until(min(max(due, now + 1e-4), now + POLL_INTERVAL))
+        MotionLoop(self, self._arm, self, lambda: None, self._orders, self._report).run(RUN_SECONDS)
         self._count_run()
 
-    def _tick(self, now: float) -> None:
-        counts, arm = self._counts, self._arm
-        counts.ticks += 1
-        arm.take_up()  # it goes on from where it stands
-        if arm.hold(now):
-            counts.held += 1
-            return
+    # -- the loop's clock: the host's loop stalls now and then
+
+    def now(self) -> float:
+        """Instant, s."""
+        return self._clock.now()
+
+    def wait_until(self, instant: float) -> None:
+        """Let the time pass until then, or for as long as the host stalls."""
+        self._count(self.now())
+        self._clock.wait_until(max(instant, self.now() + MIN_WAIT))
+        if self._stalls and self.now() >= self._stalls[0][0]:
+            self._clock.wait_until(self._stalls.pop(0)[1])
+
+    # -- its motion, orders and report
+
+    def __call__(self, pose: SurfacePose | None, now: float) -> Command:
+        """The next piece of the motion; it goes on from where the last one led that was sent."""
+        arm = self._arm
         assert arm.target is not None
         goal = goal_at(self._phase + arm.profile.tick)
-        feed = min(feed_for(arm.target, goal, arm.profile.tick), 250.0)
-        if not arm.send(Move(now, goal, feed, 0, False), now):
-            self._phase += arm.profile.tick
-            self._last_frame = now
+        return Move(now, goal, min(feed_for(arm.target, goal, arm.profile.tick), 250.0), 0, False)
+
+    def recalled(self, place: Array, stands: Array) -> None:
+        """It goes on from where it stands."""
+
+    def _report(self, tick: Tick) -> None:
+        self._counts.ticks += 1
+        self._counts.held += not tick.frame
+        if tick.frame:
+            self._phase += self._arm.profile.tick
+            self._last_frame = self.now()
+
+    def _orders(self) -> list[Order]:
+        """An operator stops it now and then, says where the arm stands if it does not, and sends it back."""
+        arm, now = self._arm, self.now()
+        if now >= self._next_stop and arm.state is ArmState.ARMED and not arm.travels:
+            self._next_stop = now + float(self._rng.exponential(10.0))
+            return [Order.STOP]
+        if now >= self._next_order and arm.state in (ArmState.STOPPED, ArmState.DISARMED):
+            if arm.target is None and arm.status(now).answered is None:
+                self._virtual.advance(now)
+                arm.stand(self._virtual.axes_at(np.array([now]))[0], now)
+            if arm.arm(now) == "":
+                arm.go(goal_at(self._phase), now)
+            self._next_order = now + 0.3
+        return []
 
     def _count(self, now: float) -> None:
         arm, counts = self._arm, self._counts
@@ -231,25 +245,12 @@ MANNER_TEXTS = {
 
 
 def run_link(options: argparse.Namespace) -> list[Figure]:
-    """The figures of all parts that the options choose."""
-    figures: list[Figure] = []
-    if options.only == "guard":
-        options.hours = options.minutes = 0.0
-    if options.hours > 0:
-        counts, runs = LinkCounts(), max(1, round(3600 * options.hours / RUN_SECONDS))
-        for k in with_progress("link", "runs of 10 min", range(runs), runs):
-            LinkRun(options.seed + k, counts, options.baud).run()
-            counts.seconds += RUN_SECONDS
-        figures += soak_figures(counts)
-    if options.minutes > 0:
-        from hardware.bench.campaigns.link_live import live_figures
-
-        figures += live_figures(60 * options.minutes, options.seed, options.busy, not options.ordinary)
-    if options.commands > 0:
-        from hardware.bench.campaigns.guard import guard_figures
-
-        figures += guard_figures(options.commands, options.seed)
-    return figures
+    """The figures of all runs."""
+    counts, runs = LinkCounts(), max(1, round(3600 * options.hours / RUN_SECONDS))
+    for k in with_progress("link", "runs of 10 min", range(runs), runs):
+        LinkRun(options.seed + k, counts, options.baud).run()
+        counts.seconds += RUN_SECONDS
+    return soak_figures(counts)
 
 
 def soak_figures(counts: LinkCounts) -> list[Figure]:

@@ -1,4 +1,4 @@
-"""`stillbed bench fuzz`: every reader of outside data, given inputs that are valid except in a few places.
+"""`python -m tests.campaigns fuzz`: every reader of outside data, given inputs that are valid except in a few places.
 
 A reader may accept an input or refuse it with one of our own errors. Anything else counts as a failure: another
 exception, more than `MAX_SECONDS` of processor time, more than `MAX_MEMORY` of memory, the end of the process. The
@@ -29,16 +29,6 @@ from hardware.arm import protocol
 from hardware.arm.driver import G1, Reply, ReplyKind
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
-from hardware.bench.campaigns.fuzz_process import (
-    Reader,
-    ReaderSum,
-    Task,
-    append_log,
-    fuzz_figures,
-    print_failure,
-    read_log,
-    run_tasks,
-)
 from hardware.bench.figures import Figure, require_positive
 from hardware.calibration.corners import read_corners, write_corners
 from hardware.calibration.rig_formats import FORMATS
@@ -71,6 +61,16 @@ from perception.wound.network import WoundNetwork, shipped_model
 from perception.wound.shape_matching import read_shape_model
 from planning.layers.repair import repair_mesh
 from planning.path import fingerprint
+from tests.campaigns.fuzz_process import (
+    Reader,
+    ReaderSum,
+    Task,
+    append_log,
+    fuzz_figures,
+    print_failure,
+    read_log,
+    run_tasks,
+)
 
 PATH_TEXT = (
     "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude\n"

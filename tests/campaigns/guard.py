@@ -1,13 +1,14 @@
-"""Random commands for the guard, on and beside all its limits, judged by an independent oracle.
+"""`python -m tests.campaigns guard`: random commands before the guard, on and beside all its limits.
 
-The oracle is written from the limits alone and shares no arithmetic with the guard. It judges all commands of a run at
-once, afterwards, and computes each number in another way: the surface's speed and a point's standard deviation by small
-steps of the point, the joints by forward kinematics. A verdict is 1 where a limit is kept, -1 where it is broken and 0
-within rounding of it.
+An independent oracle judges. It is written from the limits alone and shares no arithmetic with the guard. It judges all
+commands of a run at once, afterwards, and computes each number in another way: the surface's speed and a point's
+standard deviation by small steps of the point, the joints by forward kinematics. A verdict is 1 where a limit is kept,
+-1 where it is broken and 0 within rounding of it.
 """
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -216,8 +217,9 @@ OUTAGE_SHARE, MAX_OUTAGE_S = 0.01, 0.8  # share of the poses at which the surfac
 TRACK_STATES = list(TrackState)
 
 
-def guard_figures(commands: int, seed: int) -> list[Figure]:
+def run_guard(options: argparse.Namespace) -> list[Figure]:
     """How many random commands passed though they break a limit, and were refused though they keep all."""
+    commands, seed = options.commands, options.seed
     arms = simple_rules(), simple_rules(), simple_rules(), jointed_rules()
     counts = np.zeros(4, int)
     for k in range(max(1, round(commands / COMMANDS_A_RUN))):

@@ -1,4 +1,4 @@
-"""`stillbed bench outages`: cameras fail in every way before a moving wound; is the tracker ever lost in silence?
+"""`python -m tests.campaigns outages`: cameras fail before a moving wound; is the tracker ever lost in silence?
 
 Each outage is laid over the pictures of a surface with exact truth, with which the tracking step's poses are compared.
 """
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
+from hardware.bench.estimator import make_pictures
 from hardware.bench.figures import Figure, aligned, at_most, columns, with_progress, workers, write_page
-from hardware.bench.outage_run import OutageKind, WatchedOutage, make_pictures, run_stretch
 from hardware.report.page import Plot, area_key, document, legend, line_key, ribbon, section
+from tests.campaigns.outage_run import OutageKind, WatchedOutage, run_stretch
 
 HARMFUL_ERROR = 0.5  # mm: an error below is of no harm to a print with a nozzle of 0.4 mm
 RADIUS_FACTOR = 3.0  # times the 95 % radius: of normal errors not one in a million lies beyond

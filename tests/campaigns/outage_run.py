@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,12 +18,9 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.bench.estimator import FRAME_RATE_HZ, ScenePictures
 from hardware.simulator.camera_pipeline import draw_cover, draw_glare
-from hardware.simulator.scene.appearance import Appearance
-from hardware.simulator.scene.scene import Scene, rois
-from hardware.simulator.scene.shape import Wound, cylinder, with_wound
-from hardware.simulator.watched_arm import PictureLoop, closed_motion
+from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Image
 from perception.lens import undistort
 from perception.tracking.step import TrackingStep
@@ -174,41 +170,12 @@ def _bump_maps(camera: Camera, camera_from_bumped: Array, base_from_surface: Arr
     return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
 
 
-FRAME_RATE_HZ = 30.0
-MOTION_SETS = 96  # frame sets of the motion's loop: a breath of 3.2 s
-LOOP_WOUND = Wound((40.0, 28.0))
 WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 0.0, 24.0) for y in (-17.0, 0.0, 17.0)])  # mm, around the wound
 JUDGED_POINTS = np.array([[0, 0, 0], [15.0, 0, 0], [-15.0, 0, 0], [0, 10.0, 0], [0, -10.0, 0]])  # mm: of the print
 SPACE_95 = 2.8  # 95 % of a normal error in space lie within so many standard deviations
 START_S, CALM_S, REST_S = 1.5, 0.5, 0.7  # s before the first outage, before each, and watched after each
 HIDING_KINDS = OutageKind.OCCLUDED, OutageKind.DEAD, OutageKind.BLACK  # where they strike all cameras
 JUMP_SHARE = 0.3  # of the outages that hide the surface, in which it moves elsewhere meanwhile
-FAR_POSE = se3.exp(np.array([0.08, -0.06, 0.2, 12.0, -9.0, 6.0]))
-
-
-@dataclass(frozen=True, eq=False)
-class ScenePictures:
-    """The pictures of one scene for all stretches."""
-
-    seed: int
-    rig: Rig
-    scene: Scene
-    near: PictureLoop  # of the motion at one place
-
-    @cached_property
-    def far(self) -> PictureLoop:
-        """And at another, rendered when it is needed first."""
-        return PictureLoop(self.scene, self.rig, self.near.poses @ FAR_POSE, self.seed + 1)
-
-
-def make_pictures(seed: int, period: int = MOTION_SETS, rig: Rig | None = None) -> ScenePictures:
-    """Render the loop of one scene, `period` frame sets, some 10 s for the default."""
-    rng = np.random.default_rng([seed, 61])
-    rig = arc_rig(size=(640, 360), focal=560.0) if rig is None else rig
-    shape = with_wound(cylinder((80.0, 60.0), float(rng.uniform(50, 120))), LOOP_WOUND, seed)
-    scene = Scene(shape, Appearance(texel=0.2, wetness=0.3, drape=False), seed=seed)
-    poses = closed_motion(period, BASE_FROM_REST, rng, lively=period / MOTION_SETS)  # of one speed for any period
-    return ScenePictures(seed, rig, scene, PictureLoop(scene, rig, poses, seed))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

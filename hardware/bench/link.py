@@ -1,4 +1,4 @@
-"""The motion process on a pty in real time: jitter, stops, and what arrives, while other processes saturate the cores.
+"""`stillbed bench link`: jitter, stops, and what arrives of a motion process on a pty, while others saturate the cores.
 
 Three processes as in a live run: a virtual arm that serves a pty, the motion process, and this one, which gives poses
 and orders; and some that only use up processor time. The motion process is halted now and then, as by a busy machine;
@@ -7,10 +7,12 @@ the device goes and comes back; the controller stalls and the wire loses frames.
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import os
 import signal
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
@@ -18,23 +20,98 @@ from io import StringIO
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm.device import ArmState, LinkCode
-from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.arm.device import ArmEvent, ArmState, LinkCode
+from hardware.arm.link import Arm
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, LinkSettings, open_arm
 from hardware.bench.figures import Figure, at_least, at_most, milliseconds
-from hardware.motion.loop import Order
-from hardware.motion.step import MotionPlan, MotionReport, motion_process
+from hardware.motion.loop import MotionLoop, Order, Tick
+from hardware.motion.step import MotionStep
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
-from hardware.process.system import SharedLatest, ask_for_real_time
+from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
 from hardware.simulator.arm.ports import run_virtual_arm
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.path import Path as Toolpath
+
+MAX_REPORTED_EVENTS = 50
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionPlan:
+    """What is to be printed, and on which arm."""
+
+    path: Toolpath
+    profile: ArmProfile
+    url: str  # of the arm's port, for pyserial
+    settings: LinkSettings = field(default_factory=LinkSettings)
+    real_time: bool = True  # ask for that priority
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionReport:
+    """The state of the motion process after a tick."""
+
+    tick: Tick
+    total: int  # checkpoints
+    events: tuple[ArmEvent, ...]  # the last ones
+    late: tuple[float, float, float]  # s, median, 99 % and largest lateness of all ticks so far
+    ticks: int
+    skipped: int  # ticks left out
+    stop: tuple[float, float] | None  # s, when the last one was decided and when it was on the wire
+    priority: str  # as the system granted it
+
+
+class _Orders:
+    """The orders received; QUIT where the other end is closed, or at SIGTERM and SIGINT."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._ended = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._end)
+
+    def __call__(self) -> list[Order]:
+        orders, closed = take_messages(self._connection)
+        self._ended |= closed
+        return [*orders, Order.QUIT] if self._ended else orders
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        self._ended = True
+
+
+def motion_process(
+    plan: MotionPlan, poses: SharedLatest[SurfacePose], reports: SharedLatest[MotionReport], orders: Connection
+) -> None:
+    """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
+    clock, driver = WallClock(), open_arm(plan.url, plan.profile)
+    arm, motion = Arm(driver, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
+    priority = ask_for_real_time() if plan.real_time else "nothing asked for"
+    events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
+
+    loop: MotionLoop | None = None
+
+    def report(tick: Tick) -> None:
+        assert loop is not None
+        events.extend(arm.events())
+        late, total = loop.lateness, motion.progress.total
+        lateness, stop = (late.percentile(50), late.percentile(99), late.most), arm.stops[-1] if arm.stops else None
+        reports.put(MotionReport(tick, total, tuple(events), lateness, late.count, loop.skipped, stop, priority))
+
+    loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), report)
+    try:
+        loop.run()
+    finally:
+        loop = None  # report and loop refer to each other: the planner's solver would live until the process ends
+        arm.close()
+        driver.release()
+
 
 DEVICE_SPAN = 40.0  # s with one device, where it goes and comes back
 POSE_RATE = 30.0  # Hz
@@ -73,8 +150,9 @@ class LivePart:
     rate: float = NOT_MEASURED  # ticks a second
 
 
-def live_figures(seconds: float, seed: int, busy: int, real_time: bool) -> list[Figure]:
+def run_link(options: argparse.Namespace) -> list[Figure]:
     """Three parts of equal length: a calm one, whose jitter counts, one with halts and returns, one with a bad arm."""
+    seconds, seed, busy, real_time = 60 * options.minutes, options.seed, options.busy, not options.ordinary
     parts = [run_part(seconds / 3, seed + k, busy, real_time, part) for k, part in enumerate(LIVE_PARTS)]
     calm, halted, rough = parts
     name = f"real time {seconds / 60:.3g} min"

@@ -1,1 +1,0 @@
-"""Long campaigns for developers: faults, fuzzing, the arm's link, outages."""

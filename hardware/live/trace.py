@@ -1,0 +1,281 @@
+"""Where the time of each frame set went: spans by process, in the recording, and what they say about the slowest sets.
+
+Each process notes when it took a set over and handed it on, on the machine's monotonic clock, and what held it up: the
+collector of Python's garbage, the scheduler (the kernel's run-queue delay of the thread), page faults. The topic
+/trace holds a message a set and process. A set's way goes from its pixels in memory to the first move on the wire that
+was made of it; what the processes did meanwhile is what it waited for.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import resource
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.process.clock import Clock
+
+TRACKING_LANE, MOTION_LANE, RECORDER_LANE = "tracking", "motion", "recorder"
+QUEUE_STAGE = "frames wait for the tracker"  # what for is seen in the other spans
+ON_WIRE = "planned and written"  # the last span of a set's way
+GARBAGE, RUN_QUEUE = "collecting garbage", "ready, but not running"
+MIN_WRITE_S = 0.005  # s of a batch of the recorder, from which it is in the trace
+SLOWEST_SHARE = 0.01  # of all sets
+DRAWN_SETS = 12  # of the slowest, in the picture
+DRAWN_BEFORE_S, LANE_PX, CHART_PX = 0.03, 16, 900  # s drawn before a set is handed over
+SCHEDULER_FILE = Path("/proc/thread-self/schedstat")  # ns run, ns in the run queue, time slices: Linux
+TOPIC = "/trace"
+
+Span = tuple[str, float, float]  # what, from, until: s
+
+
+@dataclass(frozen=True, slots=True)
+class TraceEntry:
+    """What one process did of one frame set, or a batch of the recorder."""
+
+    lane: str
+    stamp: float  # s, of the set
+    spans: tuple[Span, ...]
+    queued: float = 0.0  # s for which its thread was ready and did not run
+    faults: int = 0  # page faults of its thread
+
+    @property
+    def message(self) -> dict[str, object]:
+        """As it is recorded."""
+        spans = [[name, begin, end] for name, begin, end in self.spans]
+        return {"stamp": self.stamp, "lane": self.lane, "spans": spans, "queued": self.queued, "faults": self.faults}
+
+
+def _run_queue_delay() -> float:
+    """Seconds for which this thread was ready and did not run so far; 0 where the system does not say."""
+    try:
+        return int(SCHEDULER_FILE.read_bytes().split()[1]) * 1e-9
+    except (OSError, IndexError, ValueError):
+        return 0.0
+
+
+class TraceLane:
+    """Counts what holds up the thread that made it, between one entry and the next."""
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self._name, self._clock = name, clock
+        self._garbage: list[Span] = []
+        self._collecting = 0.0
+        self._last = self._counts()
+        gc.callbacks.append(self._collected)
+
+    def entry(self, stamp: float, spans: Iterable[Span]) -> TraceEntry:
+        """The entry of a set at `stamp`, s: its spans, and what held this thread up since the last entry."""
+        delay, faults = self._counts()
+        queued, since = delay - self._last[0], faults - self._last[1]
+        self._last = delay, faults
+        garbage, self._garbage = self._garbage, []
+        return TraceEntry(self._name, stamp, (*spans, *garbage), queued, since)
+
+    def close(self) -> None:
+        """Count no more."""
+        gc.callbacks.remove(self._collected)
+
+    def _counts(self) -> tuple[float, int]:
+        usage = resource.getrusage(resource.RUSAGE_THREAD)
+        return _run_queue_delay(), usage.ru_minflt + usage.ru_majflt
+
+    def _collected(self, phase: str, information: Mapping[str, int]) -> None:
+        now = self._clock.now()
+        if phase == "start":
+            self._collecting = now
+        else:
+            self._garbage.append((GARBAGE, self._collecting, now))
+
+
+def in_turn(begin: float, names: Sequence[str], seconds: Array) -> list[Span]:
+    """Spans of stages that follow each other from `begin`, s, on; seconds: (N,) of each."""
+    ends = begin + np.cumsum(seconds)
+    return [(name, float(end - spent), float(end)) for name, spent, end in zip(names, seconds, ends, strict=False)]
+
+
+@dataclass(frozen=True, slots=True)
+class SetWay:
+    """The way of one frame set."""
+
+    stamp: float  # s
+    handed: float  # s, its pixels are in memory
+    wired: float  # s, the first move made of it is on the wire
+
+
+@dataclass(slots=True)
+class Trace:
+    """The trace of a run."""
+
+    entries: list[TraceEntry] = field(default_factory=list)
+
+    @property
+    def ways(self) -> list[SetWay]:
+        """Of the sets of which a move was made, in order of their stamps."""
+        wired = {
+            entry.stamp: end
+            for entry in self.entries
+            if entry.lane == MOTION_LANE
+            for name, _, end in entry.spans
+            if name == ON_WIRE
+        }
+        begun = {e.stamp: e.spans[0][1] for e in self.entries if e.lane == TRACKING_LANE and e.spans}
+        return [SetWay(s, begun[s], wired[s]) for s in sorted(begun.keys() & wired.keys())]
+
+    def during(self, begin: float, end: float) -> dict[str, float]:
+        """Seconds of each kind of span between two instants, s; of the run queue its share in proportion."""
+        sums: dict[str, float] = {}
+        for entry in self.entries:
+            if not entry.spans:
+                continue
+            first, last = entry.spans[0][1], max(span[2] for span in entry.spans)
+            if last <= begin or first >= end:
+                continue
+            for name, start, stop in entry.spans:
+                if name != QUEUE_STAGE and (shared := min(stop, end) - max(start, begin)) > 0:
+                    key = f"{entry.lane}: {name}"
+                    sums[key] = sums.get(key, 0.0) + shared
+            if entry.queued > 0 and last > first:
+                key, share = f"{entry.lane}: {RUN_QUEUE}", (min(last, end) - max(first, begin)) / (last - first)
+                sums[key] = sums.get(key, 0.0) + entry.queued * share
+        return sums
+
+
+def read_trace(record: Path) -> Trace:
+    """The trace in a recording; InputError where it holds none."""
+    from hardware.recording.mcap_file import ChunkMessages, parse, walk
+
+    trace = Trace()
+    for part in walk(record):
+        for stored in part.messages if isinstance(part, ChunkMessages) else ():
+            if stored.topic == TOPIC:
+                told = parse(record, stored)
+                spans = tuple((str(name), float(begin), float(end)) for name, begin, end in told["spans"])
+                counts = float(told["queued"]), int(told["faults"])
+                trace.entries.append(TraceEntry(str(told["lane"]), float(told["stamp"]), spans, *counts))
+    if not trace.entries:
+        raise InputError(record, TOPIC, "no trace", "the recording of a live run with record.trace = true")
+    return trace
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What sets waited for, s a set: all on average, and the slowest."""
+
+    name: str
+    usual: float
+    slowest: float
+
+
+def slowest_sets(ways: Sequence[SetWay], share: float = SLOWEST_SHARE) -> list[SetWay]:
+    """The slowest share of sets, one at least, the slowest first."""
+    ordered = sorted(ways, key=lambda way: way.handed - way.wired)
+    return ordered[: max(round(share * len(ordered)), 1)]
+
+
+def causes(trace: Trace, share: float = SLOWEST_SHARE) -> list[Cause]:
+    """What was done on the sets' ways, by what the slowest share spent more on than all do."""
+    ways = trace.ways
+    slow = {way.stamp for way in slowest_sets(ways, share)} if ways else set()
+    usual, slowest = dict[str, float](), dict[str, float]()
+    for way in ways:
+        for name, seconds in trace.during(way.handed, way.wired).items():
+            usual[name] = usual.get(name, 0.0) + seconds / len(ways)
+            if way.stamp in slow:
+                slowest[name] = slowest.get(name, 0.0) + seconds / len(slow)
+    found = [Cause(name, mean, slowest.get(name, 0.0)) for name, mean in usual.items()]
+    return sorted(found, key=lambda cause: cause.usual - cause.slowest)
+
+
+def trace_text(trace: Trace) -> str:
+    """The percentiles of the ways and the causes of the slowest, as a table for a terminal."""
+    ways = trace.ways
+    if not ways:
+        return "no move was made of any frame set"
+    spent = 1000 * np.array([way.wired - way.handed for way in ways])
+    median, late, most = np.percentile(spent, [50, 99, 100])
+    lines = [f"frames to wire, {len(ways)} sets: {median:.1f} / {late:.1f} / {most:.1f} ms (median, 99 %, largest)"]
+    width = max(len(cause.name) for cause in causes(trace))
+    lines.append(f"{'what was done meanwhile, ms a set':<{width}}  {'all':>7}  slowest {SLOWEST_SHARE:.0%}")
+    lines += [f"{c.name:<{width}}  {1000 * c.usual:7.2f}  {1000 * c.slowest:7.2f}" for c in causes(trace)]
+    return "\n".join(lines)
+
+
+def chrome_trace(trace: Trace) -> str:
+    """The trace for Perfetto (ui.perfetto.dev) or chrome://tracing: a process a lane, instants in microseconds."""
+    lanes = sorted({entry.lane for entry in trace.entries})
+    first = min((span[1] for entry in trace.entries for span in entry.spans), default=0.0)
+    events: list[dict[str, object]] = [
+        {"ph": "M", "name": "process_name", "pid": number, "tid": 0, "args": {"name": lane}}
+        for number, lane in enumerate(lanes)
+    ]
+    for entry in trace.entries:
+        told = {"stamp": entry.stamp, "ready, but not running, ms": 1000 * entry.queued, "page faults": entry.faults}
+        for name, begin, end in entry.spans:
+            place = {"pid": lanes.index(entry.lane), "tid": int(name == GARBAGE)}
+            when = {"ts": round(1e6 * (begin - first), 1), "dur": round(1e6 * (end - begin), 1)}
+            events.append({"ph": "X", "name": name, **place, **when, "args": told})
+    return json.dumps({"displayTimeUnit": "ms", "traceEvents": events})
+
+
+def trace_page(trace: Trace, title: str) -> str:
+    """A page with the causes, and what each process did on the ways of the slowest sets."""
+    from hardware.report.page import document, figures_table, section
+
+    ways = trace.ways
+    lead = trace_text(trace).splitlines()[0]
+    rows = [[c.name, f"{1000 * c.usual:.2f}", f"{1000 * c.slowest:.2f}"] for c in causes(trace)] if ways else []
+    charts = "".join(_lanes(trace, way) for way in slowest_sets(ways, DRAWN_SETS / len(ways))) if ways else ""
+    body = [
+        section(
+            "What was done meanwhile",
+            "Milliseconds a set, from its pixels in memory to the first move on the wire; processes work side by side.",
+            figures_table(("what", "all sets", f"slowest {SLOWEST_SHARE:.0%}"), rows),
+        ),
+        section("The slowest sets", "Each lane a process; the grey band is the set's way.", _legend(trace) + charts),
+    ]
+    return document("trace", title, lead, body, "stillbed")
+
+
+COLOURS = (
+    *("#3d7edb", "#e07b39", "#3aa37b", "#b65fc4", "#c9a227", "#d1495b", "#5aa9c7", "#8d8d8d"),
+    *("#7a5c3e", "#1f4e8c", "#9bc53d", "#f19cbb", "#5f4bb6", "#00798c"),
+)
+
+
+def _colours(trace: Trace) -> dict[str, str]:
+    names = sorted({span[0] for entry in trace.entries for span in entry.spans})
+    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
+
+
+def _legend(trace: Trace) -> str:
+    keys = (f'<span style="color:{c}">■</span> {escape(name)}' for name, c in _colours(trace).items())
+    return f"<p>{', '.join(keys)}</p>"
+
+
+def _lanes(trace: Trace, way: SetWay) -> str:
+    """What each process did on the way of one set, as SVG."""
+    begin, end = way.handed - DRAWN_BEFORE_S, way.wired
+    scale, lanes = CHART_PX / (end - begin), (TRACKING_LANE, MOTION_LANE, RECORDER_LANE)
+    band = f'<rect x="{DRAWN_BEFORE_S * scale:.1f}" y="0" width="{(end - way.handed) * scale:.1f}" '
+    parts = [f'{band}height="{LANE_PX * len(lanes)}" fill="#8883"/>']
+    colours = _colours(trace)
+    for entry in trace.entries:
+        for name, start, stop in entry.spans:
+            if stop <= begin or start >= end:
+                continue
+            left, width = (max(start, begin) - begin) * scale, (min(stop, end) - max(start, begin)) * scale
+            row = lanes.index(entry.lane)
+            text = escape(f"{entry.lane}: {name}, {1000 * (stop - start):.1f} ms")
+            place = f'x="{left:.1f}" y="{row * LANE_PX + 1}" width="{max(width, 0.5):.1f}" height="{LANE_PX - 2}"'
+            parts.append(f'<rect {place} fill="{colours[name]}"><title>{text}</title></rect>')
+    text = f"stamp {way.stamp:.3f} s: {1000 * (way.wired - way.handed):.1f} ms; from above: {', '.join(lanes)}"
+    size = f'viewBox="0 0 {CHART_PX} {LANE_PX * len(lanes)}" width="100%"'
+    return f'<p>{escape(text)}</p><svg {size} role="img" aria-label="{escape(text)}">{"".join(parts)}</svg>'
