@@ -171,7 +171,9 @@ def exposed_poses(rig: Rig, surface_map: SurfaceMap | None, tracks: Observations
     Cameras that are not exposed together see a moving surface at different places; a pose of one alone is known worse.
     """
     found = dict.fromkeys(range(len(rig)), joint)
-    for c, camera in enumerate(rig.cameras) if surface_map is not None else ():
+    if surface_map is None:
+        return found
+    for c, camera in enumerate(rig.cameras):
         mine = tracks.track[tracks.camera == c]
         if len(mine) < MIN_OWN_TRACKS:
             continue

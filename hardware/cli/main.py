@@ -220,8 +220,8 @@ def parser() -> Parser:
     commands = Commands(top, "COMMAND")
     for add in (
         _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_scan, add_plan, add_live,
-        add_record, add_trace, add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras, add_import,
-        add_export, add_train, add_bench, add_doctor, add_cache,
+        add_record, add_trace, add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras,
+        add_import, add_export, add_train, add_bench, add_doctor, add_cache,
     ):  # fmt: skip
         add(commands)
     return top

@@ -74,7 +74,7 @@ MIN_CONTRAST = 3.0  # grey levels added to the local contrast: noise of a plain 
 MIN_LIKENESS = 0.1  # added to what correlations are divided by: a plain patch tells nothing
 TRUST_POWER = 4  # by which the channel counts more whose best correlation is higher
 BENDING_COST, MAX_BENDING_COST = 0.1, 0.6  # of a slope of 1 between neighbours, and the most: a rim may be steep
-MIN_FACING = 0.15  # cosine of the viewing angle below which a camera sees too little of a node
+MIN_VIEW_FACING = 0.15  # cosine of the viewing angle below which a camera sees too little of a node
 SATURATED_GREY = 250  # where a picture tells nothing
 PROBE = 0.14  # nodes up and down, by which pictures' change with height is taken: a tenth of a pixel
 MAX_STEP = 0.8  # nodes, a round's: the windows lie on the surface to so much
@@ -114,7 +114,7 @@ class DenseFit:
         self._lenses, self._views, self._progress = lenses, tuple(views), progress
         self._node = 1.0  # mm, of a finest one
         self._levels = [parallel_map(_channels, [view.image for view in views])]
-        self._levels.append(parallel_map(cv2.pyrDown, self._levels[-1]))
+        self._levels.append([np.asarray(cv2.pyrDown(each), np.float32) for each in self._levels[-1]])
         self._bright = parallel_map(_saturated, [view.image for view in views])
 
     def __call__(
@@ -153,7 +153,7 @@ class DenseFit:
         pairs = [(a, b) for a, b in combinations(views, 2) if self._views[a].instant == self._views[b].instant]
         seen = {n: self._facing(n, points, directions) for n in views}
         ways = {n: [self._pixels(n, points + h * directions)[0] for h in (-reach, 0, reach)] for n in views}
-        count = sum(seen[a] * seen[b] for a, b in pairs) + np.float32(1e-6)
+        count = np.stack([seen[a] * seen[b] for a, b in pairs]).sum(0) + np.float32(1e-6)
 
         def score(height: float) -> Float32:
             even, power = {}, {}
@@ -186,7 +186,7 @@ class DenseFit:
             even, contrast, sums = _evened(value, weight)
             slope = (above - below) / np.float32(2 * probe)
             slope = (slope - _blur(weight[..., None] * slope, EVEN_WINDOW) / sums) / contrast
-            return even, slope, weight
+            return even, np.asarray(slope, np.float32), weight
 
         looks = parallel_map(look, range(len(self._views)))
         evens, slopes, seen = (np.stack(part) for part in zip(*looks, strict=True))  # (V, H, W, K) twice, (V, H, W)
@@ -253,7 +253,7 @@ class DenseFit:
         facing = (away * normals).sum(2) / distance
         (u, v), inside = self._pixels(n, points)
         w, h = self._lenses.rig.cameras[view.camera].size
-        inside &= (u > 2) & (v > 2) & (u < w - 3) & (v < h - 3) & (facing > MIN_FACING)
+        inside &= (u > 2) & (v > 2) & (u < w - 3) & (v < h - 3) & (facing > MIN_VIEW_FACING)
         cells = [(np.clip(p, 0, most - 1) // HIDDEN_CELL_PX).astype(int) for p, most in ((v, h), (u, w))]
         nearest = np.full((h // HIDDEN_CELL_PX + 1, w // HIDDEN_CELL_PX + 1), np.inf)
         np.minimum.at(nearest, tuple(cells), np.where(inside, distance, np.inf))
