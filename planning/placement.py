@@ -98,7 +98,8 @@ def placement_by_region(path: Path, outlines: list[Array], points: Array, outwar
     """A guess without a scan: the path's middle and long axis on those of the region, its plane z = 0 on the surface.
 
     outlines: of the region on the surface, (K, 3) mm each, surface frame; without any the mapped points (V, 3) count.
-    Of the two ways along an axis the one nearer to the surface's own x is taken. NoSurfaceError: nothing is mapped.
+    Of the two ways along an axis the one nearer to the diagonal of the surface's own x and y is taken: a region along
+    either axis comes out the same each time. NoSurfaceError: nothing is mapped.
     """
     weights, places = _along(outlines) if outlines else (np.ones(len(points)), points)
     if not len(places):
@@ -113,9 +114,9 @@ def placement_by_region(path: Path, outlines: list[Array], points: Array, outwar
     extruded = checkpoints[path.extrude] if path.extrude.sum() >= MIN_PATH_POINTS else checkpoints
     path_turn = _long_axis(_moments(np.ones(len(extruded)), extruded[:, :2])[1])
     known = region_turn is not None and path_turn is not None
-    turn = (
-        0.0 if region_turn is None or path_turn is None else (region_turn - path_turn + np.pi / 2) % np.pi - np.pi / 2
-    )
+    turn = 0.0
+    if region_turn is not None and path_turn is not None:
+        turn = (region_turn - path_turn + np.pi / 4) % np.pi - np.pi / 4
     middle = np.array([*path_middle(path)[:2], 0.0])
     turned = se3.make(se3.exp_rotation(np.array([0.0, 0.0, turn])), np.zeros(3))
     surface_from_path = surface_from_tangent @ turned @ se3.make(np.eye(3), -middle)

@@ -218,22 +218,29 @@ def printed_once(*records: Path) -> None:
 
 
 def asks_to_move(run: Running, move: MoveRequest) -> None:
-    """Open a window of the run's page, and ask for a move under the turn that it shows."""
+    """Ask for a move in a window of the run's page; again, as an operator does, where the surface is not seen then."""
 
     async def ask(address: str) -> None:
         origin = {"Origin": address.rsplit("/", 2)[0]}
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{address}socket", headers=origin) as socket:
-            asked = False
+            asked, number = False, None
             async for message in socket:
                 said = json.loads(message.data) if message.type is aiohttp.WSMsgType.TEXT else {}
                 if "bundle" in said:
                     await socket.send_str(json.dumps({"shown": said["bundle"]}))
+                view = said.get("view") or {}
                 if said.get("kind") == "asked":
-                    assert said["number"], said
-                    return
-                if not asked and said.get("view") and said["view"]["stage"] == "confirm":
-                    asked, turn = True, said["view"]["turn"]
-                    await socket.send_str(json.dumps({"ask": "move", "turn": turn, "tag": 1, "move": astuple(move)}))
+                    number = said["number"]
+                    assert number, said
+                elif number is not None and (answer := view.get("answer")) and answer["number"] == number:
+                    if answer["followed"]:
+                        return
+                    assert "not seen" in answer["words"] or "mapped" in answer["words"], answer
+                    asked, number = False, None
+                if not asked and view.get("stage") == "confirm":
+                    asked = True
+                    wanted = {"ask": "move", "turn": view["turn"], "tag": 1, "move": astuple(move)}
+                    await socket.send_str(json.dumps(wanted))
 
     asyncio.run(asyncio.wait_for(ask(re.search(r"open (\S+) to see", run.said)[1]), 30.0))
 

@@ -65,7 +65,7 @@ def test_a_dry_run_over_a_printed_picture_follows_the_picture(place: Path, by: s
             address = run.said.split("open ")[1].split(" ")[0]
             assert asyncio.run(draw(address)) == ""
         run.wait_for(r"now: move the path on the page")  # where it lies by the region alone is a guess
-        asks_to_move(run, MoveRequest(0.0, 0.0, 90.0))  # along the sheet's long side the arm does not reach
+        asks_to_move(run, MoveRequest(0.0, 0.0, -90.0))  # along the sheet's long side the arm does not reach
         run.wait_for("moved by hand")
         run.press("y")
         run.wait_for("ready")
