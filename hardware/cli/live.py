@@ -8,16 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import (
-    FAILED,
-    MODEL_HELP,
-    REGION_HELP,
-    Commands,
-    add_fault,
-    arm_profile,
-    positive,
-    wrong_option,
-)
+from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, positive, wrong_option
 from hardware.process.clock import WallClock
 from perception import named_path
 
@@ -60,7 +51,7 @@ def add_live(commands: Commands) -> None:
     add("--rig", type=Path, metavar="RIG", help="rig.toml of cameras, or a session shown in real time")
     add("--simulated", type=named_path, metavar="SCENARIO.toml", help="a scenario, rendered before the run")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
-    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     what = 'scan of the surface, in the frame of the path; or "from the cameras", which then scan it before the run'
     add("--scan", type=named_path, metavar="SCAN.ply", help=what)
@@ -113,7 +104,7 @@ def add_record(commands: Commands) -> None:
     add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
     add("--seconds", type=positive, metavar="S", help="from the first picture on; default: until Ctrl-C")
     add("--jpeg-quality", type=int, metavar="Q", help="1 to 100, default 90; 0 keeps the pictures exactly")
-    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--no-page", action="store_true", help="without a page")
     add("--force", action="store_true", help="overwrite the file")
 

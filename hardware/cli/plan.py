@@ -12,7 +12,7 @@ from estimation.errors import InputError, StillbedError
 from hardware.cli.parser import (
     FAILED,
     MODEL_HELP,
-    REGION_HELP,
+    ROI_HELP,
     Commands,
     damage_code,
     not_negative,
@@ -341,7 +341,7 @@ def add_scan(commands: Commands) -> None:
     add("-o", "--out", type=Path, required=True, metavar="X.ply", help="file to write, with X.html beside it")
     add("--sets", type=int, default=6, metavar="N", help="instants whose pictures are fused, 2 to 40; default 6")
     add("--seconds", type=positive, default=4.0, metavar="S", help="in which they are taken; default 4, a breath")
-    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--force", action="store_true", help="overwrite the files")
 
 
