@@ -371,7 +371,7 @@ def scanned_settings(settings: LiveSettings, where: object, force: bool) -> Live
     assert source is not None and record is not None
     if record.exists() and not force:
         raise InputError(record, "--record", "a file that exists", "a new file, or --force")
-    scan, path = (record.with_name(f"{record.stem}.{name}") for name in ("scan.ply", "path.csv"))
+    scan, path = (record.with_name(f"{record.stem}_{name}") for name in ("scan.ply", "path.csv"))
     print(run_scan(ScanOrder(source, scan, region=settings.region, force=True)), flush=True)
     if settings.path is not None:
         return replace(settings, scan=scan)
