@@ -80,6 +80,14 @@ def test_the_claim_is_as_wide_as_the_errors(case: str, movements: tuple[str, ...
     assert 0.35 < found.nees < 1.4 and found.inside > 0.87 and found.twist_nees < 4.0
 
 
+@pytest.mark.parametrize("movement", ["still", "lively", *slowly("breathing", "sway", "turns")])
+def test_a_twist_is_as_uncertain_as_it_claims(movement: str) -> None:
+    run = follow(world(movement, seconds=6.0))
+    settled = run.measured & (np.arange(len(run.poses)) > 60)
+    reported = nees(run.twist_errors, run.twist_covariances)[settled].mean() / 6
+    assert 0.7 < reported < 1.4
+
+
 def test_coasting_poses_are_where_they_claim_to_be() -> None:
     values = []
     for movement in FEW:

@@ -11,11 +11,13 @@ from estimation.online.camera_errors import CameraErrors
 from estimation.online.fit import FitCovariance, FrameFit
 from estimation.online.reported_covariance import (
     CALM_BEFORE_NARROWING_S,
+    NOISE_SHARE_OF_TWIST,
     FrameOriginError,
     ReportedCovariance,
     TrackNoise,
     WindowNoise,
 )
+from estimation.online.window import PRIOR_REVISION, WindowEstimate
 from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, SharedFit
 from estimation.se3 import Array
@@ -92,6 +94,14 @@ BELIEVED = 0.04 * np.eye(6)  # of the first pose, before the images are known to
 LITTLE = 1e-6 * np.eye(6)
 
 
+def window_of(covariance: Array, revision: float = PRIOR_REVISION) -> WindowEstimate:
+    one, unit = np.ones(6), np.eye(6)
+    return WindowEstimate(0.0, np.eye(4), covariance, 0 * one, 4 * unit, one, revision * one)
+
+
+WINDOW = window_of(LITTLE)
+
+
 def fit_at(stamp: float, tracks: int = 300, scatter: float = 1.0) -> FrameFit:
     _, fit = first(0.5, CameraErrors(CAMERAS))
     shared = SharedFit(np.diag(np.full(3 * CAMERAS, 1e4)), np.zeros(3 * CAMERAS))
@@ -108,9 +118,9 @@ def pose_at(stamp: float, state: TrackState = TrackState.TRACKING, reason: str =
 def quiet(seconds: float) -> tuple[ReportedCovariance, Array]:
     """A claim after so long without trouble, and what it last claimed."""
     claim, cameras, believed = ReportedCovariance(CAMERAS), CameraErrors(CAMERAS), BELIEVED
-    given = claim.measured(pose_at(0.0), fit_at(0.0), cameras, believed, LITTLE)
+    given = claim.measured(pose_at(0.0), fit_at(0.0), cameras, believed, WINDOW)
     for k in range(1, round(30 * seconds) + 1):
-        given = claim.measured(pose_at(k / 30), fit_at(k / 30), rested(0.005) if k == 1 else cameras, believed, LITTLE)
+        given = claim.measured(pose_at(k / 30), fit_at(k / 30), rested(0.005) if k == 1 else cameras, believed, WINDOW)
         cameras = RESTED
     return claim, given.covariance
 
@@ -144,17 +154,17 @@ def test_once_the_images_are_known_to_rest_less_is_claimed() -> None:
 )
 def test_whatever_is_unlike_before_brings_the_wide_claim_back_for_a_second(pose: SurfacePose, fit: FrameFit) -> None:
     claim, narrow = quiet(1.5 * CALM_BEFORE_NARROWING_S)
-    assert size(narrow) < 0.5 * size(BELIEVED) <= size(claim.measured(pose, fit, RESTED, BELIEVED, LITTLE).covariance)
+    assert size(narrow) < 0.5 * size(BELIEVED) <= size(claim.measured(pose, fit, RESTED, BELIEVED, WINDOW).covariance)
     for later in (0.1, 0.9):
         stamp = 2.0 + later * CALM_BEFORE_NARROWING_S
-        claimed = claim.measured(pose_at(stamp), fit_at(stamp), RESTED, BELIEVED, LITTLE).covariance
+        claimed = claim.measured(pose_at(stamp), fit_at(stamp), RESTED, BELIEVED, WINDOW).covariance
         assert size(claimed) >= size(BELIEVED)
 
 
 def test_a_pose_that_is_only_predicted_keeps_its_wide_claim_and_so_does_the_next() -> None:
     claim, _ = quiet(1.5 * CALM_BEFORE_NARROWING_S)
     assert size(claim.missed(pose_at(2.0, TrackState.COASTING)).covariance) >= size(BELIEVED)
-    assert size(claim.measured(pose_at(2.1), fit_at(2.1), RESTED, BELIEVED, LITTLE).covariance) >= size(BELIEVED)
+    assert size(claim.measured(pose_at(2.1), fit_at(2.1), RESTED, BELIEVED, WINDOW).covariance) >= size(BELIEVED)
 
 
 def test_of_tracks_that_scatter_less_than_they_claim_the_window_is_claimed_smaller() -> None:
@@ -165,15 +175,44 @@ def test_of_tracks_that_scatter_less_than_they_claim_the_window_is_claimed_small
     sizes = []
     for scatter in (1.0, 0.2):
         scattered = replace(fit, parts=replace(fit.parts, scatter=scatter))
-        sizes.append(size(claim.measured(pose, scattered, RESTED, BELIEVED, wide).covariance))
+        sizes.append(size(claim.measured(pose, scattered, RESTED, BELIEVED, window_of(wide)).covariance))
     assert sizes[0] - sizes[1] == pytest.approx(0.9 * 0.8 * size(wide), rel=1e-6)
+
+
+def test_a_twist_is_claimed_by_its_noise_alone_once_hindsight_changes_nothing_of_it() -> None:
+    claim, _ = quiet(2.0)
+    fit = fit_at(2.03)
+    alike = replace(fit, parts=replace(fit.parts, tracks=fit.parts.noise))
+    claimed = [
+        claim.measured(pose_at(2.03), alike, RESTED, BELIEVED, window_of(LITTLE, revision)).twist_covariance
+        for revision in (0.0, PRIOR_REVISION, 2 * PRIOR_REVISION)
+    ]
+    assert claimed[0] == pytest.approx(NOISE_SHARE_OF_TWIST * 4 * np.eye(6))
+    assert size(claimed[1]) == pytest.approx(size(4 * np.eye(6)), rel=0.1)  # as the window says
+    assert size(claimed[2]) > 1.8 * size(claimed[1])
+
+
+def test_a_twist_is_claimed_wider_where_the_cameras_expose_late() -> None:
+    claim, _ = quiet(2.0)
+    fit, late = fit_at(2.03), np.diag([0, 0, 0, 0, 0, 1.0])
+    sharp = claim.measured(pose_at(2.03), fit, RESTED, BELIEVED, window_of(LITTLE, 0.0)).twist_covariance
+    fit = replace(fit, parts=replace(fit.parts, smear=2 * fit.parts.noise * late))
+    smeared = claim.measured(pose_at(2.03), fit, RESTED, BELIEVED, window_of(LITTLE, 0.0)).twist_covariance
+    assert smeared - sharp == pytest.approx(NOISE_SHARE_OF_TWIST * 2 * 4 * late)
+
+
+def test_a_twist_is_claimed_as_the_window_says_for_a_second_after_trouble() -> None:
+    claim, _ = quiet(0.5 * CALM_BEFORE_NARROWING_S)
+    pose = replace(pose_at(0.52), twist_covariance=4 * np.eye(6))
+    given = claim.measured(pose, fit_at(0.52), RESTED, BELIEVED, window_of(LITTLE, 0.0))
+    assert np.array_equal(given.twist_covariance, pose.twist_covariance)
 
 
 def test_a_forecast_is_claimed_as_its_pose_is() -> None:
     claim, _ = quiet(1.5 * CALM_BEFORE_NARROWING_S)
     pose = pose_at(2.0)
     ahead = Forecast(np.array([0.1, 0.2]), np.zeros((2, 6)), np.stack([pose.covariance, 2 * pose.covariance]))
-    given = claim.measured(replace(pose, forecast=ahead), fit_at(2.0), RESTED, BELIEVED, LITTLE)
+    given = claim.measured(replace(pose, forecast=ahead), fit_at(2.0), RESTED, BELIEVED, WINDOW)
     less = given.covariance - pose.covariance
     assert given.forecast.covariances == pytest.approx(ahead.covariances + less)
 
@@ -186,13 +225,14 @@ CAMERA_ERRORS = CameraErrors(CAMERAS)
 def test_each_part_of_the_noise_is_resized_by_itself(scatter: float, rest: float) -> None:
     _, fit = first(1.0, CAMERA_ERRORS)
     unrest = CAMERA_ERRORS.unrest
-    averaged = WindowNoise(0.3 * fit.parts.noise, replace(fit, parts=replace(fit.parts, scatter=scatter)), unrest)
+    averaged = WindowNoise(replace(fit, parts=replace(fit.parts, scatter=scatter)), unrest)
     expected = 0.3 * (scatter * fit.parts.tracks + rest * unrest * fit.parts.by_shift @ fit.parts.by_shift.T)
-    assert averaged.covariance(TrackNoise(CAMERAS), rest * unrest) == pytest.approx(expected, rel=1e-6)
+    found = averaged.rescaled(0.3 * fit.parts.noise, TrackNoise(CAMERAS), rest * unrest)
+    assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_window_that_knows_some_axes_better_keeps_its_shape_where_nothing_is_resized() -> None:
     _, fit = first(1.0, CAMERA_ERRORS)
     window = np.linalg.inv(np.linalg.inv(fit.parts.noise) + np.diag([1e3, 0, 1e5, 0, 1e4, 0]))
-    found = WindowNoise(window, fit, CAMERA_ERRORS.unrest).covariance(TrackNoise(CAMERAS), CAMERA_ERRORS.unrest)
+    found = WindowNoise(fit, CAMERA_ERRORS.unrest).rescaled(window, TrackNoise(CAMERAS), CAMERA_ERRORS.unrest)
     assert found == pytest.approx(window, rel=1e-6)

@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.online.window import WINDOW_LAG_S, AccelerationPsd, MeasuredPose, Smoother, WindowEstimate
+from estimation.online.window import (
+    PRIOR_REVISION,
+    WINDOW_LAG_S,
+    AccelerationPsd,
+    MeasuredPose,
+    Smoother,
+    WindowEstimate,
+)
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST
 from tests.synthetic import Motion, breathing
@@ -65,6 +72,20 @@ def test_the_twist_of_a_noisy_motion_is_found_within_what_it_claims() -> None:
 def test_the_covariance_is_as_wide_as_the_errors(rate: float) -> None:
     values = [nees(run(measure(breathing, np.arange(90) / rate, s)), breathing) for s in range(6)]
     assert 0.7 < np.mean(values) < 1.3
+
+
+def test_hindsight_revises_twists_as_they_claim_where_the_motion_is_as_the_prior_has_it() -> None:
+    """Least where a surface at rest is taken for a livelier one, as `AccelerationPsd` does to be ready for a jerk."""
+
+    def revision(positions: Array) -> float:
+        stamps = np.arange(len(positions)) * DT
+        spread = np.diag(LIVELINESS_NOISE**2)
+        poses = (MeasuredPose(t, se3.exp(p), spread) for t, p in zip(stamps.tolist(), positions, strict=True))
+        return float(np.mean(run(list(poses))[-1].revision))
+
+    white = revision(wander(np.array([1e-3] * 3 + [10.0] * 3), 300, 1))
+    assert 0.6 * PRIOR_REVISION < white < 1.4 * PRIOR_REVISION
+    assert revision(wander(np.zeros(6), 300, 2)) < 0.6 * white
 
 
 def test_smoothing_a_calm_motion_never_costs_accuracy() -> None:
@@ -164,8 +185,9 @@ def test_a_gap_longer_than_the_window_begins_a_new_one() -> None:
 
 def test_a_gap_shorter_than_the_window_is_bridged() -> None:
     motion = turning(np.array([0, 0, 0.1, 5.0, 0, 0]))
-    stamps = np.r_[np.arange(20), np.arange(32, 40)] / 30
-    assert np.allclose(run(measure(motion, stamps, 5))[20].twist[3], 5.0, atol=0.5)
+    stamps, smoother = np.r_[np.arange(20), np.arange(32, 40)] / 30, Smoother()
+    assert np.allclose(run(measure(motion, stamps, 5), smoother)[20].twist[3], 5.0, atol=0.5)
+    assert smoother.rebuilds == 0
 
 
 def test_after_a_reset_nothing_is_left() -> None:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3, smooth
+from estimation.batch.normal_equations import condense
 from estimation.batch.smoothed import (
     REFINED_PRIOR,
     STATE_DOF,
@@ -21,7 +22,7 @@ from estimation.batch.smoothed import (
     prior_factors,
     transition,
 )
-from estimation.batch.solve import BlockTridiagonal
+from estimation.batch.solve import BlockTridiagonal, Elimination, NormalEquations, PassProgress
 from estimation.errors import InputError
 from estimation.observations import Observations, no_observations
 from estimation.rig import Rig
@@ -257,6 +258,60 @@ def test_gtsam_finds_no_better_landmarks_for_these_poses() -> None:
     found = np.stack([solved.atPoint3(gtsam.symbol("l", row)) for row in rows.values()])
     sigma = np.sqrt(np.diag(result.map.covariance)).reshape(-1, 3)
     assert np.abs((found - result.map.points) / sigma).max() < 0.1
+
+
+def test_gtsam_solves_the_same_condensed_factors_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps and marginals of states, landmarks and clocks; its dense factors of the shared take too much memory."""
+    passes: list[tuple[NormalEquations, Elimination]] = []
+
+    class Kept(NormalEquations):
+        def eliminate(self, progress: PassProgress, step: Array | None = None) -> Elimination:
+            passes.append((self, super().eliminate(progress, step)))
+            return passes[-1][1]
+
+    monkeypatch.setattr("estimation.batch.smooth.NormalEquations", Kept)
+    world = synthetic_world("breathing", seconds=0.5, count=12, offsets=(0.0, 0.01, -0.01))
+    result = smooth(world.rig, list(world))
+    equations, done = passes[-1]
+    steps, shared = gtsam_solution(equations)
+    count, key = len(result.stamps), len(result.stamps)
+    found = steps.optimize()
+    sigma = np.sqrt(np.diag(done.shared_covariance()))
+    assert found.at(key) == pytest.approx(done.shared_step(), abs=1e-6 * float(sigma.min()))
+    assert np.abs(steps.marginalCovariance(key) / np.outer(sigma, sigma) - shared / np.outer(sigma, sigma)).max() < 1e-6
+    again = equations.eliminate(lambda done, total: None, done.shared_step()).chain.steps()
+    for k in range(count):
+        scale = np.sqrt(np.diag(result.covariance[k]))
+        assert (np.abs(found.at(k) - again[k]) < 1e-6 * scale).all()
+        off = steps.marginalCovariance(k) - result.covariance[k]
+        assert np.abs(off / np.outer(scale, scale)).max() < 1e-6
+
+
+def gtsam_solution(equations: NormalEquations) -> tuple[gtsam.GaussianBayesTree, Array]:
+    """The states 0 to K - 1 and, as K, the shared unknowns; their covariance (S, S) by the banded solver."""
+    problem, estimate, known = equations.problem, equations.estimate, equations.known
+    part, links = condense(problem, 0, len(problem.data), estimate, equations.noise), equations._links
+    count, q, size = len(problem.data), len(problem.free), problem.size
+    equations._begin(0, count, part.information, part.gradient)
+    graph, none = gtsam.GaussianFactorGraph(), np.zeros((size, size))
+    for k in range(count):
+        own = part.information[k], part.cross[k], -part.gradient[k]
+        graph.add(gtsam.HessianFactor(k, count, *own, none, np.zeros(size), 0.0))
+    information, pull = part.shared - part.own.T @ part.own, part.pull.copy()
+    information[:q, :q] += known.calibration[np.ix_(problem.free, problem.free)]
+    information[q:, q:] += known.map
+    pull[:q] += (known.calibration @ estimate.cameras.since(known.calibrated))[problem.free]
+    pull[q:] += known.map @ (estimate.points - known.points).ravel()
+    graph.add(gtsam.HessianFactor(count, information, -pull, 0.0))
+    unit = gtsam.noiseModel.Unit.Create(STATE_DOF)
+    for k, root in enumerate(np.linalg.cholesky(equations._information)):
+        before, after, off = root.T @ links.before[k], root.T @ links.after[k], -root.T @ links.off[k]
+        graph.add(gtsam.JacobianFactor(k, before, k + 1, after, off, unit))
+    ordering = gtsam.Ordering()
+    for k in range(count + 1):
+        ordering.push_back(k)
+    shared = equations.eliminate(lambda done, total: None).shared_covariance()
+    return graph.eliminateMultifrontal(ordering), shared
 
 
 def test_what_cannot_be_smoothed_is_said() -> None:

@@ -19,7 +19,7 @@ from hardware.live.trace import (
     QUEUE_STAGE,
     RUN_QUEUE,
     TRACKING_LANE,
-    Trace,
+    RunTrace,
     TraceEntry,
     TraceLane,
     causes,
@@ -52,14 +52,14 @@ def entries(late: dict[int, float], count: int = 200) -> list[TraceEntry]:
 
 @given(st.dictionaries(st.integers(0, 198), st.floats(0.03, 0.2), max_size=3))
 def test_ways_are_as_long_as_they_were_made(late: dict[int, float]) -> None:
-    ways = Trace(entries(late)).ways
+    ways = RunTrace(entries(late)).ways
     assert len(ways) == 200 and min(way.wired - way.handed for way in ways) == pytest.approx(TRACKED + WIRED)
     slow = slowest_sets(ways)
     assert len(slow) == 2 and slow[0].wired - slow[0].handed == max(way.wired - way.handed for way in ways)
 
 
 def test_what_the_slowest_waited_for_comes_first() -> None:
-    trace = Trace(entries({50: 0.06, 120: 0.07}))
+    trace = RunTrace(entries({50: 0.06, 120: 0.07}))
     first = causes(trace)[0]
     assert first.name == f"{TRACKING_LANE}: idle"  # of the set before
     assert first.slowest == pytest.approx(0.065 + TRACKED - PERIOD, abs=2e-3) and first.usual < 0.002
@@ -70,7 +70,7 @@ def test_what_the_slowest_waited_for_comes_first() -> None:
 
 def test_time_in_the_run_queue_is_shared_over_an_entry() -> None:
     entry = TraceEntry(TRACKING_LANE, 0.0, (("work", 0.0, 1.0),), queued=0.4)
-    assert Trace([entry]).during(0.5, 2.0) == pytest.approx({"tracking: work": 0.5, f"tracking: {RUN_QUEUE}": 0.2})
+    assert RunTrace([entry]).during(0.5, 2.0) == pytest.approx({"tracking: work": 0.5, f"tracking: {RUN_QUEUE}": 0.2})
 
 
 def test_the_collector_is_seen_at_work() -> None:
@@ -108,5 +108,5 @@ def test_a_recording_without_one_says_so(tmp_path: Path) -> None:
 
 
 def test_without_any_move_there_is_a_page_all_the_same() -> None:
-    trace = Trace([TraceEntry(TRACKING_LANE, 0.0, (("wait", 0.0, 0.1),))])
+    trace = RunTrace([TraceEntry(TRACKING_LANE, 0.0, (("wait", 0.0, 0.1),))])
     assert not causes(trace) and "no move" in trace_text(trace) and "no move" in trace_page(trace, "x")

@@ -3,8 +3,8 @@
 The information of all states is block tridiagonal, with a border: every state is tied to the same landmarks and
 cameras. A Cholesky factorisation from the first state to the last needs only what the state before left of the border
 (18 rows). So a recording is taken in stretches that join exactly, in memory that does not grow with the border's size.
-GTSAM eliminates a graph likewise, but wants a factor for every observation (5.4 million in ten minutes) and a clique of
-all landmarks for each pose. Its factors and optimiser check the result in `tests/test_smoothing.py`.
+GTSAM eliminates the same condensed factors to the same numbers (`tests/test_smoothing.py`), but needs a dense factor of
+all landmarks for each frame set: eight times the memory that ten minutes may take (docs/smoothing.md).
 """
 
 from __future__ import annotations

@@ -320,7 +320,7 @@ class Estimator:
             rebuilds=self._smoother.rebuilds if self._smoother.rebuilds > rebuilds else 0,
         )
         pose = self._enter(window, fit.parts.smear, lasting, *self._states.measured(fit.stamp, quality))
-        given = surface.reported.measured(pose, fit, self.cameras, surface.first, window.covariance)
+        given = surface.reported.measured(pose, fit, self.cameras, surface.first, window)
         given = widened(given, alias_covariance(aliases)) if len(aliases) else given
         given = widened(given, displaced.covariance) if displaced.whole else given
         if self.health.rivals.doubted or unsteady:

@@ -18,6 +18,7 @@ import numpy as np
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrors
 from estimation.online.fit import FrameFit
+from estimation.online.window import WindowEstimate
 from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import INLIER_WEIGHT, PoseFit, SharedFit
 from estimation.se3 import Array, Index
@@ -27,6 +28,13 @@ PRIOR_TRACKS = 20.0  # tracks as which the initial belief counts: that all of th
 MIN_NEW_SHARE = 0.02  # of the variance: no track errs alike to the last bit
 MAX_NEW_GAP_S = 0.2  # what has changed in more need not be new
 LASTING_GAP_S = 1.0  # and up to twice that: a breath has gone half its way
+
+# A velocity's variance by white noise on acceleration and noisy positions without end: what the noise adds to it.
+# The gains sqrt(2) w and w^2 leave sqrt(2) w^3 r, of which w^3 r / (2 sqrt(2)) is by the noise r (Lyapunov's equation).
+NOISE_SHARE_OF_TWIST = 0.25
+# What the positions after it change of the velocity, in parts of what the noise and the acceleration have added. Of
+# white acceleration 0.58 are seen, of an acceleration that lasts as long as the window's memory all.
+NOISE_REVISED, MOTION_REVISED = 1.25, 2 / 3
 
 CLEAR_SHIFT_PX = 0.02  # shifts known better than that show the size of all of them
 MIN_LASTING_SHARE = 0.01  # of the variance claimed of tracks: something in them lasts
@@ -95,29 +103,29 @@ def _squared_changes(now: _TrackResiduals, then: _TrackResiduals) -> Array:
 
 
 class WindowNoise:
-    """The window's marginal of one pose, to be rescaled when tracks' and images' noise are known better.
+    """Rescales what the window says of a frame set, when tracks' and images' noise are known better.
 
     The window uses both noises as assumed at first. In the axes in which the two are independent its marginal is a part
     of the fit's covariance whatever their sizes, so each axis is rescaled by itself.
     """
 
-    def __init__(self, window: Array, fit: FrameFit, unrest: float) -> None:
-        """window: (6, 6), with `fit` the newest of the fits averaged there. unrest: px^2, as assumed in it."""
+    def __init__(self, fit: FrameFit, unrest: float) -> None:
+        """fit: the newest of those averaged in the window. unrest: px^2, as assumed in it."""
         root = np.linalg.cholesky((fit.parts.noise + fit.parts.noise.T) / 2)
         back = np.linalg.inv(root)
         whitened = back @ fit.parts.tracks @ back.T
         share, axes = np.linalg.eigh((whitened + whitened.T) / 2)
         self._by_tracks = np.clip(share, 0.0, 1.0)  # (6,) of the fit's variance, axis by axis
-        self._axes = root @ axes  # (6, 6) pose_from_axes
-        inner = axes.T @ back @ window @ back.T @ axes
-        self._window = (inner + inner.T) / 2
+        self._pose_from_axes, self._whitening = root @ axes, (back, axes)  # (6, 6) each
         self._scatter, self._unrest = fit.parts.scatter, unrest
 
-    def covariance(self, tracks: TrackNoise, unrest: float) -> Array:
-        """(6, 6), by what is known of the tracks now, and of the images' unrest, px^2."""
+    def rescaled(self, marginal: Array, tracks: TrackNoise, unrest: float) -> Array:
+        """A marginal (6, 6) of the window by what is known of the tracks now, and of the images' unrest, px^2."""
         by_images = (1 - self._by_tracks) * (unrest / self._unrest)
-        scaled = self._axes * np.sqrt(self._by_tracks * (tracks.new * self._scatter) + by_images)
-        return np.asarray(scaled @ self._window @ scaled.T)
+        scaled = self._pose_from_axes * np.sqrt(self._by_tracks * (tracks.new * self._scatter) + by_images)
+        back, axes = self._whitening
+        inner = axes.T @ back @ marginal @ back.T @ axes
+        return np.asarray(scaled @ ((inner + inner.T) / 2) @ scaled.T)
 
 
 class FrameOriginError:
@@ -129,14 +137,14 @@ class FrameOriginError:
 
     def __init__(self, window: Array, fit: FrameFit, cameras: CameraErrors) -> None:
         """window: (6, 6), the window's marginal, with `fit` the newest of the fits averaged there."""
-        self._averaged = WindowNoise(window, fit, cameras.unrest)
+        self._window, self._averaged = window, WindowNoise(fit, cameras.unrest)
         self._tracks = fit.parts.scatter * fit.parts.tracks
         self._late, self._corrected = fit.parts.by_delay, cameras.offset
 
     def covariance(self, cameras: CameraErrors, tracks: TrackNoise) -> Array:
         """(6, 6) of the error, by what is known of cameras and tracks now."""
         late = self._late @ cameras.beyond(self._corrected) @ self._late.T
-        averaged = self._averaged.covariance(tracks, cameras.unrest)
+        averaged = self._averaged.rescaled(self._window, tracks, cameras.unrest)
         return np.asarray(averaged + tracks.lasting * self._tracks + late)
 
 
@@ -221,12 +229,12 @@ class ReportedCovariance:
         self._drift.learn(fit.solution.shared, cameras.shift, self._tracks.lasting * fit.parts.scatter)
 
     def measured(
-        self, pose: SurfacePose, fit: FrameFit, cameras: CameraErrors, first: Array | None, averaged: Array
+        self, pose: SurfacePose, fit: FrameFit, cameras: CameraErrors, first: Array | None, window: WindowEstimate
     ) -> SurfacePose:
         """The pose of an accepted fit with its reported covariance.
 
-        first: (6, 6) covariance of the first pose as it was assumed then. averaged: (6, 6), the window's part of
-        `pose.covariance`.
+        first: (6, 6) covariance of the first pose as it was assumed then. window: of whose covariance that of `pose`
+        is made.
         """
         self._watch(pose, fit)
         if self._first is None and first is not None:
@@ -245,8 +253,11 @@ class ReportedCovariance:
         # subtracted: by how much the first pose's error and the window's marginal were assumed too large
         error, assumed = self._first
         first_change = error.covariance(cameras, self._tracks) - assumed
-        window_change = WindowNoise(averaged, fit, cameras.unrest).covariance(self._tracks, cameras.unrest) - averaged
-        return widened(pose, self._added + first_change + window_change)
+        noise = WindowNoise(fit, cameras.unrest)
+        window_change = noise.rescaled(window.covariance, self._tracks, cameras.unrest) - window.covariance
+        given = widened(pose, self._added + first_change + window_change)
+        by_noise = noise.rescaled(window.twist_covariance, self._tracks, cameras.unrest)
+        return replace(given, twist_covariance=_of_twist(window, fit, by_noise))
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
         """A pose that is only predicted, with its reported covariance."""
@@ -261,6 +272,19 @@ class ReportedCovariance:
         if pose.state is not TrackState.TRACKING or pose.reason or unlike:
             self._trouble = pose.stamp
         self._usual, self._stamp = self._usual + share * (now - self._usual), pose.stamp
+
+
+def _of_twist(window: WindowEstimate, fit: FrameFit, by_noise: Array) -> Array:
+    """(6, 6) of the window's twist: by noise and late exposures, as known now, and by motion, as hindsight shows.
+
+    by_noise: (6, 6), the window's marginal as the noise of tracks and images rescales it.
+    """
+    claimed = window.twist_covariance
+    by_pose = np.sqrt(np.diag(claimed) / np.diag(fit.parts.noise))  # 1/s, of the window's noise
+    by_noise = NOISE_SHARE_OF_TWIST * (by_noise + by_pose[:, None] * fit.parts.smear * by_pose)
+    moved = window.revision - NOISE_REVISED * np.diag(by_noise) / np.diag(claimed)
+    by_motion = np.sqrt(np.maximum(moved, 0.0) / MOTION_REVISED)
+    return np.asarray(by_noise + by_motion[:, None] * claimed * by_motion)
 
 
 def widened(pose: SurfacePose, more: Array) -> SurfacePose:

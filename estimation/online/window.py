@@ -9,6 +9,7 @@ surface's velocity about its own origin, and the prior does not couple rotations
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,10 @@ from estimation.se3 import Array
 WINDOW_LAG_S = 0.6  # longer changed the newest pose by nothing (0.5, 1 s, windows of 5 to 20 agree to 1e-4 mm)
 GTSAM_ERRORS = RuntimeError, IndexError, ValueError  # what its smoother was seen to throw
 MAX_PRIOR_CHI2 = 4.0  # squared sigmas of an axis, mean: a prior that is off by more gives way to the measurement
+
+HINDSIGHT_S = 0.3  # after which a twist is looked at again: half the window, what comes later hardly changes it
+REVISION_MEMORY_SETS = 300.0  # ten seconds, over which it is learned how far twists are revised then
+PRIOR_REVISION, PRIOR_REVISIONS = 0.75, 10.0  # that of a motion as the prior has it, and for how many twists it counts
 
 GRID_RATIO = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second
 ROTATION_PSD_GRID = 1e-7 * GRID_RATIO ** np.arange(18)  # rad^2/s^3, from a surface at rest to a shaken one
@@ -107,6 +112,7 @@ class WindowEstimate:
     twist: Array  # (6,)
     twist_covariance: Array  # (6, 6)
     acceleration_psd: Array  # (6,)
+    revision: Array  # (6,) mean square of what the next frame sets change of a twist, in parts of its variance
 
 
 class Smoother:
@@ -116,6 +122,7 @@ class Smoother:
         self._last: MeasuredPose | None = None
         self._motion = AccelerationPsd()
         self._psd = self._motion.psd
+        self._revised = PRIOR_REVISIONS * np.array([[PRIOR_REVISION] * 6, [1.0] * 6])  # sums: squares, and their count
         self.rebuilds = 0  # after an exception of GTSAM, since the start
         self._clear()
 
@@ -124,6 +131,7 @@ class Smoother:
         parameters.findUnusedFactorSlots = True
         self._window = gtsam.IncrementalFixedLagSmoother(WINDOW_LAG_S, parameters)
         self._key = 0
+        self._unrevised: deque[tuple[int, WindowEstimate]] = deque()  # key and estimate, to be looked at again
         self.newest: WindowEstimate | None = None  # the last estimate; None before the first measurement
 
     def reset(self) -> None:
@@ -212,7 +220,7 @@ class Smoother:
         values.insert(twist, start)
         self._window.update(graph, values, {pose: measured.stamp, twist: measured.stamp})
         estimate = self._window.calculateEstimate()
-        self._key += 1
+        self._revise(measured.stamp, estimate)
         window = WindowEstimate(
             measured.stamp,
             np.asarray(estimate.atPose3(pose).matrix()),
@@ -220,11 +228,24 @@ class Smoother:
             np.asarray(estimate.atVector(twist)),
             _symmetric(self._window.marginalCovariance(twist)),
             self._psd,
+            self._revised[0] / self._revised[1],
         )
         parts = window.pose, window.covariance, window.twist, window.twist_covariance
         if not all(np.isfinite(part).all() for part in parts):
             raise ValueError("the window's estimate is not finite")
+        self._unrevised.append((self._key, window))
+        self._key += 1
         return window
+
+    def _revise(self, stamp: float, estimate: gtsam.Values) -> None:
+        """Learn from twists that are old enough at `stamp`, s, how far the poses since then have changed them."""
+        while self._unrevised and self._unrevised[0][1].stamp <= stamp - HINDSIGHT_S:
+            key, then = self._unrevised.popleft()
+            if not estimate.exists(gtsam.symbol("v", key)):  # after a gap: it has left the window
+                continue
+            change = estimate.atVector(gtsam.symbol("v", key)) - then.twist
+            self._revised *= 1 - 1 / REVISION_MEMORY_SETS
+            self._revised += [change**2 / np.diag(then.twist_covariance), np.ones(6)]
 
     @property
     def graph(self) -> str:

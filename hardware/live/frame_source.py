@@ -18,15 +18,11 @@ import numpy as np
 
 from estimation.errors import StillbedError
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile
-from hardware.motion.loop import CommandedPose
 from hardware.process.clock import WallClock
-from hardware.process.system import SharedLatest
 from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set, parallel_map
 
 if TYPE_CHECKING:
     from hardware.cameras.feed import LiveHealth
-    from hardware.live.records import LiveMotionReport
 
 RING_SLOTS = 4  # sets: a reader that takes the newest one has 100 ms at 30 fps to copy it, which takes 2
 COLOUR_CHANNELS = 3
@@ -199,19 +195,3 @@ class LiveCameraSource:
 
 
 FrameSource = RingSource | LiveCameraSource
-
-
-class CommandedHead:
-    """Where the print head should be, by the newest commands of the motion process."""
-
-    def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
-        self._reports, self._commanded = reports, CommandedPose(profile)
-        self._last = -np.inf
-
-    def at(self, stamp: float) -> PrintHead | None:
-        """The head at `stamp`, s; commands between two looks are on a straight line, 40 ms at most."""
-        report = self._reports.get()
-        if report is not None and report.tick.stamp > self._last and report.progress is not None:
-            self._last = report.tick.stamp
-            self._commanded.add(report.tick.command, self._last)
-        return self._commanded.at(stamp)

@@ -111,7 +111,7 @@ class SetWay:
 
 
 @dataclass(slots=True)
-class Trace:
+class RunTrace:
     """The trace of a run."""
 
     entries: list[TraceEntry] = field(default_factory=list)
@@ -148,11 +148,11 @@ class Trace:
         return sums
 
 
-def read_trace(record: Path) -> Trace:
+def read_trace(record: Path) -> RunTrace:
     """The trace in a recording; InputError where it holds none."""
     from hardware.recording.mcap_file import ChunkMessages, parse, walk
 
-    trace = Trace()
+    trace = RunTrace()
     for part in walk(record):
         for stored in part.messages if isinstance(part, ChunkMessages) else ():
             if stored.topic == TOPIC:
@@ -180,7 +180,7 @@ def slowest_sets(ways: Sequence[SetWay], share: float = SLOWEST_SHARE) -> list[S
     return ordered[: max(round(share * len(ordered)), 1)]
 
 
-def causes(trace: Trace, share: float = SLOWEST_SHARE) -> list[Cause]:
+def causes(trace: RunTrace, share: float = SLOWEST_SHARE) -> list[Cause]:
     """What was done on the sets' ways, by what the slowest share spent more on than all do."""
     ways = trace.ways
     slow = {way.stamp for way in slowest_sets(ways, share)} if ways else set()
@@ -194,7 +194,7 @@ def causes(trace: Trace, share: float = SLOWEST_SHARE) -> list[Cause]:
     return sorted(found, key=lambda cause: cause.usual - cause.slowest)
 
 
-def trace_text(trace: Trace) -> str:
+def trace_text(trace: RunTrace) -> str:
     """The percentiles of the ways and the causes of the slowest, as a table for a terminal."""
     ways = trace.ways
     if not ways:
@@ -208,7 +208,7 @@ def trace_text(trace: Trace) -> str:
     return "\n".join(lines)
 
 
-def chrome_trace(trace: Trace) -> str:
+def chrome_trace(trace: RunTrace) -> str:
     """The trace for Perfetto (ui.perfetto.dev) or chrome://tracing: a process a lane, instants in microseconds."""
     lanes = sorted({entry.lane for entry in trace.entries})
     first = min((span[1] for entry in trace.entries for span in entry.spans), default=0.0)
@@ -225,7 +225,7 @@ def chrome_trace(trace: Trace) -> str:
     return json.dumps({"displayTimeUnit": "ms", "traceEvents": events})
 
 
-def trace_page(trace: Trace, title: str) -> str:
+def trace_page(trace: RunTrace, title: str) -> str:
     """A page with the causes, and what each process did on the ways of the slowest sets."""
     from hardware.report.page import document, figures_table, section
 
@@ -250,17 +250,17 @@ COLOURS = (
 )
 
 
-def _colours(trace: Trace) -> dict[str, str]:
+def _colours(trace: RunTrace) -> dict[str, str]:
     names = sorted({span[0] for entry in trace.entries for span in entry.spans})
     return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
-def _legend(trace: Trace) -> str:
+def _legend(trace: RunTrace) -> str:
     keys = (f'<span style="color:{c}">■</span> {escape(name)}' for name, c in _colours(trace).items())
     return f"<p>{', '.join(keys)}</p>"
 
 
-def _lanes(trace: Trace, way: SetWay) -> str:
+def _lanes(trace: RunTrace, way: SetWay) -> str:
     """What each process did on the way of one set, as SVG."""
     begin, end = way.handed - DRAWN_BEFORE_S, way.wired
     scale, lanes = CHART_PX / (end - begin), (TRACKING_LANE, MOTION_LANE, RECORDER_LANE)

@@ -22,10 +22,11 @@ from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
 from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
-from hardware.live.frame_source import CommandedHead, FrameSource, LiveCameraSource, RingSource, TimedFrameSet
+from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
 from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
+    CommandedHead,
     PoseEntry,
     PoseHandover,
     ScanEntry,
