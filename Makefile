@@ -10,7 +10,7 @@ DEMO   := demo
 # Bytecode is kept whatever the shell says: the tests start some hundred processes, each of which would compile it all anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test slow counterparts mutants bench check format install outages faults fuzz hazards references audit browser deceit docs
+.PHONY: demo test slow counterparts mutants bench check types replays format install outages faults fuzz hazards references audit browser deceit docs
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
@@ -20,7 +20,7 @@ test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	HYPOTHESIS_PROFILE=many $(BIN)/python -m pytest -m "slow or law" --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # Machines that others wrote: what can be installed is, what is missing is skipped, with what to install.
 COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py tests/test_genicam.py tests/test_rtsp.py
@@ -52,12 +52,18 @@ deceit: $(STAMP)
 hazards: $(STAMP)
 	$(BIN)/python -m tests.hazard_table --run
 
+# Types and replays at a time, on two cores; the rules of the house are tests, so where all tests are asked for too they come there.
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/python -m pytest tests/test_floors.py tests/test_shipped.py
 	$(BIN)/python -m tests.hazard_table --check
+	$(MAKE) --jobs 2 --output-sync types replays
+	$(if $(filter test,$(MAKECMDGOALS)),,$(BIN)/python -m pytest tests/test_floors.py tests/test_shipped.py)
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+replays: $(STAMP)
 	$(BIN)/python -m tests.process_replay
 
 # What comes of the reference recordings now is what is to come of them: for a change that is meant.

@@ -13,21 +13,23 @@ if TYPE_CHECKING:
     from tests.browser import Browser
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as the command line does
-settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=60)
+settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile("many", settings.get_profile("fixed"), max_examples=250)  # `make slow`
 settings.register_profile("unshrunk", settings.get_profile("fixed"), phases=[Phase.explicit, Phase.generate])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))  # mutants need no smallest example
 
 pytest_plugins = ["estimation.synthetic.plugin"]  # by name, so that a checkout that is not installed has it too
 
 LONGEST = (  # files that take longest, begun first: of two workers neither then waits long for the other's last file
-    *("test_tracking", "test_live_run", "test_simulate", "test_camera_calibration", "test_world", "test_estimator"),
-    *("test_calibrate_refused", "test_scene_render", "test_guard", "test_registration"),
-    *("test_estimator_suite", "test_examples", "test_track", "test_operator_page", "test_segment_command"),
-    *("test_live_faults", "test_growth", "test_fill_laws", "test_odd_camera", "test_outages", "test_fault_bench"),
+    *("test_live_run", "test_estimator_suite", "test_tracking", "test_wrong_input", "test_record", "test_local_error"),
+    *("test_bench", "test_wound_area", "test_calibrate_refused", "test_deceit", "test_track", "test_live_parts"),
+    *("test_segment_command", "test_examples", "test_cli", "test_growth", "test_outages", "test_world"),
+    *("test_recordings", "test_floors", "test_operator_stages", "test_calibrate_dispenser", "test_first_print"),
+    *("test_camera_calibration", "test_foxglove", "test_fuzz", "test_smooth_command", "test_simulated_material"),
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """A real browser; what needs one is skipped where there is none."""
     from tests.browser import Browser, executable
@@ -39,5 +41,9 @@ def browser() -> Iterator[Browser]:
     made.close()
 
 
+@pytest.hookimpl(tryfirst=True)  # before those that are not asked for are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if hasattr(getattr(item, "obj", None), "hypothesis"):
+            item.add_marker("law")
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))

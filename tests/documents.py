@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import re
+from functools import cache
 from pathlib import Path
 
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import parser, subject_parser
+from hardware.cli import main
 
 ROOT = Path(__file__).parents[1]
+parser, subject_parser = cache(main.parser), cache(main.subject_parser)  # made once for all that is shown
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAM = r"(?:stillbed|make|python -m|pip install) "
 QUOTED = re.compile(rf"`({PROGRAM}[^`]+)`")

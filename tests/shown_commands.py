@@ -100,6 +100,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench fill CSV ...": ("stillbed bench fill contour.csv --count 2", LONG),
     "stillbed bench wounds": ("stillbed bench wounds --count 1", LONG),
     "stillbed bench latency": ("stillbed bench latency sessions/monday", LONG),
+    "stillbed bench link --minutes 10 --busy 2": ("stillbed bench link --minutes 0.1", LONG),
     "stillbed bench live": (LIVE, STARTED),
     "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21": (KILLED, STARTED),
     "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21 --scenario data/live/small.toml": (KILLED, STARTED),

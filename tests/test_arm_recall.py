@@ -23,6 +23,7 @@ from planning.motion.curve import place_passed
 from planning.motion.planner import Planner
 from tests.linked import Linked, circle, linked
 from tests.moving import breathing, pose_at, raster
+from tests.slowly import slowly
 from tests.test_motion_loop import Looping, seen
 from tests.virtual_arm import HOME, arm_fault
 
@@ -127,15 +128,17 @@ def test_of_the_path_nothing_is_left_out_and_it_is_done_as_soon_as_it_can_be() -
 
 
 @pytest.mark.parametrize(
-    ("fault", "orders"),
+    "struck",
     [
-        ("stall 3s at 6s", {10.0: Order.ARM}),
         ("stall 500ms at 6s", {6.2: Order.STOP, 8.0: Order.ARM}),
-        ("stall 500ms at 6s", {6.2: Order.DISARM, 8.0: Order.ARM}),
+        *slowly(
+            ("stall 3s at 6s", {10.0: Order.ARM}),  # stopped by patience
+            ("stall 500ms at 6s", {6.2: Order.DISARM, 8.0: Order.ARM}),
+        ),
     ],
-    ids=["stopped by patience", "stopped", "disarmed"],
 )
-def test_nothing_is_left_out_where_a_call_back_ends_in_a_stop(fault: str, orders: dict[float, Order]) -> None:
+def test_nothing_is_left_out_where_a_call_back_ends_in_a_stop(struck: tuple[str, dict[float, Order]]) -> None:
+    fault, orders = struck
     link = linked(ANSWERING, arm_fault(fault), stand=False, profile=ArmProfile())
     looping = Looping({0.0: Order.AT_HOME, 0.5: Order.ARM, **orders}, link, seen)
     done = printed(looping.run(max(orders) + 6.0), link)

@@ -134,6 +134,7 @@ def test_a_pattern_that_meets_no_scene_is_told_the_scenes() -> None:
         run_bench(_arguments("estimator", "--only", "dancing"))
 
 
+@pytest.mark.slow
 def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[str]) -> None:
     run_bench(_arguments("estimator", "--soak", "0.001", "--maps", "told"))
     lines = capsys.readouterr().out.splitlines()
@@ -195,6 +196,7 @@ def test_each_part_is_a_subject_with_options_that_it_has(part: BenchPart) -> Non
         subject_parser(part.subject, SUBJECTS[part.subject]).parse_args(list(options))
 
 
+@pytest.mark.slow  # what they are made of is measured, kept and shown below
 def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = (
         BenchPart("planner", ("--updates", "20"), ("--updates", "20")),
@@ -288,6 +290,7 @@ def test_a_file_that_is_no_table_is_one_clear_line(tmp_path: Path) -> None:
             read_whole(file)
 
 
+@pytest.mark.slow
 def test_too_few_views_to_calibrate_from_are_told_and_the_figures_are_not_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -55,15 +55,16 @@ def watched(rig: Rig, back: bool = False) -> tuple[list[TrackState], list[str]]:
     return states, reasons
 
 
-@pytest.mark.parametrize("camera", [0, 2])
+@pytest.mark.parametrize("camera", [0, *slowly(2)])
 def test_half_a_millimetre_is_named(camera: int) -> None:
     states, reasons = watched(knocked(camera, se3.exp([0, 0, 0, 0.5, 0, 0])))
     assert states[-1] is TrackState.DEGRADED
     assert reasons[-1].startswith(f"{RIG.cameras[camera].name} was bumped: its picture stands 1.")
 
 
-@pytest.mark.parametrize(("camera", "scale", "words"), [(0, 1.01, "larger"), (2, 0.99, "smaller")])
-def test_a_lens_that_was_turned_is_told_from_a_bump(camera: int, scale: float, words: str) -> None:
+@pytest.mark.parametrize("turned", [(0, 1.01, "larger"), *slowly((2, 0.99, "smaller"))])
+def test_a_lens_that_was_turned_is_told_from_a_bump(turned: tuple[int, float, str]) -> None:
+    camera, scale, words = turned
     states, reasons = watched(knocked(camera, np.eye(4), scale))
     assert states[-1] is TrackState.DEGRADED
     assert RIG.cameras[camera].name in reasons[-1] and f"% {words}: its lens was turned" in reasons[-1]
@@ -86,7 +87,7 @@ def test_a_camera_that_nobody_saw_at_first_is_not_taken_for_bumped_once_it_is_se
 
 
 @pytest.mark.parametrize("unrest", [0.2, *slowly(0.5, 1.0)])
-@pytest.mark.parametrize("rate", [6.0, 30.0])
+@pytest.mark.parametrize("rate", [6.0, *slowly(30.0)])
 def test_a_picture_that_never_stood_still_is_not_taken_for_bumped_but_its_jump_is(unrest: float, rate: float) -> None:
     """A camera that exposes late before a waving surface: its picture is off to and fro, px, from the first on."""
     draw, at, detector = np.random.default_rng(6), breathing(0.0), BumpDetector([c.name for c in RIG.cameras])

@@ -100,6 +100,7 @@ def test_a_print_goes_on_under_its_own_head(tmp_path: Path, capsys: pytest.Captu
     assert np.mean(tracking[tracking.index(True) :]) > 0.98
 
 
+@pytest.mark.slow  # test_track ends a tracking by Ctrl-C, and finds what is kept of it
 def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> None:
     small = {"rig": {"size": [96, 64], "focal_px": 140}, "scene": {"texel_mm": 1.0}}
     file, out = write_scenario(tmp_path, SMALL, small, seconds=600.0), tmp_path / "out"

@@ -17,6 +17,7 @@ from tests.campaigns.deceit.judge import GUARD_MM, Judge, run
 from tests.campaigns.deceit.kinds import NAMES, make_session
 from tests.campaigns.deceit.scenes import Draw, Session, changed, ordinary
 from tests.campaigns.deceit.world import Renderer, local_places, on_tissue
+from tests.slowly import slowly
 
 SMALL = 320, 240
 COUNT, SEED = 200, 1
@@ -51,7 +52,7 @@ def darkest(dark: Array, about: Array, reach: int = 6) -> Array:
     return np.array([column + (part * x).sum() / part.sum(), row + (part * y).sum() / part.sum()])
 
 
-@pytest.mark.parametrize("rise", [0.0, 3.0])
+@pytest.mark.parametrize("rise", [3.0, *slowly(0.0)])
 def test_a_dot_is_drawn_where_the_camera_model_says(session: Session, rise: float) -> None:
     lie = replace(session.world.relief, rise=lambda t: rise * (t > 0.5))
     made, t = changed(session, relief=lie), 0.7
@@ -81,7 +82,7 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_another(session: Session) 
         assert np.abs(darkest(dark, pixel) - pixel).max() < 0.15
 
 
-@pytest.mark.parametrize("kind", ["board_covered", "shimmer", "wet_film"])
+@pytest.mark.parametrize("kind", ["shimmer", *slowly("board_covered", "wet_film")])
 def test_a_session_comes_out_the_same_to_the_last_bit(kind: str) -> None:
     a, b, other = (make_session(seed, NAMES.index(kind), (96, 72)) for seed in (1, 1, 2))
     number = len(a.stamps) - 5
@@ -168,7 +169,12 @@ def named(index: int) -> str:
     return f"{index}-{NAMES[index % len(NAMES)]}"
 
 
-@pytest.mark.parametrize("index", [i for i in TENTH if i not in STILL_WRONG], ids=named)
+# A pattern that repeats, a dressing that slips, hairs combed aside, and a camera that hangs, which is to stay followed.
+AT_ONCE = (11, 55, 176, 77)
+LATER = [i for i in TENTH if i not in STILL_WRONG and i not in AT_ONCE]
+
+
+@pytest.mark.parametrize("index", [*AT_ONCE, *slowly(*LATER)], ids=named)
 def test_a_tenth_of_the_sessions_that_would_fool_the_tracker(index: int) -> None:
     session = make_session(SEED, index, SMALL)
     verdict = run(session)

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import main, parser, subject_parser
+from hardware.cli.main import main
 from tests.api_links import broken_links
 from tests.campaigns.__main__ import CAMPAIGNS
-from tests.documents import DOCUMENTS, ROOT, commands, leaf, shown
+from tests.documents import DOCUMENTS, ROOT, commands, leaf, parser, shown, subject_parser
 from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
 
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")

@@ -119,19 +119,28 @@ def test_each_example_is_shown_in_the_documents(file: Path) -> None:
     assert f"docs/examples/{file.name}" in (EXAMPLES.parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def started(file: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parents[1])}
-    command = [sys.executable, str(file), *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-
-
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)
-def test_each_example_says_how_it_is_started(file: Path) -> None:
-    asked, wrong = started(file, "--help"), started(file, "a", "b", "c")
-    assert (asked.returncode, asked.stderr) == (0, "") and f"python docs/examples/{file.name}" in asked.stdout
-    assert (wrong.returncode, wrong.stdout) == (2, "")
-    (line,) = wrong.stderr.splitlines()
+def test_each_example_says_how_it_is_started(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def started(*words: str) -> tuple[object, str, str]:
+        monkeypatch.setattr(sys, "argv", [str(file), *words])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(file), run_name="__main__")
+        return ended.value.code, *capsys.readouterr()
+
+    asked, wrong = started("--help"), started("a", "b", "c")
+    assert (asked[0], asked[2]) == (0, "") and f"python docs/examples/{file.name}" in asked[1]
+    assert wrong[:2] == (2, "")
+    (line,) = wrong[2].splitlines()
     assert line.startswith(f"usage: python docs/examples/{file.name}")
+
+
+def test_an_example_is_a_program() -> None:
+    environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parents[1])}
+    command = [sys.executable, str(EXAMPLES / "other_dispenser.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert "other_dispenser.py" in done.stdout
 
 
 def test_what_a_script_cannot_take_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,6 +35,7 @@ from planning.fill.bead import (
 )
 from planning.fill.fill import fill, settle_angle, smooth_corners
 from planning.fill.spiral import order_runs
+from tests.slowly import slowly
 
 PACE = PrintPace()
 ROUND = region_of(np.stack([9 * np.cos(np.arange(60) * 2 * np.pi / 60), 6 * np.sin(np.arange(60) * 2 * np.pi / 60)], 1))
@@ -62,7 +63,7 @@ def test_a_wound_is_covered_once_and_nothing_beside_it(wound: Region) -> None:
     assert found.covered > 0.985 and found.double < 0.05 and found.over < 0.003
 
 
-@pytest.mark.parametrize("number", [571, 217, 759])
+@pytest.mark.parametrize("number", [571, *slowly(217, 759)])
 def test_rough_narrow_wounds_are_covered_to_99_percent(number: int) -> None:
     wound = random_wound(np.random.default_rng([1, number]))[1]
     found = fill_coverage(fill(wound, Pattern(), PACE), wound)

@@ -390,7 +390,7 @@ def test_examples_are_short_enough_to_read_at_once() -> None:
 
 def test_the_motion_process_loads_none_of_the_heavy_libraries() -> None:
     modules = [name for name in ours().modules if name.startswith("planning")]
-    code = f"import sys, hardware.motion.step, hardware.process.clock, {', '.join(modules)}; print(*sys.modules)"
+    code = f"import sys, hardware.live.motion_process, {', '.join(modules)}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "planning.command" in loaded.stdout.split() and MOTION_NEVER.isdisjoint(loaded.stdout.split())
 

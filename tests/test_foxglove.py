@@ -220,7 +220,7 @@ def test_a_live_run_is_seen_while_it_prints_and_says_who_made_it_of_what(tmp_pat
             return seen
 
     began = utc_now()
-    with light_runs(tmp_path, lines=3, speed=8.0) as start:
+    with light_runs(tmp_path, lines=2, speed=8.0) as start:
         run = start(record, "--yes", "--until-printed", f"--foxglove={port}")
         run.wait_for(r"\nprint\n")
         assert len(asyncio.run(watch())) == 4

@@ -256,6 +256,7 @@ def true_from_estimated() -> Array:
     return np.asarray(se3.inverse(turning(first.stamp)) @ first.base_from_surface)
 
 
+@pytest.mark.slow  # test_tracking follows by one camera for a while
 def test_a_limb_that_one_camera_sees_is_followed_around() -> None:
     poses, _, _ = alone_followed()
     change = se3.inverse(true_from_estimated())
@@ -264,6 +265,7 @@ def test_a_limb_that_one_camera_sees_is_followed_around() -> None:
     assert np.mean(off[-6:]) < 0.75  # mm, and 0.95 without those that it alone sees
 
 
+@pytest.mark.slow
 def test_what_one_camera_alone_has_seen_lies_on_the_surface_as_claimed() -> None:
     _, surface_map, alone = alone_followed()
     points = se3.transform_points(true_from_estimated(), surface_map.points[alone])

@@ -64,6 +64,7 @@ from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
 from tests.scans import body, height_field
 from tests.session_files import rig
+from tests.slowly import slowly
 
 THERE = available_cores()
 PROFILE = ArmProfile()
@@ -576,7 +577,7 @@ def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_a
     assert not (tmp_path / "cache" / "stillbed").exists() and files.progress.read_text() == "an earlier place"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
 def test_a_signal_while_a_scene_is_rendered_ends_it_at_once_and_leaves_nothing(tmp_path: Path, number: int) -> None:
     cache = tmp_path / "stillbed"
     (cache / "old-1.part-999999999").mkdir(parents=True)  # left by one that was killed

@@ -112,7 +112,7 @@ def test_stopped_paused_home_and_without_its_page_a_run_goes_on_until_ctrl_c(sta
         assert np.mean([move in wire for move in moves]) > 0.95
 
 
-@pytest.mark.parametrize("name", ["motion", "tracking", *slowly("recorder")])
+@pytest.mark.parametrize("name", ["motion", *slowly("tracking", "recorder")])
 def test_a_killed_process_is_noticed_the_arm_rests_the_place_is_kept(name: str, start: Start, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     run = begun(start, record)
@@ -132,6 +132,11 @@ def test_the_main_process_killed_leaves_an_arm_at_rest_and_a_whole_recording(sta
     run.process.kill()
     assert rests(record, killed, 0.5) and killed - closed(record).sets[-1][0].stamp < 0.5
     assert kept(record, tmp_path / "path.csv") == pytest.approx(last_place(record), abs=0.2)
+    again = start(record, "--resume")  # who resumes is asked, though the run before asked nobody
+    again.wait_for("confirm")
+    CLOCK.wait_until(CLOCK.now() + 0.5)
+    again.press("q")
+    assert again.end() == 1 and "\nready" not in again.said and "\nprint\n" not in again.said
 
 
 def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: Start, tmp_path: Path) -> None:
@@ -186,18 +191,7 @@ def nozzle_lies_on(record: Path, printed: PrintPath, profile: ArmProfile) -> Non
     assert len(off) > 10 and np.median(off) < 0.3
 
 
-def test_who_resumes_is_asked_again_though_the_run_before_asked_nobody(start: Start, tmp_path: Path) -> None:
-    record = tmp_path / "run.mcap"
-    first = begun(start, record)
-    first.process.send_signal(signal.SIGINT)
-    assert first.end() == 128 + signal.SIGINT
-    again = start(record, "--resume")
-    again.wait_for("confirm")
-    CLOCK.wait_until(CLOCK.now() + 0.5)
-    again.press("q")
-    assert again.end() == 1 and "\nready" not in again.said and "\nprint\n" not in again.said
-
-
+@pytest.mark.slow  # what goes wrong on purpose ends a run by the same way
 def test_a_path_that_cannot_be_kept_where_it_lies_ends_the_run_as_anything_does(start: Start, tmp_path: Path) -> None:
     run = start(tmp_path / "run.mcap", "--yes", "--unkept")
     assert run.end() == 1
@@ -244,12 +238,7 @@ def test_what_goes_wrong_on_purpose_is_said_held_through_and_stops_the_arm(start
     assert kept(record, tmp_path / "path.csv") >= last_place(record) - 1e-9
 
 
-def test_a_session_that_is_over_once_all_is_printed_is_enough(start: Start, tmp_path: Path) -> None:
-    prepare_files(tmp_path, lines=2, speed=10.0)
-    run = start(tmp_path / "run.mcap", "--yes", "--until-printed")
-    assert run.end() == 0 and "done: the path is printed" in run.said and "--resume" not in run.said
-
-
+@pytest.mark.slow  # test_wrong_input prints to the end, and test_live_stages ends in every stage
 def test_a_run_that_is_ended_once_all_is_printed_is_not_to_be_resumed(start: Start, tmp_path: Path) -> None:
     prepare_files(tmp_path, lines=2, speed=10.0)
     run = start(tmp_path / "run.mcap", "--yes")

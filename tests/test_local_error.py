@@ -24,6 +24,7 @@ from estimation.synthetic.world import arc_rig, observations, project_landmarks,
 from hardware.recording.messages import message_from_pose, pose_from_message
 from hardware.simulator.scene.shape import Deformation
 from planning.motion import guard
+from tests.slowly import slowly
 from tests.synthetic import breathing, still
 
 RIG = arc_rig()
@@ -95,21 +96,24 @@ def rise(height: float, seconds: float) -> Callable[[float], float]:
 
 
 CASES = [
-    (DENSE, 30.0, 2.0, 0.0, still),
     (DENSE, 13.0, 2.0, 1.0, breathing),
-    pytest.param(DENSE, 13.0, 2.0, 8.0, still, marks=pytest.mark.slow),
-    pytest.param(DENSE, 30.0, 3.0, 6.0, breathing, marks=pytest.mark.slow),
-    (SPARSE, 30.0, 6.0, 2.3, breathing),
     (SPARSE, 13.0, 2.0, 0.0, breathing),
-    (SPARSE, 13.0, 3.0, 12.0, still),
+    *slowly(
+        (DENSE, 30.0, 2.0, 0.0, still),
+        (DENSE, 13.0, 2.0, 8.0, still),
+        (DENSE, 30.0, 3.0, 6.0, breathing),
+        (SPARSE, 30.0, 6.0, 2.3, breathing),
+        (SPARSE, 13.0, 3.0, 12.0, still),
+    ),
 ]
 
 
-@pytest.mark.parametrize(("points", "rate", "height", "seconds", "motion"), CASES)
+@pytest.mark.parametrize("case", CASES)
 def test_a_bump_under_the_needle_is_claimed_before_it_is_two_frame_sets_old(
-    points: Array, rate: float, height: float, seconds: float, motion: Motion
+    case: tuple[Array, float, float, float, Motion],
 ) -> None:
     """Of 2 mm and more, at once or slowly, on a surface with dense landmarks and on whole pictures."""
+    points, rate, height, seconds, motion = case
     follow, bump, lifts = Followed(points, rate, motion), Deformation(bulge=1.0, radius=BUMP_MM), rise(height, seconds)
     high = np.array([lifts(k / rate) for k in range(1, int((BEGINS_S + seconds + 1.0) * rate))])
     poses = [follow(bump.displacement(points, h)) for h in high.tolist()]
@@ -122,10 +126,13 @@ def test_a_bump_under_the_needle_is_claimed_before_it_is_two_frame_sets_old(
     assert rim.max() < LIMIT_MM or lifted.mean() > MAX_PARTED_SHARE  # of so many nobody knows that they are a part
 
 
-@pytest.mark.parametrize("rate", [13.0, 30.0])
-@pytest.mark.parametrize("seconds", [0.0, 1.0, 2.4])
-def test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence(rate: float, seconds: float) -> None:
+RISES = [(13.0, 0.0), (30.0, 1.0), (13.0, 2.4), *slowly((30.0, 0.0), (13.0, 1.0), (30.0, 2.4))]
+
+
+@pytest.mark.parametrize("case", RISES)
+def test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence(case: tuple[float, float]) -> None:
     """4 mm wide, one sigma: smaller than the bells under which displacements are averaged."""
+    rate, seconds = case
     top = DENSE[np.linalg.norm(DENSE, axis=1).argmin()]
     shape = np.exp(-((DENSE - top) ** 2).sum(1) / (2 * 4.0**2))[:, None] * [0.0, 0.0, 1.0]
     follow, lifts = Followed(DENSE, rate, breathing), rise(3.0, seconds)
@@ -260,9 +267,12 @@ def resting(stamp: float) -> Array:
     return breathing(min(stamp, BEGINS_S))
 
 
-@pytest.mark.parametrize("slides", [slipping, resting])
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.7])
-def test_without_a_region_the_claim_covers_both_groups(slides: Motion, share: float) -> None:
+PARTED = [(slipping, 0.2), (resting, 0.7), *slowly((slipping, 0.5), (slipping, 0.7), (resting, 0.2), (resting, 0.5))]
+
+
+@pytest.mark.parametrize("case", PARTED)
+def test_without_a_region_the_claim_covers_both_groups(case: tuple[Motion, float]) -> None:
+    slides, share = case
     poses, off, _ = parted(share, False, slides)
     apart = np.array([np.linalg.norm((slides(p.stamp) - breathing(p.stamp))[:3, 3]) for p in poses])
     radius = np.array([p.radius_at(MIDDLE, 0.95)[0] for p in poses])

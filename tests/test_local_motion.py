@@ -75,7 +75,7 @@ def watched(tell: Callable[[int], Observations], count: int) -> list[float]:
 
 
 @given(height=st.floats(1.5, 5.0), seconds=st.floats(0.25, 0.6), late=st.floats(0.0, 1.0), seed=st.integers(0, 99))
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_a_fold_is_said_soon_doubted_and_forgotten_soon(height: float, seconds: float, late: float, seed: int) -> None:
     """Lower ones are told later, or not at all: a track's noise is 0.23 mm here."""
     phase = np.clip((np.arange(BEGINS + round(0.6 * RATE) + 12) - BEGINS - late) / (RATE * seconds), 0.0, 1.0)

@@ -83,7 +83,7 @@ def gapped(speed: float = 5.0, gap: float = 3.0) -> Path:
     st.sampled_from([2.0, 5.0, 12.0]),
     st.sampled_from([still, breathing]),
 )
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_beads_begin_and_end_where_they_are_planned(
     on: float, off: float, lag: float, speed: float, motion: Motion
 ) -> None:
@@ -113,7 +113,7 @@ def test_flow_follows_the_speed_of_a_metered_bead() -> None:
 
 
 @given(st.data())
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_nothing_is_told_on_but_on_the_path_with_a_pose_to_trust(data: st.DataObject) -> None:
     lag, delay = data.draw(st.floats(0, 0.06)), data.draw(st.floats(0, MAX_DELAY))
     path, outlets = raster(6.0, 2, 5.0), {"1": Outlet(SwitchDelay(delay, delay))}

@@ -8,6 +8,7 @@ import json
 import re
 import time
 from dataclasses import replace
+from functools import cache
 from pathlib import Path as File
 
 import cv2
@@ -125,6 +126,7 @@ def test_a_run_of_20_s_is_written_within_a_second(tmp_path: File) -> None:
     assert time.process_time() - start < 1.0
 
 
+@cache
 def figures() -> RunFigures:
     log = eventful()
     errors = nozzle_errors(log, LINE)

@@ -44,6 +44,7 @@ from hardware.report.page import Plot, document, figures_table, legend, line_key
 from planning.command import Hold, HoldReason, RefusalCode
 from tests.browser import Browser, axe_findings
 from tests.operator_page import LIVE, OFFERED, Run, Served
+from tests.slowly import slowly
 
 ROOT = Path(__file__).parents[1]
 SIZES = [(1440, 900), (1024, 768), (390, 844)]
@@ -116,7 +117,7 @@ def test_a_message_moves_no_button(run: Run) -> None:
     assert page.js(boxes) == before
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("theme", ["dark", *slowly("light")])
 def test_axe_finds_nothing_serious_in_any_stage(run: Run, theme: str) -> None:
     page = run.open((1024, 768))
     page.js(f"localStorage.setItem('stillbed.theme', '{theme}')")
@@ -444,7 +445,7 @@ def test_pictures_are_as_fine_as_the_camera_while_the_path_is_confirmed(run: Run
         ("waving.html", WavingView(1.0, 1, WavingStage.FAILED, (), (WAVED,), 0.4, 90, ("FAIL", "too few views"))),
     ],
 )
-@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("theme", ["light", *slowly("dark")])
 def test_axe_finds_nothing_serious_beside_a_recording_or_a_calibration(
     browser: Browser, name: str, view: RecordingView | WavingView, theme: str
 ) -> None:
@@ -462,7 +463,7 @@ def test_axe_finds_nothing_serious_beside_a_recording_or_a_calibration(
     served.listener.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["dark", *slowly("light")])
 def test_axe_finds_nothing_serious_in_a_report(browser: Browser, tmp_path: Path, scheme: str) -> None:
     plot = Plot(900, 200, (0.0, 1.0), (0.0, 1.0))
     plot.line(np.linspace(0, 1, 9), np.linspace(0, 1, 9), "estimate")

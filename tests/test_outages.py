@@ -34,7 +34,8 @@ from tests.test_estimator import begun, lively, look, run_skewed, stamps, step
 RIG = arc_rig(size=(320, 180), focal=280.0)
 EXTENT = np.array([[x, y, 0.0] for x in (-24.0, 24.0) for y in (-17.0, 17.0)])
 TRACKING, DEGRADED, COASTING = TrackState.TRACKING, TrackState.DEGRADED, TrackState.COASTING
-LIKE = (OutageKind.HAND, OutageKind.GLARE, OutageKind.EXPOSURE)  # like those beside them: in part hidden, or too bright
+# Like those beside them, in part hidden or too bright; and what test_faults does to a camera in a print.
+LIKE = (OutageKind.HAND, OutageKind.GLARE, OutageKind.EXPOSURE, OutageKind.BUMPED, OutageKind.SWAPPED)
 
 
 def watched(kind: OutageKind = OutageKind.DEAD, start: int = 10, end: int = 20, count: int = 40) -> WatchedOutage:

@@ -90,7 +90,7 @@ def test_what_was_repaired_is_counted(tmp_path: Path, capsys: pytest.CaptureFixt
     vertices, triangles = example_scan("forearm")
     write_ply(tmp_path / "scan.ply", vertices, np.vstack([triangles, triangles[:1]]))
     out = tmp_path / "path.csv"
-    assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(out), "--bead", "0.8", "--no-pictures"]) == 0
+    assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(out), "--bead", "2", "--no-pictures"]) == 0
     assert "scan: duplicate triangles left out (1)\n" in capsys.readouterr().out
 
 

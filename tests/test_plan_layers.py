@@ -326,7 +326,7 @@ def test_too_little_to_be_a_surface_is_refused(count: int) -> None:
 )  # fmt: skip
 @example(seed=0, gone=0, turned=0, noise=0, spikes=0, nan=0, double=0, wild=0, scale=0.001)
 @example(seed=0, gone=0, turned=0, noise=0, spikes=0, nan=0, double=0, wild=2, scale=0.001)
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_a_damaged_scan_gives_a_wound_or_one_clear_error(
     seed: int, gone: float, turned: float, noise: float, spikes: int, nan: int, double: float, wild: int, scale: float
 ) -> None:

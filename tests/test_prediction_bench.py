@@ -149,7 +149,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("short")
-@pytest.mark.parametrize("seed", [0, 1, *slowly(2, 3, 4, 5)])
+@pytest.mark.parametrize("seed", [0, *slowly(1, 2, 3, 4, 5)])
 def test_a_run_in_which_everything_goes_wrong_breaks_nothing(seed: int) -> None:
     counts = LinkCounts()
     LinkRun(seed, counts).run()

@@ -157,10 +157,10 @@ def test_ninety_percent_intervals_hold_ninety_percent(memory: float) -> None:
     points = 60 * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     tracked = seen(stamps, poses)
     made = forecasts(tracked)
-    for k in (1, 3, 5):
+    for k in (1, 5):
         inside = []
         for i, forecast in enumerate(made[:-k]):
-            if i > 300 and i % 2:
+            if i > 300 and i % 4 == 0:
                 later = replace(tracked[i], forecast=forecast).predict(float(stamps[i + k]))
                 places = (se3.transform_points(pose, points) for pose in (later.base_from_surface, poses[i + k]))
                 inside.append(np.linalg.norm(np.subtract(*places), axis=1) <= later.radius_at(points))
@@ -175,12 +175,12 @@ def test_an_irregular_time_widens_the_intervals(stamps: Array, usual: Forecast) 
 
 
 def test_memory_stays_what_it_is() -> None:
-    stamps = np.arange(0, 40, 1 / 30)
+    stamps = np.arange(0, 28, 1 / 30)
     predictor = Predictor()
     sizes = []
     for i, pose in enumerate(seen(stamps, breathing(stamps))):
         predictor.add(pose)
-        if i in (450, 1150):
+        if i in (450, 800):
             sizes.append(len(pickle.dumps(predictor)))
     assert sizes[1] < 1.02 * sizes[0]
 
@@ -249,8 +249,8 @@ def test_increments_of_the_past_are_those_of_the_group() -> None:
 
 
 RATE = 30.0
-AT = 30.0  # s at which something happens
-STAMPS = np.arange(0, 36, 1 / RATE)
+AT = 18.0  # s at which something happens
+STAMPS = np.arange(0, 24, 1 / RATE)
 
 
 def surprise_breathing(jump: Array, noise: float = 0.02) -> Array:
@@ -278,7 +278,7 @@ def claim(forecast: Forecast | None) -> float:
 
 
 def test_a_breath_is_no_surprise() -> None:
-    claims = [claim(forecast) for forecast in followed(surprise_breathing(np.zeros(len(STAMPS))))[600:]]
+    claims = [claim(forecast) for forecast in followed(surprise_breathing(np.zeros(len(STAMPS))))[400:]]
     assert max(claims) < 2 * float(np.median(claims))
 
 

@@ -32,6 +32,7 @@ from perception.mapping.scan_map import (
     match_near,
 )
 from tests import scans
+from tests.slowly import slowly
 from tests.synthetic import LOOK, SCAN_FROM_SURFACE, WIDE, pictures
 
 seeds = st.integers(0, 2**32 - 1)
@@ -220,7 +221,7 @@ def above(matched: DenseMatch) -> Array:
     return np.asarray(np.einsum("ni,ni->n", points - shape("wound").points(xy), shape("wound").normals(xy)))
 
 
-@pytest.mark.parametrize("lift", [0.0, 0.6, -0.6])
+@pytest.mark.parametrize("lift", [0.6, *slowly(0.0, -0.6)])
 def test_dense_points_lie_on_the_true_surface_whatever_they_began_on(lift: float) -> None:
     """A pixel is 0.7 mm here."""
     matched = match_near(LENSES, seen("wound")[0], nodes(lift)[0], 1)

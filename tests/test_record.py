@@ -80,6 +80,7 @@ def test_what_another_program_shows_is_recorded_whole(recorded: Path) -> None:
         assert roi.stamp < stamps[roi.camera][0]
 
 
+@pytest.mark.slow  # such a sheet is followed in test_region
 def test_the_recorded_sheet_is_tracked_as_it_was_pushed(recorded: Path, tmp_path: Path) -> None:
     run_track(recorded, tmp_path / "out")
     poses = read_tum(tmp_path / "out" / "poses.tum", exact=False).base_from_surface

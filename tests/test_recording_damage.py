@@ -259,7 +259,7 @@ def test_what_damage_leaves_says_so(flags: list[str], tmp_path: Path, capsys: py
     assert capsys.readouterr().out.startswith(f"The recording is damaged: {open_session(cut).damage}.\n")
 
 
-def test_a_plan_laid_into_a_damaged_recording_masks_and_a_calibration_from_one_say_so(
+def test_a_plan_laid_into_a_damaged_recording_and_masks_of_one_say_so(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut = tmp_path / "cut.mcap"
@@ -270,6 +270,11 @@ def test_a_plan_laid_into_a_damaged_recording_masks_and_a_calibration_from_one_s
     assert capsys.readouterr().out.endswith(told)
     assert main(["segment", str(cut), "-o", str(tmp_path / "masks"), "--method", "shape"]) == 1
     assert f"The recording is damaged: {cut}: {open_session(cut).damage}.\n" in capsys.readouterr().out
+
+
+@pytest.mark.slow  # plan and masks say it by the same words
+def test_a_calibration_from_a_damaged_recording_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut = tmp_path / "cut.mcap"
     write_board(tmp_path / "board.toml", BOARD)
     import_folder(rendered(tmp_path / "waved", instants=12), tmp_path / "waved.mcap")
     calibrate = ["calibrate", "cameras", "--board", str(tmp_path / "board.toml"), "--limit-mm", "10"]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from _pytest.mark import ParameterSet
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -71,7 +72,11 @@ class Run:
         return away, np.array([kept[r].state is TrackState.TRACKING for r in rows])
 
 
-@pytest.fixture(scope="module", params=RECORDINGS, ids=lambda r: r.name)
+def at_once_or_slowly(each: Recording) -> ParameterSet:
+    return pytest.param(each, id=each.name, marks=() if each.name == "teabox" else pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=map(at_once_or_slowly, RECORDINGS))
 def recording(request: pytest.FixtureRequest) -> tuple[Recording, Run]:
     wanted: Recording = request.param
     if not (DATA / wanted.name).is_dir():

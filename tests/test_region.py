@@ -200,6 +200,7 @@ def drawn(camera: int) -> Corners:
     return corners_from("the page", "camera", corners_at(0.0, rig().cameras[camera], 2.0).round(1).tolist())
 
 
+@pytest.mark.slow  # by its polygon it is followed above
 def test_a_sheet_on_a_table_is_followed_inside_its_coloured_frame() -> None:
     asked: list[tuple[Roi, ...]] = []
 

@@ -71,7 +71,7 @@ PAIRS = [(1, 2), *slowly((0, 1), (0, 2))]
 
 
 @pytest.mark.parametrize("cameras", PAIRS)
-@pytest.mark.parametrize("motion_at", [(breathing, 30.0), (sway, 13.0), *slowly((breathing, 13.0), (sway, 30.0))])
+@pytest.mark.parametrize("motion_at", [(sway, 13.0), *slowly((breathing, 13.0), (breathing, 30.0), (sway, 30.0))])
 def test_two_that_hang_never_outvote_the_third_in_silence(
     motion_at: tuple[Motion, float], cameras: tuple[int, int]
 ) -> None:
@@ -90,7 +90,7 @@ def test_two_that_hang_never_outvote_the_third_in_silence(
 
 @pytest.mark.parametrize("cameras", PAIRS)
 def test_two_that_come_late_are_told_by_how_much(cameras: tuple[int, int]) -> None:
-    _, poses = followed(sway, cameras, late)
+    _, poses = followed(sway, cameras, late, seconds=2.0)
     assert not silently_wrong(poses, sway)
     assert TrackState.TRACKING not in {p.state for p in poses[2:]}
     told = f"{NAMES[cameras[0]]}, {NAMES[cameras[1]]} late by 0.1"
@@ -98,10 +98,11 @@ def test_two_that_come_late_are_told_by_how_much(cameras: tuple[int, int]) -> No
 
 
 @pytest.mark.parametrize("camera", [2, *slowly(0, 1)])
-@pytest.mark.parametrize(("delay", "motion"), [(frozen, breathing), (frozen, sway), (late, sway)])
+@pytest.mark.parametrize("trick", [(frozen, sway), (late, sway), *slowly((frozen, breathing))])
 def test_one_that_hangs_or_is_late_is_left_out_and_the_others_are_believed(
-    delay: Delay, motion: Motion, camera: int
+    trick: tuple[Delay, Motion], camera: int
 ) -> None:
+    delay, motion = trick
     estimator, poses = followed(motion, [camera], delay)
     assert not silently_wrong(poses, motion)
     settled = [p for p in poses if p.stamp > START + 1.5]
@@ -111,7 +112,7 @@ def test_one_that_hangs_or_is_late_is_left_out_and_the_others_are_believed(
     assert {p.state for p in settled} == {TrackState.DEGRADED}
 
 
-@pytest.mark.parametrize("motion", [still, breathing, *slowly(along(0), along(1), along(2), sway)])
+@pytest.mark.parametrize("motion", [breathing, *slowly(still, along(0), along(1), along(2), sway)])
 def test_cameras_in_time_are_never_doubted(motion: Motion) -> None:
     estimator, poses = followed(motion, (), frozen)
     assert {p.state for p in poses} == {TrackState.TRACKING} and not any(p.reason for p in poses)
@@ -123,6 +124,7 @@ def test_two_that_hang_while_nothing_moves_are_not_told_from_a_surface_at_rest()
     assert {p.state for p in poses} == {TrackState.TRACKING}
 
 
+@pytest.mark.slow  # of the two that hang, which the first test here knows by other motions
 def test_a_motion_along_the_axis_of_the_one_that_does_not_hang_is_doubted_late() -> None:
     """It shows in a change of size only: 2.8 mm of 400 are 0.3 px of a patch that is 100 px wide."""
     motion = along(0)

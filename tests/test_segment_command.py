@@ -256,9 +256,13 @@ def test_the_bench_runs_without_data_and_says_what_is_missing(capsys: pytest.Cap
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="labelled pictures of wounds are not beside the project")
-def test_real_wounds_are_found(segmenter: NetworkSegmenter) -> None:
+def test_real_wounds_are_found(segmenter: NetworkSegmenter, tmp_path: Path) -> None:
     """Learned from, so no figure: a file that is damaged or read wrongly fails here."""
-    some = read_dataset(DATA)[::25]
+    for part in ("images", "labels"):
+        (tmp_path / part).mkdir()
+        for file in sorted((DATA / part).iterdir())[::60]:
+            (tmp_path / part / file.name).symlink_to(file)
+    some = read_dataset(tmp_path)
     reached = [dice(segmenter(np.ascontiguousarray(p.picture[..., ::-1])).mask, p.wound) for p in some]
     assert float(np.mean(reached)) > 0.85
 

@@ -225,6 +225,7 @@ def test_a_real_folder_gives_every_frame_set_whole(name: str, cameras: int, sets
 
 
 @needs_data
+@pytest.mark.slow  # made-up folders do here, and real ones are read in test_recordings
 def test_a_real_folder_survives_the_way_there_and_back(tmp_path: Path) -> None:
     folder = open_session(DATA / "teabox")
     import_folder(DATA / "teabox", tmp_path / "a.mcap")

@@ -64,6 +64,7 @@ def same_columns(one: Path, other: Path) -> bool:
     return kept[0] == kept[1]
 
 
+@pytest.mark.slow  # test_scene_render draws by several threads, and the process replay compares whole runs
 def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) -> None:
     run_simulation(recorded / "scenario.toml", recorded / "two", SimulationOptions(threads=2))
     one, two = recorded / "one", recorded / "two"
@@ -164,6 +165,7 @@ def test_the_frames_that_were_sent_are_those_of_the_commands(recorded: Path) -> 
     assert np.allclose(table.stamps, np.arange(1, 1001) / 1000, atol=1e-9) and table.extrude.any()
 
 
+@pytest.mark.slow  # test_sim_cameras garbles pictures, and some of `recorded` are garbled
 def test_what_arrives_damaged_beyond_decoding_is_told_and_left_out(tmp_path: Path) -> None:
     change = {"cameras": {"fps": 15.0, "garble": 1.0}, "scene": {"wound": False, "texel_mm": 1.0}}
     file = write_scenario(tmp_path, SMALL, change, seconds=0.8, rig={"size": [160, 90], "focal_px": 150})

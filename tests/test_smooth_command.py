@@ -31,6 +31,7 @@ from hardware.recording.session_reader import open_session, read_observations, r
 from hardware.report.evaluation import best_constant
 from hardware.simulator.scenario import read_scenario
 from perception.frames import Frame, Image
+from tests.slowly import slowly
 from tests.synthetic import write_session
 
 ROOT = Path(__file__).parents[1]
@@ -111,7 +112,7 @@ def test_what_is_done_is_not_done_again(
     assert asked[0] != asked[1]
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.9, *slowly(0.5, 0.999)])
 def test_damage_cuts_the_end(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], share: float) -> None:
     cut, out, data = tmp_path / "cut.mcap", tmp_path / "out", recording.read_bytes()
     cut.write_bytes(data[: int(share * len(data))])
@@ -204,7 +205,7 @@ def rhythms_of(times: np.ndarray, positions: np.ndarray) -> tuple[Rhythm, Rhythm
 
 def test_a_pulse_is_found_where_there_is_one_within_its_claim_and_none_where_there_is_none() -> None:
     found = []
-    for seed in range(16):
+    for seed in range(8):
         times, positions, rate = chest(seed, 60.0, 0.15 if seed % 2 else 0.0)
         pulse = rhythms_of(times, positions)[1]
         if seed % 2 == 0:
@@ -212,7 +213,7 @@ def test_a_pulse_is_found_where_there_is_one_within_its_claim_and_none_where_the
         elif not pulse.why:
             found.append(abs(pulse.rate - rate) <= pulse.claim)
             assert pulse.claim < 0.05 * rate
-    assert len(found) >= 6 and sum(found) >= len(found) - 1
+    assert len(found) >= 3 and sum(found) >= len(found) - 1
 
 
 @pytest.mark.parametrize("rate", [0.25, 0.4])
@@ -226,16 +227,21 @@ def test_the_harmonics_of_an_even_breath_are_no_pulse(rate: float) -> None:
 
 @pytest.mark.parametrize("kind", ["noise", "walk"])
 def test_chance_has_no_rhythm(kind: str) -> None:
-    for seed in range(12):
+    for seed in range(6):
         rng, times = np.random.default_rng(seed), np.arange(0, 60, 1 / 30)
         steps = rng.normal(size=(len(times), 3))
         positions = np.cumsum(steps, axis=0) if kind == "walk" else steps
         assert all(rhythm.why for rhythm in rhythms_of(times, 0.05 * positions))
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "data" / "scenarios").glob("*.toml")), ids=lambda file: file.stem)
-def test_no_scenario_gets_a_rate_that_is_off_by_more_than_its_claim(file: Path) -> None:
+UNLIKE = ("breathing_calm", "breathing_irregular", "shaking_table_0_5_hz", "steps_300um", "still")  # in their motion
+ALIKE = [file.stem for file in sorted((ROOT / "data" / "scenarios").glob("*.toml")) if file.stem not in UNLIKE]
+
+
+@pytest.mark.parametrize("name", [*UNLIKE, *slowly(*ALIKE)])
+def test_no_scenario_gets_a_rate_that_is_off_by_more_than_its_claim(name: str) -> None:
     """By its exact surface, for as long as it lasts and for a minute, with a smoothed session's noise."""
+    file = ROOT / "data" / "scenarios" / f"{name}.toml"
     scenario, table = read_scenario(file), tomllib.loads(file.read_text(encoding="utf-8"))
     rates = {part["kind"]: part.get("rate_hz", 1.15) for part in table.get("motion", [])}
     rng = np.random.default_rng(7)

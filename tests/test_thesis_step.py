@@ -216,6 +216,7 @@ def test_the_thesis_registers_to_no_scan(tmp_path: Path, capsys: pytest.CaptureF
     assert "tracking.register" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # a run by the thesis is tracked below
 def test_the_loop_closes_with_the_thesis(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, SMALL, tracking={"by": "thesis"}, seconds=0.7)
     assert main(["simulate", str(scenario), "-o", str(tmp_path / "out")]) in (0, 1)

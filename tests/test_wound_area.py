@@ -40,13 +40,13 @@ from perception.tracking.wound_area import (
 from perception.training.dataset import Labelled
 from perception.wound.network import WoundNetwork, shipped_model
 from perception.wound.segmentation import NetworkSegmenter, Segmentation, WoundBand, WoundMask
+from tests.slowly import slowly
 from tests.test_segmentation import SETTINGS, disc, picture, red_is_wound
 
 RIG = arc_rig(distortion=(0.0,) * 5)
 FLAT = SkinSurface(BASE_FROM_REST, np.zeros(6), np.zeros((6, 6)))
 NARROW = NORMAL_95 * 2 * RIG_SCALE_SIGMA  # half an interval of the logarithm where nothing but the rig's scale is open
-SEEDS = (0, 8, 14)  # a large, a small and a middling wound, on three bodies, before three sizes of picture
-rendered = cache(wound_set)
+rendered = cache(wound_set)  # seeds 0, 8, 14: a large, a small and a middling wound, of three bodies and picture sizes
 
 
 def exact(outline: WoundMask, inner: WoundMask | None = None, outer: WoundMask | None = None) -> WoundBand:
@@ -58,6 +58,7 @@ def true_bands(taken: WoundSet) -> dict[int, WoundBand]:
     return {c: exact(mask) for c, mask in enumerate(taken.wounds)}
 
 
+@cache
 def measured(taken: WoundSet, rig: Rig | None = None) -> WoundArea:
     area = wound_area(rig or taken.rig, dict(enumerate(taken.images)), true_bands(taken), 1.0)
     assert isinstance(area, WoundArea)
@@ -66,10 +67,15 @@ def measured(taken: WoundSet, rig: Rig | None = None) -> WoundArea:
 
 def circle(camera: Camera, radius: float, skin: SkinSurface = FLAT, at: tuple[float, float] = (0.0, 0.0)) -> WoundMask:
     """(H, W) what a camera sees of a circle of `radius` mm about a place of the skin frame."""
-    width, height = camera.size
-    x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    about = np.array(np.meshgrid(*2 * [[-1.5 * radius, 1.5 * radius]])).reshape(2, 4).T + at
+    corners = se3.transform_points(skin.base_from_skin, np.column_stack([about, quadric(about) @ skin.coefficients]))
+    about = np.clip(np.rint(pixels_from_points(camera, corners)[0]).astype(int), 0, camera.size)
+    low, high = about.min(0), about.max(0)
+    x, y = np.meshgrid(np.arange(low[0], high[0], dtype=float), np.arange(low[1], high[1], dtype=float))
     points = skin.points(camera, np.column_stack([x.ravel(), y.ravel()]))
-    return np.asarray((np.linalg.norm(points[:, :2] - np.array(at), axis=1) < radius).reshape(height, width))
+    mask = np.zeros(camera.size[::-1], bool)
+    mask[low[1] : high[1], low[0] : high[0]] = (np.linalg.norm(points[:, :2] - at, axis=1) < radius).reshape(x.shape)
+    return mask
 
 
 def circles(radii: tuple[float, ...], skin: SkinSurface = FLAT) -> dict[int, WoundBand]:
@@ -189,7 +195,7 @@ def test_an_area_on_a_surface_moves_with_rig_and_surface() -> None:
     assert (after.area, after.low, after.high) == pytest.approx((before.area, before.low, before.high), rel=1e-8)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", [14, *slowly(0, 8)])
 def test_the_area_inside_true_outlines_is_the_true_one(seed: int) -> None:
     taken = rendered(seed)
     area = measured(taken)
@@ -198,7 +204,7 @@ def test_the_area_inside_true_outlines_is_the_true_one(seed: int) -> None:
     assert area.high < 1.2 * area.low  # and the interval is no excuse
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", [14, *slowly(0, 8)])
 def test_the_networks_interval_holds_the_true_area(segmenter: NetworkSegmenter, seed: int) -> None:
     taken = rendered(seed)
     images = dict(enumerate(taken.images))
@@ -232,8 +238,8 @@ def test_what_cannot_be_measured_is_said_and_no_number_is_given() -> None:
         two = spoil(bands, 0)
         area = wound_area(taken.rig, images, two, 1.0)
         assert isinstance(area, WoundArea) and area.cameras == (1, 2)
-        assert wound_area(taken.rig, images, spoil(two, 1), 1.0) == ONE_VIEW
-        assert wound_area(taken.rig, images, spoil(spoil(two, 1), 2), 1.0) == NO_VIEW
+    assert wound_area(taken.rig, images, nowhere(two, 1), 1.0) == ONE_VIEW
+    assert wound_area(taken.rig, images, nowhere(nowhere(two, 1), 2), 1.0) == NO_VIEW
     assert wound_area(taken.rig, {0: images[0]}, {0: bands[0]}, 1.0) == ONE_VIEW
     blank = {c: np.full_like(image, 120) for c, image in images.items()}
     reason = wound_area(taken.rig, blank, bands, 1.0)
@@ -310,7 +316,7 @@ def test_segment_prints_the_area_of_a_sessions_wound_with_its_interval(tmp_path:
 
 
 def test_segment_says_why_there_is_no_area(tmp_path: Path, printed: Printed) -> None:
-    taken = rendered(8)
+    taken = rendered(14)
     session = write_session(tmp_path / "ward", taken)
     one = write_session(tmp_path / "one", replace(taken, images=taken.images[:1], rig=Rig(taken.rig.cameras[:1])))
     picture_file = session / "cam_0" / "0.png"

@@ -16,9 +16,11 @@ import cv2
 import numpy as np
 import pytest
 
+from estimation.errors import InputError
 from hardware.bench.figures import workers
 from hardware.cli.main import main
 from hardware.files.rig_file import write_board
+from hardware.live.prerender import prerender
 from hardware.live.view import Console
 from hardware.recording.recorder import Recorder
 from tests.board_session import BOARD
@@ -253,14 +255,15 @@ def test_an_unwritable_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").touch()
-    run = ["live", "--simulated", str(ROOT / "data/live/small.toml"), "--record", str(tmp_path / "x.mcap"), "--no-page"]
-    for cache in (tmp_path / "file", Path("/proc")):
-        monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-        assert main(run) == 2
-        told = capfd.readouterr().err
-        (line,) = [line for line in told.splitlines() if line.startswith("stillbed")]
-        assert "Traceback" not in told
-        assert line.startswith(f"stillbed: {cache}/stillbed: cache = ") and "XDG_CACHE_HOME" in line
+    scenario = ROOT / "data/live/small.toml"
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
+    assert main(["live", "--simulated", str(scenario), "--record", str(tmp_path / "x.mcap"), "--no-page"]) == 2
+    told = capfd.readouterr().err
+    (line,) = [line for line in told.splitlines() if line.startswith("stillbed")]
+    assert "Traceback" not in told
+    assert line.startswith("stillbed: /proc/stillbed: cache = ") and "XDG_CACHE_HOME" in line
+    with pytest.raises(InputError, match=r"file/stillbed: cache = .*XDG_CACHE_HOME"):
+        prerender(scenario, tmp_path / "file" / "stillbed")
 
 
 PATIENCE = 20.0  # s, on a busy machine
@@ -404,8 +407,11 @@ def test_a_wrong_command_line_is_exit_code_2_where_nobody_hears_it() -> None:
 
 def test_a_live_run_needs_no_standard_input(tmp_path: Path) -> None:
     prepare_files(tmp_path, lines=2, speed=10.0)
-    done = without((0,), "-m", "tests.light_live", str(tmp_path), str(tmp_path / "x.mcap"), "--yes")
-    assert done.returncode == 0 and "the path is printed" in done.stderr and "Traceback" not in done.stderr
+    """And a session that is over once all is printed is enough."""
+    files = str(tmp_path), str(tmp_path / "x.mcap")
+    done = without((0,), "-m", "tests.light_live", *files, "--yes", "--until-printed")
+    assert done.returncode == 0 and "done: the path is printed" in done.stderr
+    assert "--resume" not in done.stderr and "Traceback" not in done.stderr
 
 
 def test_a_console_without_a_standard_input_waits_for_no_key(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,8 @@ is compared with the way by the pose of the others (`UnequalMotion`): lens and m
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -204,29 +204,34 @@ class _PictureLook:
     information: Array  # (6, 6) of the pose by this camera alone
     pulled: Array  # (6,)
     smear: float  # px, one sigma, by late exposures
+    ways: dict[tuple[int, ...], tuple[Array, float]] = field(default_factory=dict)  # by cameras: computed once
 
-    def way(self, information: Array, pulled: Array) -> tuple[Array, float]:
-        """Where the anchors stand (2K,), px, by a pose with these normal equations, and the variance of that, px^2."""
-        known = np.linalg.inv(information + (1e-9 * np.trace(information) + 1e-12) * np.eye(6))
-        spread = float(np.einsum("ki,ij,kj->", self.slopes, known, self.slopes)) / len(self.slopes)
-        return self.pixels + self.slopes @ (known @ pulled), spread
+    def way(self, by: Mapping[int, _PictureLook]) -> tuple[Array, float]:
+        """Where the anchors stand (2K,), px, by the pose of these looks of the frame set, and the variance, px^2."""
+        if tuple(by) not in self.ways:
+            information = np.stack([look.information for look in by.values()]).sum(0)
+            known = np.linalg.inv(information + (1e-9 * np.trace(information) + 1e-12) * np.eye(6))
+            spread = float(np.einsum("ki,ij,kj->", self.slopes, known, self.slopes)) / len(self.slopes)
+            step = known @ np.stack([look.pulled for look in by.values()]).sum(0)
+            self.ways[tuple(by)] = self.pixels + self.slopes @ step, spread
+        return self.ways[tuple(by)]
 
 
 class _PictureWays:
-    """How one camera's picture went, by its own pose and by that of others: T looks."""
+    """How one camera's picture went, by its own pose and by that of others in the same frame sets: T looks."""
 
-    def __init__(self, looks: Sequence[_PictureLook] = (), rest: Sequence[Sequence[_PictureLook]] = ()) -> None:
-        """looks: of the camera. rest: those of the others in the same frame sets."""
+    def __init__(self, camera: int, sets: Sequence[Mapping[int, _PictureLook]] = ()) -> None:
+        self._camera = camera
         self._own = self._others = np.zeros((0, 0))  # (T, 2K) px
         self._variance = np.zeros((0, 1))  # (T, 1) px^2 per axis, of their difference
-        for look, others in zip(looks, rest, strict=True):
-            self.add(look, others, len(looks))
+        for looks in sets:
+            self.add(looks, len(sets))
 
-    def add(self, look: _PictureLook, rest: Sequence[_PictureLook], most: int) -> None:
-        """The next look, with those of the others in the same frame set; the last `most` are kept."""
-        own, noise = look.way(look.information, look.pulled)
-        information = np.stack([r.information for r in rest]).sum(0)
-        others, more = look.way(information, np.stack([r.pulled for r in rest]).sum(0))
+    def add(self, looks: Mapping[int, _PictureLook], most: int) -> None:
+        """The looks of the next frame set; the last `most` are kept."""
+        look = looks[self._camera]
+        own, noise = look.way({self._camera: look})
+        others, more = look.way({c: other for c, other in looks.items() if c != self._camera})
         variance = np.array([noise + more + look.smear**2])
         self._own, self._others = _longer(self._own, own, most), _longer(self._others, others, most)
         self._variance = _longer(self._variance, variance, most)
@@ -234,9 +239,7 @@ class _PictureWays:
     def unequal(self) -> float:
         """By how many times what is allowed the ways differ that end now."""
         worst = 0.0
-        for block in WAY_BLOCKS:
-            if len(self._own) < 2 * block:
-                continue
+        for block in (block for block in WAY_BLOCKS if len(self._own) >= 2 * block):
             mine, theirs, spread = (_block_means(rows, block) for rows in (self._own, self._others, self._variance))
             apart = mine - theirs
             differ = _lengths(apart[-1] - apart[:-block])
@@ -287,9 +290,8 @@ class UnequalMotion:
         if self._past and (now.keys() != self._past[-1].keys() or self._old(stamp)):
             self._forget_before(stamp, now.keys())
         self._past.append(now)
-        for c, look in now.items():
-            rest = [r for o, r in now.items() if o != c]
-            self._ways.setdefault(c, _PictureWays()).add(look, rest, len(self._past))
+        for c in now:
+            self._ways.setdefault(c, _PictureWays(c)).add(now, len(self._past))
         self._decide(stamp, {c: self._ways[c].unequal() for c in now})
 
     def _shows_usual(self, camera: int, tracks: int) -> bool:
@@ -320,11 +322,8 @@ class UnequalMotion:
 
     def _without(self, camera: int) -> float:
         """How unequal the others' ways are among themselves without a camera."""
-        rest, worst = [c for c in self._past[-1] if c != camera], 0.0
-        for c in rest if len(rest) > 1 else ():
-            others = [[look[o] for o in rest if o != c] for look in self._past]
-            worst = max(worst, _PictureWays([look[c] for look in self._past], others).unequal())
-        return worst
+        rest = [{c: look for c, look in looks.items() if c != camera} for looks in self._past]
+        return max(_PictureWays(c, rest).unequal() for c in rest[-1]) if len(rest[-1]) > 1 else 0.0
 
 
 def _block_means(rows: Array, block: int) -> Array:

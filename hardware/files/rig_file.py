@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +18,9 @@ from hardware.files.mesh_file import read_mesh
 from hardware.files.session import SURFACE_SUFFIXES
 from hardware.process import checks
 from hardware.process.checks import Table
-from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board
+
+if TYPE_CHECKING:
+    from perception.boards.board import Board
 
 RIG_FILE = "rig.toml"
 CAMERA_KEYS = ("name", "size", "matrix", "distortion", "base_from_camera")
@@ -209,7 +212,6 @@ def _check_scale(where: object, cameras: Sequence[Camera]) -> None:
         raise InputError(where, "base_from_camera of all cameras", f"{spread:.4g} mm apart", allowed)
 
 
-DEFAULT_BOARD = Board()
 BOARD_KEYS = ("kind", "squares", "square_mm")
 OPTIONAL_BOARD_KEYS = ("marker", "dictionary", "inverted", "legacy")
 MIN_SQUARES, MAX_SQUARES = 3, 60  # squares along an edge
@@ -219,7 +221,9 @@ MARKER_SHARE_RANGE = (0.3, 0.95)  # of a square: bits large enough to be read, a
 
 def read_board(path: str | Path) -> Board:
     """Read and check a board.toml; InputError names the key that is wrong."""
-    path = Path(path)
+    from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board  # loads cv2, which rigs alone do not need
+
+    path, default = Path(path), Board()
     table = checks.read_toml(path)
     checks.check_keys(path, "", table, BOARD_KEYS, OPTIONAL_BOARD_KEYS)
     kind = checks.text(path, "kind", table["kind"])
@@ -230,8 +234,8 @@ def read_board(path: str | Path) -> Board:
         allowed = f"[columns, rows], whole, {MIN_SQUARES} to {MAX_SQUARES} each"
         raise InputError(path, "squares", table["squares"], allowed)
     square = _within(path, "square_mm", table["square_mm"], *SQUARE_SIZE_RANGE)
-    marker = _within(path, "marker", table.get("marker", DEFAULT_BOARD.marker), *MARKER_SHARE_RANGE)
-    dictionary = str(table.get("dictionary", DEFAULT_BOARD.dictionary)).removeprefix("DICT_")
+    marker = _within(path, "marker", table.get("marker", default.marker), *MARKER_SHARE_RANGE)
+    dictionary = str(table.get("dictionary", default.dictionary)).removeprefix("DICT_")
     if dictionary not in DICTIONARIES:
         raise InputError(path, "dictionary", dictionary, checks.one_of_text(dictionary, DICTIONARIES))
     flags = [table.get(key, False) for key in ("inverted", "legacy")]

@@ -16,7 +16,6 @@ from estimation.pose import Forecast, MotionState, SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import LocalError, Warp
-from hardware.files.images import decode, encode
 from hardware.files.rig_file import rig_from_table, table_from_rig
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from perception.frames import OutlinedPicture, Roi
@@ -83,6 +82,8 @@ def roi_from_message(message: Message) -> Roi:
 
 def message_from_outlined(outlined: OutlinedPicture) -> Message:
     """A wound's outline with its picture, exact, as a message."""
+    from hardware.files.images import encode  # loads cv2, which a motion process does not need
+
     kind, data = encode(outlined.image)
     return {
         "stamp": outlined.stamp,
@@ -97,6 +98,8 @@ def message_from_outlined(outlined: OutlinedPicture) -> Message:
 
 def outlined_from_message(where: object, message: Message) -> OutlinedPicture:
     """A wound's outline with its picture from its message; InputError (where) for a picture that is none."""
+    from hardware.files.images import decode
+
     image = decode(bytes_from_message(message), where, "/wound_outline: data")
     polygon = np.array(message["polygon"], float).reshape(-1, 2)
     stamps = float(message["stamp"]), float(message["taken"])
