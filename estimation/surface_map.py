@@ -1,4 +1,7 @@
-"""The map of landmarks against which each frame set is matched, the warp of soft tissue, and what places may err by."""
+"""The map of landmarks against which each frame set is matched, the warp of soft tissue, and what places may err by.
+
+Beside it what the surface itself is where it was measured densely: heights on a lattice of the surface frame.
+"""
 
 from __future__ import annotations
 
@@ -187,3 +190,20 @@ def bells(points: Array, control: Array, reach: float | Array) -> Array:
     """Value (N, K) at points (N, 3) of the bell about each control point (K, 3), of one sigma `reach`, mm (or (K,))."""
     square = ((points[:, None] - control) ** 2).sum(-1)
     return np.asarray(np.exp(-square / (2 * reach**2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceHeights:
+    """The surface over the nodes of a square lattice in the surface frame; NaN where it was not measured."""
+
+    low: Array  # (2,) mm, x and y of the first node
+    step: float  # mm between nodes
+    heights: Array  # (H, W) mm along z, rows along y
+    sigma: Array  # (H, W) mm
+
+    @property
+    def nodes(self) -> Array:
+        """x and y (H, W, 2) of the nodes, mm."""
+        rows, columns = self.heights.shape
+        x, y = (self.low[k] + self.step * np.arange(n) for k, n in ((0, columns), (1, rows)))
+        return np.stack(np.meshgrid(x, y), -1)

@@ -2,7 +2,8 @@
 
 A dispenser that is told to open gives half of its flow `on` s later, and still gives half of it `off` s after it was
 told to close. A bead begins and ends where it is planned if the dispenser is told that much earlier than the nozzle is
-there. A path rests before a checkpoint with a waiting time (column `wait_s`), and where another material begins.
+there. A path rests before a checkpoint with a waiting time (column `wait_s`), where another material begins, and after
+a checkpoint whose column `look` is 1: there the needle steps aside until what was laid has been looked at.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from planning.path import Path
+from planning.path import LOOK, Path
 
 MAX_DELAY = 0.4  # s: the path is timed for half a second at least, and a bead's end must be known before it is told
 MAX_WAIT = 3600.0  # s before a checkpoint
@@ -68,7 +69,7 @@ class Rest:
     place: float  # mm of the path
     checkpoint: int  # to which it goes on
     wait: float  # s to rest there
-    material: str  # that is wanted from there on; "": as before
+    material: str  # that is wanted from there on, or LOOK; "": as before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,11 +135,16 @@ def _rests(path: Path, knots: Array, materials: tuple[str, ...], where: object) 
     wait = _numbers(path, "wait_s", where) if "wait_s" in path.extra else np.zeros(len(path))
     if (wrong := np.flatnonzero(~(wait <= MAX_WAIT))).size:
         raise InputError(where, f"checkpoint {wrong[0]}: wait_s", float(wait[wrong[0]]), f"0 to {MAX_WAIT:g} s")
+    looks = _numbers(path, "look", where) if "look" in path.extra else np.zeros(len(path))
     rests = []
     for i in range(1, len(path)):
+        if looks[i - 1]:
+            rests.append(Rest(float(knots[i - 1]), i, 0.0, LOOK))
         changed = i > 1 and materials[i] != materials[i - 1]
         if changed or (wait[i] > 0 and i > 1):
             rests.append(Rest(float(knots[i - 1]), i, float(wait[i]), materials[i] if changed else ""))
+    if looks[-1]:
+        rests.append(Rest(float(knots[-1]), len(path) - 1, 0.0, LOOK))
     return tuple(rests)
 
 
@@ -165,6 +171,8 @@ class RestsAhead:
         self._plan = plan
         self._number = sum(rest.place < place - ROUNDING for rest in plan.rests)
         self._until = math.nan  # s, until when it lasts; NaN: it is not reached
+        if (rest := self.next) is not None and rest.material == LOOK and rest.place <= place + ROUNDING:
+            self._until = 0.0  # the needle need not go there first
 
     @property
     def next(self) -> Rest | None:

@@ -142,6 +142,9 @@ class PrintPhase(Enum):
     FINISHED = "finished"
 
 
+LOOK = "(a look)"  # wanted where the needle stands aside until what was laid has been looked at; no material's name
+
+
 @dataclass(frozen=True, slots=True)
 class PrintProgress:
     """How far the print is."""
@@ -152,7 +155,7 @@ class PrintProgress:
     place: float  # mm of the path
     length: float  # mm of the whole path
     fraction: float  # the place in checkpoints: 2.35 is 35 % of the way from checkpoint 2 to 3
-    wanted: str = ""  # material that an operator has to put in before it goes on, "" if none
+    wanted: str = ""  # material that an operator has to put in before it goes on, or LOOK; "" if none
 
     @property
     def printed(self) -> int:

@@ -31,6 +31,7 @@ from planning.command import Hold, Move
 from planning.path import PrintPhase
 from tests.recorded import LOST, pose, whole_recording, write_frames
 from tests.session_files import NAMES, image, rig, stamps, trajectory
+from tests.test_looks import some_look
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -130,7 +131,9 @@ def test_every_message_has_the_fields_that_the_page_describes(tmp_path: Path) ->
         hold = Hold(0.0, 0.1, "why")
         recorder.write(RecordedTick(0.0, 0.0, True, np.nan, False, False, hold, b"", 0.0, PrintPhase.PRINTING))
         recorder.write(DispenserRecord(0.0, "needle", "on", 1.0))
+        recorder.write(some_look())
         recorder.latency(0.0, "track", 0.001, np.zeros(3, np.int64), 0.0)
+        recorder.trace(0.0, {"stamp": 0.0, "lane": "tracking", "spans": [], "queued": 0.0, "faults": 0})
         recorder.sent(0.0, b"1")
         recorder.received(0.0, b"2")
     described, seen = described_channels(), set[str]()

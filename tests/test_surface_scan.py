@@ -14,7 +14,8 @@ from estimation.pose import identity_pose
 from estimation.scans.scan import face_normals, lattice_triangles, scan_from_triangles
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.bench.mapping import scan_figures, shape_of
+from hardware.bench.mapping import shape_of
+from hardware.bench.scan import scan_figures
 from hardware.cli.plan import scanned_settings
 from hardware.files.mesh_file import read_raw_mesh, write_scan
 from hardware.live.settings import FROM_CAMERAS, LiveSettings, read_settings

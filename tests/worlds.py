@@ -31,6 +31,7 @@ from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, PrintHead
 from perception.tracking.step import StepReport
 from planning.command import Command, Hold
+from planning.laid_beads import Look
 from planning.path import PrintProgress
 
 HEADER = "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,speed_mm_s,material,temperature_c,layer,extrude"
@@ -61,6 +62,7 @@ class Heard:
         self.heads: list[tuple[float, PrintHead]] = []
         self.sent, self.received = b"", b""
         self.logs: list[NozzleLog] = []
+        self.looks: list[Look] = []
         self.changes: list[Array] = []
         self.events: list[tuple[float, str]] = []
 
@@ -94,6 +96,9 @@ class Heard:
 
     def registered(self, truth_from_estimate: Array) -> None:
         self.changes.append(truth_from_estimate)
+
+    def look(self, look: Look) -> None:
+        self.looks.append(look)
 
     def event(self, stamp: float, text: str, level: int = WARNING) -> None:
         self.events.append((stamp, text))

@@ -226,7 +226,7 @@ class FaultRun:
     def _ignore(self, *data: object, **named: object) -> None:
         pass
 
-    picture = head = pose = event = wire = registered = _ignore
+    picture = head = pose = event = wire = registered = look = _ignore
 
 
 class _ChangedStep:

@@ -1,8 +1,8 @@
-"""Subjects `map`, `registration`, `scan` and `tracks`: landmarks, scans and tracks on rendered bodies, and the truth.
+"""Subjects `look`, `map`, `registration` and `tracks`: what was laid, landmarks, a scan and tracks, and the truth.
 
 `map`: distances of landmarks from the true surface, beside the reported covariance; and the map's growth.
+`look`: layers of gel on rendered beds, some with a clog, as a look measures and judges them.
 `registration`: a scan registered to the first pictures, its error over the wound, and its verdict.
-`scan`: what the cameras scan of a body that breathes, off its true surface, beside the stated standard deviation.
 `tracks`: scatter and drift of tracks while camera and surface stand still.
 """
 
@@ -26,8 +26,9 @@ from estimation.synthetic.follow import MIN_FRAME_SETS
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench.estimator import nees
 from hardware.bench.figures import Figure, Target, at_least, at_most, relative_nees, rms
-from hardware.live.surface_scan import ScanSource, scan_surface
+from hardware.offline.looks import look_at
 from hardware.simulator.scene.appearance import Appearance, Sensor
+from hardware.simulator.scene.beads import Gel, GelPieces
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
@@ -35,7 +36,9 @@ from perception.frames import Frame, FrameSet, Image
 from perception.lens import Lenses
 from perception.mapping.features import grey
 from perception.mapping.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
+from perception.mapping.surface_heights import SurfaceView, dense_heights, first_heights
 from perception.tracking.step import TrackingStep
+from planning.laid_beads import BeadPieces, LaidBeads
 
 SCAN_SPACING = 1.0  # mm between the vertices of a scan, as handheld scanners give them
 SCAN_FROM_SURFACE = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame
@@ -82,7 +85,7 @@ def wound_points(shape: Shape) -> Array:
     return shape.points(shape.grid(shape.step)[(shape.inside > 0).ravel()])
 
 
-def _breathing(stamp: float) -> Array:
+def breathing_pose(stamp: float) -> Array:
     """base_from_surface (4, 4) at `stamp`, s, in the midst of a breath."""
     phase = 2 * np.pi * BREATH_RATE * (stamp + 0.5)
     up = 0.5 * (1 - np.cos(phase))
@@ -96,9 +99,9 @@ def _tracked_with_scan(case: ScanCase) -> Iterator[SurfacePose]:
     vertices, triangles = shape.mesh(SCAN_SPACING)
     scan = scan_from_triangles(se3.transform_points(SCAN_FROM_SURFACE, vertices), triangles)
     scene, rng = Scene(shape, Appearance(), seed=case.seed), np.random.default_rng([case.seed, 41])
-    step = TrackingStep(rig, rois(scene, rig, _breathing(0.0), 0.0), scan=scan)
+    step = TrackingStep(rig, rois(scene, rig, breathing_pose(0.0), 0.0), scan=scan)
     for stamp in np.arange(SCAN_SETS) / SCAN_RATE:
-        instants = {delay: WorldState(stamp, 0.0, _breathing(stamp + delay), np.zeros(6)) for delay in case.delays}
+        instants = {delay: WorldState(stamp, 0.0, breathing_pose(stamp + delay), np.zeros(6)) for delay in case.delays}
         images = render(scene, rig.cameras, [instants[delay] for delay in case.delays], Sensor(), rng.spawn(len(rig)))
         yield step(FrameSet(float(stamp), tuple(Frame(c, float(stamp), i) for c, i in enumerate(images))))
         step.idle()
@@ -109,7 +112,7 @@ def _registration_figures(case: ScanCase) -> list[Figure]:
     distance, squares, count = np.full(len(points), np.nan), np.nan, 0
     for pose in _tracked_with_scan(case):
         if pose.state is TrackState.TRACKING:
-            now, true = pose.base_from_surface @ SCAN_FROM_SURFACE, _breathing(pose.stamp)
+            now, true = pose.base_from_surface @ SCAN_FROM_SURFACE, breathing_pose(pose.stamp)
             distance = np.linalg.norm(se3.transform_points(now, points) - se3.transform_points(true, points), axis=1)
             error = se3.adjoint(SCAN_FROM_SURFACE) @ se3.log(se3.inverse(now) @ true)
             squares, count = relative_nees(error, pose.covariance), count + 1
@@ -119,58 +122,6 @@ def _registration_figures(case: ScanCase) -> list[Figure]:
         Figure(f"{case.name}: largest", float(distance.max()), "mm", at_most(0.15)),
         Figure(f"{case.name}: squared error, in parts of what is claimed", squares, "", at_most(3.0)),
     ]
-
-
-SCAN_WETNESS = {"dry": 0.0, "wet": 1.0}
-SCAN_SPAN, FUSED_SCAN_RATE = (
-    4.0,
-    7.5,
-)  # s, a breath; Hz: tracking makes its map of the first sets, and the rest are far apart
-SKIN_LIMITS, WOUND_LIMITS = (0.05, 0.15), (0.10, 0.30)  # mm, median and 95 %
-STATED_RATIO = Target(0.6, 1.5)  # of errors by their standard deviations, median by a normal distribution's
-
-
-def run_scan(options: argparse.Namespace) -> list[Figure]:
-    """Scans of bodies, wet and dry, fused from pictures over a breath; poses by the tracker."""
-    return [f for body in options.bodies for look in SCAN_WETNESS for f in scan_figures(body, look, options.sets)]
-
-
-def scan_figures(kind: str, look: str, sets: int, rig: Rig | None = None) -> list[Figure]:
-    """A body's scan: errors across the true surface on skin and in the wound, share of the area, honesty, time."""
-    shape, rig = shape_of(kind, 1), rig or arc_rig()
-    scene = Scene(shape, Appearance(wetness=SCAN_WETNESS[look]), seed=1)
-    pictures, name = _breathing_sets(scene, rig), f"{kind}, {look}"
-    source = ScanSource(rig, rois(scene, rig, _breathing(0.0), 0.0), pictures)
-    scanned = scan_surface(source, sets, SCAN_SPAN)
-    true_from_scanned = se3.inverse(_breathing(scanned.first.stamp)) @ scanned.first.base_from_surface
-    points = se3.transform_points(true_from_scanned, scanned.scan.vertices)
-    place = shape.material(points)
-    error = np.abs(np.einsum("ni,ni->n", points - shape.points(place), shape.normals(place)))
-    assert shape.inside is not None
-    x, y = np.rint(shape.nodes(place)).astype(int).T
-    wound, figures = shape.inside[y, x] > 0, list[Figure]()
-    for part, mine, limits in (("skin", ~wound, SKIN_LIMITS), ("wound", wound, WOUND_LIMITS)):
-        middle, high = np.percentile(error[mine], [50, 95])
-        ratio = float(np.median(error[mine] / scanned.sigma[mine]) / NORMAL_MEDIAN)
-        figures += [
-            Figure(f"{name}: off the {part}, median", float(middle), "mm", at_most(limits[0])),
-            Figure(f"{name}: off the {part}, 95 %", float(high), "mm", at_most(limits[1])),
-            Figure(f"{name}: errors on the {part}, of what is stated", ratio, "", STATED_RATIO),
-        ]
-    share = f"{scanned.area / 100:.1f} cm^2 of {scanned.sets} frame sets"
-    return [
-        *figures,
-        Figure(f"{name}: scanned of the region", 100 * scanned.coverage, "%", at_least(95), "", share),
-        Figure(f"{name}: time to fuse", scanned.seconds, "s", at_most(10)),
-    ]
-
-
-def _breathing_sets(scene: Scene, rig: Rig) -> Iterator[FrameSet]:
-    rng = np.random.default_rng([1, 41])
-    for stamp in np.arange(round((SCAN_SPAN + 1) * FUSED_SCAN_RATE)) / FUSED_SCAN_RATE:
-        state = WorldState(stamp, 0.0, _breathing(stamp), np.zeros(6))
-        images = render(scene, rig.cameras, [state] * len(rig), Sensor(), rng.spawn(len(rig)))
-        yield FrameSet(float(stamp), tuple(Frame(c, float(stamp), image) for c, image in enumerate(images)))
 
 
 MAP_RATE = 10.0  # frame sets a second: key frames are further apart
@@ -375,3 +326,64 @@ def _track_figures(name: str, stamps: Array, pixels: Array, sigmas: Array) -> li
         Figure(drift, rms(late - early), "px RMS", at_most(0.05), "", f"chance: {chance:.4f}"),
         Figure(f"{name}: tracks kept to the end", share, "%", at_least(95)),
     ]
+
+
+LOOK_FOCAL, LOOK_SIZE = 2200.0, (400, 300)  # px: 0.18 mm a pixel, about the beads
+LOOK_GEL = Gel(gloss=0.05)  # matt, as behind crossed polarisers
+LOOK_RISES = (0.0, 0.9, 1.7, 1.1)  # mm of breath at the frame sets of a look
+BEAD_SIZE = 0.64, 1.6  # mm^2 and mm, as planned
+CLOG_EVERY, CLOG_SPAN = 3, 7.0  # layers from one with a clog to the next, and mm of bead that it lasts
+
+
+def run_look(options: argparse.Namespace) -> list[Figure]:
+    """Layers of four beads; volume and height of those laid well, clogs found, and clogs that were none."""
+    layers = [_laid_layer(seed, clog=seed % CLOG_EVERY == 0) for seed in range(1, options.layers + 1)]
+    area, _ = BEAD_SIZE
+    crest = LOOK_GEL.aspect * float(np.sqrt(1.5 * area / LOOK_GEL.aspect))
+    good = [laid for laid, clog in layers if not clog]
+    heights = np.concatenate([laid.height for laid in good]) if good else np.zeros(0)
+    off = [100 * abs(laid.total[0] / laid.total[1] - 1) for laid in good]
+    missed, false = sum(clog and not laid.clogs for laid, clog in layers), sum(bool(laid.clogs) for laid in good)
+    note = f"{len(layers)} layers of {len(layers[0][0].planned)} pieces; {1000 * LOOK_GEL.gloss:g} per mille of gloss"
+    return [
+        Figure(
+            "height of a piece of bead, RMS", rms(heights[np.isfinite(heights)] - crest), "mm", at_most(0.05), "", note
+        ),
+        Figure("volume of a layer, median", float(np.median(off)), "%", at_most(5.0)),
+        Figure("volume of a layer, worst", max(off), "%"),
+        Figure(f"clogs of {CLOG_SPAN:g} mm missed", missed, "", at_most(0), "", f"of {len(layers) - len(good)}"),
+        Figure("clogs found that were none", false, "", at_most(0), "", f"in {len(good)} layers"),
+    ]
+
+
+def _laid_layer(seed: int, clog: bool) -> tuple[LaidBeads, bool]:
+    """What a look tells of a layer, and whether it had a clog."""
+    rng, kind = np.random.default_rng([seed, 71]), ("chest", "forearm", "foot")[seed % 3]
+    scene = Scene(body(kind, Wound(), seed), Appearance(wetness=0.0), seed=seed)
+    scene.gel = LOOK_GEL
+    rig = arc_rig(focal=LOOK_FOCAL, size=LOOK_SIZE)
+    lenses, (area, width), rows = Lenses(rig), BEAD_SIZE, np.arange(4)
+    start = np.array([[-7.0, width * (k - 1.5), 0.0] for k in rows])
+    end = start * [-1.0, 1.0, 1.0]
+    pieces = BeadPieces(start, end, np.full(4, area), np.full(4, width), rows, 0 * rows, 16 * rows.astype(float))
+    points = scene.shape.points(rng.uniform(-25.0, 25.0, (150, 2)))
+    low, high = start[0, :2] - 10.0, end[-1, :2] + 10.0
+    before = dense_heights(lenses, _look_views(scene, rig, rng), first_heights(points, low, high, 0.2))
+    closed, begin = int(rng.integers(4)), rng.uniform(-7.0, 7.0 - CLOG_SPAN)
+    for k in rows.tolist():
+        way = np.linspace(start[k, :2], end[k, :2], 141)
+        middle = (way[1:, 0] + way[:-1, 0]) / 2
+        flow = np.where(clog & (k == closed) & (middle > begin) & (middle < begin + CLOG_SPAN), 0.0, area)
+        scene.ink.flow(GelPieces(way[:-1], way[1:], 0.1 * flow, np.maximum(flow, area)), float(k))
+    scene.ink.flow(GelPieces(way[:0], way[:0], flow[:0], flow[:0]), 60.0)
+    return look_at(lenses, _look_views(scene, rig, rng), before, pieces)[0], clog
+
+
+def _look_views(scene: Scene, rig: Rig, rng: np.random.Generator) -> list[SurfaceView]:
+    found = []
+    for rise in LOOK_RISES:
+        pose = BASE_FROM_REST @ se3.make(np.eye(3), np.array([0.0, 0.0, rise]))
+        state = WorldState(0.0, 0.004, pose, np.zeros(6))
+        images = render(scene, rig.cameras, [state] * len(rig), Sensor(), rng.spawn(len(rig)))
+        found.append(SurfaceView({camera: grey(image) for camera, image in enumerate(images)}, pose))
+    return found

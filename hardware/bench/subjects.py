@@ -175,6 +175,9 @@ _SUBJECTS = (
         number("--seed", 1, None, "of the tracks' noise (default: 1)"),
         number("--jobs", 1, None, "processes that share the prints (default: 1)"),
     ),
+    _subject("look", "mapping", "layers of gel, as a look between layers measures them; clogs found")(
+        number("--layers", 6, "N", "every third with a clog; default 6")
+    ),
     _subject("map", "mapping", "landmarks off the true surface beside their claim, and the map's growth")(
         number("--seconds", 3.0, "S", "of each still standing; default 3")
     ),
@@ -184,7 +187,7 @@ _SUBJECTS = (
     _subject("registration", "mapping", "a scan laid into the first pictures: error and verdict")(
         number("--seeds", 2, "N", "bodies of each kind; default 2")
     ),
-    _subject("scan", "mapping", "what the cameras scan themselves, wet and dry, off the true surface")(
+    _subject("scan", "scan", "what the cameras scan themselves, wet and dry, off the true surface")(
         option("--bodies", nargs="+", choices=BODIES, default=BODIES, metavar="NAME", help=f"of {', '.join(BODIES)}"),
         number("--sets", 6, "N", "frame sets that are fused; default 6"),
     ),

@@ -251,6 +251,8 @@ def _prepared(
         path = read_path(rendered / "path.csv") if settings.path is None else path
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
+    if "look" in path.extra and (path.extra["look"] != "0").any():
+        raise InputError(named, "column look", "1", "left out, or 0: a live run cannot look at what it laid")
     task = PrintTask(
         path=path,
         dispensers=dispensers,

@@ -171,4 +171,4 @@ class _PictureSink:
     def _ignore(self, *arguments: object, **named: object) -> None:
         pass
 
-    pose = given = tick = wire = head = rows = registered = event = _ignore
+    pose = given = tick = wire = head = rows = registered = look = event = _ignore

@@ -16,6 +16,7 @@ from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
@@ -37,14 +38,13 @@ from hardware.process.system import SharedLatest
 from hardware.report.page import document, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
-from perception.mapping.dense_surface import DenseFit, DenseSurface, SurfaceView, camera_place
-from perception.mapping.scan_map import LATTICE_MARGIN_MM, heights_near, node_size
+from perception.mapping.dense_surface import DenseFit, DenseSurface, ScanView, camera_place
+from perception.mapping.scan_map import GUESS_SIGMA_MM, LATTICE_MARGIN_MM, initial_heights, node_size
 
 MAX_SETS = 40  # frame sets that are fused: more take longer and are hardly better
 MAX_FIND_TIME = 20.0  # s in which the surface is found, of recorded or real time
 MAX_NODES = 120_000  # of the lattice: a larger surface gets a coarser one
 MIN_TRACKED_SETS = 2  # whose poses agree: fewer are no scan
-GUESS_ROWS = 2000  # places at a time: a row holds every landmark
 PICTURE_WAIT = 0.5  # s of a wait for live pictures
 NO_SURFACE = "the surface was not found"
 
@@ -300,7 +300,7 @@ def fuse(
     clock = WallClock()
     start = clock.now()
     views = [
-        SurfaceView(c, instant, frame.image, se3.inverse(tracked.exposed[c]) @ rig.cameras[c].base_from_camera)
+        ScanView(c, instant, frame.image, se3.inverse(tracked.exposed[c]) @ rig.cameras[c].base_from_camera)
         for instant, tracked in enumerate(chosen)
         for c, frame in ((frame.camera, frame) for frame in tracked.frames.frames)
     ]
@@ -311,13 +311,15 @@ def fuse(
     step = node_size(lenses, cameras, se3.transform_points(first, landmarks.mean(0)[None])[0])
     step = max(step, float(np.sqrt(np.prod(high - low) / MAX_NODES)))
 
-    def guess(flat: Array) -> Array:
-        parts = [heights_near(landmarks, flat[i : i + GUESS_ROWS]) for i in range(0, len(flat), GUESS_ROWS)]
-        return np.concatenate(parts)
+    coarse = initial_heights(landmarks, low, high)
+    lines = [at + GUESS_SIGMA_MM / 2 * np.arange(n) for at, n in zip(low[::-1], coarse.shape, strict=True)]
+    heights = RegularGridInterpolator(lines, coarse.astype(float), bounds_error=False, fill_value=None)
 
-    sizes = [camera.size for camera in rig.cameras]
-    within = region_polygons(tuple(replace(each, stamp=-np.inf) for each in roi), chosen[0].frames, sizes)
-    surface = DenseFit(lenses, views, progress)(low, high, step, guess, within if isinstance(within, dict) else {})
+    begun = tuple(replace(each, stamp=-np.inf) for each in roi)
+    within = region_polygons(begun, chosen[0].frames, [camera.size for camera in rig.cameras])
+    surface = DenseFit(lenses, views, progress)(
+        low, high, step, lambda flat: heights(flat[:, ::-1]), within if isinstance(within, dict) else {}
+    )
     used, triangles = lattice_triangles(surface.sure)
     if not len(triangles):
         raise StillbedError("no part of the surface was seen alike by two cameras")

@@ -117,6 +117,7 @@ class PrintMotion:
         """
         self._profile, self._clock, self._place = profile, clock, place
         self._material, self._measured = material, measured
+        self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
         self.waits = self.material_in = False
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path

@@ -63,6 +63,7 @@ class FaultKind(StrEnum):
     FOLD = "fold"
     COVER = "cover"
     BLOCK = "block"
+    CLOG = "clog"
 
 
 class FaultRunner(StrEnum):
@@ -127,6 +128,9 @@ FAULT_SPECS: dict[tuple[FaultPart, FaultKind], FaultSpec] = {
     (Part.DISPENSER, Kind.UNPLUG): FaultSpec("its line is gone", (_SIMULATE,)),
     (Part.DISPENSER, Kind.BLOCK): FaultSpec("its line takes nothing", (_SIMULATE,)),
     (Part.DISPENSER, Kind.DROP): FaultSpec("what it is told is lost on the line", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.CLOG): FaultSpec(
+        "its needle is clogged: that share of the flow does not leave", (_SIMULATE,), "%", 1, 100, 100.0
+    ),
 }
 
 _NUMBER = r"-?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"

@@ -20,6 +20,7 @@ from hardware.files.rig_file import rig_from_table, table_from_rig
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from perception.frames import OutlinedPicture, Roi
 from planning.command import Hold, Move
+from planning.laid_beads import LaidBeads, Look, Stations
 
 Message = dict[str, Any]
 
@@ -263,6 +264,32 @@ def message_from_dispenser(record: DispenserRecord) -> Message:
     """What a dispenser did as a message."""
     flow = [] if record.flow is None else [record.flow]
     return {"stamp": record.stamp, "name": record.name, "text": record.text, "flow": flow}
+
+
+_STATIONS = ("bead", "layer", "begin", "end", "crest", "width")  # of a look: whole numbers, then mm
+_LAID = ("planned", "volume", "sigma", "height", "height_sigma")  # mm^3, and mm
+
+
+def message_from_look(look: Look) -> Message:
+    """A look as a message; what could not be judged is null."""
+    names = ("stamp", "first", "last", "seconds")
+    laid = {name: [v if np.isfinite(v) else None for v in getattr(look.laid, name).tolist()] for name in _LAID}
+    stations = {name: getattr(look.laid.stations, name).tolist() for name in _STATIONS}
+    return {
+        **{name: float(getattr(look, name)) for name in names},
+        "spread": look.width,
+        "text": look.text,
+        **stations,
+        **laid,
+    }
+
+
+def look_from_message(message: Message) -> Look:
+    """A look from its message."""
+    kinds = (np.int64, np.int64, float, float, float, float)
+    stations = Stations(*(np.array(message[name], kind) for name, kind in zip(_STATIONS, kinds, strict=True)))
+    laid = LaidBeads(stations, *(np.array(message[name], float) for name in _LAID))  # null: NaN
+    return Look(message["stamp"], message["first"], message["last"], message["seconds"], message["spread"], laid)
 
 
 def message_from_bytes(stamp: float, data: bytes) -> Message:

@@ -34,6 +34,7 @@ from hardware.recording.messages import Message, camera_frame, image_topic
 from hardware.recording.ros_messages import RosMessage
 from perception.frames import Frame, OutlinedPicture, Roi
 from planning.command import Command, Hold, Move
+from planning.laid_beads import Look
 
 MAX_CHUNK_SECONDS = 0.5  # s of stamps that a killed run may lose: half of the second that is promised
 MAX_CHUNK_BYTES = 4 * 2**20  # a chunk is unpacked whole, so its size bounds the reader's memory
@@ -49,6 +50,7 @@ RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic a
     OutlinedPicture: ("/wound_outline", messages.message_from_outlined),
     RecordedTick: ("/tick", messages.message_from_tick),
     DispenserRecord: ("/dispenser", messages.message_from_dispenser),
+    Look: ("/look", messages.message_from_look),
     Move: ("/move", messages.message_from_move),
     Hold: ("/hold", messages.message_from_hold),
 }
@@ -131,7 +133,15 @@ class Recorder:
 
     def write(
         self,
-        record: Frame | Observations | SurfacePose | Command | Roi | OutlinedPicture | RecordedTick | DispenserRecord,
+        record: Frame
+        | Observations
+        | SurfacePose
+        | Command
+        | Roi
+        | OutlinedPicture
+        | RecordedTick
+        | DispenserRecord
+        | Look,
     ) -> None:
         """Write a record to its channel at its own stamp."""
         if isinstance(record, Frame):

@@ -9,6 +9,7 @@ ooze_mm3 = 0.5
 ooze_lag_s = 0.5
 watchdog_s = 0.1
 flow_mm3_s = 5.0           # it is a valve that gives that much; left out: it gives the flow that it is told
+given = 1.1                # of the flow it is told: 1.1 lays too much, 0.9 too little
 led = true                 # whether the motion knows the four delays and leads them; false: it takes them for 0
 file = "dispenser.toml"    # or what it takes the dispensers for, as in a dispenser file
 """
@@ -16,7 +17,7 @@ file = "dispenser.toml"    # or what it takes the dispensers for, as in a dispen
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as File
 from typing import Any
@@ -33,9 +34,11 @@ from hardware.files.dispenser_file import DispenserSettings, outlets_from, read_
 from hardware.motion.loop import MaterialControl
 from hardware.process import checks
 from hardware.process.clock import Clock
-from hardware.process.faults import Fault
+from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
 from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
-from hardware.simulator.truth import FlowAt
+from hardware.simulator.scene.beads import GelPieces
+from hardware.simulator.scene.scene import Scene
+from hardware.simulator.truth import FlowAt, Truth, TruthLog
 from planning.command import Command, Move
 from planning.material import Outlets
 from planning.path import Path
@@ -50,6 +53,7 @@ METERED_ON = "ON {flow_mm3_s}"  # in the language of `arduino`
 ROUNDING = 1e-9  # s: what is shorter is the rounding of an instant
 ANSWER_TIME = 0.01  # s after a line is whole again, within which it is looked at and told
 PRESET = "arduino"
+MAX_GIVEN = 3.0  # of the flow told: a pump that gives more is not the one that was calibrated
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +64,14 @@ class SimulatedDispenser:
     metered: bool = True  # whether it gives the flow that it is told
     led: bool = True  # whether the motion knows its delays
     believed: tuple[DispenserSettings, ...] = ()  # what the motion takes it for, of a file
+    given: float = 1.0  # share of the flow it is told that it truly gives
 
 
 def dispenser_from_table(where: object, table: checks.Table, folder: File) -> SimulatedDispenser | None:
     """The table of the scenario `where`, None for an empty one; InputError names the key that makes no sense."""
     if not table:
         return None
-    checks.check_keys(where, "dispenser.", table, (), (*TRUTH_KEYS, "led", "file"))
+    checks.check_keys(where, "dispenser.", table, (), (*TRUTH_KEYS, "led", "given", "file"))
     values: dict[str, Any] = {
         name: checks.number(where, f"dispenser.{k}", table[k]) for k, name in TRUTH_KEYS.items() if k in table
     }
@@ -82,7 +87,10 @@ def dispenser_from_table(where: object, table: checks.Table, folder: File) -> Si
     except InputError as error:
         keys = {name: key for key, name in TRUTH_KEYS.items()}
         raise InputError(where, f"dispenser.{keys[str(error.what)]}", error.got, error.allowed) from None
-    result = SimulatedDispenser(truth, "flow_mm3_s" not in table, led, believed)
+    given = checks.number(where, "dispenser.given", table.get("given", 1.0))
+    if not 0 < given <= MAX_GIVEN:
+        raise InputError(where, "dispenser.given", given, f"0 < given <= {MAX_GIVEN:g}, of the flow that it is told")
+    result = SimulatedDispenser(truth, "flow_mm3_s" not in table, led, believed, given)
     if not believed:
         _drivers(result, ("",), where)
     return result
@@ -122,7 +130,7 @@ def _drivers(of: SimulatedDispenser, materials: tuple[str, ...], where: object) 
 class SimulatedDispensers:
     """Virtual dispensers, and the motion's hand on them.
 
-    control: for the motion, to be polled every few milliseconds. outlets: for its planner.
+    control: for the motion, to be polled every few milliseconds. outlets: for its planner. ideal: as without a table.
     """
 
     def __init__(
@@ -137,8 +145,10 @@ class SimulatedDispensers:
 
         InputError (where) for a path with a material that none of them carries.
         """
-        self._ideal, self._clock = of is None, clock
+        self.ideal, self._clock = of is None, clock
+        self._clogs, self._given = faults_striking(faults, FaultPart.DISPENSER, FaultKind.CLOG), 1.0
         of = SimulatedDispenser(IDEAL, metered=False) if of is None else of
+        self._given = of.given
         materials = tuple(dict.fromkeys(map(str, path.material.tolist())))
         drivers = of.believed or _drivers(of, materials, where)
         self.models = [DispenserModel(replace(of.truth, preset=each.preset), clock.now()) for each in drivers]
@@ -221,9 +231,17 @@ class SimulatedDispensers:
 
     def flow(self, instants: Array, needed: Array) -> Array:
         """The true flow (N,), mm^3/s, at instants (N,), s. needed: (N,) mm^3/s, what the bead needs there."""
-        if self._ideal:
-            return np.asarray(needed * self.open_at(instants))
-        return np.asarray(sum(model.flow_at(instants) for model in self.models))
+        leaves = self._leaves(instants)
+        if self.ideal:
+            return np.asarray(needed * self.open_at(instants) * leaves)
+        return np.asarray(sum(model.flow_at(instants) for model in self.models) * leaves)
+
+    def _leaves(self, instants: Array) -> Array:
+        """Share (N,) of the flow that passes the needle at instants (N,), s."""
+        share = np.full(len(instants), self._given)
+        for fault in self._clogs:
+            share[(instants >= fault.start) & (instants < fault.end)] *= 1 - fault.share
+        return share
 
     def flowing(self, instants: Array) -> NDArray[np.bool_]:
         """Whether half of the flow that a device was told last leaves it (N,), at instants (N,), s."""
@@ -233,7 +251,7 @@ class SimulatedDispensers:
             opened = flows > 0
             last = np.searchsorted(stamps[opened], instants, "right") - 1
             told = np.append(flows[opened], math.inf)[last]  # before the first there is none
-            flowing |= model.flow_at(instants) > told / 2
+            flowing |= model.flow_at(instants) * self._leaves(instants) > told / 2
         return flowing
 
     @staticmethod
@@ -252,3 +270,51 @@ def flow_from_told(told: Sequence[tuple[float, float]], truth: VirtualDispenserS
     for stamp, flow in told:
         model.obey(flow, stamp)
     return lambda instants, needed: model.flow_at(instants)
+
+
+BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
+AREA_PIECES, MIN_WAY = 7, 0.05  # pieces whose cross-section is one; mm of each way at least: where it stands, a puddle
+
+
+class BeadDrawing:
+    """Draws into a scene what leaves the needle: as ink as wide as planned, or as gel, as much as the flow gives."""
+
+    def __init__(
+        self,
+        gel: bool,
+        width: float,
+        truth: Truth,
+        log: TruthLog,
+        nozzle_at: Callable[[Array], Array],
+        dispensers: SimulatedDispensers,
+    ) -> None:
+        """width: mm, of ink. nozzle_at: base_from_nozzle (N, 4, 4) truly at times (N,), s."""
+        self._gel, self._width, self._truth, self._log = gel, width, truth, log
+        self._nozzle_at, self._dispensers = nozzle_at, dispensers
+        self._until = 0.0  # s
+        self._end: Array | None = None  # (2,) mm, where the last piece ended
+
+    def draw(self, scene: Scene, until: float) -> None:
+        """Draw what has left the needle up to `until`, s."""
+        ends = np.arange(self._until + BEAD_STEP, until, BEAD_STEP)
+        if not len(ends):
+            return
+        self._until = float(ends[-1])
+        places = scene.shape.material(self._truth.material(ends, self._nozzle_at(ends)[:, :3, 3]))
+        if self._gel:
+            self._flow(scene, ends, places)
+            return
+        laid = self._log.extruding(ends) if self._dispensers.ideal else self._dispensers.flowing(ends)
+        for place, there in zip(places, laid, strict=True):
+            if there and self._end is not None:
+                scene.ink.lay(self._end, place, self._width)
+            self._end = place if there else None
+
+    def _flow(self, scene: Scene, ends: Array, places: Array) -> None:
+        volume = self._dispensers.flow(ends, self._log.needed(ends)) * BEAD_STEP
+        start = np.concatenate([places[:1] if self._end is None else self._end[None], places[:-1]])
+        self._end = places[-1]
+        near, length = np.ones(min(AREA_PIECES, len(ends))), np.linalg.norm(places - start, axis=1)
+        way = np.convolve(np.maximum(length, MIN_WAY * (length > 0)), near, "same")
+        area = np.convolve(volume, near, "same") / np.maximum(way, MIN_WAY)
+        scene.ink.flow(GelPieces(start, places, volume, area), float(ends[-1]))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.se3 import Array
+from hardware.offline.looks import looks_section
 from hardware.report import page
 from hardware.report.evaluation import figure
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
@@ -148,6 +149,7 @@ def nozzle_page(result: NozzleResult) -> str:
         parts.insert(0, f'<div class="badge {"met" if result.met else "missed"}">{text}</div>')
     if len(result.run.log):
         parts += [_over_time(result), _parts(result), _spread(result), _pictures(result), _ends(result)]
+        parts.append(looks_section(result.run.looks, result.run.path))
     parts += [_holds(result), _camera_pictures(result)]
     if result.run.tracking is not None:
         parts.append('<h2 class="part">Tracking</h2>' + "\n".join(sections(result.run.tracking)))

@@ -14,6 +14,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from hardware.process import checks
+from hardware.recording.messages import message_from_look
 from hardware.report.evaluation import Evaluation, Spread, figure, finite, percent, spread
 from hardware.simulator.deposit import (
     DepositFigures,
@@ -33,6 +34,7 @@ from hardware.simulator.nozzle_error import (
     nozzle_errors,
     nozzle_figures,
 )
+from planning.laid_beads import Look
 from planning.path import Path
 
 
@@ -152,6 +154,7 @@ class NozzleRun:
     complete: bool = True  # whether it ran to its end
     pictures: tuple[tuple[str, bytes], ...] = ()  # of the cameras: name, and bytes of a JPEG or PNG
     files: tuple[tuple[str, str], ...] = ()  # beside the page: relative name, and what it holds
+    looks: tuple[Look, ...] = ()  # at what was laid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,6 +276,7 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
             **{name: getattr(deposit, name) for name in ("coverage", "gaps", "overlap", "outside", "material")},
         },
         "material": _material_dict(result.figures.material),
+        "looks": [message_from_look(look) for look in result.run.looks],
         "tracking_mm": None if result.figures.tracking is None else asdict(result.figures.tracking),
     }
     cleaned: dict[str, Any] = finite(summary)
@@ -319,6 +323,7 @@ def nozzle_text(summary: dict[str, Any]) -> str:
             lines.append(
                 f"beads that {name}: {end['count']}, {off}; most too much {_number(end['excess_max_mm3'])} mm3"
             )
+    lines += [f"look at {look['stamp']:.1f} s: {look['text']}" for look in summary["looks"]]
     for hold in summary["holds"]:
         lines.append(f"held {hold['count']} x, {hold['total_s']:.2f} s in all: {hold['reason']}")
     for limit in summary["limits"]:

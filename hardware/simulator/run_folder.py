@@ -40,6 +40,7 @@ from hardware.simulator.scenario import Scenario
 from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport, TrackingStep
 from planning.command import Move
+from planning.laid_beads import Look
 from planning.path import PrintProgress
 
 WATCH_INTERVAL = 0.5  # s of the run between two pictures
@@ -202,6 +203,7 @@ class RunFolder:
         """out: a folder that is there. line: the planned line. scan: the scan's file in out/session, if any."""
         self.out, self._truth, self._line, self._seconds = out, truth, line, scenario.seconds
         self.logs: list[NozzleLog] = []
+        self.looks: list[Look] = []
         self.pictures: dict[int, bytes] = {}  # per camera, the newest, if there is one the newest of the printing
         self.watch = WatchPage(out, scenario.known_rig, scenario.title)
         self._line_points: Array | None = None  # (N, 3) mm, of the line in the tracker's own surface frame
@@ -288,6 +290,12 @@ class RunFolder:
         if (surface_map := self._tracker.map) is not None:
             self._mapped = stamp
             self._session[1].show_surface(stamp, surface_map.points)
+
+    def look(self, look: Look) -> None:
+        """What was laid was looked at."""
+        self.looks.append(look)
+        if self._session is not None:
+            self._session[1].write(look)
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""

@@ -6,6 +6,7 @@ seed = 1
 path = "../paths/x.csv"          # checkpoints in the surface frame; files are relative to this one
 clearance_mm = 0.4               # lays the path onto the true surface at this height; left out: the path as it is
 bead_mm = 1.0
+look = "layer"                   # or a number of beads: how often the needle steps aside and what was laid is looked at
 faults = ["arm stall 600ms at 5s"]   # what goes wrong, as hardware/process/faults.py names it
 [scene]                          # the body or a scan, the wound, its wetness
 [[motion]]                       # composed in order; without any the surface is still
@@ -20,6 +21,8 @@ faults = ["arm stall 600ms at 5s"]   # what goes wrong, as hardware/process/faul
                                  # controller: servo, dead time, replies
 [dispenser]                      # what it does and what the motion knows of it (hardware/simulator/material.py); left
                                  # out: an ideal one
+[gel]                            # how what is printed lies: aspect (height by width at rest), sag_s, gloss (0 matt to
+                                 # 1); left out: beads are pictures without height
 [planted]                        # rig_offset_mm, arm_offset_mm: errors of calibration that nothing in the loop knows of
 [limits]                         # what the run must reach, for the exit code
 """
@@ -53,6 +56,7 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
+from hardware.simulator.scene.beads import FRESH_ASPECT, Gel
 from planning.kinematics import SimpleArm
 
 
@@ -97,11 +101,26 @@ class Scenario:
     limits: RunLimits  # what the run must reach
     nozzle: bool  # whether pictures show it
     beads: bool  # whether pictures show what was printed
+    gel: Gel | None  # how it lies; None: it has no height
+    looks: int | None  # beads from one look at what was laid to the next, 0: a layer; None: nobody looks
 
 
-SCENARIO_TABLES = ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "dispenser", "planted", "limits")
-OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "faults", "motion", *SCENARIO_TABLES)
+SCENARIO_TABLES = (
+    "scene",
+    "strain",
+    "rig",
+    "cameras",
+    "sensor",
+    "tracking",
+    "arm",
+    "dispenser",
+    "gel",
+    "planted",
+    "limits",
+)
+OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "look", "faults", "motion", *SCENARIO_TABLES)
 MAX_CAMERAS = 8
+LOOK_BY_LAYER = "layer"
 WITHOUT_PICTURES = ("truth", "tracks")  # ways of tracking that need no pictures
 PICTURE_SIDES = 64, 4096  # px of a picture
 MAX_SECONDS = 3600.0  # s: an hour of pictures is 300,000 of them
@@ -159,7 +178,30 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         baud=baud,
         profile=replace(profile, arm=replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ arm_shift)),
         limits=limits_from_table(path, parts["limits"]),
+        gel=_gel(path, parts["gel"]),
+        looks=_looks(path, table.get("look")),
     )
+
+
+def _gel(path: Path, table: Table) -> Gel | None:
+    checks.check_keys(path, "gel.", table, (), ("aspect", "sag_s", "gloss"))
+    if not table:
+        return None
+    usual = Gel()
+    return Gel(
+        aspect=_within(path, "gel.aspect", table.get("aspect", usual.aspect), 0.05, FRESH_ASPECT, "of the width"),
+        sag_time=_within(path, "gel.sag_s", table.get("sag_s", usual.sag_time), 0.01, 1000, "s"),
+        gloss=_within(path, "gel.gloss", table.get("gloss", usual.gloss), 0, 1, ""),
+    )
+
+
+def _looks(path: Path, value: object) -> int | None:
+    """How many beads lie between looks; 0: a layer."""
+    if value is None or value == LOOK_BY_LAYER:
+        return None if value is None else 0
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InputError(path, "look", value, f'"{LOOK_BY_LAYER}", or a number of beads of 1 or more')
+    return value
 
 
 def _table(path: Path, table: Table, name: str) -> Table:

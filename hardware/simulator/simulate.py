@@ -54,6 +54,8 @@ from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_d
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, Roi
 from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
+from planning.laid_beads import with_looks
+from planning.material import is_metered
 from planning.path import Path as Checkpoints
 
 LANDMARK_COUNT, LANDMARK_AREA = 90, (56.0, 42.0)  # landmarks, and mm of the surface round the wound that they lie in
@@ -207,6 +209,11 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
     _check_pairs(scenario, scene)
     if scenario.clearance is not None:
         path = drape_path(path, scene.shape, scenario.clearance, scenario.path)
+    if not is_metered(path) and (scenario.gel or scenario.looks is not None):
+        allowed = "with [gel] or look, columns width_mm and height_mm, or volume_mm3"
+        raise InputError(scenario.path, "columns", "no amounts of material", allowed)
+    if scenario.looks is not None:
+        path = with_looks(path, scenario.looks)
     if file.resolve().parent == out.resolve():
         raise InputError(out, "--out", "the folder that holds the scenario", "another one: files there are replaced")
     prepare_out(out, options.force)
@@ -257,6 +264,8 @@ def _check_pairs(scenario: Scenario, scene: Scene) -> None:
     if (scenario.strain is None) != (scene.deformation == UNDEFORMED):
         allowed = "both (how much over time, and of what) or neither"
         raise InputError(scenario.file, "strain, scene.deformation", "one of the two", allowed)
+    if scenario.looks is not None and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
+        raise InputError(scenario.file, "look", scenario.looks, 'with tracking.by = "pictures": cameras look')
     if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
         allowed = 'with by = "pictures": nothing else registers to a scan'
         raise InputError(scenario.file, "tracking.register", "scan", allowed)
@@ -289,7 +298,7 @@ def _write_results(
     files = tuple(f for f in FILE_NOTES if scenario.tracking.pictures or f[0] != "session")
     log = join_logs(folder.logs)
     judged = scenario.limits, told_outside, tracking, complete
-    run = NozzleRun(scenario.title, log, path, scenario.bead, *judged, pictures, files)
+    run = NozzleRun(scenario.title, log, path, scenario.bead, *judged, pictures, files, tuple(folder.looks))
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     summary["provenance"] = provenance().table()

@@ -197,6 +197,12 @@ class TruthLog:
         """Whether the motion prints (N,) at times (N,), s."""
         return np.array([self._extrude[i] if 0 <= i < len(self._due) else False for i in self._rows(times)], bool)
 
+    def needed(self, times: Array) -> Array:
+        """What the bead needs (N,), mm^3/s, at times (N,), s; 0 where nothing is printed."""
+        index = self._rows(times)
+        fraction, rate = self._fractions(times, index, (index >= 0) & (index < len(self._due)))
+        return self._needed(np.nan_to_num(fraction), rate)
+
     def rows(self, times: Array, executed: Callable[[Array], Array], flow: FlowAt | None = None) -> NozzleLog:
         """The log at times (N,), s; executed: machine axes (N, 6) at times (N,).
 
@@ -307,6 +313,8 @@ def divide_path(path: Path, piece: float) -> Path:
     number = np.concatenate([[0], *(np.arange(n) for n in counts)])  # of a piece on its way
     if "wait_s" in extra:  # at the beginning of the way
         extra["wait_s"] = np.where(number == 0, extra["wait_s"], "0")
+    if "look" in extra:  # at the end
+        extra["look"] = np.where(np.append(source[1:] != source[:-1], True), extra["look"], "0")
     if "volume_mm3" in extra:
         extra["volume_mm3"] = _divided(extra["volume_mm3"], np.concatenate([[1], np.repeat(counts, counts)]))
     return replace(path, surface_from_nozzle=cut, extra=extra, **columns)

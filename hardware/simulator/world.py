@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from ctypes import c_double
 from dataclasses import replace
+from functools import partial
 from logging import INFO, WARNING
 from typing import Protocol
 
@@ -30,6 +31,7 @@ from hardware.arm.link import Arm
 from hardware.arm.s6h4d import S6H4D
 from hardware.motion.loop import CommandedPose, MaterialControl, MotionLoop, Order, Tick
 from hardware.motion.step import PrintMotion
+from hardware.offline.looks import SurfaceLooks
 from hardware.offline.track import FrameSetStep
 from hardware.process.clock import Clock, SimClock
 from hardware.process.faults import FaultKind, FaultPart, faults_striking
@@ -47,20 +49,21 @@ from hardware.simulator.camera_pipeline import (
 )
 from hardware.simulator.cameras import Shot, TrueCameras
 from hardware.simulator.deposit import NozzleLog
-from hardware.simulator.material import SimulatedDispensers
+from hardware.simulator.material import BeadDrawing, SimulatedDispensers
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.truth import Truth, TruthLog, row_instants, truth_from_estimate
 from perception.frames import FrameSet
 from planning.kinematics import nozzle_from_axes
-from planning.path import Path, PrintPhase, PrintProgress
+from planning.laid_beads import Look
+from planning.path import LOOK, Path, PrintPhase, PrintProgress
 
 ROW_BLOCK = 0.2  # s of truth rows handed to the sink at once
 RUN_OUT = 0.3  # s that the run goes on after the path is finished
 AFTER_KILL = 1.5  # s that the rest of the world goes on without the motion
 ORDER_PERIOD = 0.3  # s between an operator's orders
 SEEN_TO_AFTER = 0.3  # s until he makes a dispenser ready that is not, and tries again
-BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
+LOOK_SECONDS = 2.5  # s that judging takes: two on a core without load
 
 
 class WorldSink(PipelineSink, Protocol):
@@ -80,6 +83,9 @@ class WorldSink(PipelineSink, Protocol):
 
     def registered(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
+
+    def look(self, look: Look) -> None:
+        """What was laid was looked at."""
 
 
 class _Wire:
@@ -120,7 +126,7 @@ class _SimulatedOperator:
             return []
         dry = self._material.reason
         self._dry_since = self._dry_since if dry else now
-        if progress.wanted:
+        if progress.wanted and progress.wanted != LOOK:
             self.seen_to.append(now)
             self._motion.put_in()
         elif dry and now >= self._dry_since + SEEN_TO_AFTER:
@@ -162,6 +168,9 @@ class SimulatedWorld:
         carries bytes from the motion to the arm, e.g. over a pty.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
+        self._step = step
+        if scene is not None:
+            scene.gel = scenario.gel
         self._truth, self._exposures, self._time = truth, exposures, SimClock()
         self._events = EventQueue(self._time)
         profile, faults = scenario.profile, scenario.faults
@@ -182,15 +191,17 @@ class SimulatedWorld:
         views = pictures, self._state_at, head
         self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *views)
         self._hangs = faults_striking(faults, FaultPart.MOTION)
-        self._lines = faults_striking(faults, FaultPart.DISPENSER)
+        self._lines = faults_striking(faults, FaultPart.DISPENSER, FaultKind.UNPLUG, FaultKind.BLOCK, FaultKind.DROP)
         self._pose: SurfacePose | None = None
         self.dispensers = SimulatedDispensers(path, scenario.dispenser, self._time, faults, scenario.path)
         material = self.dispensers.control
         material.begin(0.0, 0.0)
         self.motion = PrintMotion(profile, self._time, c_double(), material, lambda: self.link.lag)
         self._operator = _SimulatedOperator(self.motion, material)
-        self._rows_until, self._printed_until = 0.0, 0.0
-        self._bead_end: Array | None = None  # (2,) where the last piece of bead ended
+        self._rows_until = 0.0
+        beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
+        self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
+        self._looks: SurfaceLooks | None = None
         self._end = scenario.seconds
         self._killed = self._broken = False
         self._progress: ProgressReport = no_progress
@@ -301,24 +312,20 @@ class SimulatedWorld:
         times, truth, nozzle = np.array([shot.exposed]), self._truth, None
         if self.scenario.nozzle:
             self._device.advance(now)
-            nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(times)[0])
+            nozzle = self._nozzle_at(times)[0]
         pose, twist, strain = truth.base_from_surface(times)[0], truth.twist(times)[0], float(truth.amount(times)[0])
         self._last_state = WorldState(shot.exposed, shot.exposure, pose, twist, strain, nozzle, shot.gain)
         return self._last_state
 
+    def _nozzle_at(self, times: Array) -> Array:
+        return nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(times))
+
     def _print_beads(self, until: float) -> None:
-        ends = np.arange(self._printed_until + BEAD_STEP, until, BEAD_STEP)
-        if self._scene is None or not self.scenario.beads or not len(ends):
-            return
-        self._printed_until = float(ends[-1])
-        self._device.advance(self._time.now())
-        laid = self.dispensers.flowing(ends) if self.scenario.dispenser else self._truth_log.extruding(ends)
-        nozzle = nozzle_from_axes(self.scenario.true_arm, self.arm.axes_at(ends))
-        places = self._scene.shape.material(self._truth.material(ends, nozzle[:, :3, 3]))
-        for place, there in zip(places, laid, strict=True):
-            if there and self._bead_end is not None:
-                self._scene.ink.lay(self._bead_end, place, self.scenario.bead)
-            self._bead_end = place if there else None
+        if self._scene is not None and self.scenario.beads:
+            self._device.advance(self._time.now())
+            if self.scenario.gel is not None:
+                self.dispensers.advance(self._time.now())
+            self._beads.draw(self._scene, until)
 
     # -- what the motion is given, and what it does
 
@@ -327,7 +334,10 @@ class SimulatedWorld:
         self._pose, scenario = pose, self.scenario
         self._ticks.arrived(self._time.now())
         self._sink.given(pose)
-        if self.motion.progress is not None or pose.state is not TrackState.TRACKING:
+        if self.motion.progress is not None:
+            self._look_at(pose, frames)
+            return
+        if pose.state is not TrackState.TRACKING:
             return
         change: Array | None = np.eye(4)
         if self._scene is not None and scenario.tracking.pictures and not scenario.tracking.scan:
@@ -341,6 +351,20 @@ class SimulatedWorld:
         placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
         self.motion.begin(placed_path, scenario.profile, 0.0, self.dispensers.outlets)
         self._sink.registered(change)
+        if scenario.looks is not None:
+            self._looks = SurfaceLooks(scenario.known_rig, placed_path)
+
+    def _look_at(self, pose: SurfacePose, frames: FrameSet) -> None:
+        looks, progress, last = self._looks, self.motion.progress, self.motion.last
+        if looks is not None and progress is not None and looks.at(progress, last, frames, pose, self._step):
+            self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks.last))
+
+    def _looked(self, look: Look | None, now: float) -> None:
+        if look is not None:
+            look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
+            self._sink.look(look)
+            self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
+        self.motion.put_in()
 
     def _orders(self) -> list[Order]:
         now = self._time.now()

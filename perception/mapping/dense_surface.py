@@ -32,7 +32,7 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SurfaceView:
+class ScanView:
     """One picture of the surface."""
 
     camera: int  # number in the rig
@@ -108,7 +108,7 @@ class DenseFit:
     """Fits a lattice to pictures, whose number decides how long that takes."""
 
     def __init__(
-        self, lenses: Lenses, views: Sequence[SurfaceView], progress: Callable[[float], None] = lambda share: None
+        self, lenses: Lenses, views: Sequence[ScanView], progress: Callable[[float], None] = lambda share: None
     ) -> None:
         """progress: called with the share that is done."""
         self._lenses, self._views, self._progress = lenses, tuple(views), progress

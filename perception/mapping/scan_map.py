@@ -4,14 +4,12 @@ First the scan is registered to the surface's depth map. Then the pictures are m
 it lies right they look alike, where it lies wrong they differ, by as much as its relief rises or falls along the error.
 That needs no estimate of the relief, so the last steps are free of the error that flat patches make on a wound's walls.
 
-Dense matching: cameras stand 36 to 84 degrees apart, but once resampled on a surface that is right to a millimetre
-their pictures look alike, and what is left is a shift of a node or two. On the true surface thousands of points were
-measured to come out to 0.02 mm (skin) and 0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's
-wall give 0.2.
+Dense matching: cameras stand 36 to 84 degrees apart, but resampled on a surface that is right to a millimetre pictures
+look alike, and a shift of a node or two is left. On the true surface thousands of points came out to 0.02 mm (skin) and
+0.07 mm (a wet wound) at 0.36 mm a pixel, where flat patches across a wound's wall give 0.2.
 
-The depth map is a height field over the first map. Landmarks are few and their patches flat, so they miss a wound's
-walls by tenths of a millimetre. Their smooth surface is where dense matching begins; it is then matched and corrected
-repeatedly, from coarse to fine.
+The depth map is a height field over the first map: matching begins at the landmarks' smooth surface, which misses a
+wound's walls by tenths of a millimetre, and corrects it from coarse to fine.
 """
 
 from __future__ import annotations
@@ -20,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from estimation.triangulation import triangulate
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
-from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.scans.registration import Registration, register, register_near
 from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
@@ -56,7 +54,7 @@ class DenseMatch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _LatticeImage:
+class LatticeImage:
     """One camera's picture on the lattice."""
 
     even: Image  # (H, W) brightness and contrast evened out
@@ -80,12 +78,12 @@ def match_near(
     Each node's ray in the reference camera is intersected with those of the other cameras at the places that match.
     every: step in rows and columns between the nodes given, (H', W', 3).
     """
-    towards = _normals(nodes)
-    first = _lattice_image(lenses, reference, images[reference], nodes, towards)
+    towards = lattice_normals(nodes)
+    first = lattice_image(lenses, reference, images[reference], nodes, towards)
     flow = _flow()
     pixels, camera, used = [first.pixels], [reference], [first.visible]
     for c in sorted(set(images) - {reference}):
-        other = _lattice_image(lenses, c, images[c], nodes, towards)
+        other = lattice_image(lenses, c, images[c], nodes, towards)
         matches, correlation = _matched(flow, first, other)
         pixels.append(matches)
         camera.append(c)
@@ -116,8 +114,7 @@ def _triangulated(
     """The points where rays (K, H, W, 2) meet, K cameras, of those `used` (K, H, W), at nodes seen by `both` (H, W)."""
     number = np.cumsum(both.ravel()).reshape(both.shape) - 1
     which, row, column = np.nonzero(used)
-    point = number[row, column]
-    looks = pixels[which, row, column]
+    point, looks = number[row, column], pixels[which, row, column]
     met, _, residual = triangulate(lenses.rig, point, camera[which], looks, int(both.sum()), iterations=2)
     aside = np.zeros(len(met))
     np.maximum.at(aside, point, np.linalg.norm(residual, axis=1))
@@ -127,13 +124,17 @@ def _triangulated(
     return DenseMatch(points, sure)
 
 
-def _normals(nodes: Array) -> Array:
+def lattice_normals(nodes: Array) -> Array:
+    """Unit normals (H, W, 3) of the surface through nodes (H, W, 3)."""
     down, right = np.gradient(nodes, axis=(0, 1))
     across = np.cross(right, down)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
 
 
-def _lattice_image(lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array) -> _LatticeImage:
+def lattice_image(
+    lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array, evening: float = EVENING_SIGMA_NODES
+) -> LatticeImage:
+    """A picture laid on nodes (H, W, 3), base frame, with normals; evened over `evening` nodes."""
     lens = lenses.rig.cameras[camera]
     ideal, depth = ideal_pixels(lens, nodes.reshape(-1, 3))
     imaged, in_lens = lenses.image(camera, ideal, depth)
@@ -141,18 +142,16 @@ def _lattice_image(lenses: Lenses, camera: int, image: Image, nodes: Array, norm
     facing = np.abs(np.einsum("hwi,hwi->hw", view, normals)) / np.linalg.norm(view, axis=2)
     inside = in_lens & ((imaged > 1) & (imaged < np.array(lens.size) - 2)).all(1)
     shape = nodes.shape[:2]
-    x, y = imaged.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1)
-    laid = cv2.remap(image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_CUBIC)
-    grey = np.asarray(laid).astype(np.float32)
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), EVENING_SIGMA_NODES)
-    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), EVENING_SIGMA_NODES))
+    x, y = np.ascontiguousarray(imaged.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1))
+    grey = np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC)).astype(np.float32)
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), evening)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), evening))
     even = np.clip(np.rint(128 + EVENED_CONTRAST * centred / (spread + 2.0)), 0, 255).astype(np.uint8)
-    return _LatticeImage(even, ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING))
+    return LatticeImage(even, ideal.reshape(*shape, 2), inside.reshape(shape) & (facing > MIN_NODE_FACING))
 
 
 def _flow() -> cv2.DISOpticalFlow:
-    """Dense inverse search (Kroeger et al. 2016). Patches do not ask their neighbours: with that, results would depend
-    on the number of threads."""
+    """Dense inverse search (Kroeger et al. 2016); patches do not ask neighbours: threads would change the results."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setPatchSize(FLOW_PATCH_NODES)
     flow.setPatchStride(FLOW_STRIDE_NODES)
@@ -163,7 +162,7 @@ def _flow() -> cv2.DISOpticalFlow:
     return flow
 
 
-def _matched(flow: cv2.DISOpticalFlow, first: _LatticeImage, other: _LatticeImage) -> tuple[Array, Float32]:
+def _matched(flow: cv2.DISOpticalFlow, first: LatticeImage, other: LatticeImage) -> tuple[Array, Float32]:
     """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and their correlation (H, W)."""
     still = np.zeros((*first.even.shape, 2), np.float32)
     shift = np.asarray(flow.calc(first.even, other.even, still))
@@ -198,47 +197,48 @@ def relief_points(
     finest = node_size(lenses, cameras, centre)
     points = first.map.points
     low, high = np.percentile(points[:, :2], [1, 99], axis=0) + np.array([[-LATTICE_MARGIN_MM], [LATTICE_MARGIN_MM]])
-    flat, relief, sure = _lattice(low, high, GUESS_SIGMA_MM / 2), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
-    heights = heights_near(points, flat.reshape(-1, 2)).reshape(flat.shape[:2]).astype(np.float32)
+    heights, relief, sure = initial_heights(points, low, high), np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
     for width in NODE_WIDTHS:
-        flat = _lattice(low, high, width * finest)
+        flat = lattice_nodes(low, high, width * finest)
         resized = np.asarray(cv2.resize(heights, flat.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
         nodes = np.dstack([flat, resized.astype(float)])
-        match = match_near(lenses, images, _transformed(first.base_from_surface, nodes), reference)
+        match = match_near(lenses, images, transformed_nodes(first.base_from_surface, nodes), reference)
         if match is None:
             return np.zeros((0, 3))
         relief, sure = match.points, match.sure
-        inner = _transformed(se3.inverse(first.base_from_surface), relief)
-        heights = _corrected(nodes, inner, sure, width * finest)
+        inner = transformed_nodes(se3.inverse(first.base_from_surface), relief)
+        heights = corrected_heights(nodes, inner, sure, width * finest)
     sure &= _inside(lenses, reference, relief, polygons)
     return np.asarray(relief[::step, ::step][sure[::step, ::step]])
 
 
-def _lattice(low: Array, high: Array, step: float) -> Array:
+def lattice_nodes(low: Array, high: Array, step: float) -> Array:
+    """x and y (H, W, 2), mm, of nodes `step` apart from `low` to at least `high` (2,)."""
     x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def heights_near(points: Array, flat: Array) -> Array:
-    """Heights (N,) at places (N, 2) by a plane through the points (M, 3) around each, the nearer the more."""
-    away = points[None, :, :2] - flat[:, None]
+def initial_heights(points: Array, low: Array, high: Array) -> Float32:
+    """Heights on a coarse lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
+    flat = lattice_nodes(low, high, GUESS_SIGMA_MM / 2)
+    away = points[None, :, :2] - flat.reshape(-1, 1, 2)
     weight = np.exp(-(away**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
     design = np.concatenate([np.ones((*away.shape[:2], 1)), away / GUESS_SIGMA_MM], 2)
     normal = np.einsum("nmi,nm,nmj->nij", design, weight, design, optimize=True) + 1e-4 * np.eye(3)
     right = np.einsum("nmi,nm->ni", design, weight * points[:, 2])
-    return np.asarray(np.linalg.solve(normal, right[..., None])[:, 0, 0])
+    return np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2]).astype(np.float32)
 
 
-def _transformed(transform: Array, nodes: Array) -> Array:
+def transformed_nodes(transform: Array, nodes: Array) -> Array:
+    """Nodes (H, W, 3) carried by a transform (4, 4)."""
     return se3.transform_points(transform, nodes.reshape(-1, 3)).reshape(nodes.shape)
 
 
-def _corrected(nodes: Array, matches: Array, sure: NDArray[np.bool_], step: float) -> Float32:
+def corrected_heights(nodes: Array, matches: Array, sure: NDArray[np.bool_], step: float) -> Float32:
     """New heights (H, W) from the points (H, W, 3) matched at the nodes (H, W, 3), in the surface frame."""
     heights, off = nodes[..., 2], matches - nodes
     down, right = np.gradient(heights, step)
-    up = (off[..., 2] - right * off[..., 0] - down * off[..., 1]).astype(np.float32)
-    up = np.where(sure, up, 0).astype(np.float32)
+    up = np.where(sure, off[..., 2] - right * off[..., 0] - down * off[..., 1], 0).astype(np.float32)
     around = np.asarray(cv2.medianBlur(up, 5))
     up = np.where(np.abs(up - around) < MAX_JUMP_MM, up, around)
     weight = sure.astype(np.float32) + 1e-6

@@ -138,6 +138,7 @@ HORIZON_POINTS = 30  # evenly spread grid points of one horizon: some 15 us for 
 FEW_KNOTS = 10  # checkpoints in one horizon up to which each has grid points of its own
 MAX_MORE_POINTS = 100  # beside the even ones: 1.5 ms, twice a second
 SPEED_CHANGE = 0.1  # share of the speed that it changes by at a checkpoint with a grid point of its own
+LOOK_ASIDE = 25.0  # mm beside the path: a cartridge is 8 mm in radius, and its picture leans out as it is nearer
 APPROACH_HEIGHT = 10.0  # mm above the surface, along the nozzle, on the way to and from the path
 APPROACH_SPEED = 20.0  # mm/s on that way, slow enough for a person to step in
 DIRECT_DISTANCE = 2.0  # mm: from here the nozzle goes straight to its place, without going up first
@@ -334,6 +335,25 @@ def point_above(surface_from_nozzle: Array) -> Array:
     """The nozzle (4, 4) straight above where it is now, where it touches nothing."""
     rotation, place = surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3]
     return se3.make(rotation, place + APPROACH_HEIGHT * rotation[:, 2])
+
+
+def aside_curve(surface_from_nozzle: Array, goal: Array) -> PathCurve | None:
+    """From the nozzle (4, 4) up over what it printed, then to `goal` (4, 4); None if there."""
+    rotation, place = surface_from_nozzle[:3, :3], surface_from_nozzle[:3, 3]
+    rise = max(0.0, float((goal[:3, 3] - place) @ rotation[:, 2]))
+    lifted = se3.make(rotation, place + rise * rotation[:, 2])
+    return _through([surface_from_nozzle, lifted, goal], APPROACH_SPEED)
+
+
+def pose_aside(surface_from_nozzle: Array, zone: Array) -> Array:
+    """The nozzle (4, 4) above and beside the path's zone (2, 3), low and high, mm: nothing there is behind the tool.
+
+    It goes along the surface's x, to the side that is nearer: cameras stand on an arc in the plane of y and z.
+    """
+    above = point_above(surface_from_nozzle)
+    low, high = zone[0][0] - LOOK_ASIDE, zone[1][0] + LOOK_ASIDE
+    above[0, 3] = low if above[0, 3] - low < high - above[0, 3] else high
+    return above
 
 
 def straight_curve(surface_from_nozzle: Array, goal: Array) -> PathCurve | None:

@@ -38,20 +38,22 @@ from planning.motion.curve import (
     AxisFollower,
     Gridpoints,
     PathCurve,
+    aside_curve,
     curve_through,
     entry_curve,
     gridpoints_on,
     place_passed,
     point_above,
+    pose_aside,
     straight_curve,
 )
 from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
-from planning.path import Path, PrintPhase, PrintProgress, check_path, check_start
+from planning.path import LOOK, Path, PrintPhase, PrintProgress, check_path, check_start
 
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second
 PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
 PAUSED = "paused"
-RESTS = "rests for wait_s"
+RESTS, LOOKS = "rests for wait_s", "stands aside for a look"
 STALL_TICKS = 3.0  # ticks without a call after which the arm has come to rest by itself
 MAX_SENT_MOVES = 64  # a second of them, more than an arm is sent before they are called back
 POSE_LIMIT_FRACTION = 0.98  # of the guard's limits for a pose: the planner brakes before the guard would refuse
@@ -124,9 +126,7 @@ class Planner:
             self._pause_pose, self._retreated, self._segment = None, False, None
         if reason := self._keep_segment(pose, now):
             return self._stop(now, reason)
-        if self._finished:
-            return self._stop(now, "path finished")
-        return self._follow(pose, now)
+        return self._stop(now, "path finished") if self._finished else self._follow(pose, now)
 
     def refused(self, axes: Array) -> None:
         """Note that the last move was not sent: the arm is at `axes` (6,), and the segment begins anew."""
@@ -241,15 +241,15 @@ class Planner:
         return nozzle if pose.warp is None else pose.warp.uncarry(nozzle[None])[0]
 
     def _retreat(self, pose: SurfacePose, now: float) -> Command:
-        """In a pause: straight up from where it began, then at rest; an interrupted retreat is resumed."""
-        nozzle, segment = self._nozzle(pose, now), self._segment
-        waits = PAUSED if self.paused else f"material {self._rests.wanted} is to be put in"
+        """In a pause: up from where it began, for a look aside too, then at rest; what was interrupted is resumed."""
+        nozzle, segment, looks = self._nozzle(pose, now), self._segment, self._rests.wanted == LOOK
+        waits = PAUSED if self.paused else LOOKS if looks else f"material {self._rests.wanted} is to be put in"
         if self._pause_pose is None:
-            self._pause_pose = point_above(nozzle)
+            self._pause_pose = pose_aside(nozzle, self._zone) if looks else point_above(nozzle)
         if segment is not None and segment.phase is PrintPhase.RETREATING and now >= segment.timing.end:
             self._retreated = segment.timing.places[-1] >= segment.curve.length
             segment = None
-        curve = None if self._retreated else straight_curve(nozzle, self._pause_pose)
+        curve = None if self._retreated else (aside_curve if looks else straight_curve)(nozzle, self._pause_pose)
         if curve is None:
             return self._stop(now, waits)
         begins = segment is None or segment.phase is not PrintPhase.RETREATING

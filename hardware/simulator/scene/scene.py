@@ -20,12 +20,12 @@ from hardware.simulator.scene.appearance import (
     Appearance,
     Drape,
     Lamp,
-    PrintedBeads,
     backdrop,
     drape_over,
     lamps,
     node_axes,
 )
+from hardware.simulator.scene.beads import Gel, PrintedBeads
 from hardware.simulator.scene.fields import Field, Layers, as_field, linear_light
 from hardware.simulator.scene.rays import HeightField, RenderView, height_field
 from hardware.simulator.scene.shape import Deformation, Shape
@@ -50,7 +50,7 @@ class Scene:
     """A body before the cameras; same arguments, same pictures. It is painted when somebody first looks.
 
     base_from_rest: (4, 4) mm, base_from_surface when nothing moves: there the far cloth lies and over it hang lamps.
-    Only `ink` changes: pictures rendered after a bead was laid show it.
+    Only `ink` changes: pictures rendered after a bead was laid show it. gel: how what is printed lies; None: as ink.
     """
 
     def __init__(
@@ -60,7 +60,10 @@ class Scene:
         deformation: Deformation = UNDEFORMED,
         seed: int = 0,
         base_from_rest: Array = BASE_FROM_REST,
+        gel: Gel | None = None,
     ) -> None:
+        self.gel = gel  # to be set before somebody looks
+        self._raised: tuple[int, HeightField] | None = None  # version of the beads, and the heights with them
         self.shape, self.look, self.deformation = shape, look or Appearance(), deformation
         self.base_from_rest = base_from_rest @ shape.surface_from_grid  # of the grid
         self._seed = seed
@@ -91,16 +94,27 @@ class Scene:
                 heights = draped_heights(shape, half)
                 layers = paint_layers(shape, heights, half, look, self._seed)
                 cloth = backdrop(look, rng) if half is None else drape_over(shape, half, look, rng)
-                self._painted = PaintedScene(heights, height_field(heights), layers, cloth, PrintedBeads(layers))
+                beads = PrintedBeads(layers, self.gel)
+                self._painted = PaintedScene(heights, height_field(heights), layers, cloth, beads)
             return self._painted
 
     def heights(self, amount: float) -> HeightField:
         """Heights on the nodes of material points under `amount` of the deformation, the drape's hem among them."""
-        painted = self._get_painted()
+        painted, shape = self._get_painted(), self.shape
+        still = self._with_beads(painted)
         if not amount * self.deformation.bulge:
+            return still
+        lift = self.deformation.lift(np.stack(node_axes(shape.size, shape.step), -1), amount)
+        return height_field(still.height + lift.astype(np.float32))
+
+    def _with_beads(self, painted: PaintedScene) -> HeightField:
+        beads = painted.ink
+        if beads.gel is None or not beads.version:
             return painted.relief
-        lift = self.deformation.lift(np.stack(node_axes(self.shape.size, self.shape.step), -1), amount)
-        return height_field(painted.node_heights + lift.astype(np.float32))
+        if self._raised is None or self._raised[0] != beads.version:
+            laid = beads.heights(self.shape.size, self.shape.step)
+            self._raised = beads.version, height_field(painted.node_heights + laid)
+        return self._raised[1]
 
     @property
     def opening(self) -> tuple[float, float]:

@@ -1,0 +1,213 @@
+"""Looks at what was laid: gathers the views while the needle stands aside, measures, judges, and draws the result.
+
+The first look, before anything is laid, measures the surface; each of the others what has come since. The last frame
+set of a look takes some two seconds of a core.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from html import escape
+from pathlib import Path as File
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
+from estimation.rig import Rig
+from estimation.se3 import Array
+from estimation.surface_map import SurfaceHeights
+from hardware.offline.track import FrameSetStep
+from hardware.recording import messages
+from hardware.recording.session_reader import read_channels
+from hardware.report import page
+from hardware.report.evaluation import figure
+from perception.frames import FrameSet
+from perception.lens import Lenses
+from perception.mapping.scan_map import node_size
+from perception.mapping.surface_heights import (
+    SurfaceView,
+    dense_heights,
+    first_heights,
+    heights_with_beads,
+    sweep_beads,
+    view_of,
+)
+from planning.command import Command, Hold
+from planning.laid_beads import (
+    BeadPieces,
+    LaidBeads,
+    Look,
+    bead_heights,
+    judge_beads,
+    nearest_station,
+    pieces_between,
+    stations_of,
+)
+from planning.motion.planner import LOOKS
+from planning.path import LOOK, Path, PrintProgress, way_lengths
+
+VIEWS = 4  # frame sets of a look: each at another place of the breath, so that pixels fall elsewhere
+VIEW_SPACING = 0.25  # s between them
+SETTLED = 0.3  # s after the needle came to rest aside: it may swing, and pictures are late
+MARGIN = 10.0  # mm of surface beside the path that is measured as well: matching begins with what is coarse
+MIN_STEP = 0.2  # mm between nodes: ten across a bead, and a look in two seconds
+WIDTHS = (1.0, 1.12, 1.25, 1.4)  # by the planned: gel spreads
+LOOK_TOPIC = "/look"
+PLOT_SCALE = 14.0  # px a mm of the drawing
+SHARE_COLOURS = ((0.6, "#c0392b"), (0.8, "#e67e22"), (1.25, "#27ae60"), (1.6, "#e67e22"), (math.inf, "#8e44ad"))
+
+
+class SurfaceLooks:
+    """The looks of one print. surface: as it was measured last, None before the first. last: what the last one told."""
+
+    def __init__(self, rig: Rig, path: Path) -> None:
+        """path: with its column `look`, in the surface frame of the poses. InputError where it says no amounts."""
+        self._lenses, self._path = Lenses(rig), path
+        pieces_between(path, 0, len(path) - 1)
+        self._views: list[SurfaceView] = []
+        self._gathered = -math.inf  # s, of the last view
+        self._widths: tuple[float, ...] = WIDTHS
+        self._from = 0.0  # checkpoints, up to where was looked at
+        self._aside, self._done = math.nan, False  # s, since when the needle stands aside
+        self.last: Look | None = None
+        self.surface: SurfaceHeights | None = None
+
+    def at(
+        self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose, step: FrameSetStep
+    ) -> bool:
+        """Whether a look is done by this frame set and those given before, which is said once; `last` is what it told.
+
+        command: the last one. step: the tracker, whose map says about where the surface lies.
+        """
+        if progress.wanted != LOOK:
+            self._aside, self._done = math.nan, False
+            return False
+        if self._done or not (isinstance(command, Hold) and command.reason == LOOKS):
+            return False
+        self._aside = pose.stamp if math.isnan(self._aside) else self._aside
+        surface_map = getattr(step, "map", None)
+        if surface_map is None or not self._keep(frames, pose, self._aside):
+            return False
+        self._done = True
+        if self.surface is None:
+            self._from, self.last = progress.fraction, None
+            self._measure(surface_map.points)
+        else:
+            self.last = self._judge(progress.fraction, pose.stamp)
+        return True
+
+    def _measure(self, landmarks: Array) -> None:
+        """Measure the surface before anything is laid, near landmarks (N, 3) mm, surface frame."""
+        views, self._views = self._views, []
+        low, high = self._path.zone[:, :2] + np.array([[-MARGIN], [MARGIN]])
+        node = node_size(self._lenses, sorted(views[0].images), views[0].base_from_surface[:3, 3])
+        self.surface = dense_heights(self._lenses, views, first_heights(landmarks, low, high, max(node, MIN_STEP)))
+
+    def _keep(self, frames: FrameSet, pose: SurfacePose, since: float = -math.inf) -> bool:
+        """Keep a frame set if it is of use; whether there are enough. since: s, when the needle came to rest aside."""
+        due = pose.stamp >= self._gathered + VIEW_SPACING and pose.stamp >= since + SETTLED
+        if due and pose.state is TrackState.TRACKING and len(frames.frames) > 1:
+            self._gathered = pose.stamp
+            self._views.append(view_of(frames, pose.base_from_surface))
+        return len(self._views) >= VIEWS
+
+    def _judge(self, fraction: float, now: float) -> Look:
+        """What lies there of the path up to `fraction` checkpoints."""
+        assert self.surface is not None
+        views, self._views = self._views, []
+        pieces = pieces_between(self._path, self._from, fraction)
+        laid, self.surface, width = look_at(self._lenses, views, self.surface, pieces, self._widths)
+        self._widths = (width,)  # a property of the gel, seen best on the bare surface
+        first, self._from = self._from, fraction
+        return Look(now, first, fraction, now - self._aside, width, laid)
+
+
+def look_at(
+    lenses: Lenses,
+    views: Sequence[SurfaceView],
+    before: SurfaceHeights,
+    pieces: BeadPieces,
+    widths: Sequence[float] = WIDTHS,
+) -> tuple[LaidBeads, SurfaceHeights, float]:
+    """What lies of planned beads, the surface after, and how wide beads are by the planned, one of `widths`."""
+    nodes = before.nodes
+    station, _ = nearest_station(pieces, stations_of(pieces), nodes)
+    dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in widths]
+    swept = sweep_beads(lenses, views, before, dues, station)
+    width, due = widths[swept.width], dues[swept.width]
+    after = heights_with_beads(before, due, station, swept)
+    laid = judge_beads(before, after, replace(pieces, width=pieces.width * width))
+    filled = np.where(np.isfinite(after.heights), after.heights, before.heights + due)  # unknown: taken for laid
+    return laid, replace(after, heights=filled), width
+
+
+def read_looks(recording: File) -> list[Look]:
+    """The looks of a recording, in order of stamp; none of a folder. InputError where it cannot be read."""
+    if not recording.is_file():
+        return []
+    return sorted(read_channels(recording, {LOOK_TOPIC: partial(_look, recording)}), key=lambda look: look.stamp)
+
+
+def _look(recording: File, message: messages.Message) -> Look:
+    try:
+        return messages.look_from_message(message)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(recording, LOOK_TOPIC, str(error), "a look, as stillbed writes it") from None
+
+
+def looks_section(looks: Sequence[Look], path: Path) -> str:
+    """The looks as a section of a report: a table, and a drawing of the beads by what lies there; "" of none."""
+    if not looks:
+        return ""
+    rows = []
+    for look in looks:
+        volume, planned, _ = look.laid.total
+        laid, crest = look.laid, look.laid.stations.crest
+        off = laid.height[np.isfinite(laid.height)] - crest[np.isfinite(laid.height)]
+        heights = [np.median(crest) + _median(off), np.median(crest), float(np.std(off)) if len(off) else math.nan]
+        clogs = "; ".join(f"{a:.0f} to {b:.0f} mm" for a, b in laid.clogs) or "none"
+        values = f"{look.stamp:.1f}", f"{look.seconds:.1f}", figure(volume), figure(planned), *map(figure, heights)
+        rows.append([*values, str(int(laid.gap.sum())), str(int(laid.blob.sum())), clogs])
+    head = ("at, s", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "planned, mm", "uneven, mm")
+    table = page.figures_table((*head, "gaps", "blobs", "clogs"), rows)
+    drawn = "".join(
+        f"<figure>{look_picture(look, path)}<figcaption>after {look.last:.0f} checkpoints: {escape(look.text)}"
+        "</figcaption></figure>"
+        for look in looks
+    )
+    text = (
+        "What lies there of the planned beads, by the cameras while the needle stood aside. Green: as planned to a "
+        "quarter; orange: less than 0.8 or more than 1.25; red: a gap; violet: a blob; grey: not seen."
+    )
+    return page.section("Looks at what was laid", text, table + f'<div class="pictures">{drawn}</div>')
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def look_picture(look: Look, path: Path) -> str:
+    """The stations of a look from above, each in the colour of its share, as SVG."""
+    places = path.surface_from_nozzle[:, :2, 3]
+    knots = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
+    low, high = path.zone[:, :2] + np.array([[-2.0], [2.0]])
+    size = (high - low) * PLOT_SCALE
+    lines, stations = [], look.laid.stations
+    for i, share in enumerate(look.laid.share.tolist()):
+        at = np.linspace(stations.begin[i], stations.end[i], 6)
+        points = np.column_stack([np.interp(at, knots, places[:, k]) for k in (0, 1)])
+        x, y = ((points - low) * PLOT_SCALE).T
+        y = size[1] - y
+        colour = "#999" if math.isnan(share) else next(c for most, c in SHARE_COLOURS if share < most)
+        way = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+        width = 0.85 * stations.width[i] / look.width * PLOT_SCALE
+        title = "not seen" if math.isnan(share) else f"{share:.0%} of the planned"
+        lines.append(
+            f'<path d="M{way}" stroke="{colour}" stroke-width="{width:.1f}" fill="none"><title>{title}</title></path>'
+        )
+    box = f'viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" width="{min(size[0], 520):.0f}"'
+    return f'<svg {box} role="img" aria-label="beads by how much lies there">{"".join(lines)}</svg>'

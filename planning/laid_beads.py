@@ -1,0 +1,277 @@
+"""What was laid, judged by the surface before and after: volume and height of each piece of bead, gaps, blobs, a clog.
+
+Between two height fields of one lattice lies the volume that came, whatever the surface's slope. A planned bead of
+cross-section A and width w is taken for a parabola, 3 A / (2 w) high, which fills A; swept along the path with round
+ends, where neighbours overlap they add up. Each node belongs to the nearest bead, planned and measured alike, so a
+piece of bead is not wronged by its neighbours. What both fields are off by together, away from all beads, is taken off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.errors import InputError
+from estimation.se3 import Array, Index
+from estimation.surface_map import SurfaceHeights
+from planning.material import bead_areas, is_metered
+from planning.path import MIN_SPACING, Path, way_lengths
+
+STATION_LENGTH = 2.5  # mm of bead judged as one: two or three widths, half of the shortest clog that must be found
+BESIDE = 0.4  # mm beside a planned bead that count to it: how far a nozzle is off, and gel creeps
+AWAY = 1.5  # mm from all planned beads, beyond which nothing can have come
+MIN_AWAY_NODES = 50  # nodes from which the common offset is taken
+SHARED_ERROR = 1.0  # mm within which nodes share their error: about half a patch of the matching
+MIN_SEEN = 0.6  # share of a piece's nodes that must be measured
+GAP_SHARE, BLOB_SHARE = 0.6, 1.6  # of the planned volume: less is a gap, more a blob
+SURE = 2.0  # sigmas by which it is so
+THIN_SHARE = 0.9  # surely less than that of the planned: a part of a clog, which may begin within a piece
+CLOG_LENGTH = 4.0  # mm of bead that thin pieces in a row lack together, in the order in which they are laid: a clog
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeadPieces:
+    """P straight pieces of planned beads in the order in which they are laid, surface frame."""
+
+    start: Array  # (P, 3) mm
+    end: Array  # (P, 3) mm
+    area: Array  # (P,) mm^2, cross-section
+    width: Array  # (P,) mm
+    bead: Index  # (P,) number of the bead, rising by one
+    layer: Index  # (P,)
+    place: Array  # (P,) mm along the path, of the start
+
+    def __len__(self) -> int:
+        return len(self.area)
+
+
+def pieces_between(path: Path, first: float, last: float, where: object = "path") -> BeadPieces:
+    """The beads that a path lays on its ways `first` to `last`, in checkpoints; pieces of both ends are whole.
+
+    InputError for a path that does not say how much material it needs.
+    """
+    if not is_metered(path):
+        raise InputError(where, "look", "a path without amounts", "columns width_mm and height_mm, or volume_mm3")
+    ways = np.arange(max(int(np.floor(first)), 0) + 1, min(int(np.ceil(last)), len(path) - 1) + 1)
+    poses = path.surface_from_nozzle
+    knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
+    begins = path.extrude & ~np.concatenate([[False], path.extrude[:-1]])
+    bead = np.cumsum(begins) - 1
+    moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1) > MIN_SPACING
+    ways = ways[path.extrude[ways] & moved[ways - 1]]
+    area = bead_areas(path, where)[ways]
+    width = np.sqrt(2.5 * area)  # of a bead 0.4 as high as it is wide
+    if "width_mm" in path.extra:
+        width = path.extra["width_mm"][ways].astype(float)
+    start, end = poses[ways - 1, :3, 3], poses[ways, :3, 3]
+    return BeadPieces(start, end, area, width, bead[ways], path.layer[ways], knots[ways - 1])
+
+
+def bead_heights(pieces: BeadPieces, nodes: Array) -> Array:
+    """How high (H, W) mm planned beads lie over nodes (H, W, 2) mm of a lattice, x and y; they keep their volume."""
+    heights = np.zeros(nodes.shape[:2])
+    x, y = nodes[0, :, 0], nodes[:, 0, 1]
+    for a, b, area, width in zip(pieces.start, pieces.end, pieces.area, pieces.width, strict=True):
+        radius, way = width / 2, b[:2] - a[:2]
+        length = float(np.linalg.norm(way))
+        low, high = np.minimum(a, b)[:2] - radius, np.maximum(a, b)[:2] + radius
+        columns = slice(*np.searchsorted(x, (low[0], high[0])))
+        rows = slice(*np.searchsorted(y, (low[1], high[1])))
+        off = nodes[rows, columns] - a[:2]
+        along = off @ way / length
+        across = (off[..., 0] * way[1] - off[..., 1] * way[0]) / length
+        chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+        swept = _half_disc(along, chord) - _half_disc(along - length, chord)
+        steep = float(np.linalg.norm(b - a)) / length  # more gel over the same ground on a slope
+        heights[rows, columns] += 1.5 * area * steep / (np.pi * radius**3) * swept
+    return heights
+
+
+def _half_disc(at: Array, radius: Array) -> Array:
+    """The integral (...) of sqrt(radius^2 - t^2) over t from 0 to `at`, of which only -radius to radius counts."""
+    t = np.clip(at, -radius, radius)
+    angle = np.arcsin(t / np.maximum(radius, 1e-12))
+    return np.asarray(0.5 * (t * np.sqrt(np.maximum(radius**2 - t**2, 0.0)) + radius**2 * angle))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stations:
+    """S pieces of bead, each judged as one, in the order in which they are laid."""
+
+    bead: Index  # (S,)
+    layer: Index  # (S,)
+    begin: Array  # (S,) mm along the path
+    end: Array  # (S,) mm
+    crest: Array  # (S,) mm, height of a single bead as planned
+    width: Array  # (S,) mm
+
+
+def stations_of(pieces: BeadPieces) -> Stations:
+    """Beads cut evenly into stations of about STATION_LENGTH."""
+    lengths, rows = np.linalg.norm(pieces.end - pieces.start, axis=1), []
+    for bead in np.unique(pieces.bead):
+        own = np.flatnonzero(pieces.bead == bead)
+        begin, end = pieces.place[own[0]], pieces.place[own[-1]] + lengths[own[-1]]
+        edges = np.linspace(begin, end, max(1, round((end - begin) / STATION_LENGTH)) + 1)
+        middle = own[np.searchsorted(pieces.place[own], (edges[1:] + edges[:-1]) / 2, "right") - 1]
+        crest = 1.5 * pieces.area[middle] / pieces.width[middle]
+        rows.append((np.full(len(middle), bead), pieces.layer[middle], edges[:-1], edges[1:], crest, middle))
+    if not rows:
+        none, zero = np.zeros(0, np.int64), np.zeros(0)
+        return Stations(none, none, zero, zero, zero, zero)
+    bead, layer, begin, end, crest, middle = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return Stations(bead, layer, begin, end, crest, pieces.width[middle])
+
+
+def nearest_station(pieces: BeadPieces, stations: Stations, nodes: Array) -> tuple[NDArray[np.int64], Array]:
+    """Station (H, W) of the planned bead nearest to each node (H, W, 2) mm, and how far it is beside it, mm.
+
+    -1 beyond BESIDE; below 0 the node lies on the bead.
+    """
+    flat = nodes.reshape(-1, 2)
+    best, place, bead = np.full(len(flat), np.inf), np.zeros(len(flat)), np.full(len(flat), -1)
+    for i in range(len(pieces)):
+        a, way = pieces.start[i, :2], (pieces.end - pieces.start)[i, :2]
+        share = np.clip((flat - a) @ way / float(way @ way), 0.0, 1.0)
+        away = np.linalg.norm(flat - a - share[:, None] * way, axis=1) - pieces.width[i] / 2
+        nearer = away < best
+        best[nearer], bead[nearer] = away[nearer], pieces.bead[i]
+        place[nearer] = pieces.place[i] + share[nearer] * float(np.linalg.norm(pieces.end[i] - pieces.start[i]))
+    order = np.full(len(flat), -1, np.int64)
+    near = best < BESIDE
+    order[near] = np.searchsorted(stations.begin, place[near], "right") - 1
+    order[near & (order < 0)] = 0
+    wrong = near & (stations.bead[order] != bead) if len(stations.bead) else near
+    order[wrong] += 1  # a bead's first place, rounded to just before it
+    return order.reshape(nodes.shape[:2]), best.reshape(nodes.shape[:2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaidBeads:
+    """The S stations of a look, as they were laid; NaN where too little was seen."""
+
+    stations: Stations
+    planned: Array  # (S,) mm^3
+    volume: Array  # (S,) mm^3
+    sigma: Array  # (S,) mm^3
+    height: Array  # (S,) mm, of the crest that a single bead would have
+    height_sigma: Array  # (S,) mm
+
+    @property
+    def share(self) -> Array:
+        """Laid of the planned (S,)."""
+        return np.asarray(self.volume / self.planned)
+
+    @property
+    def gap(self) -> NDArray[np.bool_]:
+        """(S,) where surely too little lies."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.volume + SURE * self.sigma < GAP_SHARE * self.planned)
+
+    @property
+    def blob(self) -> NDArray[np.bool_]:
+        """(S,) where surely too much lies."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.volume - SURE * self.sigma > BLOB_SHARE * self.planned)
+
+    @property
+    def clogs(self) -> list[tuple[float, float]]:
+        """From, to, mm along the path: thin pieces that follow each other and lack more than CLOG_LENGTH of bead."""
+        with np.errstate(invalid="ignore"):
+            thin = self.volume + SURE * self.sigma < THIN_SHARE * self.planned
+        lacks = np.nan_to_num((1 - self.share) * (self.stations.end - self.stations.begin))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], thin, [False]]).astype(np.int8))).reshape(-1, 2)
+        return [
+            (float(self.stations.begin[a]), float(self.stations.end[b - 1]))
+            for a, b in edges.tolist()
+            if lacks[a:b].sum() > CLOG_LENGTH
+        ]
+
+    @property
+    def total(self) -> tuple[float, float, float]:
+        """Laid, planned, mm^3, of what was seen, and the share of the planned that was."""
+        seen = np.isfinite(self.volume)
+        planned = float(self.planned[seen].sum())
+        return float(self.volume[seen].sum()), planned, planned / max(float(self.planned.sum()), 1e-12)
+
+
+def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPieces) -> LaidBeads:
+    """What lies where beads were planned; both fields are of one lattice, surface frame."""
+    assert before.heights.shape == after.heights.shape and before.step == after.step
+    nodes, cell = after.nodes, after.step**2
+    stations = stations_of(pieces)
+    station, beside = nearest_station(pieces, stations, nodes)
+    risen = after.heights - before.heights
+    away = (beside > AWAY) & np.isfinite(risen)
+    if away.sum() >= MIN_AWAY_NODES:
+        risen = risen - np.median(risen[away])
+    due, variance = bead_heights(pieces, nodes), before.sigma**2 + after.sigma**2
+    count = len(stations.bead)
+    own = station >= 0
+    seen = own & np.isfinite(risen) & np.isfinite(variance)
+
+    def total(values: Array, where: NDArray[np.bool_]) -> Array:
+        return np.asarray(np.bincount(station[where], values[where], count)[:count], float)
+
+    nodes_seen, squares = total(np.ones_like(due), seen), total(due**2, seen)
+    enough = (nodes_seen >= MIN_SEEN * np.maximum(total(np.ones_like(due), own), 1)) & (nodes_seen > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        planned = total(due, own) * cell
+        filled = planned / (total(due, seen) * cell)  # for what was not seen of a piece
+        shared = np.minimum(nodes_seen, np.pi * (SHARED_ERROR / after.step) ** 2)
+        volume = np.where(enough, total(risen, seen) * cell * filled, np.nan)
+        sigma = np.sqrt(total(variance, seen) * shared) * cell * filled
+        scale = np.where(enough, total(risen * due, seen) / squares, np.nan)
+        scale_sigma = np.sqrt(total(variance * due**2, seen) * shared) / squares
+    return LaidBeads(stations, planned, volume, sigma, scale * stations.crest, scale_sigma * stations.crest)
+
+
+def with_looks(path: Path, beads: int = 0) -> Path:
+    """The path with a look before all, and after each layer, or after every so many beads and the last one."""
+    ends = np.flatnonzero(path.extrude & ~np.append(path.extrude[1:], False))
+    if beads:
+        ends = ends[np.append(np.arange(beads - 1, len(ends) - 1, beads), len(ends) - 1)] if len(ends) else ends
+    else:
+        ends = ends[np.append(path.layer[ends[1:]] != path.layer[ends[:-1]], True)] if len(ends) else ends
+    looks = np.full(len(path), "0")
+    looks[[0, *ends]] = "1"
+    return replace(path, extra={**path.extra, "look": looks})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """A look at what was laid."""
+
+    stamp: float  # s, when it was done
+    first: float  # checkpoints, of the path from where
+    last: float  # to where it was laid
+    seconds: float  # that the needle stood aside
+    width: float  # of beads, by the planned
+    laid: LaidBeads
+
+    @property
+    def text(self) -> str:
+        """What was found, in a sentence or two."""
+        volume, planned, seen = self.laid.total
+        if not planned > 0:
+            return "nothing could be judged: the beads are not seen"
+        crest = self.laid.stations.crest
+        off = self.laid.height - crest
+        parts = [f"{volume:.1f} of {planned:.1f} mm³ lie there ({volume / planned:.0%})"]
+        parts.append(f"beads {np.nanmedian(self.laid.height):.2f} mm high (planned {np.median(crest):.2f})")
+        parts.append(f"{np.nanmedian(self.laid.stations.width):.1f} mm wide, {np.nanstd(off):.2f} mm uneven")
+        parts += [f"clogged from {a:.0f} to {b:.0f} mm of the path" for a, b in self.laid.clogs]
+        gaps, blobs = int(self.laid.gap.sum()), int(self.laid.blob.sum())
+        parts += [
+            f"{n} of {len(crest)} pieces {word}" for n, word in ((gaps, "lack gel"), (blobs, "have too much")) if n
+        ]
+        parts += [f"{1 - seen:.0%} not seen"] if seen < 0.99 else []
+        return ", ".join(parts)
+
+
+def clogged(looks: Sequence[Look]) -> list[tuple[float, float]]:
+    """From, to, mm along the path: the clogs of all looks."""
+    return [clog for look in looks for clog in look.laid.clogs]
