@@ -305,16 +305,13 @@ def fuse(
         for c, frame in ((frame.camera, frame) for frame in tracked.frames.frames)
     ]
     lenses, cameras = Lenses(rig), sorted({view.camera for view in views})
-    margin = np.array([LATTICE_MARGIN_MM, LATTICE_MARGIN_MM])
-    low, high = np.percentile(landmarks[:, :2], [1, 99], axis=0) + np.stack([-margin, margin])
+    low, high = np.percentile(landmarks[:, :2], [1, 99], axis=0) + LATTICE_MARGIN_MM * np.array([[-1.0], [1.0]])
     first = chosen[0].pose.base_from_surface
     step = node_size(lenses, cameras, se3.transform_points(first, landmarks.mean(0)[None])[0])
     step = max(step, float(np.sqrt(np.prod(high - low) / MAX_NODES)))
-
     coarse = initial_heights(landmarks, low, high)
     lines = [at + GUESS_SIGMA_MM / 2 * np.arange(n) for at, n in zip(low[::-1], coarse.shape, strict=True)]
     heights = RegularGridInterpolator(lines, coarse.astype(float), bounds_error=False, fill_value=None)
-
     begun = tuple(replace(each, stamp=-np.inf) for each in roi)
     within = region_polygons(begun, chosen[0].frames, [camera.size for camera in rig.cameras])
     surface = DenseFit(lenses, views, progress)(

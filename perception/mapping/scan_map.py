@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from estimation.triangulation import triangulate
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
+from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.scans.registration import Registration, register, register_near
 from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
