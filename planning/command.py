@@ -67,6 +67,7 @@ class RefusalCode(StrEnum):
     WATCHDOG = "watchdog"
     STOP_DISTANCE = "stop_distance"
     FLOW = "flow"
+    CLEARANCE = "clearance"
 
 
 class HoldReason(str):

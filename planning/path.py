@@ -210,7 +210,8 @@ MIN_SINGULAR_ANGLE = float(np.deg2rad(5))
 MIN_SHOULDER_DISTANCE = 20.0
 SPIN_CANDIDATES = 24  # candidates all round: 15 degrees apart
 REACHABLE = "ok"
-REACH_REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed")
+TISSUE = "tool meets tissue"
+REACH_REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed", TISSUE)
 UNREACHABLE_COST = 1e3  # no smoothness is worth a checkpoint that cannot be printed
 SPIN_STEP_COST = 1.0  # of a spin by one candidate from one checkpoint to the next
 RANGE_END_COST = 1.0  # per rad that a joint is nearer than RANGE_END_ANGLE to the end of its range
@@ -275,7 +276,7 @@ def reach_of(
             (wrist < MIN_SINGULAR_ANGLE) | (elbow < MIN_SINGULAR_ANGLE) | (shoulder < MIN_SHOULDER_DISTANCE),
             ~(speed <= 1),
         ]
-    reason = np.select(wrong, list(range(1, len(REACH_REASONS))), 0)
+    reason = np.select(wrong, list(range(1, len(wrong) + 1)), 0)
     unspun = np.zeros(len(path))
     return Reach(joints[0], bound, wrist, elbow, shoulder, manipulability, speed, reason.astype(np.int64), unspun)
 

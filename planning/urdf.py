@@ -15,7 +15,7 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from planning.path import REACH_REASONS, Path, Reach, SurfaceMotion, joint_speed_share
+from planning.path import Path, Reach, SurfaceMotion, joint_speed_share
 
 MAX_STEPS = 100  # of one solution; from one checkpoint to the next three are usual
 DAMPING = 1e-3  # rad or m a unit: below it a direction counts as lost
@@ -121,6 +121,6 @@ def urdf_reach(arm: UrdfKinematics, arm_from_surface: Array, path: Path, motion:
     speed = joint_speed_share(inverse, arm.speed, arm_from_surface, path, motion)
     with np.errstate(invalid="ignore"):
         wrong = [~np.isfinite(joints).all(axis=(0, 2)), bound < 0, good < MIN_MANIPULABILITY, ~(speed <= 1)]
-    reason = np.select(wrong, list(range(1, len(REACH_REASONS))), 0)
+    reason = np.select(wrong, list(range(1, len(wrong) + 1)), 0)
     unknown = np.full(len(path), np.nan)
     return Reach(joints[0], bound, unknown, unknown, unknown, good, speed, reason.astype(np.int64), np.zeros(len(path)))

@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import Dialect
-from hardware.cli.main import main
-from hardware.files import arm_file
-from hardware.files.arm_file import (
+from hardware.arm.profile import (
     FAR_LIMIT,
     LIMIT_KEYS,
+    LIMIT_RANGES,
+    ArmProfile,
     far_limits_text,
-    read_arm,
+    limit_unit,
     unreached_limits_text,
-    write_arm,
 )
+from hardware.arm.protocol import Dialect
+from hardware.cli.main import main
+from hardware.files.arm_file import read_arm, write_arm
 from hardware.simulator.arm.settings import ARM_KEYS, ArmSettings, ReplyMode, arm_settings_from_table
 from planning.command import MotionLimits, Move, NoGo, Refusal, RefusalCode, box, cylinder, half_space
 from planning.kinematics import SimpleArm
@@ -271,9 +271,9 @@ def test_a_zone_of_wrong_shapes_is_refused() -> None:
 
 def test_every_limit_has_a_range_with_room_around_its_default() -> None:
     defaults = MotionLimits()
-    assert set(arm_file.LIMIT_RANGES) == set(arm_file.LIMIT_KEYS)
-    for name, (low, high) in arm_file.LIMIT_RANGES.items():
-        value = np.asarray(getattr(defaults, name)) / arm_file._unit(name)
+    assert set(LIMIT_RANGES) == set(LIMIT_KEYS)
+    for name, (low, high) in LIMIT_RANGES.items():
+        value = np.asarray(getattr(defaults, name)) / limit_unit(name)
         assert (low < value).all() and (1.5 * value < high).all(), name
 
 

@@ -17,7 +17,7 @@ from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile
 from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
-from hardware.process.ticks import PoseLockedSchedule
+from hardware.process.clock import PoseLockedSchedule
 from hardware.simulator.scene.scene import Scene, rois
 from perception.lens import Lenses
 from perception.mapping.features import grey, polygon_mask

@@ -21,9 +21,8 @@ from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.bench.link import MotionPlan, MotionReport, motion_process
 from hardware.motion.loop import CommandedPose, MotionLoop, Order, Tick, TickMotion
 from hardware.motion.step import MotionStep
-from hardware.process.clock import SimClock, WallClock
+from hardware.process.clock import Histogram, SimClock, WallClock
 from hardware.process.system import SharedLatest
-from hardware.process.ticks import Histogram
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move

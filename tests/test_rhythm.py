@@ -13,20 +13,21 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from hardware.cli import doctor
 from hardware.operator.view import CheckVerdict
-from hardware.process.clock import SimClock, WallClock
-from hardware.process.system import SharedLatest
-from hardware.process.ticks import (
+from hardware.process.clock import (
     EASE_RANGE,
     MAX_EARLY_SHARE,
     SLOW_RATIO,
     Evenness,
     PoseLockedSchedule,
+    SimClock,
     TickSchedule,
+    WallClock,
     evenness_from_times,
     measure_evenness,
     own_interval,
     tick_in_step,
 )
+from hardware.process.system import SharedLatest
 from tests.moving import breathing, pose_at
 
 LOOK = 0.002  # s between looks of the loop

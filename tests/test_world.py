@@ -13,7 +13,7 @@ from estimation.synthetic.world import BASE_FROM_REST as BASE_FROM_REST
 from hardware.arm.driver import Pause
 from hardware.arm.protocol import encode
 from hardware.motion.loop import Tick
-from hardware.process.ticks import EASE_RANGE
+from hardware.process.clock import EASE_RANGE
 from hardware.simulator.deposit import NozzleLog
 from hardware.simulator.nozzle_error import nozzle_lag
 from hardware.simulator.scenario import read_scenario

@@ -1,5 +1,6 @@
-"""Landmarks from pixels: triangulated from several cameras at once, refined look by look as the surface turns, or put
-where one camera's rays meet a surface that is known at points only, by a smooth local fit with its uncertainty.
+"""Landmarks from pixels: of several cameras at once, look by look as the surface turns, or of one camera alone.
+
+Where rays meet a surface that is known at points only: a smooth local fit, and its uncertainty.
 
 A landmark that one camera sees has no depth of its own; its neighbours tell where the surface goes on. Around each ray
 the height of the nearest points over their mean plane is a polynomial of fourth order (moving least squares; Levin

@@ -14,8 +14,9 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import ArmDriver, ByteListener
 from hardware.arm.protocol import FRAME_LENGTH, THESIS_DIALECT, Dialect
-from hardware.process.ticks import tick_in_step
+from hardware.process.clock import tick_in_step
 from perception.frames import SYRINGE, check_profile
+from planning.clearance import ToolPart
 from planning.command import MotionLimits
 from planning.kinematics import JointModel, SimpleArm, joints_from_axes, nozzle_from_axes
 from planning.motion.curve import LOOKAHEAD
@@ -26,6 +27,30 @@ MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
 MAX_FLIGHT = 0.5  # s: what is under way cannot be called back by an arm without a stop of its own
 AXIS_LETTERS = "XYZABC"
+AXIS_UNITS = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])  # mm and rad, of X Y Z A B C in mm and degrees
+UNIT_ROUNDING = 1e-9  # relative, of a number that has been degrees and rad
+LIMIT_KEYS = tuple(f.name for f in fields(MotionLimits) if f.name != "zones")
+LIMIT_RANGES = {  # in the file's units: beyond, a slip of the pen would switch a check off, or the arm would never move
+    "speed": (0.1, 2000.0),  # the arm's own top speed is 250 mm/s; a large industrial arm's is 2 m/s
+    "acceleration": (1.0, 100_000.0),  # 100 m/s^2 is ten times gravity
+    "jerk": (10.0, 10_000_000.0),  # full acceleration within 10 ms
+    "jump": (0.001, 40.0),  # 2 m/s at 50 ticks a second
+    "turn": (0.001, 40.0),  # 2000 degrees/s likewise
+    "low": (-3000.0, 3000.0),  # nothing on a bench reaches 3 m; angles are within two turns anyhow
+    "high": (-3000.0, 3000.0),
+    "feed": (0.1, 2000.0),  # as speed
+    "pose_age": (0.01, 2.0),  # after 2 s a breathing chest is anywhere within its breath
+    "pose_error": (0.001, 10.0),  # ten beads' width
+    "surface_speed": (0.1, 1000.0),  # a cough moves a chest by 200 mm/s
+    "surface_turn": (0.1, 720.0),
+    "stop_time": (0.01, 2.0),  # five times what the slowest arm needs
+    "stop_distance": (0.1, 200.0),
+    "on_path": (0.001, 10.0),  # ten beads' width
+    "pause": (0.0001, 1.0),
+}
+FAR_LIMIT = 3.0  # times the S6H4D's own: the operator is told of a limit beyond it
+AXIS_LIMITS = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
+ANGLE_LIMITS = ("turn", "surface_turn")  # single numbers in rad
 DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm and rad
 ARM_FROM_BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
 
@@ -46,6 +71,7 @@ class ArmProfile:
     tool: Array = field(default_factory=SYRINGE.copy)  # (K, 2) mm, of what hangs on it: height above the tip, radius
     dead_time: float | None = None  # s that a command takes to the arm; None: what a frame takes at `baud`
     flight: float | None = None  # s of motion that may be under way; None: the link's own limit
+    parts: tuple[ToolPart, ...] = ()  # of the tool, beside what `tool` describes
     urdf: UrdfArm | None = None  # the joints of an arm that `arm` has no model of
     flange_from_nozzle: Array | None = None  # (4, 4) mm, for an arm that is told where its flange goes
 
@@ -103,6 +129,45 @@ def in_step(profile: ArmProfile, interval: float) -> ArmProfile:
     """
     shortest = max(profile.tick / 2, 2 * profile.frame_time)
     return replace(profile, tick=tick_in_step(profile.tick, interval, shortest))
+
+
+def limit_unit(name: str) -> Array:
+    """Factor from a limit in the file, in mm and degrees, to mm and rad."""
+    return AXIS_UNITS if name in AXIS_LIMITS else np.asarray(np.deg2rad(1.0) if name in ANGLE_LIMITS else 1.0)
+
+
+def limit_unit_text(name: str) -> str:
+    """The unit of a limit in the file."""
+    units = {"speed": "s", "acceleration": "s^2", "jerk": "s^3", "feed": "s", "surface_speed": "s", "surface_turn": "s"}
+    length = "mm and degrees" if name in AXIS_LIMITS else "degrees" if name in ANGLE_LIMITS else "mm"
+    length = "s" if name in ("pose_age", "stop_time", "pause") else length
+    return f"{length} per {units[name]}" if name in units else length
+
+
+def far_limits_text(limits: MotionLimits) -> str:
+    """One line for the operator about limits of more than FAR_LIMIT times the S6H4D's own; "" where there are none."""
+    usual, far = MotionLimits(), list[str]()
+    for name in LIMIT_KEYS:
+        value, known = (np.atleast_1d(getattr(each, name) / limit_unit(name)) for each in (limits, usual))
+        times = np.abs(value) / np.abs(known)
+        axis = int(times.argmax())
+        if times[axis] > FAR_LIMIT * (1 + UNIT_ROUNDING):
+            of = f" of {AXIS_LETTERS[axis]}" if name in AXIS_LIMITS else ""
+            far.append(f"limits.{name} = {value[axis]:g}{of}, {times[axis]:.3g} times its {known[axis]:g}")
+    return f"limits far beyond a SEED S6H4D's: {'; '.join(far)}. Does this arm bear them?" if far else ""
+
+
+def unreached_limits_text(profile: ArmProfile) -> str:
+    """One line about speeds that the planner never reaches, as jump and turn in a tick allow less; "" without any."""
+    limits, unit = profile.limits, limit_unit("speed")
+    most = limits.per_tick(profile.tick)
+    axes = np.flatnonzero(most < limits.speed * (1 - UNIT_ROUNDING)).tolist()
+    groups: dict[str, list[str]] = {}
+    for i in axes:
+        groups.setdefault(f"{(limits.speed / unit)[i]:g}, at most {(most / unit)[i]:.1f}", []).append(AXIS_LETTERS[i])
+    told = "; ".join(f"{' '.join(letters)} {each}" for each, letters in groups.items())
+    why = f"limits.jump and limits.turn of a tick of {profile.tick:g} s hold for all axes together"
+    return f"limits.speed that is never reached: {told}, as {why}" if told else ""
 
 
 def measured_lag(profile: ArmProfile, lag: float) -> float:

@@ -37,9 +37,8 @@ from hardware.live.records import EXPOSURE_TO_WIRE_STAGE, FRAMES_TO_WIRE_STAGE, 
 from hardware.live.settings import LiveSettings, available_cores, settings_text
 from hardware.offline.track import tracker
 from hardware.process.checks import read_toml
-from hardware.process.clock import CpuClock, WallClock
+from hardware.process.clock import CpuClock, WallClock, measure_evenness
 from hardware.process.progress import cache_folder
-from hardware.process.ticks import measure_evenness
 from hardware.recording.session_reader import open_session
 from hardware.simulator.dispenser import VirtualDispenserSettings
 from hardware.simulator.nozzle_error import MaterialFigures

@@ -23,9 +23,8 @@ from estimation.errors import StillbedError
 from hardware.bench.figures import this_machine
 from hardware.files.mesh_reader import SHARED_LIBRARIES
 from hardware.operator.view import Check, CheckVerdict
-from hardware.process.clock import Clock
+from hardware.process.clock import Clock, Histogram, measure_evenness
 from hardware.process.system import NO_PRIORITY
-from hardware.process.ticks import Histogram, measure_evenness
 
 if TYPE_CHECKING:
     from hardware.cameras.sources import CameraDevice

@@ -260,7 +260,8 @@ def add_arm(commands: Commands) -> None:
 
 
 def _run_arm(a: argparse.Namespace) -> int:
-    from hardware.files.arm_file import arm_for, far_limits_text
+    from hardware.arm.profile import far_limits_text
+    from hardware.files.arm_file import arm_for
 
     if not (a.device or a.virtual):
         from hardware.arm.console import drivers_text

@@ -62,9 +62,11 @@ def add_plan(commands: Commands) -> None:
     )  # fmt: skip
     add(
         "--arm", type=named_path, metavar="ARM.toml",
-        help="ask this arm's joints about each checkpoint and write the column `feasible`; without, there is none, and "
-        "`stillbed reach` adds it",
+        help="keep this arm's tool clear of the tissue, turning it or leaving beads out; and ask its joints about each "
+        "checkpoint, for the column `feasible`, which `stillbed reach` adds without it",
     )  # fmt: skip
+    motion = "measure --amplitude-mm: a recording, a folder of `stillbed track`, or a trajectory of the surface"
+    add("--motion", metavar="SESSION", help=motion)
     add("--no-pictures", action="store_true", help="write neither pictures nor the report")
     add("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
     _add_scan(command)
@@ -141,6 +143,7 @@ def _add_way(command: argparse.ArgumentParser) -> None:
         ("--tilt-deg", 30.0, "DEG", "most the tool leans off the plane's normal"),
         ("--turning-deg-mm", 5.0, "DEG/MM", "most it turns on its way"),
         ("--spin-deg", 0.0, "DEG", "about its own axis, free for a round nozzle"),
+        ("--amplitude-mm", 0.0, "MM", "by which the tissue moves, kept free around the tool of --arm beside 0.5 mm"),
     ):
         add(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
 
@@ -152,7 +155,9 @@ def _run_plan(a: argparse.Namespace) -> int:
     values = {f.name: getattr(a, f.name) for f in fields(PlanSettings) if f.name != "tissues"}
     settings = PlanSettings(tissues=tuple(a.tissue), **values)
     source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
-    order = PlanRequest(*source, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, settings=settings)
+    order = PlanRequest(
+        *source, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, motion=a.motion, settings=settings
+    )
     text, damage = run_plan(order)
     print(text)
     return damage_code(damage)
@@ -177,6 +182,8 @@ def add_reach(commands: Commands) -> None:
     add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="of its motion along its normal")
     add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="of its motion about x, y and z")
     add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="of that motion; default 0.25")
+    scan = "that the tool must stay out of, in the path's frame; default: PATH_scan.ply, where plan wrote it"
+    add("--scan", type=named_path, metavar="SCAN", help=scan)
     add("--spin", action="store_true", help="let the tool spin about its own axis where that helps")
     add("-o", "--out", type=Path, metavar="OUT", help="folder to write to, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
@@ -195,7 +202,7 @@ def _six_numbers(text: str) -> tuple[float, ...]:
 def _run_reach(a: argparse.Namespace) -> int:
     from hardware.offline.reach import ReachQuestion, run_reach
 
-    question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin)
+    question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin, a.scan)
     answer = run_reach(a.path, a.arm, question, a.out, a.force)
     print(answer.text)
     return 0 if answer.feasible else FAILED

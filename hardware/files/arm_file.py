@@ -15,7 +15,12 @@ dead_time_s = 0.0                             # optional, that a command takes t
 flange_from_nozzle = [[...], ...]             # optional, 4x4, mm, for an arm that is told where its flange goes
 flight_s = 0.05                               # optional, motion that may be under way at once
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
-tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm
+tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm, and turns
+                                              # about the nozzle's axis; up to where it is 0.25 wider it is the needle
+[[tool_part]]                                 # optional, what else hangs there: mm, nozzle frame, z back into the tool
+name = "print head"
+box = [[-20, -30, 60], [40, 30, 120]]         # or: cylinder or capsule = [[0, 0, 60], [0, 0, 120]] and radius = 12,
+                                              # cone likewise and radii = [5, 12], or mesh = "head.stl" beside this file
 [limits]                                      # as in planning/command.py; arrays are X Y Z in mm, A B C in degrees
 speed = [150, 150, 150, 120, 120, 120]
 turn = 2.4
@@ -42,7 +47,6 @@ posture = ["front", "up", "negative"]
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -50,11 +54,25 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import ARM_FROM_BENCH, AXIS_LETTERS, ArmProfile, at_baud, driver_kind, placed
+from hardware.arm.profile import (
+    ARM_FROM_BENCH,
+    AXIS_LIMITS,
+    AXIS_UNITS,
+    LIMIT_KEYS,
+    LIMIT_RANGES,
+    ArmProfile,
+    at_baud,
+    driver_kind,
+    limit_unit,
+    limit_unit_text,
+    placed,
+)
 from hardware.arm.protocol import Dialect
+from hardware.files.mesh_file import read_mesh
 from hardware.process import checks
 from perception import shipped_file
 from perception.frames import check_profile
+from planning.clearance import BASE_MARGIN, PART_KINDS, ToolBody, ToolPart, tool_body
 from planning.command import MotionLimits, NoGo, box, cylinder, half_space
 from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.urdf import UrdfArm
@@ -63,9 +81,7 @@ URDF_KEYS = ("name", "urdf", "flange", "ready_deg")
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
 _RAD = float(np.deg2rad(1.0))  # rad a degree
-_ROUNDING = 1e-9  # relative, of a number that has been degrees and rad
 _DH_UNITS = np.array([1.0, _RAD, 1.0, _RAD])  # mm and rad, of a row in mm and degrees
-_AXIS_UNITS = np.array([1.0, 1, 1, _RAD, _RAD, _RAD])  # likewise, of X Y Z A B C
 
 
 def _kinematics(where: object, table: object) -> tuple[JointModel | None, AngleMode]:
@@ -167,29 +183,7 @@ def _zone(where: object, table: checks.Table) -> NoGo:
     return zone
 
 
-LIMIT_KEYS = tuple(f.name for f in fields(MotionLimits) if f.name != "zones")
-LIMIT_RANGES = {  # in the file's units: beyond, a slip of the pen would switch a check off, or the arm would never move
-    "speed": (0.1, 2000.0),  # the arm's own top speed is 250 mm/s; a large industrial arm's is 2 m/s
-    "acceleration": (1.0, 100_000.0),  # 100 m/s^2 is ten times gravity
-    "jerk": (10.0, 10_000_000.0),  # full acceleration within 10 ms
-    "jump": (0.001, 40.0),  # 2 m/s at 50 ticks a second
-    "turn": (0.001, 40.0),  # 2000 degrees/s likewise
-    "low": (-3000.0, 3000.0),  # nothing on a bench reaches 3 m; angles are within two turns anyhow
-    "high": (-3000.0, 3000.0),
-    "feed": (0.1, 2000.0),  # as speed
-    "pose_age": (0.01, 2.0),  # after 2 s a breathing chest is anywhere within its breath
-    "pose_error": (0.001, 10.0),  # ten beads' width
-    "surface_speed": (0.1, 1000.0),  # a cough moves a chest by 200 mm/s
-    "surface_turn": (0.1, 720.0),
-    "stop_time": (0.01, 2.0),  # five times what the slowest arm needs
-    "stop_distance": (0.1, 200.0),
-    "on_path": (0.001, 10.0),  # ten beads' width
-    "pause": (0.0001, 1.0),
-}
-FAR_LIMIT = 3.0  # times the S6H4D's own: the operator is told of a limit beyond it
 MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
-_AXES = ("speed", "acceleration", "jerk", "low", "high")  # (6,), the rest are single numbers
-_ANGLES = ("turn", "surface_turn")  # single numbers in rad
 _ARRAYS = {  # shapes
     **{"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)},
     "flange_from_nozzle": (4, 4),
@@ -197,7 +191,7 @@ _ARRAYS = {  # shapes
 ARM_KEYS = (
     *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
     *("dead_time_s", "flight_s"),
-    *("limits", "no_go", "kinematics"),
+    *("tool_part", "limits", "no_go", "kinematics"),
 )
 # of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
 PART_PREFIXES = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}
@@ -246,7 +240,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             arm=SimpleArm(
                 arrays.get("arm_from_base", default.arm.arm_from_base),
                 arrays.get("arm_from_upright", default.arm.arm_from_upright),
-                arrays["home_mm_deg"] * _AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
+                arrays["home_mm_deg"] * AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
                 *_kinematics(path, None if by_urdf else kinematics),
                 tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
             ),
@@ -260,6 +254,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             dead_time=checks.number(path, "dead_time_s", table["dead_time_s"]) if "dead_time_s" in table else None,
             flight=checks.number(path, "flight_s", table["flight_s"]) if "flight_s" in table else None,
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
+            parts=_parts(path, table.get("tool_part")),
         )
     except InputError as error:
         if error.where == str(path):
@@ -276,7 +271,7 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
     """The text of an arm file, as `write_arm` writes it."""
     arm, dialect, limits = profile.arm, profile.dialect, profile.limits
     lines = [f"# {line}" for line in remark.splitlines()] + [
-        f"home_mm_deg = {checks.toml_numbers(arm.home / _AXIS_UNITS)}",
+        f"home_mm_deg = {checks.toml_numbers(arm.home / AXIS_UNITS)}",
         f"arm_from_base = {checks.toml_numbers(arm.arm_from_base)}",
         f"arm_from_upright = {checks.toml_numbers(arm.arm_from_upright)}",
         f"tool_offset_mm = {checks.toml_numbers(arm.tool_offset)}",
@@ -298,7 +293,8 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
-        *(f"{name} = {checks.toml_numbers(getattr(limits, name) / _unit(name))}" for name in LIMIT_KEYS),
+        *(f"{name} = {checks.toml_numbers(getattr(limits, name) / limit_unit(name))}" for name in LIMIT_KEYS),
+        *_part_lines(profile.parts),
         *_no_go_lines(limits.zones),
         *_kinematics_lines(arm),
         *_urdf_lines(profile.urdf),
@@ -326,17 +322,51 @@ def tool_from_value(where: object, key: str, value: object) -> Array:
     return profile
 
 
-def _unit(name: str) -> Array:
-    """Factor from a limit in the file, in mm and degrees, to mm and rad."""
-    return _AXIS_UNITS if name in _AXES else np.asarray(_RAD if name in _ANGLES else 1.0)
+def _parts(path: Path, tables: object) -> tuple[ToolPart, ...]:
+    """The parts of the tool that no profile describes, in `[[tool_part]]` tables."""
+    return tuple(_part(path, table) for table in ([] if tables is None else checks.tables(path, "tool_part", tables)))
 
 
-def _unit_text(name: str) -> str:
-    """The unit of a limit in the file."""
-    units = {"speed": "s", "acceleration": "s^2", "jerk": "s^3", "feed": "s", "surface_speed": "s", "surface_turn": "s"}
-    length = "mm and degrees" if name in _AXES else "degrees" if name in _ANGLES else "mm"
-    length = "s" if name in ("pose_age", "stop_time", "pause") else length
-    return f"{length} per {units[name]}" if name in units else length
+def _part(path: Path, table: checks.Table) -> ToolPart:
+    checks.check_keys(path, "tool_part.", table, ("name",), (*PART_KINDS, "radius", "radii"))
+    name = checks.text(path, "tool_part.name", table["name"])
+    kinds = [kind for kind in PART_KINDS if kind in table]
+    wanted = {"cylinder": ["radius"], "capsule": ["radius"], "cone": ["radii"]}
+    if len(kinds) != 1 or [key for key in ("radius", "radii") if key in table] != wanted.get(kinds[0], []):
+        allowed = "one of box, cylinder and capsule with radius, cone with radii, mesh"
+        raise InputError(path, f"tool_part {name!r}", [key for key in table if key != "name"], allowed)
+    kind, key = kinds[0], f"tool_part.{kinds[0]}"
+    if kind == "mesh":
+        file = path.parent / checks.text(path, key, table[kind])
+        return ToolPart(name, kind, np.zeros((2, 3)), np.zeros(2), str(file.resolve()))
+    radii = [table["radius"]] * 2 if "radius" in table else table.get("radii", [0.0, 0.0])
+    values = checks.numbers(path, key, table[kind], (2, 3), "mm"), checks.numbers(path, f"{key}: radii", radii, (2,))
+    try:
+        return ToolPart(name, kind, *values)
+    except InputError as error:
+        raise InputError(path, f"tool_part {name!r}", error.got, error.allowed) from None
+
+
+def _part_lines(parts: tuple[ToolPart, ...]) -> list[str]:
+    """The parts as `[[tool_part]]` tables; a mesh by the whole path of its file."""
+    lines: list[str] = []
+    for part in parts:
+        value = json.dumps(part.file) if part.kind == "mesh" else checks.toml_numbers(part.ends)
+        lines += ["", "[[tool_part]]", f"name = {json.dumps(part.name)}", f"{part.kind} = {value}"]
+        if part.kind in ("cylinder", "capsule"):
+            lines.append(f"radius = {checks.toml_number(part.radii[0])}")
+        lines += [f"radii = {checks.toml_numbers(part.radii)}"] if part.kind == "cone" else []
+    return lines
+
+
+def tool_body_of(profile: ArmProfile, margin: float = BASE_MARGIN, touch: float = 0.0) -> ToolBody:
+    """The tool of an arm as a body; reads what meshes it has. InputError where one cannot be read."""
+    return tool_body(profile.tool, profile.parts, margin, touch, _mesh_triangles)
+
+
+def _mesh_triangles(file: str) -> Array:
+    """Triangles (T, 3, 3), mm, of a part's mesh."""
+    return read_mesh(file).scan.corners
 
 
 def _limits(path: Path, table: object, zones: object) -> MotionLimits:
@@ -345,41 +375,15 @@ def _limits(path: Path, table: object, zones: object) -> MotionLimits:
     checks.check_keys(path, "limits.", table, (), LIMIT_KEYS)
     limits: dict[str, Array | float] = {}
     for name, value in table.items():
-        number = checks.numbers(path, f"limits.{name}", value, (6,) if name in _AXES else ()) * _unit(name)
-        limits[name] = number if name in _AXES else float(number)
+        number = checks.numbers(path, f"limits.{name}", value, (6,) if name in AXIS_LIMITS else ()) * limit_unit(name)
+        limits[name] = number if name in AXIS_LIMITS else float(number)
     no_go = [] if zones is None else [_zone(path, each) for each in checks.tables(path, "no_go", zones)]
     checked = MotionLimits(**limits, zones=tuple(no_go))  # type: ignore[arg-type]
     for name, value in table.items():
         low, high = LIMIT_RANGES[name]
         if np.min(value) < low or np.max(value) > high:
-            raise InputError(path, f"limits.{name}", value, f"{low:g} to {high:g}, {_unit_text(name)}")
+            raise InputError(path, f"limits.{name}", value, f"{low:g} to {high:g}, {limit_unit_text(name)}")
     return checked
-
-
-def far_limits_text(limits: MotionLimits) -> str:
-    """One line for the operator about limits of more than FAR_LIMIT times the S6H4D's own; "" where there are none."""
-    usual, far = MotionLimits(), list[str]()
-    for name in LIMIT_KEYS:
-        value, known = (np.atleast_1d(getattr(each, name) / _unit(name)) for each in (limits, usual))
-        times = np.abs(value) / np.abs(known)
-        axis = int(times.argmax())
-        if times[axis] > FAR_LIMIT * (1 + _ROUNDING):
-            of = f" of {AXIS_LETTERS[axis]}" if name in _AXES else ""
-            far.append(f"limits.{name} = {value[axis]:g}{of}, {times[axis]:.3g} times its {known[axis]:g}")
-    return f"limits far beyond a SEED S6H4D's: {'; '.join(far)}. Does this arm bear them?" if far else ""
-
-
-def unreached_limits_text(profile: ArmProfile) -> str:
-    """One line about speeds that the planner never reaches, as jump and turn in a tick allow less; "" without any."""
-    limits, unit = profile.limits, _unit("speed")
-    most = limits.per_tick(profile.tick)
-    axes = np.flatnonzero(most < limits.speed * (1 - _ROUNDING)).tolist()
-    groups: dict[str, list[str]] = {}
-    for i in axes:
-        groups.setdefault(f"{(limits.speed / unit)[i]:g}, at most {(most / unit)[i]:.1f}", []).append(AXIS_LETTERS[i])
-    told = "; ".join(f"{' '.join(letters)} {each}" for each, letters in groups.items())
-    why = f"limits.jump and limits.turn of a tick of {profile.tick:g} s hold for all axes together"
-    return f"limits.speed that is never reached: {told}, as {why}" if told else ""
 
 
 def _dialect(path: Path, table: checks.Table) -> Dialect:

@@ -15,15 +15,19 @@ a print is, which outlives the run:
 
 from __future__ import annotations
 
+import base64
 import csv
 import difflib
 import io
+import json
 import math
 import os
 import threading
+import zlib
 from collections.abc import Sequence
 from ctypes import c_double
 from pathlib import Path as File
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +36,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.process import checks
+from planning.clearance import Balls, Envelope, TissueGuard, ToolBody
 from planning.path import Path, PrintProgress, ProgressMark, check_path, fingerprint, resume_fraction
 
 POSE_COLUMNS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
@@ -326,3 +331,41 @@ class ProgressWriter:
             self._written, self.failed = fraction, ""
         except OSError as error:
             self.failed = f"{self._file}: {error.strerror or error}"
+
+
+def tissue_text(tissue: TissueGuard) -> str:
+    """What a run keeps its tool out of, as JSON for its recording: arrays as base64 of their compressed bytes."""
+    parts = {"balls": tissue.body.balls, "groups": tissue.body.groups, "body": tissue.body, "envelope": tissue.envelope}
+    return json.dumps({name: _packed(part) for name, part in parts.items()})
+
+
+def tissue_from_text(text: str, where: object) -> TissueGuard:
+    """The same again, to the bit; InputError where the text is damaged."""
+    try:
+        tables = {name: _unpacked(table) for name, table in json.loads(text).items()}
+        balls, groups = Balls(**tables["balls"]), Balls(**tables["groups"])
+        body = ToolBody(balls=balls, groups=groups, **(tables["body"] | {"names": tuple(tables["body"]["names"])}))
+        return TissueGuard(body, Envelope(**tables["envelope"]))
+    except (ValueError, TypeError, KeyError, AttributeError, zlib.error) as error:
+        raise InputError(where, "tissue", checks.error_text(error), "what a live run wrote") from None
+
+
+def _packed(part: object) -> dict[str, object]:
+    """The fields of a record but for further records in it."""
+    values = {name: getattr(part, name) for name in getattr(part, "__slots__")}  # noqa: B009
+    arrays = {
+        name: [value.dtype.str, value.shape, base64.b64encode(zlib.compress(value.tobytes(), 1)).decode("ascii")]
+        for name, value in values.items()
+        if isinstance(value, np.ndarray)
+    }
+    return arrays | {name: value for name, value in values.items() if isinstance(value, float | tuple)}
+
+
+def _unpacked(table: dict[str, object]) -> dict[str, Any]:
+    def value(packed: Any) -> Any:
+        if not isinstance(packed, list) or len(packed) != 3 or not isinstance(packed[1], list):
+            return packed
+        kind, shape, data = packed
+        return np.frombuffer(zlib.decompress(base64.b64decode(data)), np.dtype(kind)).reshape(shape).copy()
+
+    return {name: value(packed) for name, packed in table.items()}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path as File
 
 import numpy as np
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
@@ -14,6 +16,7 @@ from hardware.arm.profile import AXIS_LETTERS, ArmProfile, placed
 from hardware.live.records import LiveMotionReport, RecorderReport, RunReports, TrackingReport
 from hardware.operator.view import MAX_MOVE_DEG, MAX_MOVE_MM, Check, CheckVerdict, MoveRequest
 from hardware.process.progress import count_text
+from planning.clearance import GUARD_TOUCH, TissueGuard
 from planning.command import AXIS_MARGIN, JOINT_MARGIN
 from planning.kinematics import axes_from_nozzle, joints_from_axes
 from planning.material import Outlets, with_offsets
@@ -41,11 +44,25 @@ class PrintTask:
     patience: float = 10.0  # s without pictures, after which the arm is stopped
     dispensers: str = ""  # text of the dispenser file; "": nothing is extruded
     outlets: Outlets = field(default_factory=dict)  # of the path's materials
+    tissue: TissueGuard | None = None  # that the tool is kept out of, in the path's own frame; None without a scan
 
     @property
     def fingerprint(self) -> str:
         """Of the path as its file has it; "" in a dry run, of which no progress is kept."""
         return fingerprint(self.path) if self.lift is None else ""
+
+
+def guarded_tissue(scan: File, path: Path, profile: ArmProfile) -> TissueGuard:
+    """What the tool is kept out of, by the scan in a file, in the path's frame. InputError where that is not at it."""
+    from hardware.files.arm_file import tool_body_of  # loads what the motion does not need
+    from hardware.files.mesh_file import read_mesh
+    from planning.layers.clearing import tissue_guard
+
+    body = tool_body_of(profile, margin=0.0, touch=GUARD_TOUCH)
+    try:
+        return tissue_guard(read_mesh(scan).scan, path, body)
+    except InputError as error:
+        raise InputError(scan, error.what, error.got, error.allowed) if error.where == "scan" else error from None
 
 
 SILENT_INTERVALS, SILENCE_SLACK = 2, 0.01  # a process is silent after so many of its intervals, and so many s

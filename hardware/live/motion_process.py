@@ -37,9 +37,8 @@ from hardware.live.records import (
 from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import PrintMotion
-from hardware.process.clock import WallClock
+from hardware.process.clock import PoseLockedSchedule, WallClock
 from hardware.process.system import ask_for_real_time, set_up_process, take_messages
-from hardware.process.ticks import PoseLockedSchedule
 from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
@@ -70,7 +69,7 @@ class _OrderReceiver:
                 orders.append(order)
             elif isinstance(order, BeginPrint):
                 self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
-                self._motion.begin(order.path, order.profile, order.start, order.outlets)
+                self._motion.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
             elif order is PauseOrder.MATERIAL_IN:
                 self._motion.put_in()
             elif order is PauseOrder.RESUME:

@@ -22,8 +22,8 @@ from hardware.live.prepared import Prepared
 from hardware.live.records import RunReports, StageHistograms, StageTiming
 from hardware.live.state_machine import RunStateMachine
 from hardware.operator.view import HoldRow, RunResult, RunStage
+from hardware.process.clock import Histogram
 from hardware.process.system import provenance
-from hardware.process.ticks import Histogram
 from planning.command import Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from planning.path import PrintPhase, way_lengths

@@ -25,9 +25,9 @@ from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.rig import Rig
 from estimation.se3 import Array
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, far_limits_text
 from hardware.dispenser.dispenser import check_path_materials
-from hardware.files.arm_file import arm_over, far_limits_text, read_arm
+from hardware.files.arm_file import arm_over, read_arm
 from hardware.files.dispenser_file import (
     dispensers_from_text,
     drivers_of,
@@ -37,7 +37,7 @@ from hardware.files.dispenser_file import (
 from hardware.files.path_file import read_path, read_progress
 from hardware.files.region_table import check_region
 from hardware.files.rig_file import RIG_FILE, read_rig, scan_of
-from hardware.live.checklist import PrintTask
+from hardware.live.checklist import PrintTask, guarded_tissue
 from hardware.live.settings import (
     VIRTUAL_ARM,
     LiveSettings,
@@ -265,6 +265,8 @@ def _prepared(
         unattended=settings.unattended,
         patience=settings.patience,
     )
+    if scan is not None:
+        task = replace(task, tissue=guarded_tissue(scan, path, task.profile))
     rig, again = rig_from_session(session), scenario is not None
     check_rig(rig)
     notes += filter(None, [far_limits_text(task.profile.limits)])

@@ -106,7 +106,7 @@ def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Itera
     step, profile = None, inputs.profile
     for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
-            step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets)
+            step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets, inputs.tissue)
         if step is not None and tick.get("lag"):
             step.lag = float(tick["lag"][0])
         if step is not None and tick.get("recalled"):

@@ -23,9 +23,10 @@ from hardware.live.frame_source import Encoded, FrameRing
 from hardware.live.trace import TraceEntry
 from hardware.motion.loop import CommandedPose, DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
+from hardware.process.clock import Histogram
 from hardware.process.system import SharedLatest
-from hardware.process.ticks import Histogram
 from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
+from planning.clearance import TissueGuard
 from planning.material import Outlets
 from planning.path import Path, PrintProgress
 from planning.placement import PathPlacement
@@ -89,6 +90,7 @@ class BeginPrint:
     start: float  # place on the path, counted in checkpoints
     outlets: Outlets  # of its materials
     fingerprint: str  # of the path as its file has it
+    tissue: TissueGuard | None = None  # that the tool is kept out of, in the same frame
 
 
 class PauseOrder(Enum):
@@ -287,11 +289,14 @@ def recorded_begin(order: BeginPrint, dispensers: str = "") -> tuple[dict[str, s
 
     dispensers: text of their file, "" without one.
     """
+    from hardware.files.path_file import tissue_text
     from hardware.recording.session_reader import input_texts, inputs_from_texts  # loads what the motion must not
 
-    texts = input_texts(order.path, order.profile, dispensers)
+    tissue = "" if order.tissue is None else tissue_text(order.tissue)
+    texts = input_texts(order.path, order.profile, dispensers, tissue)
     inputs = inputs_from_texts(texts, File("kept"))
-    return texts, replace(order, path=inputs.path, profile=inputs.profile, outlets=inputs.outlets)
+    used = replace(order, path=inputs.path, profile=inputs.profile, outlets=inputs.outlets, tissue=inputs.tissue)
+    return texts, used
 
 
 class CommandedHead:

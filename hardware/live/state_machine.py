@@ -326,7 +326,9 @@ class RunStateMachine:
         task, profile, status = self.task, self.placed_path.profile, motion.tick.status
         path = self.placed_path.path if task.lift is None else raised_path(self.placed_path.path, task.lift)
         profile = replace(in_step(profile, interval), lag=measured_lag(task.profile, status.lag))
-        return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint)]
+        assert self.placement is not None
+        tissue = None if task.tissue is None else task.tissue.moved(self.placement.surface_from_path)
+        return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint, tissue)]
 
     def _follow_print(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress

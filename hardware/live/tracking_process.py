@@ -40,7 +40,7 @@ from hardware.live.trace import QUEUE_STAGE, TRACKING_LANE, TraceLane, in_turn
 from hardware.offline.track import FrameSetStep, region_search, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
-from hardware.process.clock import WallClock
+from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
     ask_to_go_first,
     pipe_closed,
@@ -48,7 +48,6 @@ from hardware.process.system import (
     settle_memory,
     signal_at_parents_end,
 )
-from hardware.process.ticks import own_interval
 from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import FrameSet, Roi, region_since
 from perception.tracking.step import STAGES, TrackingStep

@@ -25,8 +25,7 @@ from hardware.arm.jog import RecalledMoves
 from hardware.arm.link import Arm, shut_down
 from hardware.arm.profile import ArmProfile
 from hardware.dispenser.dispenser import Dispenser, Dispensers, DispenserState, close_dispensers
-from hardware.process.clock import Clock
-from hardware.process.ticks import Histogram, TickSchedule
+from hardware.process.clock import Clock, Histogram, TickSchedule
 from perception.frames import PrintHead
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes

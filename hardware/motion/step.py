@@ -17,6 +17,7 @@ from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile, measured_lag
 from hardware.motion.loop import MaterialControl
 from hardware.process.clock import Clock
+from planning.clearance import TissueGuard
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
@@ -28,15 +29,23 @@ class MotionStep:
     """One arm printing one path; call it once a tick."""
 
     def __init__(
-        self, path: Path, profile: ArmProfile | None = None, start: float = 0.0, outlets: Outlets | None = None
+        self,
+        path: Path,
+        profile: ArmProfile | None = None,
+        start: float = 0.0,
+        outlets: Outlets | None = None,
+        tissue: TissueGuard | None = None,
     ) -> None:
-        """start: place on the path where printing begins, in checkpoints. outlets: of the path's materials."""
+        """start: place on the path where printing begins, in checkpoints. outlets: of the path's materials.
+
+        tissue: that the tool is kept out of, where a scan tells of it.
+        """
         self.profile = ArmProfile() if profile is None else profile
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
         path = with_offsets(path, outlets or {})
         self._planner = Planner(path, *settings, lag, start, outlets)
-        self._guard = Guard(*settings, path.zone, lag)
+        self._guard = Guard(*settings, path.zone, lag, tissue)
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s, as the guard lets it pass. pose: the newest there is."""
@@ -124,9 +133,11 @@ class PrintMotion:
         self.paused = self.asked = False
         self.begun = self.lag = math.nan
 
-    def begin(self, path: Path, profile: ArmProfile, start: float, outlets: Outlets) -> None:
-        """Print this path, surface frame, from now on. start: place on it, in checkpoints."""
-        self._begin = lambda place: MotionStep(path, profile, place, outlets)
+    def begin(
+        self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
+    ) -> None:
+        """Print this path, surface frame, from now on. start: place on it, in checkpoints. tissue: see `MotionStep`."""
+        self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
         self._make(start)
 
     def homed(self) -> None:

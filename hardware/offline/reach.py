@@ -12,8 +12,9 @@ import numpy as np
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
-from hardware.files.arm_file import far_limits_text, read_arm, unreached_limits_text
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, far_limits_text, unreached_limits_text
+from hardware.files.arm_file import read_arm, tool_body_of
+from hardware.files.mesh_file import read_mesh
 from hardware.files.path_file import read_path, write_path
 from hardware.process.progress import duration_text, prepare_out
 from hardware.report.page import (
@@ -27,9 +28,21 @@ from hardware.report.page import (
     section,
     spanning,
 )
+from planning.clearance import BASE_MARGIN
 from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel
+from planning.layers.clearing import path_rooms
 from planning.motion.retime import run_times
-from planning.path import REACH_REASONS, Path, Reach, SurfaceMotion, best_posture, best_spin, reach_at_spin, spin_path
+from planning.path import (
+    REACH_REASONS,
+    TISSUE,
+    Path,
+    Reach,
+    SurfaceMotion,
+    best_posture,
+    best_spin,
+    reach_at_spin,
+    spin_path,
+)
 from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
 
 PAGE_WIDTH_PX = 900
@@ -99,6 +112,7 @@ class ReachQuestion:
     turn_deg: float = 0.0
     rate_hz: float = 0.25
     spin: bool = False
+    scan: File | None = None  # that the tool must stay out of; None: PATH_scan.ply beside the path, where plan wrote it
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,16 +131,45 @@ def run_reach(
     if out is not None:
         prepare_out(out, force)
     model, motion, reach = _evaluated(checkpoints, arm, question)
-    best, profile = None, read_arm(arm)
+    best, profile, scan = None, read_arm(arm), _scan_of(path, question)
+    reach, met = _with_tissue(reach, checkpoints, profile, scan, question)
     if isinstance(model, JointModel):
         best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
     seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
     text = reach_text(model, reach, best, question, seconds)
-    text = "\n".join(filter(None, [text, far_limits_text(profile.limits), unreached_limits_text(profile)]))
+    text = "\n".join(filter(None, [text, met, far_limits_text(profile.limits), unreached_limits_text(profile)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
         (out / "reach.html").write_text(reach_page(path.name, model.name, text, checkpoints, reach), encoding="utf-8")
     return ReachAnswer(text, bool(reach.feasible.all()))
+
+
+def _scan_of(path: File, question: ReachQuestion) -> File | None:
+    """The scan that a path was planned on."""
+    beside = path.with_name(f"{path.stem}_scan.ply")
+    return question.scan if question.scan is not None else beside if beside.is_file() else None
+
+
+def _with_tissue(
+    reach: Reach, path: Path, profile: ArmProfile, scan: File | None, question: ReachQuestion
+) -> tuple[Reach, str]:
+    """The reach with checkpoints marked at which the tool has no room, and a line about that."""
+    if scan is None:
+        return reach, "tool: not checked against the tissue, as there is no scan: --scan SCAN"
+    spun = replace(path, surface_from_nozzle=spin_path(path, reach.spin))
+    try:
+        body = tool_body_of(profile, BASE_MARGIN + question.amplitude_mm)
+        room, part = path_rooms(read_mesh(scan).scan, spun, body)
+    except InputError as error:
+        raise InputError(scan, error.what, error.got, error.allowed) if error.where == "scan" else error from None
+    short, worst = room < 0, int(room.argmin())
+    marked = replace(reach, reason=np.where(short & reach.feasible, REACH_REASONS.index(TISSUE), reach.reason))
+    if not short.any():
+        return marked, f"tool: {body.margin:g} mm or more from the tissue at all checkpoints"
+    return marked, (
+        f"tool: too near to the tissue at {int(short.sum())} checkpoints, by up to {-room[worst]:.2f} mm: the "
+        f"{part[worst]} at checkpoint {worst}; {body.margin:g} mm are kept"
+    )
 
 
 def with_feasible(path: Path, arm: File) -> tuple[Path, str]:

@@ -201,6 +201,7 @@ CAUSE_TILES = {  # tile of the page, what is measured, its unit, and how many of
     RefusalCode.SURFACE_SPEED: ("cause", "surface speed", "mm/s", 1.0),
     RefusalCode.SURFACE_TURN: ("cause", "surface turn", "°/s", 180 / pi),
     RefusalCode.JUMP: ("cause", "step", "mm", 1.0),
+    RefusalCode.CLEARANCE: ("cause", "tool in the tissue", "mm", 1.0),
     RefusalCode.TURN: ("cause", "turn", "°", 180 / pi),
     RefusalCode.WATCHDOG: ("cause", "still moving", "s", 1.0),
     RefusalCode.STOP_DISTANCE: ("cause", "way to rest", "mm", 1.0),

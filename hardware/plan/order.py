@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.files.arm_file import read_arm, tool_body_of
 from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import read_contour
 from hardware.plan.question import clicks_of, scan_colour, write_question
 from hardware.process.progress import ProgressReport, no_progress
+from planning.clearance import BASE_MARGIN, ToolBody
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
 from planning.layers.checkpoints import CheckpointSettings, ToolLimits
@@ -46,7 +48,7 @@ SETTING_RANGES = (
     ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, MAX_SPEED), ("travel", 0.1, MAX_SPEED),
     ("temperature", MIN_TEMPERATURE, MAX_TEMPERATURE), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50),
     ("wait", 0, 3600), ("sideways", 1, 100_000), ("tilt_deg", 0, 60), ("turning_deg_mm", 0.01, 90),
-    ("spin_deg", -360, 360), ("bump", 0, 20), ("bump_clearance", 0, 20),
+    ("spin_deg", -360, 360), ("bump", 0, 20), ("bump_clearance", 0, 20), ("amplitude_mm", 0, 100),
 )  # fmt: skip
 
 
@@ -78,6 +80,7 @@ class PlanSettings:
     spin_deg: float = 0.0
     bump: float | None = None
     bump_clearance: float | None = None
+    amplitude_mm: float = 0.0
 
     def rows(self) -> list[tuple[str, str]]:
         """Each setting and its value, as text."""
@@ -111,6 +114,7 @@ class PlanRequest:
     arm: Path | None = None  # whose reach of each checkpoint is written
     clicks: str | None = None  # places on the wound's rim, mm, as the command line has them
     wound: int | None = None  # of the places that a question has shown, from 1
+    motion: str | None = None  # recording or trajectory by which the tissue's amplitude is measured
     settings: PlanSettings = field(default_factory=PlanSettings)
 
 
@@ -231,6 +235,42 @@ def in_mm(vertices: Array, triangles: Index, unit: str, where: object) -> Array:
     hint = f"; its numbers look like another unit: say {units}" if units else ""
     allowed = f"{MIN_SCAN_WITH_SKIN:g} to {MAX_SCAN_WITH_SKIN:g} mm{hint}"
     raise InputError(where, "size of the scan", f"{size:.4g} mm along its longest side, read as {unit}", allowed)
+
+
+AMPLITUDE_SHARE = 99.0  # % of the time in which the tissue is within its amplitude: a lost pose is none of it
+
+
+def tool_of(request: PlanRequest) -> ToolBody | None:
+    """The tool of the request's arm, with the margin that it keeps; None without an arm."""
+    amplitude = request.settings.amplitude_mm
+    if request.motion is not None and amplitude:
+        raise InputError(COMMAND_LINE, "--motion", request.motion, "nothing beside --amplitude-mm")
+    if request.arm is None:
+        for name, value in (("--motion", request.motion), ("--amplitude-mm", amplitude)):
+            if value:
+                raise InputError(COMMAND_LINE, name, value, "nothing without --arm, whose tool must keep clear")
+        return None
+    if request.motion is not None:
+        amplitude = measured_amplitude(request.motion)
+    return tool_body_of(read_arm(request.arm), BASE_MARGIN + amplitude)
+
+
+def measured_amplitude(motion: str) -> float:
+    """How far, mm, a tracked surface's origin goes from the middle of its motion, most of the time.
+
+    motion: a recording, a folder of `stillbed track` or `smooth`, or a trajectory as TUM or CSV.
+    """
+    from hardware.offline.trajectory_files import read_pose_series  # loads gtsam
+
+    places = read_pose_series(motion).trajectory.base_from_surface[:, :3, 3]
+    if not len(places):
+        raise InputError(motion, "poses", "none", "a trajectory of the surface")
+    ends = np.percentile(places, [100 - AMPLITUDE_SHARE, AMPLITUDE_SHARE], axis=0)
+    off = np.linalg.norm(places - ends.mean(axis=0), axis=1)
+    amplitude, most = float(np.percentile(off, AMPLITUDE_SHARE)), max(row[2] for row in SETTING_RANGES[-1:])
+    if not amplitude <= most:
+        raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", f"{most:g} mm or less: of tissue, not of a camera")
+    return amplitude
 
 
 SCAN_STEPS = 3  # a mesh is read, repaired, and its wound found

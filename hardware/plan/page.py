@@ -21,7 +21,8 @@ from hardware.report.page import document, figures_table, round_step, row_of_til
 from planning.fill.bead import Bead
 from planning.layers.checkpoints import tool_rotations
 from planning.layers.grid import interpolate
-from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, seconds_to
+from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, Unscanned, seconds_to
+from planning.layers.wound import WoundFindings
 
 PICTURE_WIDTH, PICTURE_MARGIN, HEAD_HEIGHT, FOOT_HEIGHT = 940.0, 24.0, 34.0, 34.0  # px
 MAX_DRAWING_HEIGHT = 900.0  # px of the drawing
@@ -35,10 +36,12 @@ text { font: 13px "Inter", "Segoe UI", "DejaVu Sans", system-ui, sans-serif; fil
 .travel { fill: none; stroke: #e06c00; stroke-width: 1.8; vector-effect: non-scaling-stroke; stroke-dasharray: 4 3; }
 .around { fill: #8a5a3c; stroke: #5b3822; stroke-width: 1; vector-effect: non-scaling-stroke; }
 .over { fill: none; stroke: #5b3822; stroke-width: 1.8; vector-effect: non-scaling-stroke; stroke-dasharray: 2 2; }
+.left { fill: none; stroke: #fff; stroke-width: 3; vector-effect: non-scaling-stroke; stroke-dasharray: 0 5; }
 .gap { fill: #d3232f; } .start { fill: #2f9e5b; stroke: #fff; stroke-width: 1.5; }
 .end { fill: #1c2430; stroke: #fff; stroke-width: 1.5; } .bar { stroke: #1c2430; stroke-width: 2; fill: none; }
 """
 TISSUE_COLOURS = ((0.16, 0.52, 0.72), (0.87, 0.56, 0.2), (0.33, 0.66, 0.45), (0.55, 0.42, 0.75), (0.8, 0.36, 0.26))
+SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 SURFACE_NODES = 120  # nodes along the longer side of the surfaces in the view
 PAGE_STYLE = """
 #plan-canvas { width: 100%; height: 560px; display: block; touch-action: none; cursor: grab; border-radius: 8px;
@@ -93,6 +96,7 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
         *_beads(layer.beads),
         f'<path class="gap" fill-rule="evenodd" d="{_areas(figures.coverage.gaps)}"/>',
         *_bumps(layer),
+        *(f'<path class="left" stroke-linecap="round" d="{_line(points)}"/>' for points in layer.left_out),
         f'<path class="travel" d="{travels}"/>',
     ]
     ends = np.array([layer.beads[0].points[0], layer.beads[-1].points[-1]])
@@ -123,6 +127,7 @@ def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: flo
     at = height - 16
     keys = f"{bar:g} mm · beads at their true width · red: open · dashed: travel · green: start · black: end"
     keys += "" if layer.around.is_empty else " · brown: bump, gone round"
+    keys += " · white: no room for the tool" if layer.left_out else ""
     keys += "" if layer.over.is_empty else " · dotted: bump, gone over"
     return (
         f'<text x="{PICTURE_MARGIN}" y="21" font-weight="600">{escape(title)}</text>'
@@ -301,3 +306,66 @@ def _sheet(plan: Plan, heights: Array) -> dict[str, Any]:
         "x": float(low[0]), "y": float(low[1]), "step": step, "columns": columns, "rows": rows,
         "heights": _base64(values, "<f4"),
     }  # fmt: skip
+
+
+def layers_text(numbers: list[int]) -> str:
+    """Layers as people name them: layer 3, layers 2 to 5, layers 1, 4, 6."""
+    if len(numbers) == 1:
+        return f"layer {numbers[0]}"
+    if len(numbers) > 2 and numbers[-1] - numbers[0] + 1 == len(numbers):
+        return f"layers {numbers[0]} to {numbers[-1]}"
+    return "layers " + ", ".join(str(n) for n in numbers)
+
+
+def tool_text(plan: Plan) -> str:
+    """What was done to keep the tool clear of the tissue, in words."""
+    done = plan.clearance
+    if done is None:
+        return "not checked, as no arm was given: --arm ARM.toml describes its tool"
+    turned = (
+        f", turned by up to {np.rad2deg(done.most):.1f} degrees at {done.turned} checkpoints" if done.turned else ""
+    )
+    text = f"{done.margin:.1f} mm or more from the tissue{turned}"
+    if not done.left_out:
+        return text
+    layers = layers_text(sorted({each.layer + 1 for each in done.left_out}))
+    length, worst = sum(each.length for each in done.left_out), max(done.left_out, key=lambda each: each.short)
+    return (
+        f"{text}; {len_text(length)} of bead in {layers} left out, {count_text(len(done.left_out), 'piece')}: "
+        f"at any allowed tilt the {worst.part} would come too near, upright by up to {worst.short:.1f} mm, as at "
+        f"{_place_text(worst.place)}"
+    )
+
+
+def tool_facts(plan: Plan) -> dict[str, Any] | None:
+    """The same as numbers; layers counted from 1, mm, degrees, scan frame."""
+    if (done := plan.clearance) is None:
+        return None
+    left = [
+        {
+            "layer": each.layer + 1, "length_mm": each.length, "place_mm": each.place.tolist(), "part": each.part,
+            "short_mm": each.short,
+        }
+        for each in done.left_out
+    ]  # fmt: skip
+    most = float(np.rad2deg(done.most))
+    return {"margin_mm": done.margin, "turned_checkpoints": done.turned, "most_deg": most, "left_out": left}
+
+
+def unscanned_text(beads: Unscanned) -> str:
+    """Beads over places that the scan does not show, in words."""
+    where = "over a hole of the scan" if beads.hole else "beyond the scan's rim"
+    layers = layers_text([number + 1 for number in beads.layers])
+    place = _place_text(beads.place)
+    return f"{len_text(beads.length)} of bead in {layers} lie {where}, as at {place}: the bed there is guessed"
+
+
+def _place_text(place: Array) -> str:
+    return "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*place)
+
+
+def volume_text(findings: WoundFindings) -> str:
+    """The volume, and its 95 % interval where the skin's place leaves it open."""
+    spread = SIGMA_95 * findings.volume_sigma
+    interval = f" (95 %: {max(findings.volume - spread, 0):.0f} to {findings.volume + spread:.0f})" if spread else ""
+    return f"{findings.volume:.0f} mm^3{interval}"

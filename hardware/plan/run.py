@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,13 +25,34 @@ from hardware.files.arm_file import read_arm
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import gcode_text, write_path
 from hardware.offline.reach import read_jointed_arm, with_feasible
-from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, order_of, subject_of
-from hardware.plan.page import ReportText, bounds_of, layer_svg, len_text, material_text, page_text
+from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, order_of, subject_of, tool_of
+from hardware.plan.page import (
+    ReportText,
+    bounds_of,
+    layer_svg,
+    layers_text,
+    len_text,
+    material_text,
+    page_text,
+    tool_facts,
+    tool_text,
+    unscanned_text,
+    volume_text,
+)
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text, write_atomically
 from hardware.process.system import provenance
-from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, figures_of, make_plan, total_of
-from planning.layers.wound import WoundFindings, WoundVolume
+from planning.layers.plan import (
+    LayerFigures,
+    Plan,
+    PlannedLayer,
+    PlanTotal,
+    figures_of,
+    make_plan,
+    total_of,
+    unscanned_beads,
+)
+from planning.layers.wound import WoundVolume
 from planning.motion.retime import run_times
 from planning.path import check_path
 from planning.placement import PathPlacement, placement_by_scan
@@ -51,7 +72,6 @@ LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
 )  # fmt: skip
-SIGMA_95 = 1.96  # deviations on either side of the mean, in a 95 % interval
 REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is written
 
 
@@ -63,7 +83,7 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     from hardware.recording.session_reader import open_session
 
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
-    order = order_of(request.settings, flat)
+    order = replace(order_of(request.settings, flat), tool=tool_of(request))
     if request.arm is not None:
         read_jointed_arm(request.arm)  # what is wrong with it is told before the long work
     damage = ""
@@ -108,7 +128,7 @@ def _tables(
         "checkpoints": len(plan.path), "mode": plan.order.mode, "missing_tissues": plan.stack.missing,
         "wound": asdict(plan.wound.findings), "total": asdict(total),
         "repairs": None if subject.repairs is None else asdict(subject.repairs), "settings": asdict(request.settings),
-        "bumps": bump_facts(plan), "feasible": arm,
+        "bumps": bump_facts(plan), "feasible": arm, "tool": tool_facts(plan),
         "surface_from_plane": plan.wound.surface_from_plane.tolist(), "provenance": provenance().table(),
     }  # fmt: skip
     write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
@@ -161,7 +181,7 @@ def _pictures(
             (folder / name).write_text(pictures[-1], encoding="utf-8")
             progress(i + 1, len(layers))
     repairs = [] if subject.repairs is None else subject.repairs.rows()
-    findings = [*findings_rows(plan), ("what an arm can print", arm)]
+    findings = [*findings_rows(plan), ("what an arm can print", arm), ("the tool and the tissue", tool_text(plan))]
     text = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
     page = page_text(plan, layers, total, text, pictures)
     write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
@@ -180,6 +200,7 @@ def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path,
         "ink: " + ", ".join(f"{volume / 1000:.3f} ml of {material_text(name)}" for name, volume in total.volume),
     ]
     lines += [f"bumps: {bumps_text(plan)}"] if layers_with_bumps(plan) else []
+    lines += [f"tool: {tool_text(plan)}"] if plan.clearance is not None and not plan.clearance.left_out else []
     done = [] if subject.repairs is None else [f"{what} ({n})" for what, n in subject.repairs.rows()[2:] if n]
     if done:
         lines.append("scan: " + ", ".join(done))
@@ -216,16 +237,12 @@ def findings_rows(plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
-def volume_text(findings: WoundFindings) -> str:
-    """The volume, and its 95 % interval where the skin's place leaves it open."""
-    spread = SIGMA_95 * findings.volume_sigma
-    interval = f" (95 %: {max(findings.volume - spread, 0):.0f} to {findings.volume + spread:.0f})" if spread else ""
-    return f"{findings.volume:.0f} mm^3{interval}"
-
-
 def notes_of(plan: Plan) -> list[str]:
     """What somebody should look at before printing."""
     notes = list(plan.wound.findings.notes)
+    if plan.clearance is not None and plan.clearance.left_out:
+        notes.append(f"tool: {tool_text(plan)}")
+    notes += [unscanned_text(each) for each in unscanned_beads(plan)]
     if plan.stack.missing:
         notes.append(f"not printed, as the wound is not deep enough: {', '.join(plan.stack.missing)}")
     off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
@@ -263,22 +280,13 @@ def bumps_text(plan: Plan) -> str:
     around = [p.layer.number + 1 for p in plan.layers if not p.around.is_empty]
     parts = []
     if over:
-        parts.append(f"gone over in {_layers_text(over)}")
+        parts.append(f"gone over in {layers_text(over)}")
     if around:
         clear = plan.order.passing.clear(plan.order.pattern.width)
         highest = max(p.layer.bumps.highest for p in plan.layers if not p.around.is_empty)
-        text = f"gone round with {clear:.2f} mm between in {_layers_text(around)}"
+        text = f"gone round with {clear:.2f} mm between in {layers_text(around)}"
         parts.append(f"{text}, up to {highest:.2f} mm over it")
     return "; ".join(parts)
-
-
-def _layers_text(numbers: list[int]) -> str:
-    """Layers as people name them: layer 3, layers 2 to 5, layers 1, 4, 6."""
-    if len(numbers) == 1:
-        return f"layer {numbers[0]}"
-    if len(numbers) > 2 and numbers[-1] - numbers[0] + 1 == len(numbers):
-        return f"layers {numbers[0]} to {numbers[-1]}"
-    return "layers " + ", ".join(str(n) for n in numbers)
 
 
 @dataclass(frozen=True, slots=True)

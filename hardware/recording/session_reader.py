@@ -27,7 +27,7 @@ from hardware.files.arm_file import arm_from_text, arm_text
 from hardware.files.dispenser_file import dispensers_from_text, outlets_from
 from hardware.files.folder_tables import check_polygon, checked_rows, trajectory_from_rows
 from hardware.files.images import check_size, decode
-from hardware.files.path_file import path_from_text, path_text
+from hardware.files.path_file import path_from_text, path_text, tissue_from_text
 from hardware.files.session import SURFACE_SUFFIXES, FrameRef, PrintHeadLog, Session, head_from_row, pair_refs
 from hardware.files.session_folder import open_folder
 from hardware.recording import messages
@@ -45,6 +45,7 @@ from hardware.recording.mcap_file import (
 )
 from hardware.recording.messages import Message, image_topic
 from perception.frames import Image, OutlinedPicture, PrintHead, Roi
+from planning.clearance import TissueGuard
 from planning.command import Command
 from planning.material import Outlets
 from planning.path import Path as PrintPath
@@ -362,6 +363,7 @@ def corrected_pictures(recording: Path) -> list[Labelled]:
 
 
 PATH_ATTACHMENT, ARM_ATTACHMENT, DISPENSER_ATTACHMENT = "path.csv", "arm.toml", "dispenser.toml"
+TISSUE_ATTACHMENT = "tissue.json"  # what the guard kept the tool out of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,12 +373,14 @@ class PrintInputs:
     path: PrintPath
     profile: ArmProfile
     outlets: Outlets
+    tissue: TissueGuard | None  # that the tool was kept out of
 
 
-def input_texts(path: PrintPath, profile: ArmProfile, dispensers: str = "") -> dict[str, str]:
-    """Path, arm and dispenser file as texts, by the names of the recording's attachments. dispensers: "" without."""
+def input_texts(path: PrintPath, profile: ArmProfile, dispensers: str = "", tissue: str = "") -> dict[str, str]:
+    """Path, arm, dispenser file and tissue as texts, by the names of the recording's attachments; "" without."""
     texts = {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it")}
-    return texts | ({DISPENSER_ATTACHMENT: dispensers} if dispensers else {})
+    rest = {DISPENSER_ATTACHMENT: dispensers, TISSUE_ATTACHMENT: tissue}
+    return texts | {name: text for name, text in rest.items() if text}
 
 
 def used_inputs(record: Path) -> PrintInputs:
@@ -390,7 +394,7 @@ def inputs_from_texts(texts: Mapping[str, str], record: Path) -> PrintInputs:
     if PATH_ATTACHMENT not in texts or ARM_ATTACHMENT not in texts:
         raise InputError(record, "recording", "no path", "the recording of a run that began to print")
     path = path_from_text(texts[PATH_ATTACHMENT], record / PATH_ATTACHMENT)
-    where = record / DISPENSER_ATTACHMENT
-    dispensers = texts.get(DISPENSER_ATTACHMENT, "")
+    dispensers, where = texts.get(DISPENSER_ATTACHMENT, ""), record / DISPENSER_ATTACHMENT
     outlets = outlets_from(dispensers_from_text(dispensers, where), where) if dispensers else {}
-    return PrintInputs(path, arm_from_text(texts[ARM_ATTACHMENT], record / ARM_ATTACHMENT), outlets)
+    tissue = tissue_from_text(texts[TISSUE_ATTACHMENT], record) if TISSUE_ATTACHMENT in texts else None
+    return PrintInputs(path, arm_from_text(texts[ARM_ATTACHMENT], record / ARM_ATTACHMENT), outlets, tissue)

@@ -33,10 +33,9 @@ from hardware.motion.loop import CommandedPose, MaterialControl, MotionLoop, Ord
 from hardware.motion.step import PrintMotion
 from hardware.offline.looks import SurfaceLooks
 from hardware.offline.track import FrameSetStep
-from hardware.process.clock import Clock, SimClock
+from hardware.process.clock import Clock, PoseLockedSchedule, SimClock
 from hardware.process.faults import FaultKind, FaultPart, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
-from hardware.process.ticks import PoseLockedSchedule
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults, VirtualDevice
 from hardware.simulator.camera_pipeline import (

@@ -300,7 +300,8 @@ def fill_coverage(beads: Sequence[Bead], region: Region) -> FillCoverage:
     material = sum(bead.area for bead in beads)
     gaps = only_areas(difference(region, union))
     over, area = difference(union, region).area, region.area
-    return FillCoverage((union.area - over) / area, over / area, (material - union.area) / area, gaps)
+    double = max(material - union.area, 0.0)  # the round ends of short beads cover more than length times width
+    return FillCoverage((union.area - over) / area, over / area, double / area, gaps)
 
 
 def covered_area(beads: Sequence[Bead], arc: int = 16) -> BaseGeometry:

@@ -224,8 +224,13 @@ def ceiling(grid: Grid, scan: Array) -> Array:
     return np.asarray(maximum_filter(scan, size=2 * round(TRAVEL_CLEARANCE / grid.step) + 1))
 
 
-def checkpoints_on(ground: TipSurface, beads: Sequence[Bead], layer_of: Index, way: CheckpointSettings) -> Checkpoints:
-    """The checkpoints of beads, in printing order, of the layers `layer_of` (B,) that they belong to."""
+def checkpoints_on(
+    ground: TipSurface, beads: Sequence[Bead], layer_of: Index, way: CheckpointSettings
+) -> tuple[BeadPoints, Checkpoints]:
+    """The checkpoints of beads, in printing order, of the layers `layer_of` (B,) that they belong to; no travels yet.
+
+    And the points of the beads, in the chart, that they are.
+    """
     stack, shares = ground.stack, np.array([layer.share for layer in ground.stack.layers])
     runs = bead_points(beads, way.chord)
     share = shares[layer_of[runs.bead]]
@@ -244,11 +249,10 @@ def checkpoints_on(ground: TipSurface, beads: Sequence[Bead], layer_of: Index, w
     allowed = np.maximum(np.minimum(full, np.sqrt(way.sideways * bend_radii(runs))), way.slowest * full)
     speed = np.where(runs.first, way.travel, np.minimum(allowed, np.r_[allowed[:1], allowed[:-1]]))
     wait = np.zeros(len(tip))
-    printed = Checkpoints(tip, tilt, speed, ~runs.first, runs.width, height, volume, layer, runs.bead, wait)
-    return _with_travels(ground, printed, runs, way)
+    return runs, Checkpoints(tip, tilt, speed, ~runs.first, runs.width, height, volume, layer, runs.bead, wait)
 
 
-def _with_travels(ground: TipSurface, printed: Checkpoints, runs: BeadPoints, way: CheckpointSettings) -> Checkpoints:
+def with_travels(ground: TipSurface, printed: Checkpoints, runs: BeadPoints, way: CheckpointSettings) -> Checkpoints:
     """The beads with a travel before each: up along the tool, over what stands between, and down."""
     starts, ends = np.flatnonzero(runs.first), np.flatnonzero(runs.last)
     a, b = np.r_[starts[0], ends[:-1]], starts  # before the first bead there is only the way down

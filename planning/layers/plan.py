@@ -9,15 +9,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import shapely
+from scipy.ndimage import distance_transform_edt
 from shapely import MultiPolygon
 
+from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
+from planning.clearance import ToolBody
 from planning.command import MotionLimits
 from planning.fill.bead import SHARP_TURN, Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
 from planning.fill.fill import fill, settle_angle
 from planning.kinematics import SimpleArm
 from planning.layers.checkpoints import (
+    BeadPoints,
     Checkpoints,
     CheckpointSettings,
     TipSurface,
@@ -26,8 +30,10 @@ from planning.layers.checkpoints import (
     curvature,
     path_from,
     tilt_field,
+    with_travels,
 )
-from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, nodes_within, unroll
+from planning.layers.clearing import LaidTissue, ToolClearance, beads_with_room, travels_with_room
+from planning.layers.grid import Chart, as_multi, flat_chart, grid_over, interpolate, nodes_within, unroll
 from planning.layers.slicing import BumpPassing, Layer, LayerMode, LayerStack, Tissue, layer_stack
 from planning.layers.wound import WoundFindings, WoundVolume
 from planning.motion.retime import run_times
@@ -40,6 +46,7 @@ SEAM_SHIFT = 0.6180339887498949
 TICK = 0.02  # s of an arm of no particular kind
 MIN_DISC_AREA = 0.75  # widths squared: a part of less area holds no disc of that width, which has pi / 4 of them
 GRID_STEP, GRID_MARGIN = 1.0, 5.0  # mm: a plane needs no fine grid
+UNSCANNED_FROM = 1.0  # mm to the nearest scanned place: a hole 2 mm wide, beyond what a lost triangle leaves
 MAX_GRID_NODES = 1000.0  # nodes along a side
 
 
@@ -53,6 +60,7 @@ class PlanOrder:
     way: CheckpointSettings = field(default_factory=CheckpointSettings)
     crossed: bool = True  # lines of every second layer across the others'
     passing: BumpPassing = field(default_factory=BumpPassing)  # how bumps of the bed are passed
+    tool: ToolBody | None = None  # that must have room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +72,7 @@ class PlannedLayer:
     beads: tuple[Bead, ...]  # in printing order
     over: MultiPolygon  # bumps that it goes over
     around: MultiPolygon  # bumps that it goes round
+    left_out: tuple[Array, ...] = ()  # lines (N, 2) of beads over which the tool has no room
 
     @property
     def coverage(self) -> FillCoverage:
@@ -83,6 +92,7 @@ class Plan:
     ground: TipSurface
     layers: tuple[PlannedLayer, ...]
     order: PlanOrder
+    clearance: ToolClearance | None = None  # None: no tool was given
 
 
 def make_plan(
@@ -105,9 +115,34 @@ def make_plan(
         raise InputError(where, "beads", "none has room", allowed)
     layer_of = np.repeat([p.layer.number for p in planned], [len(p.beads) for p in planned])
     ground = _tip_surface(wound, stack, chart, order.way)
-    points = checkpoints_on(ground, beads, layer_of, order.way)
+    runs, printed = checkpoints_on(ground, beads, layer_of, order.way)
+    if order.tool is None:
+        points, clearance = with_travels(ground, printed, runs, order.way), None
+    else:
+        laid = LaidTissue(wound, stack, order.tool)
+        runs, printed, clearance = beads_with_room(runs, printed, laid, order.way, wound.surface_from_plane)
+        if not len(printed.tip):
+            worst = max(clearance.left_out, key=lambda left: left.short)
+            allowed = f"a longer or thinner needle, or more tilt: the {worst.part} lacks up to {worst.short:.1f} mm"
+            raise InputError(where, "beads", "none over which the tool has room", allowed)
+        planned = [_without_left_out(layer, runs, printed, clearance) for layer in planned]
+        points = travels_with_room(with_travels(ground, printed, runs, order.way), laid)
     path = path_from(points, ground, order.way.tool.spin)
-    return Plan(path, points, wound, stack, chart, ground, tuple(planned), order)
+    return Plan(path, points, wound, stack, chart, ground, tuple(planned), order, clearance)
+
+
+def _without_left_out(
+    layer: PlannedLayer, runs: BeadPoints, printed: Checkpoints, clearance: ToolClearance
+) -> PlannedLayer:
+    """The layer with what is printed of its beads, and the lines of what is not."""
+    number = layer.layer.number
+    left = tuple(each.line for each in clearance.left_out if each.layer == number)
+    if not left:
+        return layer
+    own = np.flatnonzero(printed.layer == number)
+    cuts = np.flatnonzero(np.diff(runs.bead[own])) + 1
+    beads = tuple(Bead(runs.points[rows], runs.width[rows]) for rows in np.split(own, cuts) if len(rows))
+    return replace(layer, beads=beads, left_out=left)
 
 
 def _in_chart(shape: MultiPolygon, chart: Chart) -> MultiPolygon:
@@ -133,6 +168,38 @@ def _tip_surface(wound: WoundVolume, stack: LayerStack, chart: Chart, way: Check
     low, high = (tilt_field(wound.grid, end, inside, way.tool) for end in ends)
     curvatures = np.stack([curvature(wound.grid, end, way.spacing / 2) for end in ends], axis=-1)
     return TipSurface(stack, chart, wound.surface_from_plane, low, high, curvatures, ceiling(wound.grid, wound.bed))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unscanned:
+    """Beads over places that the scan does not show."""
+
+    hole: bool  # a hole of the scan; else beyond its rim
+    layers: tuple[int, ...]
+    length: float  # mm
+    place: Array  # (3,) mm, scan frame, in the longest stretch's middle
+
+
+def unscanned_beads(plan: Plan) -> list[Unscanned]:
+    """Beads over what was not scanned within UNSCANNED_FROM, over holes and beyond the rim."""
+    wound, points = plan.wound, plan.points
+    away = distance_transform_edt(~wound.scanned) * wound.grid.step
+    if not (away > UNSCANNED_FROM).any():
+        return []
+    off = interpolate(wound.grid, away, points.tip[:, :2]) > UNSCANNED_FROM
+    inner = interpolate(wound.grid, wound.holes.astype(float), points.tip[:, :2]) > 0.5
+    step = np.r_[0.0, np.linalg.norm(np.diff(points.tip, axis=0), axis=1)] * points.extrude
+    found = []
+    for hole in (True, False):
+        over = off & points.extrude & (inner == hole)
+        if not over.any():
+            continue
+        stretch = np.cumsum(np.diff(over, prepend=False) & over) * over
+        longest = np.flatnonzero(stretch == np.bincount(stretch, step * over).argmax())
+        place = se3.transform_points(wound.surface_from_plane, points.tip[longest[len(longest) // 2]][None])[0]
+        layers = tuple(np.unique(points.layer[over]).tolist())
+        found.append(Unscanned(hole, layers, float(step[over].sum()), place))
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,4 +327,5 @@ def flat_wound(contour: Array, thickness: float, where: object) -> WoundVolume:
         level=0.0, noise=0.0, smoothing=0.0,
         scatter=0.0, closed=0.0, hidden=0.0, cut=0.0, others=0, notes=(),
     )  # fmt: skip
-    return WoundVolume(np.eye(4), grid, bed, bed + thickness, np.zeros(grid.shape), outline, findings)
+    all_of_it, none = np.ones(grid.shape, bool), np.zeros(grid.shape, bool)
+    return WoundVolume(np.eye(4), grid, bed, bed + thickness, np.zeros(grid.shape), outline, findings, all_of_it, none)

@@ -19,6 +19,7 @@ from estimation.se3 import Array
 from planning.layers.grid import (
     Grid,
     HeightMap,
+    Mask,
     as_multi,
     axes_along,
     filled,
@@ -63,6 +64,8 @@ class WoundVolume:
     sigma: Array  # (H, W) mm, their standard deviation
     outline: MultiPolygon  # in the plane, mm; islands of intact skin are its holes
     findings: WoundFindings
+    scanned: Mask  # (H, W) where the scan has a triangle
+    holes: Mask  # (H, W) where it has none within its rim
 
     @property
     def depth(self) -> Array:
@@ -210,7 +213,8 @@ def _checked_wound(scan: Scan, found: OutlinedWound, given: bool, others: int, w
     if findings.depth < MIN_DEPTH / 2:
         raise InputError(where, "depth inside the outline", f"{findings.depth:.2g} mm", f"{MIN_DEPTH / 2:g} mm or more")
     findings = replace(findings, notes=tuple(_notes(findings)))
-    return WoundVolume(fine.surface_from_plane, fine.grid, fine.heights, skin, sigma, shape, findings)
+    own = fine.surface_from_plane, fine.grid, fine.heights, skin, sigma, shape, findings
+    return WoundVolume(*own, fine.scanned, fine.closed)
 
 
 def _deviations(found: OutlinedWound) -> tuple[Array, float]:

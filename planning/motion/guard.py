@@ -14,6 +14,7 @@ import numpy as np
 from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
+from planning.clearance import TissueGuard
 from planning.command import MAX_FLOW, Command, MotionLimits, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, joints_from_axes, nozzle_from_axes
 
@@ -25,9 +26,15 @@ class Guard:
     """Checks commands in the order in which they are sent."""
 
     def __init__(
-        self, limits: MotionLimits, arm: SimpleArm, tick: float, zone: Array | None = None, lag: float = 0.0
+        self,
+        limits: MotionLimits,
+        arm: SimpleArm,
+        tick: float,
+        zone: Array | None = None,
+        lag: float = 0.0,
+        tissue: TissueGuard | None = None,
     ) -> None:
-        """lag: s from one tick after a command until the arm is at its axes.
+        """lag: s from one tick after a command until the arm is at its axes. tissue: that the tool must stay out of.
 
         zone: (2, 3) mm, low and high corner of the printed region in the surface frame; None: everywhere. The surface's
         error and speed are taken at the zone's place nearest to the nozzle: far from it, on the way from home, a small
@@ -35,6 +42,7 @@ class Guard:
         """
         self._limits, self._arm, self._tick, self.lag = limits, arm, tick, lag
         self._zone = np.array([[-np.inf] * 3, [np.inf] * 3]) if zone is None else zone
+        self._tissue = tissue
         self._axes = arm.home.copy()  # of the last move that was let through
         self._stamp = -math.inf
         self._trusted_at = -math.inf
@@ -58,7 +66,7 @@ class Guard:
         if not breach and isinstance(command, Move):
             breach = self._reach(command) or self._motion(command) or self._joints(command) or self._no_go(command)
             breach = breach or self._material(command)
-            breach = breach or (self._stopping(command, distrust) if distrust else None)
+            breach = breach or (self._stopping(command, distrust) if distrust else self._clearance(command, pose, now))
         if breach:
             return Refusal(now, self._limits.pause, f"refused: {breach.text}", breach.code, breach.got, breach.limit)
         self._stamp = now
@@ -129,6 +137,19 @@ class Guard:
             if (depth := zone.depth_along(start, end)) > 0:
                 return Breach(RefusalCode.NO_GO, depth, 0.0, f"{depth:.3f} mm inside the no-go zone {zone.name!r}")
         return None
+
+    def _clearance(self, move: Move, pose: SurfacePose | None, now: float) -> Breach | None:
+        """The tool in the tissue where the move leads, as the trusted pose foretells it; a way out of it is free."""
+        if self._tissue is None or pose is None:
+            return None
+        surface_from_base = se3.inverse(pose.base_at(np.array([now + self._tick + self.lag]))[0])
+        place = surface_from_base @ nozzle_from_axes(self._arm, move.axes)
+        if self._tissue.clear(place):
+            return None
+        after, part = self._tissue.room(place)
+        if after >= 0 or after > self._tissue.room(surface_from_base @ nozzle_from_axes(self._arm, self._axes))[0]:
+            return None
+        return Breach(RefusalCode.CLEARANCE, -after, 0.0, f"the {part} would be {-after:.2f} mm in the tissue")
 
     def _material(self, move: Move) -> Breach | None:
         """What the dispenser is told: a finite flow, at an instant within the tick."""
