@@ -26,6 +26,8 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "DEVICE": "./serving",
     "MASKS": "out/masks",
     "SCAN": "wound.stl",
+    "RIG_OR_SESSION": "sessions/monday",
+    "SCAN.ply": "scanned.ply",
     "FILE": "moved.tum",
     "OUT": "out/new",
     "DIR": "sessions",
@@ -45,7 +47,7 @@ NAMES = {  # named in passing, without what it needs; each is run as a part of a
         "stillbed record",
         "stillbed reach",
     ),
-    *("stillbed replay", "stillbed segment", "stillbed simulate", "stillbed track", "stillbed train"),
+    *("stillbed replay", "stillbed scan", "stillbed segment", "stillbed simulate", "stillbed track", "stillbed train"),
 }
 TRACKED = "stillbed track sessions/monday -o out/new --record new.mcap --arm arm.toml --prefilter bilateral --wound"
 COMPLETED = {  # an option named in passing, and a command with it
@@ -110,6 +112,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
     "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 2", LONG),
     "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),
+    "stillbed bench scan": ("stillbed bench scan --bodies forearm --sets 2", LONG),
     "stillbed bench segmentation DATASET": (
         "stillbed bench segmentation dataset --rendered 1 --areas 1",
         "has a small one",

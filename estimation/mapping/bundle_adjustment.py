@@ -18,7 +18,7 @@ from estimation.mapping.triangulation import smooth_normals
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
 from estimation.pose_solver import PointTracks, PoseFit, project, solve_pose
-from estimation.rig import Rig
+from estimation.rig import Rig, ideal_pixels
 from estimation.runtime import trim_heap
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
@@ -155,11 +155,34 @@ def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Arra
     return change
 
 
+MIN_OWN_TRACKS, MAX_OFFSET_PX = 20, 0.5  # of a camera whose own pose counts; px it may stand off the joint one
+
+
 def single_fit(rig: Rig, points: Array, observations: Observations, camera: int, near: Array) -> PoseFit:
     """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
     mine = observations.only(observations.camera == camera)
     tracks = PointTracks.of(mine, points[mine.track])
     return solve_pose(rig, tracks, near, scales=(4.0, 1.0), prior=SINGLE_CAMERA_PRIOR)
+
+
+def exposed_poses(rig: Rig, surface_map: SurfaceMap | None, tracks: Observations, joint: Array) -> dict[int, Array]:
+    """base_from_surface (4, 4) by camera: the `joint` one, or the camera's own where its tracks contradict that.
+
+    Cameras that are not exposed together see a moving surface at different places; a pose of one alone is known worse.
+    """
+    found = dict.fromkeys(range(len(rig)), joint)
+    if surface_map is None:
+        return found
+    for c, camera in enumerate(rig.cameras):
+        mine = tracks.track[tracks.camera == c]
+        if len(mine) < MIN_OWN_TRACKS:
+            continue
+        own = single_fit(rig, surface_map.points, tracks, c, joint).base_from_surface
+        poses = np.stack([joint, own])
+        here, there = ideal_pixels(camera, se3.transform_points(poses, surface_map.points[mine]))[0]
+        if np.median(np.linalg.norm(here - there, axis=1)) > MAX_OFFSET_PX:
+            found[c] = own
+    return found
 
 
 def _fit(rig: Rig, points: Array, frame: KeyFrame) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from estimation.se3 import Array, Index, Mask
@@ -87,6 +87,16 @@ def _vertex_normals(points: Array, faces: Index) -> Array:
     return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
 
 
+def lattice_triangles(sure: Mask) -> tuple[Index, Index]:
+    """Nodes (V,) of a lattice (H, W), row by row, that are corners of triangles of sure ones, and those (T, 3) by rows
+    of V; anticlockwise where rows run along y, columns along x and the eye stands at +z."""
+    number = np.arange(sure.size).reshape(sure.shape)
+    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]))
+    triangles = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
+    used, corner = np.unique(triangles[sure.ravel()[triangles].all(1)], return_inverse=True)
+    return used, corner.reshape(-1, 3)
+
+
 class _Scene:
     """open3d's ray casting scene of a scan. It is in float32 and tells the triangle; places follow in float64.
 
@@ -142,6 +152,29 @@ def cast_rays(scan: Scan, origins: ArrayLike, directions: Array) -> Hits:
     points[ray] = origins[ray] + depth[:, None] * directions[ray]
     normals[ray] = normals_at(scan, triangle, weights)
     return Hits(points, normals, np.isfinite(points[:, 0]))
+
+
+LIGHT_BESIDE_EYE = np.array([-0.4, 0.3, 0.87])  # of a picture: from above left
+DARKEST_SHADE = 0.45  # of what faces away from the light
+
+
+def picture_of_scan(scan: Scan, colours: NDArray[np.uint8], way: Array, pixels: int) -> NDArray[np.uint8]:
+    """A picture (pixels, pixels, 3) of a scan with colours (V, 3), as seen from far away in direction `way` (3,)."""
+    z = way / np.linalg.norm(way)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.5 else [0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    axes = np.stack([x, np.cross(z, x), z])
+    seen = scan.vertices @ axes.T
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    lines, middle = np.linspace(-0.52, 0.52, pixels) * (high - low)[:2].max(), (low + high) / 2
+    u, v = np.meshgrid(lines + middle[0], middle[1] - lines)
+    flat = np.column_stack([u.ravel(), v.ravel(), np.full(u.size, high[2] + 1)])
+    hits = cast_rays(scan, flat @ axes, np.broadcast_to(-z, (u.size, 3)))
+    near = cKDTree(scan.vertices).query(hits.points[hits.hit])[1]
+    lit = np.clip(hits.normals[hits.hit] @ (LIGHT_BESIDE_EYE @ axes), 0, 1)
+    image = np.full((u.size, 3), 255, np.uint8)
+    image[hits.hit] = np.clip(colours[near] * (DARKEST_SHADE + 0.6 * lit)[:, None], 0, 255)
+    return image.reshape(pixels, pixels, 3)
 
 
 def foot_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:

@@ -85,7 +85,7 @@ def wound_points(shape: Shape) -> Array:
     return shape.points(shape.grid(shape.step)[(shape.inside > 0).ravel()])
 
 
-def _breathing(stamp: float) -> Array:
+def breathing_pose(stamp: float) -> Array:
     """base_from_surface (4, 4) at `stamp`, s, in the midst of a breath."""
     phase = 2 * np.pi * BREATH_RATE * (stamp + 0.5)
     up = 0.5 * (1 - np.cos(phase))
@@ -99,9 +99,9 @@ def _tracked_with_scan(case: ScanCase) -> Iterator[SurfacePose]:
     vertices, triangles = shape.mesh(SCAN_SPACING)
     scan = scan_from_triangles(se3.transform_points(SCAN_FROM_SURFACE, vertices), triangles)
     scene, rng = Scene(shape, Appearance(), seed=case.seed), np.random.default_rng([case.seed, 41])
-    step = TrackingStep(rig, rois(scene, rig, _breathing(0.0), 0.0), scan=scan)
+    step = TrackingStep(rig, rois(scene, rig, breathing_pose(0.0), 0.0), scan=scan)
     for stamp in np.arange(SCAN_SETS) / SCAN_RATE:
-        instants = {delay: WorldState(stamp, 0.0, _breathing(stamp + delay), np.zeros(6)) for delay in case.delays}
+        instants = {delay: WorldState(stamp, 0.0, breathing_pose(stamp + delay), np.zeros(6)) for delay in case.delays}
         images = render(scene, rig.cameras, [instants[delay] for delay in case.delays], Sensor(), rng.spawn(len(rig)))
         yield step(FrameSet(float(stamp), tuple(Frame(c, float(stamp), i) for c, i in enumerate(images))))
         step.idle()
@@ -112,7 +112,7 @@ def _registration_figures(case: ScanCase) -> list[Figure]:
     distance, squares, count = np.full(len(points), np.nan), np.nan, 0
     for pose in _tracked_with_scan(case):
         if pose.state is TrackState.TRACKING:
-            now, true = pose.base_from_surface @ SCAN_FROM_SURFACE, _breathing(pose.stamp)
+            now, true = pose.base_from_surface @ SCAN_FROM_SURFACE, breathing_pose(pose.stamp)
             distance = np.linalg.norm(se3.transform_points(now, points) - se3.transform_points(true, points), axis=1)
             error = se3.adjoint(SCAN_FROM_SURFACE) @ se3.log(se3.inverse(now) @ true)
             squares, count = relative_nees(error, pose.covariance), count + 1
@@ -133,6 +133,7 @@ PIXEL_MM = CAMERA_DISTANCE / FOCAL_PX
 PLAIN_LOOK = Appearance(texel=0.2, wetness=0.3, drape=False)
 LIMB_RADIUS = 46.0  # mm
 SIGMA_RATIO = Target(0.3, 2.0)  # of an error's size by its standard deviation
+NORMAL_MEDIAN = 0.6745  # of the size of what is normally distributed, in standard deviations
 OUTLIER_SIGMAS = 5.0  # landmarks beyond are not counted: the pose solver leaves them out
 
 
@@ -205,7 +206,7 @@ def _map_errors(name: str, shape: Shape, stamps: Array) -> list[Figure]:
         # an error that all tracks of a patch share is not in the covariance of poses
         sigma = np.hypot(sigma, RELIEF_PX * PIXEL_MM)
         inlier = np.abs(height) < OUTLIER_SIGMAS * max(0.1, float(np.median(sigma)))
-        size = float(np.median(np.abs(height[inlier]) / sigma[inlier]) / 0.6745)
+        size = float(np.median(np.abs(height[inlier]) / sigma[inlier]) / NORMAL_MEDIAN)
         note = f"{len(height)} landmarks, {np.mean(height[inlier]):+.3f} mm in the mean"
         median = float(np.median(np.abs(height)))
         figures.append(Figure(f"{name}, {when}: off the surface", median, "mm", None, "", note))

@@ -26,6 +26,7 @@ RENDERED = (
     *("still", *BREATHING, "shaking_table_0_5_hz", "steps_300um"),
     *("turns", "hand", "camera_lost", "clock_offsets", "wet_glare", "deformation"),
 )  # scenarios
+BODIES = ("chest", "forearm", "foot")  # that the simulator has
 MAPS = ("told", "seen")  # whose map the estimator has: the world's own, or one that it made
 MADE = (
     "flat patch, shaking table",
@@ -181,10 +182,14 @@ _SUBJECTS = (
         number("--seconds", 3.0, "S", "of each still standing; default 3")
     ),
     _subject("plan", "fill", "a whole plan of a large wound: time, memory, coverage, ink")(
-        option("--body", choices=("forearm", "chest", "foot"), default="forearm", help="default forearm")
+        option("--body", choices=BODIES, default="forearm", help="default forearm")
     ),
     _subject("registration", "mapping", "a scan laid into the first pictures: error and verdict")(
         number("--seeds", 2, "N", "bodies of each kind; default 2")
+    ),
+    _subject("scan", "scan", "what the cameras scan themselves, wet and dry, off the true surface")(
+        option("--bodies", nargs="+", choices=BODIES, default=BODIES, metavar="NAME", help=f"of {', '.join(BODIES)}"),
+        number("--sets", 6, "N", "frame sets that are fused; default 6"),
     ),
     _subject("prediction", "prediction", "where a breathing chest will be, 100 to 500 ms ahead")(
         option(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, arm_profile, positive, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, positive, wrong_option
 from hardware.process.clock import WallClock
 from perception import named_path
 
@@ -29,7 +29,6 @@ NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
 NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
 LIVE_ALLOWED = "a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; or "
 LIVE_ALLOWED += "--simulated data/live/small.toml --record run.mcap, to see a run without any device"
-REGION_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
 
@@ -54,9 +53,10 @@ def add_live(commands: Commands) -> None:
     add("--rig", type=Path, metavar="RIG", help="rig.toml of cameras, or a session shown in real time")
     add("--simulated", type=named_path, metavar="SCENARIO.toml", help="a scenario, rendered before the run")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
-    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
-    add("--scan", type=named_path, metavar="SCAN.ply", help="scan of the surface, in the frame of the path")
+    what = 'scan of the surface, in the frame of the path; or "from the cameras", which then scan it before the run'
+    add("--scan", type=named_path, metavar="SCAN.ply", help=what)
     add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
     add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="what lets material out; else nothing does")
@@ -106,7 +106,7 @@ def add_record(commands: Commands) -> None:
     add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
     add("--seconds", type=positive, metavar="S", help="from the first picture on; default: until Ctrl-C")
     add("--jpeg-quality", type=int, metavar="Q", help="1 to 100, default 90; 0 keeps the pictures exactly")
-    add("--region", type=Path, metavar="FILE.toml", help=REGION_HELP)
+    add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--no-page", action="store_true", help="without a page")
     add("--force", action="store_true", help="overwrite the file")
 
@@ -176,6 +176,7 @@ def add_init(commands: Commands) -> None:
 
 
 def _run_live(a: argparse.Namespace) -> int:
+    from hardware.cli.plan import scanned_settings
     from hardware.files.region_table import read_region
     from hardware.live.prepared import prepare, prepare_resumed
     from hardware.live.run import LiveRun
@@ -201,7 +202,9 @@ def _run_live(a: argparse.Namespace) -> int:
             prepared = prepare_resumed(a.resume, flags, faults)
         else:
             settings = LiveSettings() if a.settings is None else read_settings(a.settings)
-            prepared = prepare(override_settings(settings, flags), a.settings or "command line", a.force, faults)
+            where = a.settings or "command line"
+            settings = scanned_settings(override_settings(settings, flags), where, a.force)
+            prepared = prepare(settings, where, a.force, faults)
     except InputError as error:
         raise named_by_flag(error, [name for name, value in flags.items() if value is not None]) from None
     with Console(a.open) as console:

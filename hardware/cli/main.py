@@ -20,7 +20,7 @@ from hardware.cli.calibrate import add_calibrate
 from hardware.cli.dispenser import add_dispenser
 from hardware.cli.live import add_arm, add_cameras, add_init, add_live, add_record, add_trace
 from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Parser, add_fault, error_text, wrong_option
-from hardware.cli.plan import add_plan, add_reach, add_segment, add_train
+from hardware.cli.plan import add_plan, add_reach, add_scan, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
 from hardware.process.progress import BAD, cache_folder, left_files_text, painted, prepare_out, write_error_text
@@ -226,9 +226,9 @@ def parser() -> Parser:
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = Commands(top, "COMMAND")
     for add in (
-        _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_plan, add_live, add_record,
-        add_trace, add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras, add_import,
-        add_export, add_train, add_bench, add_doctor, add_cache,
+        _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_scan, add_plan, add_live,
+        add_record, add_trace, add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras,
+        add_import, add_export, add_train, add_bench, add_doctor, add_cache,
     ):  # fmt: skip
         add(commands)
     return top

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Run = Callable[[argparse.Namespace], int | None]  # a command: its exit code, None for 0
 FAULT_TEXT = 'what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md'
+ROI_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
 MODEL_HELP = "the network that finds the wound: your own, of stillbed train, or by default the one that comes along"
 FAILED = 1  # exit code where a command ran, and its result is not good enough
 WRONG_INPUT = 2  # exit code

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from estimation.errors import StillbedError
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, damage_code, not_negative, wrong_option
+from estimation.errors import InputError, StillbedError
+from hardware.cli.parser import (
+    FAILED,
+    MODEL_HELP,
+    ROI_HELP,
+    Commands,
+    damage_code,
+    not_negative,
+    positive,
+    wrong_option,
+)
 from perception import named_path
 
 if TYPE_CHECKING:
+    from hardware.live.settings import LiveSettings
     from perception.wound.segmentation import Segmenter
 
 PLAN_TEXT = """\
@@ -316,3 +327,64 @@ def _run_train(arguments: argparse.Namespace) -> None:
     from hardware.simulator.scene.render import wound_view
 
     print(run_train(arguments, wound_view))
+
+
+def add_scan(commands: Commands) -> None:
+    """Add the sub-command `scan`."""
+    add = commands.add(
+        "scan",
+        _run_scan,
+        "scan the surface with the calibrated cameras themselves",
+        "Scan the surface with the calibrated cameras: it is tracked for a breath, and pictures of some instants are\n"
+        "fused into a mesh with colour and a standard deviation a vertex, in the surface frame of that session. What\n"
+        "two cameras do not see alike stays open. X.html beside it shows it from three sides, says how much of the\n"
+        "region was seen and how well, and where to put another camera. Ctrl-C fuses what was seen until then.",
+        "stillbed scan rig.toml -o wound.ply",
+        "stillbed scan try.mcap -o wound.ply --sets 12",
+        "stillbed scan data/scenarios/breathing_calm.toml -o wound.ply",
+    ).add_argument
+    what = "rig.toml or session.toml of live cameras, a scenario.toml, a session folder or an .mcap file"
+    add("source", type=named_path, metavar="RIG_OR_SESSION", help=what)
+    add("-o", "--out", type=Path, required=True, metavar="X.ply", help="file to write, with X.html beside it")
+    add("--sets", type=int, default=6, metavar="N", help="instants whose pictures are fused, 2 to 40; default 6")
+    add("--seconds", type=positive, default=4.0, metavar="S", help="in which they are taken; default 4, a breath")
+    add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
+    add("--force", action="store_true", help="overwrite the files")
+
+
+def _run_scan(a: argparse.Namespace) -> None:
+    from hardware.files.region_table import ANY_REGION, read_region
+    from hardware.live.surface_scan import ScanOrder, run_scan
+
+    region = ANY_REGION if a.region is None else read_region(a.region)
+    print(run_scan(ScanOrder(a.source, a.out, a.sets, a.seconds, region, a.force)))
+
+
+def scanned_settings(settings: LiveSettings, where: object, force: bool) -> LiveSettings:
+    """The settings of a run that scans for itself, with the scan that its cameras make now and the path planned on it.
+
+    Both stand beside the recording. Without a path it is planned with `plan`'s defaults, and at a terminal the operator
+    says whether those layers are to be printed. InputError, StillbedError where that is not said.
+    """
+    from hardware.live.settings import FROM_CAMERAS, check_settings
+    from hardware.live.surface_scan import ScanOrder, run_scan
+    from hardware.plan.order import PlanRequest
+    from hardware.plan.run import run_plan
+
+    if settings.scan is None or settings.scan.name != FROM_CAMERAS:
+        return settings
+    source, record = settings.simulated or settings.rig, settings.record
+    check_settings(replace(settings, scan=None, path=settings.path or source), where)
+    assert source is not None and record is not None
+    if record.exists() and not force:
+        raise InputError(record, "--record", "a file that exists", "a new file, or --force")
+    scan, path = (record.with_name(f"{record.stem}_{name}") for name in ("scan.ply", "path.csv"))
+    print(run_scan(ScanOrder(source, scan, region=settings.region, force=True)), flush=True)
+    if settings.path is not None:
+        return replace(settings, scan=scan)
+    print(run_plan(PlanRequest(path, scan, force=True))[0], flush=True)
+    if not settings.unattended and sys.stdin.isatty():
+        answer = input(f"The layers are in {path.with_suffix('.html')}. Are they to be printed? yes or no: ")
+        if answer.strip().lower() not in ("y", "yes"):
+            raise StillbedError(f"not printed, as you said. The plan is kept: {path}, on {scan}")
+    return replace(settings, scan=scan, path=path)

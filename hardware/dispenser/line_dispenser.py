@@ -15,7 +15,7 @@ from typing import Protocol
 
 from estimation.errors import InputError
 from hardware.arm.driver import UnpluggedError
-from hardware.arm.port import Port, PortOpener
+from hardware.arm.port import HttpOpener, Port, PortOpener, is_http
 from hardware.dispenser.dispenser import (
     CLOSE_TIME,
     DispenserEvent,
@@ -24,7 +24,6 @@ from hardware.dispenser.dispenser import (
     DispenserStatus,
     EventLog,
 )
-from hardware.dispenser.http_port import HttpOpener, is_http
 from hardware.dispenser.messages import (
     DispenserLine,
     Message,

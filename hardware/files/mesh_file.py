@@ -344,3 +344,18 @@ def write_ply(path: Path, vertices: Array, triangles: NDArray[np.int64]) -> None
     head += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
     body = [" ".join(repr(float(v)) for v in p) for p in vertices] + [f"3 {a} {b} {c}" for a, b, c in triangles]
     path.write_text("\n".join(head + body) + "\n", encoding="ascii")
+
+
+def write_scan(
+    path: Path, vertices: Array, triangles: NDArray[np.int64], colours: NDArray[np.uint8], sigma: Array
+) -> None:
+    """Write a scan as a binary PLY file: vertices (V, 3) mm, colours (V, 3) RGB, sigma (V,) mm, triangles (T, 3)."""
+    head = ["ply", "format binary_little_endian 1.0", "comment mm; sigma: one standard deviation across the surface"]
+    head += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
+    head += [*(f"property uchar {name}" for name in ("red", "green", "blue")), "property float sigma"]
+    head += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
+    vertex = np.zeros(len(vertices), np.dtype([("at", "<f4", 3), ("rgb", "u1", 3), ("sigma", "<f4")]))
+    vertex["at"], vertex["rgb"], vertex["sigma"] = vertices, colours, sigma
+    face = np.zeros(len(triangles), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
+    face["count"], face["corner"] = 3, triangles
+    path.write_bytes(("\n".join(head) + "\n").encode("ascii") + vertex.tobytes() + face.tobytes())

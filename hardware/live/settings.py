@@ -27,6 +27,7 @@ from hardware.operator.settings import OperatorSettings
 from hardware.process import checks
 
 LOOPBACK = "127.0.0.1"  # nobody but this machine
+FROM_CAMERAS = "from the cameras"  # instead of a scan's file: they scan, and it is planned, before the run
 VIRTUAL_ARM = "virtual"  # the arm that needs no device
 MAX_LIFT_MM = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at
 MAX_PATIENCE = 600.0  # s of patience
@@ -62,7 +63,7 @@ class LiveSettings:
     scan: Path | None = _key(
         "print.scan",
         '"scan.ply"',
-        "scan of the surface, mm, in the path's frame; without one you move the path into place",
+        f'scan of the surface, mm, in the path\'s frame, or "{FROM_CAMERAS}"; without one you move the path into place',
     )
     dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
     lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under

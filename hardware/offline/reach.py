@@ -57,7 +57,7 @@ REMEDIES = {  # by REACH_REASONS
     "joint range": "let the tool spin (--spin), take the better posture, or turn the surface",
     "singular": "let the tool spin (--spin), or lay the surface elsewhere or a little tilted",
     "joint speed": "print slower there (speed_mm_s of the path), or keep the surface calmer",
-    REACH_REASONS[TISSUE]: "plan with --arm, which tilts the tool or leaves the bead out; or a longer needle",
+    TISSUE: "plan with --arm, which tilts the tool or leaves the bead out; or a longer needle",
 }
 ARM_WIDTH_PX, ARM_HEIGHT_PX = 440, 300  # of a picture of the arm, two of which stand side by side
 MAX_STRETCHES = 60  # of red checkpoints that are listed; the table reach.csv has all

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +40,7 @@ from hardware.plan.page import (
     volume_text,
 )
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, count_text, duration_text
+from hardware.process.progress import Progress, count_text, duration_text, write_atomically
 from hardware.process.system import provenance
 from planning.layers.plan import (
     LayerFigures,
@@ -100,9 +99,9 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
         plan = make_plan(subject.wound, order, subject.name, progress)
     path, arm = (plan.path, NO_ARM_GIVEN) if request.arm is None else with_feasible(plan.path, request.arm)
     check_path(path)
-    _write_atomically(request.out, lambda file: write_path(file, path))
+    write_atomically(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
-        _write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
+        write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
     with _progress("measure", "layers") as progress:
         profile = ArmProfile() if request.arm is None else read_arm(request.arm)
         layers = figures_of(plan, progress, run_times(path, profile.arm, profile.limits, profile.tick))
@@ -117,16 +116,6 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed]), damage
 
 
-def _write_atomically(file: Path, write: Callable[[Path], object]) -> None:
-    """Write a file atomically: under another name first, then renamed."""
-    part = file.with_name(file.name + ".part")
-    try:
-        write(part)
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def _tables(
     request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str
 ) -> list[str]:  # fmt: skip
@@ -134,7 +123,7 @@ def _tables(
     stem = request.out.with_suffix("")
     table, summary = stem.with_name(stem.name + "_layers.csv"), stem.with_suffix(".json")
     written = [table.name, summary.name]
-    _write_atomically(table, lambda file: _write_layers(file, layers))
+    write_atomically(table, lambda file: _write_layers(file, layers))
     facts = {
         "checkpoints": len(plan.path), "mode": plan.order.mode, "missing_tissues": plan.stack.missing,
         "wound": asdict(plan.wound.findings), "total": asdict(total),
@@ -142,12 +131,12 @@ def _tables(
         "bumps": bump_facts(plan), "feasible": arm, "tool": tool_facts(plan),
         "surface_from_plane": plan.wound.surface_from_plane.tolist(), "provenance": provenance().table(),
     }  # fmt: skip
-    _write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
+    write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
     meshes = {"_scan.ply": None if subject.repairs is None else _surface(plan.wound), "_example.ply": subject.example}
     for ending, mesh in meshes.items():
         if mesh is not None:
             file = stem.with_name(stem.name + ending)
-            _write_atomically(file, partial(write_ply, vertices=mesh[0], triangles=mesh[1]))
+            write_atomically(file, partial(write_ply, vertices=mesh[0], triangles=mesh[1]))
             written.append(file.name)
     return written
 
@@ -195,7 +184,7 @@ def _pictures(
     findings = [*findings_rows(plan), ("what an arm can print", arm), ("the tool and the tissue", tool_text(plan))]
     text = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
     page = page_text(plan, layers, total, text, pictures)
-    _write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
+    write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
     return [f"{folder.name}/ ({len(pictures)} pictures)", report.name]
 
 

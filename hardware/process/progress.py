@@ -190,6 +190,16 @@ def write_error_text(error: Exception, out: Path | None) -> str:
     return f"{out}: {why}; {left_files_text(out)}{cut}"
 
 
+def write_atomically(file: Path, write: Callable[[Path], object]) -> None:
+    """Write a file under another name first, then rename it: there is never half of one."""
+    part = file.with_name(file.name + ".part")
+    try:
+        write(part)
+        os.replace(part, file)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def cache_folder() -> Path:
     """Where it is, as the XDG rules have it; it may not be there yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stillbed"

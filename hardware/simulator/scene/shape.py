@@ -42,7 +42,7 @@ class Shape:
 
     def heights_at(self, xy: ArrayLike) -> Array:
         """Z (N,) mm at material points (N, 2) mm; beyond the rectangle as at its edge."""
-        return _bilinear(self, self._nodes(xy))[0]
+        return _bilinear(self, self.nodes(xy))[0]
 
     def points(self, xy: ArrayLike) -> Array:
         """Points (N, 3) mm, surface frame, at material points (N, 2) mm."""
@@ -51,7 +51,7 @@ class Shape:
 
     def normals(self, xy: ArrayLike) -> Array:
         """Unit normals (N, 3), surface frame, out of the surface, at material points (N, 2) mm."""
-        _, across, along = _bilinear(self, self._nodes(xy))
+        _, across, along = _bilinear(self, self.nodes(xy))
         up = np.column_stack([-across, -along, np.ones(len(across))])
         return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True) @ self.surface_from_grid[:3, :3].T)
 
@@ -65,7 +65,7 @@ class Shape:
         on = (np.abs(xy) <= np.array(self.size) / 2 + 1e-6).all(axis=1)
         if self.valid is None:
             return np.asarray(on)
-        x, y = np.rint(self._nodes(xy)).astype(int).T
+        x, y = np.rint(self.nodes(xy)).astype(int).T
         return np.asarray(on & self.valid[y, x])
 
     def grid(self, step: float, part: float = 1.0) -> Array:
@@ -81,11 +81,11 @@ class Shape:
         a, b, c, d = (m.ravel() for m in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
         triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
         if self.valid is not None:
-            x, y = np.rint(self._nodes(flat)).astype(int).T
+            x, y = np.rint(self.nodes(flat)).astype(int).T
             triangles = triangles[self.valid[y, x][triangles].all(1)]
         return self.points(flat), triangles
 
-    def _nodes(self, xy: ArrayLike) -> Array:
+    def nodes(self, xy: ArrayLike) -> Array:
         """Material points (N, 2) in nodes from the first one, kept on the rectangle."""
         nodes = np.asarray(xy, float).reshape(-1, 2) / self.step + (np.array(self.heights.shape[::-1]) - 1) / 2
         return np.clip(nodes, 0, np.array(self.heights.shape[::-1]) - 1)
