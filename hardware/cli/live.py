@@ -19,16 +19,15 @@ if TYPE_CHECKING:
 
 SETTINGS_FLAGS = (
     "rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift", "stands_home",
-    "jpeg_quality",
-    "dispensers", "operator", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key",
+    "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
 NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
-LIVE_ALLOWED = "a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; or "
-LIVE_ALLOWED += "--simulated data/live/small.toml --record run.mcap, to see a run without any device"
+LIVE_ALLOWED = """a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; or \
+--simulated data/live/small.toml --record run.mcap, to see a run without any device"""
 SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
 
 
@@ -43,7 +42,6 @@ def add_live(commands: Commands) -> None:
         "whatever ends the run, and --resume goes on where it stopped. Exit code 0 where the path is printed, 1 where\n"
         "the run ended before, 2 for wrong input, 128 and more where a signal ended it.",
         "stillbed live session.toml",
-        "stillbed live --rig rig.toml --path path.csv --scan scan.ply --arm /dev/ttyUSB0 --record run.mcap",
         "stillbed live --simulated data/scenarios/breathing_calm.toml --record run.mcap --yes",
         "stillbed live --resume run.mcap",
         "stillbed live session.toml --page-address 0.0.0.0 --page-cert page.pem --page-key page.key --page-name lab",
@@ -99,8 +97,7 @@ def add_record(commands: Commands) -> None:
         "pictures, rates and how sharp they are. Ctrl-C, the page or --seconds ends it; whatever ends it, what was\n"
         "written before is kept. track, smooth, segment, plan --session and calibrate take the file. Exit code 1\n"
         "where nothing came, or the recording ended by a fault.",
-        "stillbed record rig.toml -o try.mcap",
-        "stillbed record rig.toml -o try.mcap --seconds 20 --jpeg-quality 0",
+        "stillbed record rig.toml -o try.mcap --seconds 20",
     ).add_argument
     add("which", type=Path, metavar="RIG.toml", help="its cameras; or a session.toml, with its rig, region and quality")
     add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")

@@ -33,7 +33,7 @@ from hardware.offline.track import region_search, tracker
 from hardware.operator.shared_state import DrawnRegion
 from hardware.process.checks import read_toml
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, cache_folder, duration_text, write_atomically
+from hardware.process.progress import Progress, cache_folder, cached, duration_text, write_atomically
 from hardware.process.system import SharedLatest
 from hardware.report.page import document, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
@@ -195,7 +195,7 @@ def _live_sets(cameras: LiveCameraSource) -> Iterator[FrameSet]:
 
 def _rendered(scenario: Path, seconds: float) -> Path:
     """The session of a scenario, rendered as far as it is needed unless all of it is there."""
-    from hardware.live.prerender import cached, prerender  # loads all of the simulator
+    from hardware.live.prerender import prerender  # loads all of the simulator
 
     whole = cached(scenario, cache_folder())
     return (whole if whole.session.exists() else prerender(scenario, cache_folder(), seconds=seconds + 2)).session
