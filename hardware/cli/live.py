@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 SETTINGS_FLAGS = (
     "rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift", "stands_home",
-    "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key",
+    "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port",
+    "page_certificate", "page_key",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
@@ -116,7 +117,6 @@ def add_trace(commands: Commands) -> None:
         "where the time of a live run's slowest frame sets went",
         "Read the trace in the recording of a live run: how long frame sets took from their pixels in memory to the\n"
         "first move on the wire, and what the processes did meanwhile, for all sets and for the slowest hundredth.",
-        "stillbed trace run.mcap",
         "stillbed trace run.mcap -o run.json --page run.trace.html",
     ).add_argument
     add("record", type=Path, metavar="X.mcap", help="the recording of a live run")
