@@ -74,7 +74,13 @@ class Served:
         """Serve."""
         self._loop, self._ended = asyncio.new_event_loop(), asyncio.Event()
         serving = serve(self.link, self.settings, self.listener.dup(), self._ended, self._limits)
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(serving,), daemon=True)
+        runner = asyncio.Runner(loop_factory=lambda: self._loop)
+
+        def run() -> None:
+            with runner:  # which ends the tasks that are left: they hold the link and its memory
+                runner.run(serving)
+
+        self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
 
     def end(self) -> None:

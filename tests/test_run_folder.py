@@ -168,7 +168,7 @@ def test_the_pictures_to_show_are_of_the_printing_where_there_is_one(tmp_path: P
     with folder:
         feed(folder, 3)
         assert folder.pictures == {c: picture(c, 2)[1] for c in range(3)}
-        folder.command(move(0.4, True), progress(), bytes(48), b"")
+        folder.tick(tick(move(0.4, True)), progress())
         folder.picture(shot(0, 3), *picture(0, 3))
         folder.tick(tick(Hold(0.5, 0.001, "blind")), progress())
         folder.picture(shot(0, 4), *picture(0, 4))

@@ -376,7 +376,7 @@ def test_holes_of_a_scan_are_no_surface_and_overhangs_hide_what_is_below() -> No
     roof = np.array([[-11.0, -3.0, 2.0], [-5.0, -3.0, 2.0], [-11.0, 3.0, 2.0]])
     over = len(vertices) + np.array([[0, 1, 2]])
     shape = shape_from_scan(np.concatenate([vertices, roof]), np.concatenate([kept, over]), 0.5)
-    at = np.rint(shape._nodes(shape.material([[8.0, 0.0, 0.0], [0.0, 10.0, 0.0]]))).astype(int)
+    at = np.rint(shape.nodes(shape.material([[8.0, 0.0, 0.0], [0.0, 10.0, 0.0]]))).astype(int)
     assert shape.valid[at[:, 1], at[:, 0]].tolist() == [False, True]
     under, beside = shape.points(shape.material([[-10.0, -2.0, 0.0], [0.0, 10.0, 0.0]]))
     assert under[2] == pytest.approx(2.0, abs=0.05)

@@ -183,7 +183,7 @@ def test_a_method_that_there_is_not_is_refused_with_those_there_are(capsys: pyte
         main(["track", "x", "-o", "y", "--method", "theses"])
     assert ended.value.code == 2
     said = capsys.readouterr().err
-    assert "theses" in said and all(name in said for name in TRACKING_METHODS)
+    assert "theses" in said and any(f"did you mean {name}?" in said for name in TRACKING_METHODS)
 
 
 @pytest.mark.parametrize("method", ["thesis", *slowly("thesis-flow")])

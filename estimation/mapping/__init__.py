@@ -1,3 +1,3 @@
 """The map of landmarks: triangulation, bundle adjustment beside the frame's path, a local surface through it."""
 
-__all__ = ["bundle_adjustment", "local_surface", "refiner"]
+__all__ = ["bundle_adjustment", "refiner", "triangulation"]

@@ -153,11 +153,8 @@ BENCH_PARTS = (
     BenchPart("plan", (), None),
     BenchPart("fill", ("--count", "60"), ("--count", "3")),
     BenchPart("planner", ("--updates", "20000"), ("--updates", "2000")),
-    BenchPart("link", ("--hours", "0.5", "--commands", "20000"), ("--hours", "0.01", "--commands", "500")),
+    BenchPart("link", ("--minutes", "1"), ("--minutes", "0.1")),
     BenchPart("loop", ("--jobs", "2"), ("--jobs", "2", "--scenario", "breathing_deep")),
-    BenchPart("outages", ("--count", "22")),
-    BenchPart("faults", ("--count", "42", "--jobs", "2"), None),
-    BenchPart("fuzz", ("--count", "10000", "--jobs", "2"), ("--count", "2000", "--jobs", "2")),
     BenchPart("registration", ("--seeds", "1")),
     BenchPart("growth", ("--seconds", "2")),
 )  # fmt: skip

@@ -215,7 +215,7 @@ def _mesh_of(path: str) -> Arrays:
 
 def _colours_of(mesh: Any) -> Arrays:
     """The colours of a mesh of open3d, if it has any."""
-    shares = np.asarray(mesh.vertex_colors)
+    shares = np.clip(np.nan_to_num(np.asarray(mesh.vertex_colors)), 0.0, 1.0)
     return {"colours": np.rint(255 * shares).astype(np.uint8)} if len(shares) == len(mesh.vertices) > 0 else {}
 
 

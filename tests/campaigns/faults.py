@@ -44,6 +44,7 @@ FAULT_AMOUNTS = {  # of what has one, uniform in the logarithm
     (FaultPart.ARM, FaultKind.SLOW): (30.0, 90.0),  # %
     (FaultPart.SURFACE, FaultKind.FAST): (30.0, 200.0),  # mm/s
     (FaultPart.SURFACE, FaultKind.FOLD): (0.5, 5.0),  # mm
+    (FaultPart.DISPENSER, FaultKind.CLOG): (20.0, 100.0),  # %
 }
 CAMPAIGN_KINDS = [key for key, spec in FAULT_SPECS.items() if FaultRunner.SIMULATE in spec.runners]
 ENDING_KINDS = [key for key in CAMPAIGN_KINDS if key[1] is FaultKind.KILL]  # after which a run cannot go on

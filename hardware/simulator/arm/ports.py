@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import pty
-import select
 import signal
 import threading
 import tty
@@ -17,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Protocol
 
@@ -199,7 +199,7 @@ class PtyLink:
             self._client.write(data[start : start + _CHUNK_BYTES])
             due = min(start + _CHUNK_BYTES, len(data))
             while len(arrived) < due:
-                if not select.select([self._ours], [], [], _READ_TIMEOUT)[0]:
+                if not wait([self._ours], _READ_TIMEOUT):
                     raise TimeoutError(f"{self.name} gave {len(arrived)} of {len(data)} bytes back")
                 arrived += os.read(self._ours, due - len(arrived))
         return bytes(arrived)
