@@ -133,10 +133,19 @@ def simulated(folder: Path) -> None:
 
 def interrupted(folder: Path) -> None:
     """run.mcap, of a live run that was interrupted while it printed."""
-    words = ("--simulated", "data/scenarios/breathing_calm.toml", "--record", "run.mcap", "--yes", "--no-page")
+    words = (
+        "--simulated",
+        "data/scenarios/breathing_calm.toml",
+        "--record",
+        "run.mcap",
+        "--yes",
+        "--no-page",
+        "--trace",
+        "first.json",
+    )
     cache = folder.parent / "cache"
     prerender(folder / words[1], cache / "stillbed", threads=1)
-    live = Running(*words, cache=cache, cwd=folder)
+    live = Running(*words, "--trace", "first.json", cache=cache, cwd=folder)
     try:
         live.wait_for(r"\nprint\n")
         CLOCK.wait_until(CLOCK.now() + PRINTED)
