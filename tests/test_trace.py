@@ -29,6 +29,7 @@ from hardware.live.trace import (
     slowest_sets,
     trace_page,
     trace_text,
+    write_trace,
 )
 from hardware.process.clock import WallClock
 from hardware.recording.recorder import Recorder
@@ -98,6 +99,13 @@ def test_it_comes_back_from_a_recording_and_a_viewer_reads_it(tmp_path: Path) ->
     assert min(event["ts"] for event in spans) == 0.0 <= min(event["dur"] for event in spans)
     page = trace_page(trace, "x")
     assert page.count("<svg role") + page.count("<svg view") >= 12 and "tracking: idle" in page
+
+
+def test_a_run_that_left_none_keeps_its_own_end_and_says_why(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
+        recorder.event(0.0, "ended in the check")
+    assert "no trace" in write_trace(tmp_path / "x.mcap", tmp_path / "x.json")
+    assert not (tmp_path / "x.json").exists()
 
 
 def test_a_recording_without_one_says_so(tmp_path: Path) -> None:

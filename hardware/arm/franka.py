@@ -49,7 +49,6 @@ LOOK_BACK = 0.02  # s by which the commands are followed later: a tick, so that 
 GAIN = 20.0  # 1/s of what is missing: settles in 0.05 s, five control periods
 DYNAMICS = 0.5  # of franky's limits, which are libfranka's: 6.5 m/s^2 and 3250 m/s^3
 STOP_TIME = 0.3  # s, after which a robot that still moves is told the hard way
-REST_SPEED = 1.0  # mm/s, or degrees/s, below which it is at rest
 RATE_STEP = 1e-5  # rad/s: 0.005 mm/s at the tool; Ruckig is spared changes smaller than that
 POSTURE_GAIN = 1.0  # 1/s: far slower than the tool's
 MAX_JOINT_RATE = 1.0  # rad/s: less than half of what the slowest joint may do

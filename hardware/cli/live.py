@@ -208,9 +208,9 @@ def _run_live(a: argparse.Namespace) -> int:
         outcome = LiveRun(prepared, console)()
         console.say(outcome.words)
     if a.trace is not None:
-        from hardware.live.trace import chrome_trace, read_trace
+        from hardware.live.trace import write_trace
 
-        a.trace.write_text(chrome_trace(read_trace(prepared.files.record)), encoding="utf-8")
+        print(write_trace(prepared.files.record, a.trace) or f"trace: {a.trace}")
     return outcome.code
 
 

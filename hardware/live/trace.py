@@ -11,9 +11,11 @@ from __future__ import annotations
 import gc
 import json
 import resource
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -112,9 +114,11 @@ class SetWay:
 
 @dataclass(slots=True)
 class RunTrace:
-    """The trace of a run."""
+    """The trace of a run; nothing is added once it is asked what was done."""
 
     entries: list[TraceEntry] = field(default_factory=list)
+    _sorted: list[tuple[float, float, TraceEntry]] | None = None
+    _longest: float = 0.0  # s
 
     @property
     def ways(self) -> list[SetWay]:
@@ -132,11 +136,13 @@ class RunTrace:
     def during(self, begin: float, end: float) -> dict[str, float]:
         """Seconds of each kind of span between two instants, s; of the run queue its share in proportion."""
         sums: dict[str, float] = {}
-        for entry in self.entries:
-            if not entry.spans:
-                continue
-            first, last = entry.spans[0][1], max(span[2] for span in entry.spans)
-            if last <= begin or first >= end:
+        if self._sorted is None:  # by when they begin, and the longest of them
+            spanned = [(e.spans[0][1], max(span[2] for span in e.spans), e) for e in self.entries if e.spans]
+            self._sorted = sorted(spanned, key=lambda each: each[0])
+            self._longest = max((last - first for first, last, _ in spanned), default=0.0)
+        after = bisect_left(self._sorted, begin - self._longest, key=lambda each: each[0])
+        for first, last, entry in takewhile(lambda each: each[0] < end, islice(self._sorted, after, None)):
+            if last <= begin:
                 continue
             for name, start, stop in entry.spans:
                 if name != QUEUE_STAGE and (shared := min(stop, end) - max(start, begin)) > 0:
@@ -201,10 +207,11 @@ def trace_text(trace: RunTrace) -> str:
         return "no move was made of any frame set"
     spent = 1000 * np.array([way.wired - way.handed for way in ways])
     median, late, most = np.percentile(spent, [50, 99, 100])
+    found = causes(trace)
     lines = [f"frames to wire, {len(ways)} sets: {median:.1f} / {late:.1f} / {most:.1f} ms (median, 99 %, largest)"]
-    width = max(len(cause.name) for cause in causes(trace))
+    width = max(len(cause.name) for cause in found)
     lines.append(f"{'what was done meanwhile, ms a set':<{width}}  {'all':>7}  slowest {SLOWEST_SHARE:.0%}")
-    lines += [f"{c.name:<{width}}  {1000 * c.usual:7.2f}  {1000 * c.slowest:7.2f}" for c in causes(trace)]
+    lines += [f"{c.name:<{width}}  {1000 * c.usual:7.2f}  {1000 * c.slowest:7.2f}" for c in found]
     return "\n".join(lines)
 
 
@@ -223,6 +230,15 @@ def chrome_trace(trace: RunTrace) -> str:
             when = {"ts": round(1e6 * (begin - first), 1), "dur": round(1e6 * (end - begin), 1)}
             events.append({"ph": "X", "name": name, **place, **when, "args": told})
     return json.dumps({"displayTimeUnit": "ms", "traceEvents": events})
+
+
+def write_trace(record: Path, file: Path) -> str:
+    """Write the trace in a recording for such a viewer; why there is none to write, "" where it is written."""
+    try:
+        file.write_text(chrome_trace(read_trace(record)), encoding="utf-8")
+    except (InputError, OSError) as error:
+        return f"{file} is not written: {error}"
+    return ""
 
 
 def trace_page(trace: RunTrace, title: str) -> str:

@@ -97,18 +97,6 @@ def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: F
     return np.stack([draw_cover(image[..., k], box, 0.0, fault_rng(fault)) for k in range(image.shape[2])], -1)
 
 
-def draw_glare(image: Image, box: tuple[Array, Array], share: float, rng: np.random.Generator) -> Image:
-    """Soft saturated spots over about `share` of a box (low, high px)."""
-    low, high = box
-    light = np.zeros(image.shape, np.float32)
-    for _ in range(3):
-        centre = low + rng.uniform(0.1, 0.9, 2) * (high - low)
-        radius = (high - low) * np.sqrt(share / 3 / np.pi) * rng.uniform(0.8, 1.2)
-        middle, axes = (tuple(np.round(v).astype(int).tolist()) for v in (centre, radius))
-        cv2.ellipse(light, middle, axes, 0, 0, 360, 400.0, -1)
-    return np.asarray(np.clip(image + cv2.GaussianBlur(light, (0, 0), 3.0), 0, 255), np.uint8)
-
-
 RENDERER = Path(__file__).parent / "scene"  # its files make what a picture shows
 KEPT_RUNS = 2  # whose pictures are kept: two ways to track one scene in turn find theirs again
 PUTS = 60  # pictures from commit to commit: of a run that is killed no more are lost

@@ -270,7 +270,6 @@ RING_GAP, RING_SCALE, RING_WIDTH = 1.5, 1.5, 6.0  # mm outside the disc, to so m
 DISC_STEP = 1.5  # mm between nodes where they are looked for
 MIN_RING_SHARE, MIN_DISC_SHARE = 0.6, 0.5  # of the ring and of the disc that must have been scanned
 MIN_UNEVENNESS = 0.15  # mm, of the ring about its quadric: a smoother one is no surer
-MAX_CONDITION = 1e9  # of a fit
 
 
 @dataclass(frozen=True, slots=True)

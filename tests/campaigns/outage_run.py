@@ -19,7 +19,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from hardware.bench.estimator import FRAME_RATE_HZ, ScenePictures
-from hardware.simulator.camera_pipeline import draw_cover, draw_glare
+from hardware.simulator.camera_pipeline import draw_cover
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Image
 from perception.lens import undistort
@@ -32,6 +32,18 @@ FLASH = (0.03, 0.2)  # s
 BUMP_TURN, BUMP_SHIFT = np.deg2rad(0.5), 2.0  # rad, mm: the least bump; the hardest is twice that
 HAND_SLIDE = 0.15  # s in which a hand comes and goes
 RAY_SPACING = 8  # px between the rays that are traced for a bumped camera
+
+
+def draw_glare(image: Image, box: tuple[Array, Array], share: float, rng: np.random.Generator) -> Image:
+    """Soft saturated spots over about `share` of a box (low, high px)."""
+    low, high = box
+    light = np.zeros(image.shape, np.float32)
+    for _ in range(3):
+        centre = low + rng.uniform(0.1, 0.9, 2) * (high - low)
+        radius = (high - low) * np.sqrt(share / 3 / np.pi) * rng.uniform(0.8, 1.2)
+        middle, axes = (tuple(np.round(v).astype(int).tolist()) for v in (centre, radius))
+        cv2.ellipse(light, middle, axes, 0, 0, 360, 400.0, -1)
+    return np.asarray(np.clip(image + cv2.GaussianBlur(light, (0, 0), 3.0), 0, 255), np.uint8)
 
 
 class OutageKind(Enum):
