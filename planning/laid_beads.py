@@ -8,6 +8,7 @@ piece of bead is not wronged by its neighbours. What both fields are off by toge
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,7 +21,7 @@ from estimation.surface_map import SurfaceHeights
 from planning.material import bead_areas, is_metered
 from planning.path import MIN_SPACING, Path, way_lengths
 
-STATION_LENGTH = 2.5  # mm of bead judged as one: two or three widths, half of the shortest clog that must be found
+STATION_LENGTH = 1.25  # mm of bead judged as one: a quarter of the shortest clog that must be found, to see its ends
 BESIDE = 0.4  # mm beside a planned bead that count to it: how far a nozzle is off, and gel creeps
 AWAY = 1.5  # mm from all planned beads, beyond which nothing can have come
 MIN_AWAY_NODES = 50  # nodes from which the common offset is taken
@@ -28,8 +29,10 @@ SHARED_ERROR = 1.0  # mm within which nodes share their error: about half a patc
 MIN_SEEN = 0.6  # share of a piece's nodes that must be measured
 GAP_SHARE, BLOB_SHARE = 0.6, 1.6  # of the planned volume: less is a gap, more a blob
 SURE = 2.0  # sigmas by which it is so
-THIN_SHARE = 0.9  # surely less than that of the planned: a part of a clog, which may begin within a piece
-CLOG_LENGTH = 4.0  # mm of bead that thin pieces in a row lack together, in the order in which they are laid: a clog
+CLOG_LENGTH = 3.2  # mm of bead that pieces in a row lack together: 5 mm are seen as 4, as half a piece looks fuller
+CLOG_REFERENCE = 0.25  # share that a piece lacks in vain: pieces of good beads were measured to lack less than 0.2
+CLOG_OVER = 1.0  # mm by which the sum falls back where a clog is over: three good pieces, so two clogs are not one
+MIN_USUAL = 0.5  # of the planned: what most pieces have, below which most of them are clogged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,16 +182,28 @@ class LaidBeads:
 
     @property
     def clogs(self) -> list[tuple[float, float]]:
-        """From, to, mm along the path: thin pieces that follow each other and lack more than CLOG_LENGTH of bead."""
-        with np.errstate(invalid="ignore"):
-            thin = self.volume + SURE * self.sigma < THIN_SHARE * self.planned
-        lacks = np.nan_to_num((1 - self.share) * (self.stations.end - self.stations.begin))
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], thin, [False]]).astype(np.int8))).reshape(-1, 2)
-        return [
-            (float(self.stations.begin[a]), float(self.stations.end[b - 1]))
-            for a, b in edges.tolist()
-            if lacks[a:b].sum() > CLOG_LENGTH
-        ]
+        """From, to, mm along the path: pieces in the order in which they were laid that lack CLOG_LENGTH of bead.
+
+        By a cumulative sum (Page 1954) of what each lacks beside what pieces usually have, less CLOG_REFERENCE.
+        """
+        length = self.stations.end - self.stations.begin
+        seen = np.isfinite(self.volume)
+        usual = float(np.median(self.share[seen])) if seen.any() else 1.0
+        usual = min(usual, 1.0) if usual > MIN_USUAL else 1.0
+        lacks = np.where(seen, 1 - self.share / usual, CLOG_REFERENCE) * length  # what was not seen is passed over
+        unsure = np.where(seen, self.sigma / self.planned / usual, 0.0) * length
+        clogs, first, total, most, last = list[tuple[float, float]](), 0, 0.0, 0.0, 0
+        for i, gain in enumerate([*(lacks - CLOG_REFERENCE * length).tolist(), -math.inf]):
+            total += gain
+            if total > most:
+                most, last = total, i + 1
+            if total > max(0.0, most - CLOG_OVER):
+                continue
+            own = slice(first, last)
+            if last > first and lacks[own].sum() > max(CLOG_LENGTH, SURE * unsure[own].sum()):
+                clogs.append((float(self.stations.begin[first]), float(self.stations.end[last - 1])))
+            first, total, most, last = i + 1, 0.0, 0.0, 0
+        return clogs
 
     @property
     def total(self) -> tuple[float, float, float]:

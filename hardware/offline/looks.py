@@ -135,9 +135,10 @@ def look_at(
 ) -> tuple[LaidBeads, SurfaceHeights, float]:
     """What lies of planned beads, the surface after, and how wide beads are by the planned, one of `widths`."""
     nodes = before.nodes
-    station, _ = nearest_station(pieces, stations_of(pieces), nodes)
+    stations = stations_of(pieces)
+    station, _ = nearest_station(pieces, stations, nodes)
     dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in widths]
-    swept = sweep_beads(lenses, views, before, dues, station)
+    swept = sweep_beads(lenses, views, before, dues, station, np.diff(stations.bead) == 0)
     width, due = widths[swept.width], dues[swept.width]
     after = heights_with_beads(before, due, station, swept)
     laid = judge_beads(before, after, replace(pieces, width=pieces.width * width))

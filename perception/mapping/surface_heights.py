@@ -36,7 +36,9 @@ EVENING = 1.0  # mm over which brightness is evened out in the sweep: about a be
 MIN_SWEEP_FACING = 0.35  # cosine of the viewing angle: a bead's steep side hides itself
 MIN_ALIKE = 0.35  # mean correlation at the best share below which nothing is said
 WIDTH_VIEWS = 1  # views by which the width is found
-AS_ALIKE = 0.01  # of the correlation: of widths as good as the best the narrowest is taken, as a pixel blurs outwards
+AS_ALIKE = 0.02  # of the correlation: of widths as good as the best the narrowest is taken, as a pixel blurs outwards
+COARSE_VIEWS = 2  # views by which the coarse sweep is made: one alone may have a lamp's image on the bead
+BESIDE_WEIGHT = 0.5  # of the pieces before and after in one piece's correlation: alone it is too short to be sure
 SHARE_FLOOR = 0.05  # of the planned bead: what the sweep is off by however many frame sets there are
 MIN_STATION_NODES = 20  # nodes of a piece of bead that are seen
 
@@ -114,18 +116,19 @@ def sweep_beads(
     before: SurfaceHeights,
     dues: Sequence[Array],
     station: NDArray[np.int64],
+    joined: NDArray[np.bool_],
 ) -> BeadShares:
     """The share of each piece of bead by sweeping, and how wide beads are.
 
     dues: (H, W) mm each, the planned beads on the lattice of `before`, of one volume and rising widths. station: (H, W)
-    piece of bead that a node belongs to, -1 for none.
+    piece of bead that a node belongs to, -1 for none. joined: (S - 1,) whether the next piece is of the same bead.
     """
-    count = int(station.max(initial=-1)) + 1
+    count = len(joined) + 1
     ground = np.where(np.isfinite(before.heights), before.heights, np.nanmedian(before.heights))
-    lattice = _SweepLattice(lenses, before, ground, station, count)
-    tried = np.array([np.mean([_swept(lattice, v, due)[1].mean() for v in views[:WIDTH_VIEWS]]) for due in dues])
-    width = int(np.flatnonzero(tried >= tried.max() - AS_ALIKE)[0])
-    shares, alike = (np.stack(part) for part in zip(*(_swept(lattice, v, dues[width]) for v in views), strict=True))
+    lattice = _SweepLattice(lenses, before, ground, station, joined)
+    tried = np.array([_swept(lattice, views[:WIDTH_VIEWS], due)[1].mean() for due in dues]) if len(dues) > 1 else None
+    width = 0 if tried is None else int(np.flatnonzero(tried >= tried.max() - AS_ALIKE)[0])
+    shares, alike = _swept(lattice, views, dues[width])
     inside = station >= 0
     nodes = np.bincount(station[inside], np.isfinite(before.heights[inside]), count)
     known = (alike.mean(axis=0) > MIN_ALIKE) & (nodes >= MIN_STATION_NODES)
@@ -149,19 +152,19 @@ def heights_with_beads(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SweepLattice:
-    """The lattice of a sweep, and the nodes (N,) on it that belong to one of `count` pieces of bead."""
+    """The lattice of a sweep, and the nodes (N,) on it that belong to one of S pieces of bead."""
 
     lenses: Lenses
     before: SurfaceHeights
     ground: Array  # (H, W) mm, without holes
     station: NDArray[np.int64]  # (H, W)
-    count: int
+    joined: NDArray[np.bool_]  # (S - 1,) whether the next piece is of the same bead
 
     def alike(self, view: SurfaceView, heights: Array) -> Array:
         """Mean correlation (S,) of the cameras' pictures, laid on `heights` (H, W), over each piece of bead."""
         nodes = scan_map.transformed_nodes(view.base_from_surface, np.dstack([self.before.nodes, heights]))
         normals, inside = scan_map.lattice_normals(nodes), self.station >= 0
-        number, count, evening = self.station[inside], self.count, EVENING / self.before.step
+        number, evening = self.station[inside], EVENING / self.before.step
         grey, visible = {}, {}
         for camera, image in view.images.items():
             towards = self.lenses.rig.cameras[camera].base_from_camera[:3, 3] - nodes
@@ -169,26 +172,34 @@ class _SweepLattice:
             laid = scan_map.lattice_image(self.lenses, camera, image, nodes, normals, evening)
             grey[camera] = laid.even.astype(float)[inside] - 128
             visible[camera] = (laid.visible & (facing > MIN_SWEEP_FACING))[inside]
-        total, pairs = np.zeros(count), np.zeros(count)
+        total, pairs = np.zeros(len(self.joined) + 1), np.zeros(len(self.joined) + 1)
         for pair in combinations(sorted(grey), 2):
             both = np.logical_and(*(visible[c] for c in pair)).astype(float)
-            seen = np.bincount(number, both, count)
-            means = [np.bincount(number, both * grey[c], count) / np.maximum(seen, 1) for c in pair]
+            seen = self._summed(number, both)
+            means = [self._summed(number, both * grey[c]) / np.maximum(seen, 1) for c in pair]
             a, b = (both * (grey[c] - mean[number]) for c, mean in zip(pair, means, strict=True))
-            strength = np.bincount(number, a * a, count) * np.bincount(number, b * b, count)
+            strength = self._summed(number, a * a) * self._summed(number, b * b)
             enough = seen >= MIN_STATION_NODES
-            total += np.where(enough, np.bincount(number, a * b, count), 0.0) / np.sqrt(strength + 1)
+            total += np.where(enough, self._summed(number, a * b), 0.0) / np.sqrt(strength + 1)
             pairs += enough
         return total / np.maximum(pairs, 1)
 
+    def _summed(self, number: NDArray[np.int64], values: Array) -> Array:
+        """Sums (S,) of values (N,) over the nodes of each piece, and with less weight of those before and after it."""
+        own = np.bincount(number, values, len(self.joined) + 1)
+        beside = BESIDE_WEIGHT * self.joined
+        own[1:], own[:-1] = own[1:] + beside * own[:-1], own[:-1] + beside * own[1:]
+        return np.asarray(own)
 
-def _swept(lattice: _SweepLattice, view: SurfaceView, due: Array) -> tuple[Array, Array]:
-    """Share (S,) of each piece of a planned bead at which one view's pictures are most alike, and how much so."""
+
+def _swept(lattice: _SweepLattice, views: Sequence[SurfaceView], due: Array) -> tuple[Array, Array]:
+    """Share (V, S) of each piece of a planned bead at which each view's pictures are most alike, and how much so."""
     inside = lattice.station >= 0
-    first, _ = _peak(np.stack([lattice.alike(view, lattice.ground + s * due) for s in COARSE_SHARES]), COARSE_SHARES)
-    own = np.where(inside, first[np.maximum(lattice.station, 0)], 0.0)
-    fine = [lattice.alike(view, lattice.ground + (own + s) * due) for s in FINE_SHARES]
-    change, alike = _peak(np.stack(fine), FINE_SHARES)
+    coarse = [lattice.alike(v, lattice.ground + s * due) for v in views[:COARSE_VIEWS] for s in COARSE_SHARES]
+    first, _ = _peak(np.stack(coarse).reshape(-1, len(COARSE_SHARES), len(coarse[0])).mean(axis=0), COARSE_SHARES)
+    own = lattice.ground + np.where(inside, first[np.maximum(lattice.station, 0)], 0.0) * due
+    fine = (_peak(np.stack([lattice.alike(v, own + s * due) for s in FINE_SHARES]), FINE_SHARES) for v in views)
+    change, alike = (np.stack(part) for part in zip(*fine, strict=True))
     return first + change, alike
 
 

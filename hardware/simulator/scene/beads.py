@@ -112,6 +112,14 @@ class PrintedBeads:
                 self._grow(low, high)
         self._settle()
 
+    def scrape(self) -> None:
+        """Take all gel away: the surface is as it was."""
+        if self._box is not None:
+            x0, y0, x1, y1 = self._box
+            self._fresh[:, y0:y1, x0:x1] = 0.0
+            self._note()
+            self._settle()
+
     def heights(self, size: tuple[float, float], step: float) -> Field:
         """Heights (H, W) mm of gel on nodes `step` mm apart about the origin, over `size` (x, y) mm; all 0 of ink."""
         scale, ox, oy = self._layers.offsets(0)
