@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceHeights
 from perception.frames import FrameSet, Image
@@ -123,12 +124,17 @@ def sweep_beads(
     dues: (H, W) mm each, the planned beads on the lattice of `before`, of one volume and rising widths. station: (H, W)
     piece of bead that a node belongs to, -1 for none. joined: (S - 1,) whether the next piece is of the same bead.
     """
-    count = len(joined) + 1
+    rows, columns = (_reach(np.flatnonzero((station >= 0).any(axis=axis)), before.step) for axis in (1, 0))
+    box = (slice(*rows), slice(*columns))
+    station, dues, count = station[box], [due[box] for due in dues], len(joined) + 1
+    low = before.low + before.step * np.array([columns[0], rows[0]])
+    before = replace(before, low=low, heights=before.heights[box], sigma=before.sigma[box])
     ground = np.where(np.isfinite(before.heights), before.heights, np.nanmedian(before.heights))
-    lattice = _SweepLattice(lenses, before, ground, station, joined)
-    tried = np.array([_swept(lattice, views[:WIDTH_VIEWS], due)[1].mean() for due in dues]) if len(dues) > 1 else None
+    lattice = _SweepLattice(replace(before, heights=ground), station, joined)
+    laid = [lattice.views(lenses, view) for view in views]
+    tried = np.array([_swept(lattice, laid[:WIDTH_VIEWS], due)[1].mean() for due in dues]) if len(dues) > 1 else None
     width = 0 if tried is None else int(np.flatnonzero(tried >= tried.max() - AS_ALIKE)[0])
-    shares, alike = _swept(lattice, views, dues[width])
+    shares, alike = _swept(lattice, laid, dues[width])
     inside = station >= 0
     nodes = np.bincount(station[inside], np.isfinite(before.heights[inside]), count)
     known = (alike.mean(axis=0) > MIN_ALIKE) & (nodes >= MIN_STATION_NODES)
@@ -150,28 +156,67 @@ def heights_with_beads(
     return replace(before, heights=before.heights + share * due, sigma=np.abs(sigma) * due)
 
 
+def _reach(taken: NDArray[np.int64], step: float) -> tuple[int, int]:
+    """From which row or column to which a sweep reaches that are `taken`, with what their evening takes in beside."""
+    beside = int(np.ceil(3 * EVENING / step))
+    return (0, 0) if not len(taken) else (max(int(taken[0]) - beside, 0), int(taken[-1]) + beside + 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _GroundView:
+    """Where one camera's picture shows the nodes of a lattice, H rows of W, on the ground and above it."""
+
+    image: Image
+    pixels: NDArray[np.float32]  # (H, W, 2) px of the ground,
+    rise: NDArray[np.float32]  # (H, W, 2) px, and how they move a mm above it: heights are thousandths of the distance
+    inside: NDArray[np.bool_]  # (H, W) whether the picture has them
+    towards: Array  # (H, W, 3) unit, to the camera, surface frame
+
+    def even(self, heights: Array, evening: float) -> NDArray[np.float32]:
+        """Grey levels (H, W) at `heights` (H, W) mm above the ground, evened over `evening` nodes; about 0."""
+        where = self.pixels + heights[..., None].astype(np.float32) * self.rise
+        grey = np.asarray(cv2.remap(self.image, where, None, cv2.INTER_CUBIC), np.float32)
+        centred = grey - cv2.GaussianBlur(grey, (0, 0), evening)
+        spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), evening))
+        return np.asarray(scan_map.EVENED_CONTRAST * centred / (spread + 2.0), np.float32)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _SweepLattice:
     """The lattice of a sweep, and the nodes (N,) on it that belong to one of S pieces of bead."""
 
-    lenses: Lenses
-    before: SurfaceHeights
-    ground: Array  # (H, W) mm, without holes
+    ground: SurfaceHeights  # without holes
     station: NDArray[np.int64]  # (H, W)
     joined: NDArray[np.bool_]  # (S - 1,) whether the next piece is of the same bead
 
-    def alike(self, view: SurfaceView, heights: Array) -> Array:
-        """Mean correlation (S,) of the cameras' pictures, laid on `heights` (H, W), over each piece of bead."""
-        nodes = scan_map.transformed_nodes(view.base_from_surface, np.dstack([self.before.nodes, heights]))
-        normals, inside = scan_map.lattice_normals(nodes), self.station >= 0
-        number, evening = self.station[inside], EVENING / self.before.step
-        grey, visible = {}, {}
+    def views(self, lenses: Lenses, view: SurfaceView) -> dict[int, _GroundView]:
+        """How each camera sees the ground."""
+        found = {}
         for camera, image in view.images.items():
-            towards = self.lenses.rig.cameras[camera].base_from_camera[:3, 3] - nodes
-            facing = np.einsum("hwi,hwi->hw", towards, normals) / np.linalg.norm(towards, axis=2)
-            laid = scan_map.lattice_image(self.lenses, camera, image, nodes, normals, evening)
-            grey[camera] = laid.even.astype(float)[inside] - 128
-            visible[camera] = (laid.visible & (facing > MIN_SWEEP_FACING))[inside]
+            lens, shape, where = lenses.rig.cameras[camera], self.station.shape, []
+            for height in (0.0, 1.0):
+                nodes = np.dstack([self.ground.nodes, self.ground.heights + height]).reshape(-1, 3)
+                ideal, depth = ideal_pixels(lens, se3.transform_points(view.base_from_surface, nodes))
+                pixels, in_lens = lenses.image(camera, ideal, depth)
+                where.append(pixels.reshape(*shape, 2))
+            inside = in_lens & ((pixels > 1) & (pixels < np.array(lens.size) - 2)).all(1)
+            seen_from = (se3.inverse(view.base_from_surface) @ lens.base_from_camera)[:3, 3]
+            towards = (seen_from - nodes).reshape(*shape, 3)
+            towards /= np.linalg.norm(towards, axis=2, keepdims=True)
+            ground, rise = where[0].astype(np.float32), (where[1] - where[0]).astype(np.float32)
+            found[camera] = _GroundView(image, ground, rise, inside.reshape(shape), towards)
+        return found
+
+    def alike(self, views: dict[int, _GroundView], heights: Array) -> Array:
+        """Mean correlation (S,) of the cameras' pictures, laid `heights` (H, W) above the ground, over each piece."""
+        inside, evening = self.station >= 0, EVENING / self.ground.step
+        down, right = np.gradient(self.ground.heights + heights, self.ground.step)
+        steep = np.sqrt(1 + down**2 + right**2)
+        number, grey, visible = self.station[inside], {}, {}
+        for camera, view in views.items():
+            x, y, z = np.moveaxis(view.towards, -1, 0)
+            grey[camera] = view.even(heights, evening)[inside].astype(float)
+            visible[camera] = (view.inside & (z - right * x - down * y > MIN_SWEEP_FACING * steep))[inside]
         total, pairs = np.zeros(len(self.joined) + 1), np.zeros(len(self.joined) + 1)
         for pair in combinations(sorted(grey), 2):
             both = np.logical_and(*(visible[c] for c in pair)).astype(float)
@@ -184,6 +229,10 @@ class _SweepLattice:
             pairs += enough
         return total / np.maximum(pairs, 1)
 
+    def spread(self, values: Array) -> Array:
+        """Values (S,) of pieces on their nodes (H, W), 0 elsewhere."""
+        return np.where(self.station >= 0, values[np.maximum(self.station, 0)], 0.0)
+
     def _summed(self, number: NDArray[np.int64], values: Array) -> Array:
         """Sums (S,) of values (N,) over the nodes of each piece, and with less weight of those before and after it."""
         own = np.bincount(number, values, len(self.joined) + 1)
@@ -192,15 +241,27 @@ class _SweepLattice:
         return np.asarray(own)
 
 
-def _swept(lattice: _SweepLattice, views: Sequence[SurfaceView], due: Array) -> tuple[Array, Array]:
+def _swept(lattice: _SweepLattice, views: Sequence[dict[int, _GroundView]], due: Array) -> tuple[Array, Array]:
     """Share (V, S) of each piece of a planned bead at which each view's pictures are most alike, and how much so."""
-    inside = lattice.station >= 0
-    coarse = [lattice.alike(v, lattice.ground + s * due) for v in views[:COARSE_VIEWS] for s in COARSE_SHARES]
-    first, _ = _peak(np.stack(coarse).reshape(-1, len(COARSE_SHARES), len(coarse[0])).mean(axis=0), COARSE_SHARES)
-    own = lattice.ground + np.where(inside, first[np.maximum(lattice.station, 0)], 0.0) * due
+    first = _coarse(lattice, views, due, np.zeros(len(lattice.joined) + 1), np.ones(len(lattice.joined) + 1, bool))
+    bead = np.concatenate([[0], np.cumsum(~lattice.joined)])
+    for turn in (0, 1):
+        first = _coarse(lattice, views, due, first, bead % 2 == turn)
+    own = lattice.spread(first) * due
     fine = (_peak(np.stack([lattice.alike(v, own + s * due) for s in FINE_SHARES]), FINE_SHARES) for v in views)
     change, alike = (np.stack(part) for part in zip(*fine, strict=True))
     return first + change, alike
+
+
+def _coarse(
+    lattice: _SweepLattice, views: Sequence[dict[int, _GroundView]], due: Array, others: Array, moved: NDArray[np.bool_]
+) -> Array:
+    """Shares (S,) at which the pictures are most alike, of the pieces that are `moved` while `others` (S,) stay."""
+    tried = []
+    for share in COARSE_SHARES:
+        heights = lattice.spread(np.where(moved, share, others)) * due
+        tried.append(np.mean([lattice.alike(view, heights) for view in views[:COARSE_VIEWS]], axis=0))
+    return np.where(moved, _peak(np.stack(tried), COARSE_SHARES)[0], others)
 
 
 def _peak(alike: Array, shares: Array) -> tuple[Array, Array]:
