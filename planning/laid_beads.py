@@ -29,9 +29,10 @@ SHARED_ERROR = 1.0  # mm within which nodes share their error: about half a patc
 MIN_SEEN = 0.6  # share of a piece's nodes that must be measured
 GAP_SHARE, BLOB_SHARE = 0.6, 1.6  # of the planned volume: less is a gap, more a blob
 SURE = 2.0  # sigmas by which it is so
-CLOG_LENGTH = 3.2  # mm of bead that pieces in a row lack together: 5 mm are seen as 4, as half a piece looks fuller
-CLOG_REFERENCE = 0.25  # share that a piece lacks in vain: pieces of good beads were measured to lack less than 0.2
-CLOG_OVER = 1.0  # mm by which the sum falls back where a clog is over: three good pieces, so two clogs are not one
+CLOG_LENGTH = 1.2  # mm of bead that pieces in a row lack together: good beads up to 0.3, clogs of 5.2 mm from 1.7 on
+CLOG_REFERENCE = 0.2  # share that a piece lacks in vain: pieces of good beads are told to 0.05-0.08
+CLOG_OVER = 0.7  # mm by which the sum falls back where a clog is over: three good pieces, so two clogs are not one
+CLOG_END = 0.35  # of what the emptiest piece lacks, below which a piece at the end is no part of a clog
 MIN_USUAL = 0.5  # of the planned: what most pieces have, below which most of them are clogged
 
 
@@ -199,9 +200,9 @@ class LaidBeads:
                 most, last = total, i + 1
             if total > max(0.0, most - CLOG_OVER):
                 continue
-            own = slice(first, last)
-            if last > first and lacks[own].sum() > max(CLOG_LENGTH, SURE * unsure[own].sum()):
-                clogs.append((float(self.stations.begin[first]), float(self.stations.end[last - 1])))
+            own = first + np.flatnonzero(lacks[first:last] > CLOG_END * lacks[first:last].max(initial=0.0))
+            if len(own) and lacks[own].sum() > max(CLOG_LENGTH, SURE * unsure[own].sum()):
+                clogs.append((float(self.stations.begin[own[0]]), float(self.stations.end[own[-1]])))
             first, total, most, last = i + 1, 0.0, 0.0, 0
         return clogs
 

@@ -1,7 +1,6 @@
-"""Subjects `look`, `map`, `registration` and `tracks`: what was laid, landmarks, a scan and tracks, and the truth.
+"""Subjects `map`, `registration` and `tracks`: landmarks, a scan and tracks, and the truth.
 
 `map`: distances of landmarks from the true surface, beside the reported covariance; and the map's growth.
-`look`: layers of gel on rendered beds, some with a clog, as a look measures and judges them.
 `registration`: a scan registered to the first pictures, its error over the wound, and its verdict.
 `tracks`: scatter and drift of tracks while camera and surface stand still.
 """
@@ -26,9 +25,7 @@ from estimation.synthetic.follow import MIN_FRAME_SETS
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench.estimator import nees
 from hardware.bench.figures import Figure, Target, at_least, at_most, relative_nees, rms
-from hardware.offline.looks import look_at
 from hardware.simulator.scene.appearance import Appearance, Sensor
-from hardware.simulator.scene.beads import Gel, GelPieces
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
@@ -36,9 +33,7 @@ from perception.frames import Frame, FrameSet, Image
 from perception.lens import Lenses
 from perception.mapping.features import grey
 from perception.mapping.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
-from perception.mapping.surface_heights import SurfaceView, dense_heights, first_heights
 from perception.tracking.step import TrackingStep
-from planning.laid_beads import BeadPieces, LaidBeads
 
 SCAN_SPACING = 1.0  # mm between the vertices of a scan, as handheld scanners give them
 SCAN_FROM_SURFACE = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame
@@ -326,64 +321,3 @@ def _track_figures(name: str, stamps: Array, pixels: Array, sigmas: Array) -> li
         Figure(drift, rms(late - early), "px RMS", at_most(0.05), "", f"chance: {chance:.4f}"),
         Figure(f"{name}: tracks kept to the end", share, "%", at_least(95)),
     ]
-
-
-LOOK_FOCAL, LOOK_SIZE = 2200.0, (400, 300)  # px: 0.18 mm a pixel, about the beads
-LOOK_GEL = Gel(gloss=0.05)  # matt, as behind crossed polarisers
-LOOK_RISES = (0.0, 0.9, 1.7, 1.1)  # mm of breath at the frame sets of a look
-BEAD_SIZE = 0.64, 1.6  # mm^2 and mm, as planned
-CLOG_EVERY, CLOG_SPAN = 3, 7.0  # layers from one with a clog to the next, and mm of bead that it lasts
-
-
-def run_look(options: argparse.Namespace) -> list[Figure]:
-    """Layers of four beads; volume and height of those laid well, clogs found, and clogs that were none."""
-    layers = [_laid_layer(seed, clog=seed % CLOG_EVERY == 0) for seed in range(1, options.layers + 1)]
-    area, _ = BEAD_SIZE
-    crest = LOOK_GEL.aspect * float(np.sqrt(1.5 * area / LOOK_GEL.aspect))
-    good = [laid for laid, clog in layers if not clog]
-    heights = np.concatenate([laid.height for laid in good]) if good else np.zeros(0)
-    off = [100 * abs(laid.total[0] / laid.total[1] - 1) for laid in good]
-    missed, false = sum(clog and not laid.clogs for laid, clog in layers), sum(bool(laid.clogs) for laid in good)
-    note = f"{len(layers)} layers of {len(layers[0][0].planned)} pieces; {1000 * LOOK_GEL.gloss:g} per mille of gloss"
-    return [
-        Figure(
-            "height of a piece of bead, RMS", rms(heights[np.isfinite(heights)] - crest), "mm", at_most(0.05), "", note
-        ),
-        Figure("volume of a layer, median", float(np.median(off)), "%", at_most(5.0)),
-        Figure("volume of a layer, worst", max(off), "%"),
-        Figure(f"clogs of {CLOG_SPAN:g} mm missed", missed, "", at_most(0), "", f"of {len(layers) - len(good)}"),
-        Figure("clogs found that were none", false, "", at_most(0), "", f"in {len(good)} layers"),
-    ]
-
-
-def _laid_layer(seed: int, clog: bool) -> tuple[LaidBeads, bool]:
-    """What a look tells of a layer, and whether it had a clog."""
-    rng, kind = np.random.default_rng([seed, 71]), ("chest", "forearm", "foot")[seed % 3]
-    scene = Scene(body(kind, Wound(), seed), Appearance(wetness=0.0), seed=seed)
-    scene.gel = LOOK_GEL
-    rig = arc_rig(focal=LOOK_FOCAL, size=LOOK_SIZE)
-    lenses, (area, width), rows = Lenses(rig), BEAD_SIZE, np.arange(4)
-    start = np.array([[-7.0, width * (k - 1.5), 0.0] for k in rows])
-    end = start * [-1.0, 1.0, 1.0]
-    pieces = BeadPieces(start, end, np.full(4, area), np.full(4, width), rows, 0 * rows, 16 * rows.astype(float))
-    points = scene.shape.points(rng.uniform(-25.0, 25.0, (150, 2)))
-    low, high = start[0, :2] - 10.0, end[-1, :2] + 10.0
-    before = dense_heights(lenses, _look_views(scene, rig, rng), first_heights(points, low, high, 0.2))
-    closed, begin = int(rng.integers(4)), rng.uniform(-7.0, 7.0 - CLOG_SPAN)
-    for k in rows.tolist():
-        way = np.linspace(start[k, :2], end[k, :2], 141)
-        middle = (way[1:, 0] + way[:-1, 0]) / 2
-        flow = np.where(clog & (k == closed) & (middle > begin) & (middle < begin + CLOG_SPAN), 0.0, area)
-        scene.ink.flow(GelPieces(way[:-1], way[1:], 0.1 * flow, np.maximum(flow, area)), float(k))
-    scene.ink.flow(GelPieces(way[:0], way[:0], flow[:0], flow[:0]), 60.0)
-    return look_at(lenses, _look_views(scene, rig, rng), before, pieces)[0], clog
-
-
-def _look_views(scene: Scene, rig: Rig, rng: np.random.Generator) -> list[SurfaceView]:
-    found = []
-    for rise in LOOK_RISES:
-        pose = BASE_FROM_REST @ se3.make(np.eye(3), np.array([0.0, 0.0, rise]))
-        state = WorldState(0.0, 0.004, pose, np.zeros(6))
-        images = render(scene, rig.cameras, [state] * len(rig), Sensor(), rng.spawn(len(rig)))
-        found.append(SurfaceView({camera: grey(image) for camera, image in enumerate(images)}, pose))
-    return found

@@ -175,8 +175,8 @@ _SUBJECTS = (
         number("--seed", 1, None, "of the tracks' noise (default: 1)"),
         number("--jobs", 1, None, "processes that share the prints (default: 1)"),
     ),
-    _subject("look", "mapping", "layers of gel, as a look between layers measures them; clogs found")(
-        number("--layers", 6, "N", "every third with a clog; default 6")
+    _subject("look", "scan", "layers of gel, as a look between layers measures them; clogs found")(
+        number("--layers", 60, "N", "every sixth with a clog; default 60")
     ),
     _subject("map", "mapping", "landmarks off the true surface beside their claim, and the map's growth")(
         number("--seconds", 3.0, "S", "of each still standing; default 3")

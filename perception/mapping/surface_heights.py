@@ -3,11 +3,12 @@
 Before: dense matching, as `scan_map` does it, from several frame sets of a surface that breathes, whose mean is taken.
 After: a bead is a few pixels wide and its edges have the strongest texture, which patches take for that of all around
 (foreground fattening: a single bead was measured twice as large). What is planned there is known, though. So each piece
-of bead is swept: the pictures are laid on the surface before plus 0, 1/4, ... 9/4 of the planned bead, and the share at
-which they look most alike is how much lies there. Where the shape is right, a patch has nothing to fatten.
+of bead is swept: pictures are laid on the surface before plus 0, 1/4, ... 9/4 of the planned bead, and where they look
+most alike is how much lies there; then every other bead again, with its neighbours as they were found: steep sides
+stand beside it. Where the shape is right, a patch has nothing to fatten.
 
 On matt gel, seen 9 pixels wide, this was measured right to 5 %; on glossy gel it lies low, as a mirrored lamp stands
-behind the surface that mirrors it (docs/looks.md).
+behind the surface that mirrors it (docs/simulator.md).
 """
 
 from __future__ import annotations
@@ -38,7 +39,6 @@ MIN_SWEEP_FACING = 0.35  # cosine of the viewing angle: a bead's steep side hide
 MIN_ALIKE = 0.35  # mean correlation at the best share below which nothing is said
 WIDTH_VIEWS = 1  # views by which the width is found
 AS_ALIKE = 0.02  # of the correlation: of widths as good as the best the narrowest is taken, as a pixel blurs outwards
-COARSE_VIEWS = 2  # views by which the coarse sweep is made: one alone may have a lamp's image on the bead
 BESIDE_WEIGHT = 0.5  # of the pieces before and after in one piece's correlation: alone it is too short to be sure
 SHARE_FLOOR = 0.05  # of the planned bead: what the sweep is off by however many frame sets there are
 MIN_STATION_NODES = 20  # nodes of a piece of bead that are seen
@@ -175,7 +175,7 @@ class _GroundView:
     def even(self, heights: Array, evening: float) -> NDArray[np.float32]:
         """Grey levels (H, W) at `heights` (H, W) mm above the ground, evened over `evening` nodes; about 0."""
         where = self.pixels + heights[..., None].astype(np.float32) * self.rise
-        grey = np.asarray(cv2.remap(self.image, where, None, cv2.INTER_CUBIC), np.float32)
+        grey = np.asarray(cv2.remap(self.image, where[..., 0], where[..., 1], cv2.INTER_CUBIC), np.float32)
         centred = grey - cv2.GaussianBlur(grey, (0, 0), evening)
         spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), evening))
         return np.asarray(scan_map.EVENED_CONTRAST * centred / (spread + 2.0), np.float32)
@@ -260,7 +260,7 @@ def _coarse(
     tried = []
     for share in COARSE_SHARES:
         heights = lattice.spread(np.where(moved, share, others)) * due
-        tried.append(np.mean([lattice.alike(view, heights) for view in views[:COARSE_VIEWS]], axis=0))
+        tried.append(np.mean([lattice.alike(view, heights) for view in views], axis=0))
     return np.where(moved, _peak(np.stack(tried), COARSE_SHARES)[0], others)
 
 
