@@ -245,6 +245,18 @@ def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPiece
     return LaidBeads(stations, planned, volume, sigma, scale * stations.crest, scale_sigma * stations.crest)
 
 
+LOOK_BY_LAYER = "layer"
+
+
+def beads_between_looks(where: object, key: str, value: object) -> int | None:
+    """How many beads lie between looks, 0: a layer; None of None. InputError of what is neither."""
+    if value is None or value == LOOK_BY_LAYER:
+        return None if value is None else 0
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InputError(where, key, value, f'"{LOOK_BY_LAYER}", or a number of beads of 1 or more')
+    return value
+
+
 def with_looks(path: Path, beads: int = 0) -> Path:
     """The path with a look before all, and after each layer, or after every so many beads and the last one."""
     ends = np.flatnonzero(path.extrude & ~np.append(path.extrude[1:], False))

@@ -24,6 +24,7 @@ import numpy as np
 
 from estimation.errors import StillbedError
 from estimation.pose import Trajectory
+from estimation.se3 import Array
 from hardware.files.images import decode
 from hardware.files.session import FrameReader, FrameRef, Session
 from hardware.live.frame_source import Encoded, FrameRing
@@ -314,6 +315,7 @@ class RunChannels:
     start: c_double  # s, when printing began; NaN before
     looks: c_uint64  # how often the surface is to be looked for anew
     outline: SharedLatest[OutlineOrder]  # put before `looks` is set
+    placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of what is printed, put when it is begun
 
     def end(self) -> None:
         """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
@@ -349,14 +351,14 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:
             processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
-        looks, outline = RawValue(c_uint64, 0), SharedLatest[OutlineOrder]()
-        ends_of_tracking = to_recorder[1][1], looks, outline, lifeline[0]
+        looks, outline, placed = RawValue(c_uint64, 0), SharedLatest[OutlineOrder](), SharedLatest[Array]()
+        ends_of_tracking = to_recorder[1][1], looks, outline, placed, lifeline[0]
         track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, *ends_of_tracking)
         processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
         sender = RecorderSender(to_recorder[2][1])
         own_ends = orders[1], lifeline[1], arm_lifeline[1], sender, link, trouble
         stack.pop_all()
-    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, start, looks, outline)
+    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, start, looks, outline, placed)
 
 
 def _start_arm(processes: ProcessGroup, prepared: Prepared, device: File, lifeline: Connection) -> None:

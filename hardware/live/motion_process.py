@@ -74,6 +74,8 @@ class _OrderReceiver:
                 self._motion.put_in()
             elif order is PauseOrder.RESUME:
                 self._motion.resume()
+            elif order is PauseOrder.LOOK:
+                self._motion.look()
             else:
                 self._motion.paused = True
         self.alone |= closed
@@ -141,7 +143,7 @@ class _TickReporter:
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
             inputs = stamp, asked, begun, motion.waits, motion.material_in
             motion.material_in, lag = False, motion.lag if asked else math.nan
-            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag))
+            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag, motion.aside))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)

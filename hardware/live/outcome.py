@@ -336,6 +336,7 @@ class RunOutcome:
             section("Error at the nozzle", TIMELINE_CAPTION, drawn),
             section("Beads", BEADS_CAPTION, beads),
             *self._track_section(),
+            *self._look_section(),
             *self._picture_section(),
             section("How long each stage took", "Milliseconds.", timings),
             section("Holds", "Why the nozzle stood, and all other time since the approach began.", reasons),
@@ -356,6 +357,15 @@ class RunOutcome:
             return []
         drawn = track_map(track, placed.path.surface_from_nozzle[:, :3, 3], placed.path.extrude)
         return [section("Nozzle track", TRACK_CAPTION, drawn)]
+
+    def _look_section(self) -> list[str]:
+        """What looks found between layers, or when the operator asked for one."""
+        if not self.prepared.task.looks or self.machine.placed_path is None:
+            return []
+        from hardware.offline.looks import looks_section, read_looks
+
+        section = looks_section(read_looks(self.prepared.files.record), self.machine.placed_path.path)
+        return [section] if section else []
 
     def _picture_section(self) -> list[str]:
         from hardware.report.page import camera_pictures, section

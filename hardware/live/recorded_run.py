@@ -121,7 +121,7 @@ def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Itera
         now = float(tick["stamp"])
         if tick.get("material_in"):
             step.material_in()
-        step.paused = bool(tick.get("paused"))
+        step.paused, step.aside = bool(tick.get("paused")), bool(tick.get("aside"))
         command = step(poses[stamp[0]] if stamp else None, now)
         frame = frame_from_command(command, profile.dialect)
         yield ReplayedTick(now, command, frame, bytes_from_message({"data": tick["frame"]}))

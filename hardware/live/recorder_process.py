@@ -44,6 +44,7 @@ from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
 from hardware.process.system import SharedLatest, set_up_process, state_inputs
 from perception.frames import OutlinedPicture, Roi
+from planning.laid_beads import Look
 
 if TYPE_CHECKING:
     from hardware.recording.recorder import PublishedMessage, Recorder
@@ -366,7 +367,7 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.show_scan(entry.stamp, entry.points)
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
-    elif isinstance(entry, Roi | OutlinedPicture | DispenserRecord):
+    elif isinstance(entry, Roi | OutlinedPicture | DispenserRecord | Look):
         recorder.write(entry)
 
 

@@ -27,6 +27,7 @@ from hardware.process.clock import Histogram
 from hardware.process.system import SharedLatest
 from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
 from planning.clearance import TissueGuard
+from planning.laid_beads import Look
 from planning.material import Outlets
 from planning.path import Path, PrintProgress
 from planning.placement import PathPlacement
@@ -79,6 +80,8 @@ class TrackingReport:
     looks: int = 0  # how often the surface was looked for anew
     since: float = nan  # s, stamp of the first frame set since then
     outlined: bool = False  # whether the page was given pictures to correct the wound's outline on
+    looked: int = 0  # how often what was laid was looked at
+    look: str = ""  # what the last of these looks told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +101,8 @@ class PauseOrder(Enum):
 
     PAUSE = "pause"
     RESUME = "resume"
-    MATERIAL_IN = "material in"  # what the motion asked for was put in
+    MATERIAL_IN = "material in"  # what the motion asked for was put in, or the look that it stands aside for is done
+    LOOK = "look"  # step aside in a pause, for a look at what was laid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +225,7 @@ class UsedEntry:
 
 # the rig comes first: nothing is written before the cameras are known
 Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
-Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceEntry
+Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceEntry | Look
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
 
 
@@ -267,6 +271,7 @@ class TrackingChannels:
     recorder: Connection
     looks: c_uint64  # how often the surface is to be looked for anew
     outline: SharedLatest[OutlineOrder]  # put before `looks` is set
+    placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of what is printed, from when it is begun
     lifeline: Connection  # its end says that the run is gone
 
 

@@ -82,7 +82,7 @@ class LiveRun:
         self._announced = -1e9  # s
         self._silence_logged = self._arm_halted = False
         self._placement_written: tuple[PlacedPath, bool] | None = None  # what run.surface.toml says, whether confirmed
-        self._shown: tuple[PlacedPath | None, int, ScanDrawing | None] = None, 0, None  # path, landmarks and scan
+        self._shown: tuple[object, ...] = None, 0, None, None  # path, landmarks, scan, and what a look found
         self._lies = ""  # the placement, as run.surface.toml has it
         self._asked: RunStage | None = None  # the stage whose keys were told
         self._profile: ArmProfile | None = None  # of the arm since the path was begun
@@ -228,6 +228,8 @@ class LiveRun:
 
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""
+        assert self._machine.placement is not None
+        self._channels.placed.put(self._machine.placement.surface_from_path)
         texts, order = recorded_begin(order, self._prepared.task.dispensers)
         texts["surface.toml"] = self._lies
         for name, text in texts.items():
@@ -279,10 +281,10 @@ class LiveRun:
         """Show path, surface and scan on the page; keep where the path lies, for a run that resumes."""
         tracking, placed, link = self._reports.tracking, self._machine.placed_path, self._channels.link
         surface, scan = None if tracking is None else tracking.surface, link.scan.get()
-        shown = placed, 0 if surface is None else len(surface), scan
+        shown = placed, 0 if surface is None else len(surface), scan, link.laid.get()
         if any(a is not b and a != b for a, b in zip(shown, self._shown, strict=True)):
             self._shown = shown
-            link.scene.put(self._scene(surface, scan))
+            link.scene.put(replace(self._scene(surface, scan), laid=shown[3]))
         if (lies := self._placement()) is not None:
             self._lies = placement_text(lies)
             write_placement(self._prepared.files.surface, lies)

@@ -65,6 +65,9 @@ class LiveSettings:
         '"scan.ply"',
         f'scan of the surface, mm, in the path\'s frame, or "{FROM_CAMERAS}"; without one you move the path into place',
     )
+    look: str = _key(
+        "print.look", '"layer"', 'when the needle steps aside and what was laid is looked at: "layer", or "4" beads', ""
+    )
     dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
     lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under
         "print.lift_mm", "10.0", "how far above, in a dry run; 0 to 100", 10.0
@@ -208,6 +211,11 @@ def _check_foxglove(port: int, where: object) -> None:
             socket.create_server((LOOPBACK, port)).close()
         except OSError as error:
             raise InputError(where, key, port, f"{free} ({error.strerror})") from None
+
+
+def looks_between(settings: LiveSettings) -> int | str | None:
+    """What the setting says of looks: a number of beads, "layer", or None; anything else as it stands."""
+    return int(settings.look) if settings.look.isdecimal() else settings.look or None
 
 
 def used_files(settings: LiveSettings) -> list[Path]:

@@ -36,13 +36,14 @@ from hardware.operator.view import (
     Wish,
     refusal,
 )
-from planning.path import PrintPhase
+from planning.path import LOOK, PrintPhase
 from planning.placement import PathPlacement
 
 HOMING_TIMEOUT = 60.0  # s: across the whole room at 20 mm/s
 ARMING_TIMEOUT = 5.0  # s until a stopped arm is at rest and can be armed
 RESEND_AFTER = 0.3  # s between orders to an arm that was not ready for the last one
 SEARCH_TIMEOUT = 180.0  # s in which an unattended run must pass its checks and find the surface
+LOOKING_TEXT = "the nozzle steps aside, and what was laid is looked at"
 OUTLINED_TEXT = "inside the outline that the operator corrected"
 ARM_BACK_TEXT = "the arm is back: resume, or go home first"
 ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
@@ -81,6 +82,7 @@ class RunStateMachine:
     _after_homing: RunStage = RunStage.APPROACH
     _outlined: bool = False  # whether the page has pictures of this look, on which the outline can be corrected
     _wanted: str = ""  # material that the operator was asked for in this pause
+    _looked: int = 0  # looks that the tracking reported and that are known to the motion
 
     @property
     def offers(self) -> tuple[Wish, ...]:
@@ -89,6 +91,7 @@ class RunStateMachine:
         if self.stage is RunStage.FIND and self.outline:
             return (Wish.AGAIN, *offers)
         held = [Wish.LIFT] if self._at_home else []
+        held += [] if self.task.looks and not self._at_home else [Wish.LOOK]
         if self.stage is RunStage.CONFIRM and self.placement is not None:
             held += [Wish.CONFIRM] if not self.confirmable else []
             held += [Wish.MOVE] if not self.placement.usable else []
@@ -176,6 +179,9 @@ class RunStateMachine:
             return self.pause("by the operator", now)
         elif wish is Wish.HOME:
             return [PauseOrder.PAUSE, *self._home(RunStage.STOPPED, now)]
+        elif wish is Wish.LOOK:
+            self._enter(RunStage.PAUSED, LOOKING_TEXT, now)
+            return [PauseOrder.LOOK]
         elif wish is Wish.LIFT:
             self._enter(RunStage.PAUSED, "lifted by the operator", now)
             self._ordered, self._armed = now, False
@@ -336,6 +342,8 @@ class RunStateMachine:
             return []
         if not self._armed:
             return self._arm_again(motion, now)
+        if progress is not None and progress.wanted == LOOK:
+            return self._await_look(tracking, now)
         if progress is None or self.stage is RunStage.PAUSED:
             return []
         if progress.phase is PrintPhase.FINISHED or tracking.ended:
@@ -348,6 +356,16 @@ class RunStateMachine:
         if self.stage is RunStage.APPROACH and progress.phase is PrintPhase.PRINTING:
             self._enter(RunStage.PRINT, "", now)
         return []
+
+    def _await_look(self, tracking: TrackingReport, now: float) -> Orders:
+        """Go on once the look is done for which the nozzle stands aside; resuming in a pause goes on without it."""
+        if self.stage is RunStage.PAUSED:
+            self._wanted = LOOK
+        if tracking.looked == self._looked:
+            return []
+        self._looked = tracking.looked
+        self._enter(self.stage, tracking.look, now)
+        return [PauseOrder.MATERIAL_IN]
 
     def _ask_for(self, material: str, now: float) -> Orders:
         """Have the operator put in another material; an unattended run has a dispenser for each."""

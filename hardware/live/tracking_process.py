@@ -37,9 +37,11 @@ from hardware.live.records import (
     TrackingReport,
 )
 from hardware.live.trace import QUEUE_STAGE, TRACKING_LANE, TraceLane, in_turn
+from hardware.offline.looks import LiveLooks, station_places
 from hardware.offline.track import FrameSetStep, region_search, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
+from hardware.operator.shared_state import LaidDrawing
 from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
     ask_to_go_first,
@@ -182,6 +184,9 @@ class _TrackingLoop:
             sender.put(replace(roi, stamp=self.report.stamp))
         self._rois, self._drawn = rois, region.drawn and not rois
         self._sheet: OutlineSheet | None = None  # of this look, where a network looked
+        self._looks = LiveLooks(rig, prepared.task.path) if prepared.task.looks else None
+        if self._looks is not None:
+            stack.callback(self._looks.close)
         self._steps = stack.enter_context(ExitStack())
         self._look(0)
 
@@ -256,6 +261,7 @@ class _TrackingLoop:
         self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
         self._count_times(arrived, pose, start, sent)
         self._offer_outline(frames, pose)
+        self._look_at_print(frames, pose)
         self._register(pose, arrived)
         self._report(arrived, pose)
         self._show(frames, pose)
@@ -270,6 +276,19 @@ class _TrackingLoop:
             waited, last = (QUEUE_STAGE, arrived.handed, start), ("map and idle work", told, ready)
             stages = in_turn(start, STAGES, self._step.last.seconds)
             self._sender.put(self._lane.entry(pose.stamp, [waited, *stages, ("page and record", sent, told), last]))
+
+    def _look_at_print(self, frames: FrameSet, pose: SurfacePose) -> None:
+        """Look at what was laid where the nozzle stands aside for it."""
+        if self._looks is None:
+            return
+        motion, surface_map, lies = self._channels.motion.get(), self._step.map, self._channels.placed.get()
+        progress, command = (None, None) if motion is None else (motion.progress, motion.tick.command)
+        landmarks = None if surface_map is None else surface_map.points
+        look = self._looks(progress, command, frames, pose, landmarks, lies)
+        if look is not None and self._looks.placed is not None:
+            self._sender.put(look)
+            ends = station_places(look, self._looks.placed, 2)
+            self._channels.link.laid.put(LaidDrawing(ends, look.laid.share))
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""
@@ -335,6 +354,8 @@ class _TrackingLoop:
             surface=self._landmarks(pose),
             draws=self._drawn and not self._step.roi,
             outlined=self._sheet is not None,
+            looked=0 if self._looks is None else self._looks.count,
+            look="" if self._looks is None else self._looks.text,
         )
         self._channels.reports.put(self.report)
 

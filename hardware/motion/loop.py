@@ -213,6 +213,7 @@ class RecordedTick:
     phase: PrintPhase
     recalled: Array | None = None  # (2, 6) mm and rad: where the arm rested and stands, where moves were called back
     lag: float = nan  # s, the arm's lag from this tick on; NaN: as before
+    aside: bool = False  # whether they were to wait beside all that is printed, for a look
 
 
 MAX_COMMANDS = 256  # commands, five seconds of them: frames are never that late

@@ -21,7 +21,7 @@ from planning.clearance import TissueGuard
 from planning.command import Command, Hold, Move
 from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
-from planning.motion.planner import Planner
+from planning.motion.planner import LOOKS, Planner
 from planning.path import Path, PrintProgress
 
 
@@ -86,6 +86,15 @@ class MotionStep:
         self._planner.paused = value
 
     @property
+    def aside(self) -> bool:
+        """Whether in a pause the nozzle is to stand beside all that is printed, so that cameras see it."""
+        return self._planner.aside
+
+    @aside.setter
+    def aside(self, value: bool) -> None:
+        self._planner.aside = value
+
+    @property
     def progress(self) -> PrintProgress:
         """How far the print is, and in which phase."""
         return self._planner.progress
@@ -104,7 +113,8 @@ class PrintMotion:
     last: the last command.
     asked: whether planner and guard made it.
     begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
-    waits: whether they were told to wait above the surface.
+    waits: whether they were told to wait above the surface,
+    aside: and that beside all that is printed, for a look.
     material_in: whether the material that was wanted was put in since this was last reset.
     lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
         tick, so that a replay is equal byte by byte.
@@ -127,7 +137,7 @@ class PrintMotion:
         self._profile, self._clock, self._place = profile, clock, place
         self._material, self._measured = material, measured
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
-        self.waits = self.material_in = False
+        self.waits = self.material_in = self.aside = False
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
         self.paused = self.asked = False
@@ -147,12 +157,18 @@ class PrintMotion:
 
     def resume(self) -> None:
         """Go on after a pause, with the dispenser made ready again."""
-        self.paused = False
+        self.paused = self.aside = False
         self._prepare_material()
 
+    def look(self) -> None:
+        """Step aside in a pause, until what was laid has been looked at, which `put_in` says."""
+        self.aside = self.paused
+
     def put_in(self) -> None:
-        """The operator has put in the material that was wanted."""
-        if self._step is not None and self._step.progress.wanted:
+        """The operator has put in the material that was wanted, or the look is done."""
+        if self.aside:
+            self.aside = False
+        elif self._step is not None and self._step.progress.wanted:
             self._step.material_in()
             self.material_in = True
             self._prepare_material()
@@ -175,13 +191,14 @@ class PrintMotion:
             return self.last
         dry = "" if self._material is None else self._material.reason
         self._step.paused = self.waits = self.paused or bool(dry)
+        self._step.aside = self.aside
         measured = self._measured()
         lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
         self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
         if not math.isnan(self.lag):
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if self.waits and isinstance(self.last, Hold):
+        if self.waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last

@@ -7,7 +7,9 @@ set of a look takes some two seconds of a core.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from html import escape
@@ -53,10 +55,13 @@ from planning.path import LOOK, Path, PrintProgress, way_lengths
 VIEWS = 4  # frame sets of a look: each at another place of the breath, so that pixels fall elsewhere
 VIEW_SPACING = 0.25  # s between them
 SETTLED = 0.3  # s after the needle came to rest aside: it may swing, and pictures are late
+LOOK_TIMEOUT = 15.0  # s aside, after which a look goes without the views that did not come
 MARGIN = 10.0  # mm of surface beside the path that is measured as well: matching begins with what is coarse
 MIN_STEP = 0.2  # mm between nodes: ten across a bead, and a look in two seconds
 WIDTHS = (1.0, 1.12, 1.25, 1.4)  # by the planned: gel spreads
+NOTHING_JUDGED = "looked at: the surface was measured, and nothing was judged yet"
 LOOK_TOPIC = "/look"
+STATION_POINTS = 6  # of a piece's drawn line
 PLOT_SCALE = 14.0  # px a mm of the drawing
 SHARE_COLOURS = ((0.6, "#c0392b"), (0.8, "#e67e22"), (1.25, "#27ae60"), (1.6, "#e67e22"), (math.inf, "#8e44ad"))
 
@@ -64,15 +69,18 @@ SHARE_COLOURS = ((0.6, "#c0392b"), (0.8, "#e67e22"), (1.25, "#27ae60"), (1.6, "#
 class SurfaceLooks:
     """The looks of one print. surface: as it was measured last, None before the first. last: what the last one told."""
 
-    def __init__(self, rig: Rig, path: Path) -> None:
-        """path: with its column `look`, in the surface frame of the poses. InputError where it says no amounts."""
+    def __init__(self, rig: Rig, path: Path, start: float = 0.0) -> None:
+        """path: in the surface frame of the poses. start: where it begins, in checkpoints.
+
+        InputError where the path says no amounts.
+        """
         self._lenses, self._path = Lenses(rig), path
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
         self._gathered = -math.inf  # s, of the last view
         self._widths: tuple[float, ...] = WIDTHS
-        self._from = 0.0  # checkpoints, up to where was looked at
-        self._aside, self._done = math.nan, False  # s, since when the needle stands aside
+        self._from = start  # checkpoints, up to where was looked at
+        self._aside, self._now, self._done = math.nan, math.nan, False  # s, since when the needle stands aside, and now
         self.last: Look | None = None
         self.surface: SurfaceHeights | None = None
 
@@ -83,26 +91,42 @@ class SurfaceLooks:
 
         command: the last one. step: the tracker, whose map says about where the surface lies.
         """
+        surface_map = getattr(step, "map", None)
+        if surface_map is None or not self.gather(progress, command, frames, pose):
+            return False
+        self.finish(progress.fraction, surface_map.points)
+        return True
+
+    def gather(self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose) -> bool:
+        """Keep the views of a look; whether they are enough by this frame set, which is said once."""
         if progress.wanted != LOOK:
             self._aside, self._done = math.nan, False
             return False
         if self._done or not (isinstance(command, Hold) and command.reason == LOOKS):
             return False
         self._aside = pose.stamp if math.isnan(self._aside) else self._aside
-        surface_map = getattr(step, "map", None)
-        if surface_map is None or not self._keep(frames, pose, self._aside):
-            return False
-        self._done = True
-        if self.surface is None:
-            self._from, self.last = progress.fraction, None
-            self._measure(surface_map.points)
-        else:
-            self.last = self._judge(progress.fraction, pose.stamp)
-        return True
+        self._done = self._keep(frames, pose, self._aside) or pose.stamp > self._aside + LOOK_TIMEOUT
+        self._now = pose.stamp
+        return self._done
+
+    def begin(self, views: Sequence[SurfaceView], landmarks: Array) -> None:
+        """Measure the surface in views from before anything is laid, near landmarks (N, 3) mm, surface frame."""
+        self._views = list(views)
+        self._measure(landmarks)
+
+    def finish(self, fraction: float, landmarks: Array) -> None:
+        """Judge what lies there of the path up to `fraction` checkpoints; or measure where nothing was laid yet."""
+        self.last = None
+        if self.surface is None or not len(pieces_between(self._path, self._from, fraction)):
+            self._from = fraction
+            self._measure(landmarks)
+        elif self._views:
+            self.last = self._judge(fraction, self._now)
 
     def _measure(self, landmarks: Array) -> None:
-        """Measure the surface before anything is laid, near landmarks (N, 3) mm, surface frame."""
         views, self._views = self._views, []
+        if not views:
+            return
         low, high = self._path.zone[:, :2] + np.array([[-MARGIN], [MARGIN]])
         node = node_size(self._lenses, sorted(views[0].images), views[0].base_from_surface[:3, 3])
         self.surface = dense_heights(self._lenses, views, first_heights(landmarks, low, high, max(node, MIN_STEP)))
@@ -124,6 +148,70 @@ class SurfaceLooks:
         self._widths = (width,)  # a property of the gel, seen best on the bare surface
         first, self._from = self._from, fraction
         return Look(now, first, fraction, now - self._aside, width, laid)
+
+
+class LiveLooks:
+    """The looks of a live run, judged in a thread while tracking goes on. count: done so far. text: of the last one.
+
+    The bare surface is measured in views from just before the print begins, when the arm stands at its home.
+    """
+
+    def __init__(self, rig: Rig, path: Path) -> None:
+        """path: in its own frame."""
+        self._rig, self._path = rig, path
+        self._looks: SurfaceLooks | None = None
+        self._bare = deque[SurfaceView](maxlen=VIEWS)
+        self._kept = -math.inf  # s, of the last of these
+        self._worker = ThreadPoolExecutor(1, "looks")
+        self._job: Future[None] | None = None
+        self._counts = False  # whether the job is a look, rather than the bare surface
+        self.count, self.text = 0, ""
+        self.placed: Path | None = None  # the path, in the surface frame
+
+    def close(self) -> None:
+        """Leave what is being judged."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def __call__(
+        self,
+        progress: PrintProgress | None,
+        command: Command | None,
+        frames: FrameSet,
+        pose: SurfacePose,
+        landmarks: Array | None,
+        lies: Array | None,
+    ) -> Look | None:
+        """A look that is done by now; it is None, too, of one that saw nothing, which `count` counts as well.
+
+        progress, command: of the motion, the last ones. landmarks: (N, 3) mm of the map. lies: (4, 4) mm
+        surface_from_path, None before the print begins.
+        """
+        if self._job is not None:
+            return self._finished() if self._job.done() else None
+        if lies is None or landmarks is None or progress is None or command is None:
+            if pose.state is TrackState.TRACKING and len(frames.frames) > 1 and pose.stamp > self._kept + VIEW_SPACING:
+                self._kept = pose.stamp
+                self._bare.append(view_of(frames, pose.base_from_surface))
+            return None
+        if self._looks is None:
+            self.placed = replace(self._path, surface_from_nozzle=lies @ self._path.surface_from_nozzle)
+            self._looks, self._counts = SurfaceLooks(self._rig, self.placed, progress.fraction), False
+            self._job = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
+            self._bare.clear()
+        elif self._looks.gather(progress, command, frames, pose):
+            self._counts = True
+            self._job = self._worker.submit(self._looks.finish, progress.fraction, landmarks)
+        return None
+
+    def _finished(self) -> Look | None:
+        assert self._job is not None and self._looks is not None
+        job, self._job = self._job, None
+        job.result()
+        if not self._counts:
+            return None
+        self.count, look = self.count + 1, self._looks.last
+        self.text = f"looked at: {look.text}" if look is not None else NOTHING_JUDGED
+        return look
 
 
 def look_at(
@@ -191,17 +279,21 @@ def _median(values: Array) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
+def station_places(look: Look, path: Path, count: int = STATION_POINTS) -> Array:
+    """Places (S, count, 3) mm along each piece of bead that was looked at, on the path."""
+    knots = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
+    at = np.linspace(look.laid.stations.begin, look.laid.stations.end, count, axis=1)
+    return np.stack([np.interp(at, knots, path.surface_from_nozzle[:, k, 3]) for k in range(3)], axis=-1)
+
+
 def look_picture(look: Look, path: Path) -> str:
     """The stations of a look from above, each in the colour of its share, as SVG."""
-    places = path.surface_from_nozzle[:, :2, 3]
-    knots = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
+    places = station_places(look, path)[..., :2]
     low, high = path.zone[:, :2] + np.array([[-2.0], [2.0]])
     size = (high - low) * PLOT_SCALE
     lines, stations = [], look.laid.stations
     for i, share in enumerate(look.laid.share.tolist()):
-        at = np.linspace(stations.begin[i], stations.end[i], 6)
-        points = np.column_stack([np.interp(at, knots, places[:, k]) for k in (0, 1)])
-        x, y = ((points - low) * PLOT_SCALE).T
+        x, y = ((places[i] - low) * PLOT_SCALE).T
         y = size[1] - y
         colour = "#999" if math.isnan(share) else next(c for most, c in SHARE_COLOURS if share < most)
         way = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))

@@ -82,6 +82,8 @@ def scene_text(scene: PageScene) -> str:
         surface=np.round(scene.surface, 2).ravel(),
         triangles=scene.triangles.ravel(),
         scan=np.round(scene.scan, 2).ravel(),
+        laid=[] if scene.laid is None else np.round(scene.laid.pieces, 2).ravel(),
+        share=[] if scene.laid is None else np.round(scene.laid.share, 2),
     )
 
 

@@ -193,6 +193,7 @@ NEXT_STAGES = {
     Wish.START: RunStage.APPROACH,
     Wish.PAUSE: RunStage.PAUSED,
     Wish.LIFT: RunStage.PAUSED,
+    Wish.LOOK: RunStage.PAUSED,
     Wish.RESUME: RunStage.APPROACH,
     Wish.STOP: RunStage.STOPPED,
     Wish.HOME: RunStage.HOMING,

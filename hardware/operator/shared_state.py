@@ -185,6 +185,14 @@ class CorrectedOutline:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LaidDrawing:
+    """What a look found of S pieces of bead, surface frame."""
+
+    pieces: Array  # (S, 2, 3) mm, from, to
+    share: Array  # (S,) of the planned; NaN where it was not seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PageScene:
     """What stands still in the view: cameras, and path and surface in the surface frame. Sent when it changes."""
 
@@ -196,6 +204,7 @@ class PageScene:
     triangles: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))  # (T, 3), or none known
     scan: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))  # (L, 2, 3) mm, lines of the scan
     layer: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (K,) of each of the places
+    laid: LaidDrawing | None = None  # what the last look found
 
 
 def scene_from(
@@ -338,6 +347,7 @@ class OperatorLink:
     sheet: SharedLatest[PagePictures] = field(default_factory=lambda: SharedLatest(SHEET_CAPACITY))
     scene: SharedLatest[PageScene] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))
     scan: SharedLatest[ScanDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
+    laid: SharedLatest[LaidDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
     requests: RequestLine = field(default_factory=RequestLine)
     regions: SharedLatest[DrawnRegion] = field(default_factory=SharedLatest)  # from the page
     outlines: SharedLatest[CorrectedOutline] = field(default_factory=lambda: SharedLatest(OUTLINE_CAPACITY))

@@ -42,6 +42,7 @@ class Wish(StrEnum):
     AGAIN = "again"  # do this stage anew: check, or look for the wound
     START = "start"  # let the arm move: approach, then print
     PAUSE = "pause"  # hold above the surface, ready to go on
+    LOOK = "look"  # in a pause: step aside, and look at what was laid
     LIFT = "lift"  # after a stop: arm, and go up from the surface, as in a pause
     RESUME = "resume"  # go on printing where it left off
     STOP = "stop"  # come to rest now
@@ -56,6 +57,7 @@ WISH_WORDS = {  # on buttons, in messages, in the terminal and in the documents:
     Wish.AGAIN: "Look again",
     Wish.START: "Start",
     Wish.PAUSE: "Pause",
+    Wish.LOOK: "Look at the print",
     Wish.LIFT: "Lift",
     Wish.RESUME: "Resume",
     Wish.STOP: "Stop",
@@ -66,6 +68,7 @@ WISH_KEYS = {  # in the terminal and on the page; Enter stops in the terminal on
     Wish.STOP: "space",
     Wish.PAUSE: "p",
     Wish.RESUME: "r",
+    Wish.LOOK: "o",
     Wish.LIFT: "l",
     Wish.HOME: "h",
     Wish.CONFIRM: "y",
@@ -83,7 +86,7 @@ STAGE_OFFERS = {
     RunStage.READY: (Wish.START, Wish.AGAIN, Wish.END),
     RunStage.APPROACH: (Wish.PAUSE, Wish.HOME, Wish.END),
     RunStage.PRINT: (Wish.PAUSE, Wish.HOME, Wish.END),
-    RunStage.PAUSED: (Wish.RESUME, Wish.HOME, Wish.END),
+    RunStage.PAUSED: (Wish.RESUME, Wish.LOOK, Wish.HOME, Wish.END),
     RunStage.STOPPED: (Wish.RESUME, Wish.LIFT, Wish.HOME, Wish.END),
     RunStage.HOMING: (Wish.END,),
 }
@@ -94,7 +97,7 @@ STAGE_QUESTIONS = {
     RunStage.READY: "Is nobody within the arm's reach? Then it may start",
     RunStage.APPROACH: "The nozzle goes to where printing begins",
     RunStage.PRINT: "Printing",
-    RunStage.PAUSED: "Paused: resume, go home, or finish",
+    RunStage.PAUSED: "Paused: resume, look at the print, go home, or finish",
     RunStage.STOPPED: "Stopped: resume, lift the nozzle, go home, or finish",
     RunStage.HOMING: "The arm goes home",
     RunStage.DONE: "The path is printed",

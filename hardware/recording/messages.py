@@ -245,7 +245,8 @@ def hold_from_message(message: Message) -> Hold:
 
 def message_from_tick(tick: RecordedTick) -> Message:
     """A tick of the motion as a message; its command is written as a message of its own."""
-    return {
+    aside = {"aside": True} if tick.aside else {}
+    return aside | {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
         "asked": tick.asked,

@@ -58,6 +58,7 @@ from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
 from hardware.simulator.scene.beads import FRESH_ASPECT, Gel
 from planning.kinematics import SimpleArm
+from planning.laid_beads import beads_between_looks
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,6 @@ SCENARIO_TABLES = (
 )
 OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "look", "faults", "motion", *SCENARIO_TABLES)
 MAX_CAMERAS = 8
-LOOK_BY_LAYER = "layer"
 WITHOUT_PICTURES = ("truth", "tracks")  # ways of tracking that need no pictures
 PICTURE_SIDES = 64, 4096  # px of a picture
 MAX_SECONDS = 3600.0  # s: an hour of pictures is 300,000 of them
@@ -179,7 +179,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         profile=replace(profile, arm=replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ arm_shift)),
         limits=limits_from_table(path, parts["limits"]),
         gel=_gel(path, parts["gel"]),
-        looks=_looks(path, table.get("look")),
+        looks=beads_between_looks(path, "look", table.get("look")),
     )
 
 
@@ -193,15 +193,6 @@ def _gel(path: Path, table: Table) -> Gel | None:
         sag_time=_within(path, "gel.sag_s", table.get("sag_s", usual.sag_time), 0.01, 1000, "s"),
         gloss=_within(path, "gel.gloss", table.get("gloss", usual.gloss), 0, 1, ""),
     )
-
-
-def _looks(path: Path, value: object) -> int | None:
-    """How many beads lie between looks; 0: a layer."""
-    if value is None or value == LOOK_BY_LAYER:
-        return None if value is None else 0
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise InputError(path, "look", value, f'"{LOOK_BY_LAYER}", or a number of beads of 1 or more')
-    return value
 
 
 def _table(path: Path, table: Table, name: str) -> Table:

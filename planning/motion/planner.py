@@ -102,6 +102,8 @@ class Planner:
         self._finished = False
         self._last_call = -np.inf
         self.paused = False  # go up from the surface and stand there, until this is no longer set
+        self.aside = False  # in a pause: stand beside all that is printed, so that cameras see it
+        self._stands_aside = False
         self._pause_pose: Array | None = None  # surface_from_nozzle (4, 4) where it stands in a pause
         self._retreated = False
         self._sent: deque[tuple[Array, float]] = deque(maxlen=MAX_SENT_MOVES)  # goal (3,), mm, and the place then
@@ -123,7 +125,7 @@ class Planner:
         if self.paused or self._rests.wanted:
             return self._retreat(pose, now)
         if self._pause_pose is not None:  # after a pause the way back to the path begins anew
-            self._pause_pose, self._retreated, self._segment = None, False, None
+            self._pause_pose, self._retreated, self._segment, self._stands_aside = None, False, None, False
         if reason := self._keep_segment(pose, now):
             return self._stop(now, reason)
         return self._stop(now, "path finished") if self._finished else self._follow(pose, now)
@@ -160,8 +162,9 @@ class Planner:
         phase = PrintPhase.WAITING if self._segment is None else self._segment.phase
         phase = PrintPhase.FINISHED if self._finished else phase
         fraction = float(np.interp(self._place, self._curve.knots, np.arange(len(self._path))))
+        wanted = LOOK if self.paused and self.aside else self._rests.wanted
         return PrintProgress(
-            phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction, self._rests.wanted
+            phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction, wanted
         )
 
     # -- whether to move
@@ -242,14 +245,18 @@ class Planner:
 
     def _retreat(self, pose: SurfacePose, now: float) -> Command:
         """In a pause: up from where it began, for a look aside too, then at rest; what was interrupted is resumed."""
-        nozzle, segment, looks = self._nozzle(pose, now), self._segment, self._rests.wanted == LOOK
-        waits = PAUSED if self.paused else LOOKS if looks else f"material {self._rests.wanted} is to be put in"
-        if self._pause_pose is None:
+        nozzle, segment, looked = self._nozzle(pose, now), self._segment, self.paused and self.aside
+        looks = looked or self._rests.wanted == LOOK
+        waits = PAUSED if self.paused else f"material {self._rests.wanted} is to be put in"
+        waits = LOOKS if looked or (looks and not self.paused) else waits
+        if self._pause_pose is None or (looks and not self._stands_aside):
             self._pause_pose = pose_aside(nozzle, self._zone) if looks else point_above(nozzle)
+            segment, self._retreated, self._stands_aside = None, False, looks
         if segment is not None and segment.phase is PrintPhase.RETREATING and now >= segment.timing.end:
             self._retreated = segment.timing.places[-1] >= segment.curve.length
             segment = None
-        curve = None if self._retreated else (aside_curve if looks else straight_curve)(nozzle, self._pause_pose)
+        way = aside_curve if self._stands_aside else straight_curve
+        curve = None if self._retreated else way(nozzle, self._pause_pose)
         if curve is None:
             return self._stop(now, waits)
         begins = segment is None or segment.phase is not PrintPhase.RETREATING

@@ -141,12 +141,26 @@ export class SceneView {
         hop: { colour: dark() ? "rgb(120 180 215 / .22)" : "rgb(42 111 151 / .18)", width: ratio }, next: { colour: colours.path, width: 1.4 * ratio },
         done: { colour: colours.done, width: 3 * ratio },
       }, this.layers);
+      this.laid(g, (x, y, z) => place(moved(pose, x, y, z)), ratio);
       if (here) this.mark(g, here, ratio);
       this.uncertainty(g, place, pose, view.tracking.covariance, ratio);
     }
     this.cameras(g, place, ratio);
     if (view && view.motion && view.motion.base_from_nozzle) this.tool(g, place, view.motion.base_from_nozzle);
     this.ruler(ratio);
+  }
+  // what the last look found: green as planned to a quarter, orange less than 0.8 or more than 1.25, red a gap, violet a blob
+  laid(g, at, ratio) {
+    const { laid, share } = this.scene;
+    g.lineWidth = 5 * ratio;
+    for (let i = 0; share && i < share.length; i += 1) {
+      const s = share[i];
+      g.strokeStyle = s === null ? "#999" : s < 0.6 ? "#c0392b" : s < 0.8 ? "#e67e22" : s < 1.25 ? "#27ae60" : s < 1.6 ? "#e67e22" : "#8e44ad";
+      g.beginPath();
+      g.moveTo(...at(...laid.slice(6 * i, 6 * i + 3)));
+      g.lineTo(...at(...laid.slice(6 * i + 3, 6 * i + 6)));
+      g.stroke();
+    }
   }
   // the place that is printed next, or where a run goes on
   mark(g, [x, y], ratio) {

@@ -33,10 +33,10 @@ export const ACTIVITIES = {
   homing: { word: "Going home", tone: "good" },
 };
 export const WISHES = {
-  confirm: "Yes, it lies right", move: "Move", outline: "Use this outline", again: "Look again", start: "Start", pause: "Pause", lift: "Lift",
+  confirm: "Yes, it lies right", move: "Move", outline: "Use this outline", again: "Look again", start: "Start", pause: "Pause", lift: "Lift", look: "Look at the print",
   resume: "Resume", stop: "Stop", home: "Home", end: "Finish",
 };
-export const KEYS = { p: "pause", r: "resume", l: "lift", h: "home", y: "confirm", s: "start", a: "again", q: "end" }; // the terminal's
+export const KEYS = { p: "pause", r: "resume", l: "lift", o: "look", h: "home", y: "confirm", s: "start", a: "again", q: "end" }; // the terminal's
 export const AGAIN = { check: "Check again", confirm: "No, look again" };
 export const VERDICTS = { pass: "✓ good", warn: "! look", fail: "✗ mend", busy: "… busy" };
 
