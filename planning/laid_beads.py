@@ -269,6 +269,17 @@ def with_looks(path: Path, beads: int = 0) -> Path:
     return replace(path, extra={**path.extra, "look": looks})
 
 
+def path_with_looks(path: Path, asked: object, dry: bool, where: object) -> tuple[Path, bool]:
+    """The path of a run with the looks that are asked for, and whether there can be any. InputError where not."""
+    beads, can = beads_between_looks(where, "look", asked), is_metered(path) and not dry
+    if beads is not None:
+        path = with_looks(path, beads)
+    if not can and "look" in path.extra and (path.extra["look"] != 0).any():
+        got, allowed = "a dry run" if dry else "a path without amounts", "columns width_mm and height_mm, or volume_mm3"
+        raise InputError(where, "look", got, f"no dry run, and a path with {allowed}")
+    return path, can
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
     """A look at what was laid."""

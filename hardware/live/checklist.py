@@ -83,6 +83,15 @@ def silence_text(name: str, last: float, interval: float, now: float) -> str:
     return ""
 
 
+def silent_process(reports: RunReports, tick: float, now: float) -> str:
+    """That motion or tracking says nothing, "" while both report. tick: s of the motion."""
+    motion, tracking = reports.motion, reports.tracking
+    silent = "" if motion is None else silence_text("motion", motion.tick.stamp, tick, now)
+    if silent or tracking is None or tracking.ended:
+        return silent
+    return silence_text("tracking", tracking.stamp, tracking.interval, now)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPath:
     """A path placed on the surface, not begun yet."""

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from estimation import se3
 from estimation.errors import StillbedError
+from estimation.pose import Trajectory
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set, parallel_map
@@ -29,6 +31,14 @@ COLOUR_CHANNELS = 3
 ENCODED_BYTES_PER_PIXEL = 2  # room for an encoded picture: more than any PNG of a camera's picture takes
 
 Encoded = tuple[str, bytes]  # "png" or "jpeg", and the picture as the camera gave it
+
+
+def true_pose(truth: Trajectory, stamp: float) -> Array:
+    """base_from_surface (4, 4) at `stamp`, s, interpolated between the truth's own stamps."""
+    after = int(np.clip(np.searchsorted(truth.stamps, stamp), 1, len(truth) - 1))
+    before, span = after - 1, truth.stamps[after] - truth.stamps[after - 1]
+    share = (stamp - truth.stamps[before]) / span
+    return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
 
 
 class SourceEnded(StillbedError):

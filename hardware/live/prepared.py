@@ -56,8 +56,8 @@ from hardware.process.progress import UNFINISHED, cache_error, cache_folder, cac
 from hardware.process.system import SPAWN, blocked_sigint
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
-from planning.laid_beads import beads_between_looks, with_looks
-from planning.material import Outlets, is_metered, with_offsets
+from planning.laid_beads import path_with_looks
+from planning.material import Outlets, with_offsets
 from planning.path import Path
 
 RENDERED = File("session.mcap")  # of a scenario: the session in its folder, which holds no scan
@@ -255,7 +255,7 @@ def _prepared(
         path = read_path(rendered / "path.csv") if settings.path is None else path
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
-    path, looks = _looks(settings, path, named, where)
+    path, looks = path_with_looks(path, looks_between(settings), settings.dry_run, named or where)
     task = PrintTask(
         path=path,
         dispensers=dispensers,
@@ -276,18 +276,6 @@ def _prepared(
     notes += filter(None, [far_limits_text(task.profile.limits)])
     notes += [f"will happen: {fault}" for fault in faults]
     return Prepared(settings, session, rig, again, virtual, task, scan, placement, files, tuple(notes), faults)
-
-
-def _looks(settings: LiveSettings, path: Path, named: File | None, where: object) -> tuple[Path, bool]:
-    """The path with the looks that the settings ask for, and whether there can be any, as it says its amounts."""
-    beads = beads_between_looks(where, "print.look", looks_between(settings))
-    can = is_metered(path) and not settings.dry_run
-    if beads is not None:
-        path = with_looks(path, beads)
-    if not can and "look" in path.extra and (path.extra["look"] != 0).any():
-        allowed = "no dry run, and a path with columns width_mm and height_mm, or volume_mm3"
-        raise InputError(named or where, "look", "dry run" if settings.dry_run else "a path without amounts", allowed)
-    return path, can
 
 
 def _check_rig(settings: LiveSettings, faults: tuple[Fault, ...], where: object, rig: Rig) -> None:

@@ -221,22 +221,20 @@ class LiveRun:
                 except InputError as error:
                     why = f"{error.what} = {error.got}, allowed {error.allowed}"
                     reason = f"what lies on the surface cannot be printed: {why}"
-                    self._send(self._machine.end(reason, self._clock.now()))
-                    return
+                    return self._send(self._machine.end(reason, self._clock.now()))
             with suppress(OSError):  # the motion process is gone: the next cycle sees that
                 self._channels.orders.send(order)
 
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""
-        assert self._machine.placement is not None
-        self._channels.placed.put(self._machine.placement.surface_from_path)
+        if (placement := self._machine.placement) is not None:
+            self._channels.placed.put(placement.surface_from_path)
         texts, order = recorded_begin(order, self._prepared.task.dispensers)
         texts["surface.toml"] = self._lies
         for name, text in texts.items():
             self._channels.sender.put(UsedEntry(name, text))
         self._profile = order.profile
-        lag = 1000 * order.profile.lag
-        self._log(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {lag:.0f} ms")
+        self._log(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {1000 * order.profile.lag:.0f} ms")
         return order
 
     def _time_stops(self) -> None:

@@ -19,7 +19,7 @@ from hardware.live.checklist import (
     place_path,
     raised_path,
     run_checks,
-    silence_text,
+    silent_process,
 )
 from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
 from hardware.motion.loop import Order
@@ -132,7 +132,7 @@ class RunStateMachine:
         self.checks = run_checks(reports, task, self.placed_path, now, waited)
         if not self.ended:
             orders += self._advance(reports, now)
-        self.silence = self._silent_process(reports, now) if self.stage in ACTIVE_STAGES else ""
+        self.silence = silent_process(reports, self.task.profile.tick, now) if self.stage in ACTIVE_STAGES else ""
         return orders
 
     def end(self, reason: str, now: float, stage: RunStage = RunStage.FAILED) -> Orders:
@@ -216,13 +216,6 @@ class RunStateMachine:
         return [*([Order.AT_HOME] if declared else []), Order.HOME]
 
     # -- events
-
-    def _silent_process(self, reports: RunReports, now: float) -> str:
-        motion, tracking = reports.motion, reports.tracking
-        silent = "" if motion is None else silence_text("motion", motion.tick.stamp, self.task.profile.tick, now)
-        if silent or tracking is None or tracking.ended:
-            return silent
-        return silence_text("tracking", tracking.stamp, tracking.interval, now)
 
     def _advance(self, reports: RunReports, now: float) -> Orders:
         tracking, motion = reports.tracking, reports.motion
@@ -359,8 +352,7 @@ class RunStateMachine:
 
     def _await_look(self, tracking: TrackingReport, now: float) -> Orders:
         """Go on once the look is done for which the nozzle stands aside; resuming in a pause goes on without it."""
-        if self.stage is RunStage.PAUSED:
-            self._wanted = LOOK
+        self._wanted = LOOK if self.stage is RunStage.PAUSED else ""
         if tracking.looked == self._looked:
             return []
         self._looked = tracking.looked

@@ -16,13 +16,13 @@ import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
-from estimation.pose import SurfacePose, TrackState, Trajectory
+from estimation.pose import SurfacePose, TrackState
 from estimation.runtime import use_one_arena
 from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
 from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
-from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
+from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet, true_pose
 from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
@@ -73,14 +73,6 @@ EXPOSURE_STAGE = "exposure to frames handed over"
 TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
 TRUE_PLACE = "placed in the true frame of the simulated world"
-
-
-def _true_pose(truth: Trajectory, stamp: float) -> Array:
-    """base_from_surface (4, 4) at `stamp`, s, interpolated between the truth's own stamps."""
-    after = int(np.clip(np.searchsorted(truth.stamps, stamp), 1, len(truth) - 1))
-    before, span = after - 1, truth.stamps[after] - truth.stamps[after - 1]
-    share = (stamp - truth.stamps[before]) / span
-    return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
 
 
 def _restore_map(step: FrameSetStep, placement: SurfacePlacement, session: Session, shift: float) -> Array:
@@ -184,9 +176,7 @@ class _TrackingLoop:
             sender.put(replace(roi, stamp=self.report.stamp))
         self._rois, self._drawn = rois, region.drawn and not rois
         self._sheet: OutlineSheet | None = None  # of this look, where a network looked
-        self._looks = LiveLooks(rig, prepared.task.path) if prepared.task.looks else None
-        if self._looks is not None:
-            stack.callback(self._looks.close)
+        self._looks = LiveLooks(rig, prepared.task.path, stack) if prepared.task.looks else None
         self._steps = stack.enter_context(ExitStack())
         self._look(0)
 
@@ -318,7 +308,7 @@ class _TrackingLoop:
         if scan is not None:
             placed = placement_by_scan(scan, middle, outward)
         elif self._prepared.again and self._truth is not None:
-            lies = se3.inverse(pose.base_from_surface) @ _true_pose(self._truth, arrived.source)
+            lies = se3.inverse(pose.base_from_surface) @ true_pose(self._truth, arrived.source)
             placed = PathPlacement(lies, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
         elif (surface_map := self._step.map) is not None:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
@@ -350,7 +340,7 @@ class _TrackingLoop:
             unrecorded=self._sender.dropped,
             timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._truth is None else _true_pose(self._truth, arrived.source),
+            truth=None if self._truth is None else true_pose(self._truth, arrived.source),
             surface=self._landmarks(pose),
             draws=self._drawn and not self._step.roi,
             outlined=self._sheet is not None,

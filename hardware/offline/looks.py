@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from html import escape
@@ -156,21 +157,18 @@ class LiveLooks:
     The bare surface is measured in views from just before the print begins, when the arm stands at its home.
     """
 
-    def __init__(self, rig: Rig, path: Path) -> None:
-        """path: in its own frame."""
+    def __init__(self, rig: Rig, path: Path, stack: ExitStack) -> None:
+        """path: in its own frame. stack: at whose end what is still judged is left."""
         self._rig, self._path = rig, path
         self._looks: SurfaceLooks | None = None
         self._bare = deque[SurfaceView](maxlen=VIEWS)
         self._kept = -math.inf  # s, of the last of these
         self._worker = ThreadPoolExecutor(1, "looks")
+        stack.callback(self._worker.shutdown, wait=False, cancel_futures=True)
         self._job: Future[None] | None = None
         self._counts = False  # whether the job is a look, rather than the bare surface
         self.count, self.text = 0, ""
         self.placed: Path | None = None  # the path, in the surface frame
-
-    def close(self) -> None:
-        """Leave what is being judged."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
 
     def __call__(
         self,
@@ -187,7 +185,7 @@ class LiveLooks:
         surface_from_path, None before the print begins.
         """
         if self._job is not None:
-            return self._finished() if self._job.done() else None
+            return self._finished(pose.stamp) if self._job.done() else None
         if lies is None or landmarks is None or progress is None or command is None:
             if pose.state is TrackState.TRACKING and len(frames.frames) > 1 and pose.stamp > self._kept + VIEW_SPACING:
                 self._kept = pose.stamp
@@ -203,15 +201,17 @@ class LiveLooks:
             self._job = self._worker.submit(self._looks.finish, progress.fraction, landmarks)
         return None
 
-    def _finished(self) -> Look | None:
+    def _finished(self, now: float) -> Look | None:
         assert self._job is not None and self._looks is not None
         job, self._job = self._job, None
         job.result()
         if not self._counts:
             return None
-        self.count, look = self.count + 1, self._looks.last
-        self.text = f"looked at: {look.text}" if look is not None else NOTHING_JUDGED
-        return look
+        self.count, self.text, look = self.count + 1, NOTHING_JUDGED, self._looks.last
+        if look is None:
+            return None
+        self.text = f"looked at: {look.text}"
+        return replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
 
 
 def look_at(

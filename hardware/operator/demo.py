@@ -191,9 +191,7 @@ NEXT_STAGES = {
     Wish.OUTLINE: RunStage.FIND,
     Wish.AGAIN: RunStage.FIND,
     Wish.START: RunStage.APPROACH,
-    Wish.PAUSE: RunStage.PAUSED,
-    Wish.LIFT: RunStage.PAUSED,
-    Wish.LOOK: RunStage.PAUSED,
+    **dict.fromkeys((Wish.PAUSE, Wish.LIFT, Wish.LOOK), RunStage.PAUSED),
     Wish.RESUME: RunStage.APPROACH,
     Wish.STOP: RunStage.STOPPED,
     Wish.HOME: RunStage.HOMING,
@@ -205,7 +203,7 @@ TIMED_STAGES = {  # stages that end by themselves: after how many s, and what fo
     RunStage.APPROACH: (2.5, RunStage.PRINT),
     RunStage.HOMING: (3.0, RunStage.READY),
 }
-STAGE_REASONS = {RunStage.STOPPED: "stopped by the operator", RunStage.PAUSED: "paused by the operator"}
+STAGE_REASONS = {stage: f"{stage.value} by the operator" for stage in (RunStage.STOPPED, RunStage.PAUSED)}
 
 
 class DemoRun:

@@ -99,13 +99,10 @@ class Planner:
         self._rests = RestsAhead(self._material, self._place)
         self._flow = FlowCommands(self._material, outlets or {}, lag, tick)
         self.horizons = 0  # timed so far
-        self._finished = False
-        self._last_call = -np.inf
-        self.paused = False  # go up from the surface and stand there, until this is no longer set
-        self.aside = False  # in a pause: stand beside all that is printed, so that cameras see it
-        self._stands_aside = False
+        self._finished, self._last_call = False, -np.inf
+        self.paused = self.aside = False  # go up and stand there; for a look, beside all that is printed
         self._pause_pose: Array | None = None  # surface_from_nozzle (4, 4) where it stands in a pause
-        self._retreated = False
+        self._retreated = self._stands_aside = False
         self._sent: deque[tuple[Array, float]] = deque(maxlen=MAX_SENT_MOVES)  # goal (3,), mm, and the place then
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
@@ -162,10 +159,8 @@ class Planner:
         phase = PrintPhase.WAITING if self._segment is None else self._segment.phase
         phase = PrintPhase.FINISHED if self._finished else phase
         fraction = float(np.interp(self._place, self._curve.knots, np.arange(len(self._path))))
-        wanted = LOOK if self.paused and self.aside else self._rests.wanted
-        return PrintProgress(
-            phase, self._checkpoint(), len(self._path), self._place, self._curve.length, fraction, wanted
-        )
+        wanted, count = LOOK if self.paused and self.aside else self._rests.wanted, len(self._path)
+        return PrintProgress(phase, self._checkpoint(), count, self._place, self._curve.length, fraction, wanted)
 
     # -- whether to move
 
@@ -245,18 +240,16 @@ class Planner:
 
     def _retreat(self, pose: SurfacePose, now: float) -> Command:
         """In a pause: up from where it began, for a look aside too, then at rest; what was interrupted is resumed."""
-        nozzle, segment, looked = self._nozzle(pose, now), self._segment, self.paused and self.aside
-        looks = looked or self._rests.wanted == LOOK
-        waits = PAUSED if self.paused else f"material {self._rests.wanted} is to be put in"
-        waits = LOOKS if looked or (looks and not self.paused) else waits
+        nozzle, segment, looks = self._nozzle(pose, now), self._segment, self.progress.wanted == LOOK
+        waits = LOOKS if looks else f"material {self._rests.wanted} is to be put in"
+        waits = PAUSED if self.paused and not self.aside else waits
         if self._pause_pose is None or (looks and not self._stands_aside):
             self._pause_pose = pose_aside(nozzle, self._zone) if looks else point_above(nozzle)
             segment, self._retreated, self._stands_aside = None, False, looks
         if segment is not None and segment.phase is PrintPhase.RETREATING and now >= segment.timing.end:
-            self._retreated = segment.timing.places[-1] >= segment.curve.length
-            segment = None
-        way = aside_curve if self._stands_aside else straight_curve
-        curve = None if self._retreated else way(nozzle, self._pause_pose)
+            self._retreated, segment = bool(segment.timing.places[-1] >= segment.curve.length), None
+        leads = aside_curve if self._stands_aside else straight_curve
+        curve = None if self._retreated else leads(nozzle, self._pause_pose)
         if curve is None:
             return self._stop(now, waits)
         begins = segment is None or segment.phase is not PrintPhase.RETREATING
