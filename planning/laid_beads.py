@@ -53,7 +53,7 @@ class BeadPieces:
 
 
 def pieces_between(path: Path, first: float, last: float, where: object = "path") -> BeadPieces:
-    """The beads that a path lays on its ways `first` to `last`, in checkpoints; pieces of both ends are whole.
+    """The beads that a path lays from `first` to `last`, in checkpoints, between which both may lie.
 
     InputError for a path that does not say how much material it needs.
     """
@@ -64,14 +64,16 @@ def pieces_between(path: Path, first: float, last: float, where: object = "path"
     knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
     begins = path.extrude & ~np.concatenate([[False], path.extrude[:-1]])
     bead = np.cumsum(begins) - 1
-    moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1) > MIN_SPACING
-    ways = ways[path.extrude[ways] & moved[ways - 1]]
+    begun, done = np.clip(first - ways + 1, 0.0, 1.0), np.clip(last - ways + 1, 0.0, 1.0)  # shares of each way
+    moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[ways - 1] * (done - begun) > MIN_SPACING
+    ways, begun, done = (column[path.extrude[ways] & moved] for column in (ways, begun, done))
     area = bead_areas(path, where)[ways]
     width = np.sqrt(2.5 * area)  # of a bead 0.4 as high as it is wide
     if "width_mm" in path.extra:
         width = path.extra["width_mm"][ways].astype(float)
-    start, end = poses[ways - 1, :3, 3], poses[ways, :3, 3]
-    return BeadPieces(start, end, area, width, bead[ways], path.layer[ways], knots[ways - 1])
+    way, whole = poses[ways, :3, 3] - poses[ways - 1, :3, 3], knots[ways] - knots[ways - 1]
+    start, end = (poses[ways - 1, :3, 3] + share[:, None] * way for share in (begun, done))
+    return BeadPieces(start, end, area, width, bead[ways], path.layer[ways], knots[ways - 1] + begun * whole)
 
 
 def bead_heights(pieces: BeadPieces, nodes: Array) -> Array:

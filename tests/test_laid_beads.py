@@ -161,6 +161,9 @@ def test_a_path_gives_its_beads_and_one_without_amounts_is_refused() -> None:
     pieces = pieces_between(path, 0.0, 3.0)
     assert pieces.bead.tolist() == [0, 1] and pieces.place.tolist() == [0.0, 12.0]
     assert pieces.area == pytest.approx([0.64, 0.64]) and len(pieces_between(path, 1.0, 3.0)) == 1
+    halves = [pieces_between(path, 0.0, 0.5), pieces_between(path, 0.5, 2.25), pieces_between(path, 2.25, 3.0)]
+    assert [(p.place[0], p.start[0, 0], p.end[0, 0]) for p in halves] == [(0, 0, 5), (5, 5, 10), (14.5, 7.5, 0)]
+    assert len(pieces_between(path, 1.0, 2.0)) == 0 and len(pieces_between(path, 0.0, 1.0 + 1e-9)) == 1
     bare: Path = replace(path, extra={})
     with pytest.raises(InputError, match="width_mm"):
         pieces_between(bare, 0.0, 3.0)

@@ -47,7 +47,7 @@ from hardware.operator.view import (
 from hardware.process.progress import TimeLeft
 from hardware.report.report import bead_map, track_map
 from planning.command import Hold
-from planning.path import PrintPhase, PrintProgress, way_lengths
+from planning.path import LOOK, PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
 from tests.moving import raster
 from tests.session_files import rig
@@ -72,6 +72,7 @@ class Staged:
         self.ended, self.asked, self.answers = "", 0, 0
         self.placement: PathPlacement | None = CERTAIN
         self.points, self.looks, self.outlined = GROUND, 0, False
+        self.looked, self.found = 0, ""
         self.orders: list[object] = []
         self.led: list[object] = []  # orders on the way to where it prints, begun paths by a word
 
@@ -85,7 +86,7 @@ class Staged:
         pose = replace(self.pose, stamp=self.now)
         self.seen.tracking = TrackingReport(
             self.now, ("a", "b"), (0, 1), pose, self.placement, 0.0, 5, ended=self.ended, used=(50, 50),
-            surface=self.points, looks=self.looks, outlined=self.outlined,
+            surface=self.points, looks=self.looks, outlined=self.outlined, looked=self.looked, look=self.found,
         )  # fmt: skip
         nan = float("nan")
         status = ArmStatus(self.now, self.arm, "why", PROFILE.arm.home, None, 0.0, nan, nan, 0.0, 0, 0, self.answers, 0)
@@ -329,6 +330,42 @@ def test_another_material_is_asked_for_and_only_the_one_who_was_asked_says_that_
     run.orders.clear()
     run.look(Wish.RESUME)
     assert run.orders == [PauseOrder.MATERIAL_IN, PauseOrder.RESUME]
+
+
+def test_between_layers_it_goes_on_once_the_look_is_done_and_nobody_is_asked() -> None:
+    run = Staged(looks=True).to_print()
+    run.look(seconds=1.0)
+    run.wanted = LOOK
+    run.stays(RunStage.PRINT)
+    assert not run.orders
+    run.looked, run.found = 1, "looked at: 5 of 5 mm³"
+    assert run.look() is RunStage.PRINT and run.orders == [PauseOrder.MATERIAL_IN]
+    assert run.conductor.reason == run.found
+    run.stays(RunStage.PRINT)  # the motion's report is still from before
+    assert run.orders == [PauseOrder.MATERIAL_IN]
+
+
+def test_in_a_pause_the_operator_may_look_and_whoever_resumes_goes_on_without_it() -> None:
+    run = Staged(looks=True).to_print()
+    assert run.look(Wish.LOOK) is RunStage.PRINT and not run.orders  # not while it prints
+    run.look(Wish.PAUSE)
+    run.orders.clear()
+    assert run.look(Wish.LOOK) is RunStage.PAUSED and run.orders == [PauseOrder.LOOK]
+    run.wanted = LOOK
+    run.stays(RunStage.PAUSED, 5)
+    run.looked, run.found = 1, "looked at: nothing lies there"
+    assert run.look() is RunStage.PAUSED and run.orders == [PauseOrder.LOOK, PauseOrder.MATERIAL_IN]
+    assert run.conductor.reason == run.found
+    run.orders.clear()
+    run.look(Wish.RESUME)
+    assert run.orders == [PauseOrder.MATERIAL_IN, PauseOrder.RESUME]
+    assert Wish.LOOK not in Staged().to_print().conductor.offers
+
+
+def test_without_amounts_in_the_path_nobody_may_look() -> None:
+    run = Staged().to_print()
+    run.look(Wish.PAUSE)
+    assert Wish.RESUME in run.conductor.offers and Wish.LOOK not in run.conductor.offers
 
 
 def test_after_the_way_home_the_material_is_asked_for_again() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import wait
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path as File
 
@@ -13,11 +15,14 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceHeights
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.offline.looks import look_at, look_picture, looks_section, read_looks
+from hardware.arm.profile import ArmProfile
+from hardware.motion.step import MotionStep
+from hardware.offline.looks import LiveLooks, look_at, look_picture, looks_section, read_looks
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
 from hardware.recording.messages import message_from_look
@@ -31,13 +36,14 @@ from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import body
 from hardware.simulator.truth import divide_path
+from perception.frames import Frame, FrameSet
 from perception.lens import Lenses
 from perception.mapping.surface_heights import (
     SurfaceView,
     dense_heights,
     first_heights,
 )
-from planning.command import Move
+from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.laid_beads import (
     BeadPieces,
@@ -48,9 +54,10 @@ from planning.laid_beads import (
 )
 from planning.motion.guard import Guard
 from planning.motion.planner import LOOKS, Planner
-from planning.path import LOOK, Path, PrintPhase
+from planning.path import LOOK, Path, PrintPhase, PrintProgress
 from tests import worlds
 from tests.moving import path_through, pose_at, still
+from tests.slowly import slowly
 from tests.test_planner import CLOSE, LIMITS
 
 TICK, START = 0.02, 10.0  # s
@@ -98,6 +105,29 @@ def test_the_needle_goes_aside_for_each_look_and_lays_all_beads() -> None:
     assert [round(fraction, 3) for _, fraction in asides] == [0, 3, 7]
     for tip, _ in asides:
         assert max(tip[0] - high[0], path.zone[0][0] - tip[0]) > 24 and tip[2] > high[2] + 5
+
+
+@pytest.mark.parametrize("asked", [150, *slowly(400)])  # on its way up, and at rest above
+def test_in_a_pause_the_needle_goes_aside_when_somebody_looks_and_lays_the_rest_once(asked: int) -> None:
+    path = layers()
+    step = MotionStep(path, replace(ArmProfile(), limits=LIMITS, arm=CLOSE, tick=TICK))
+    printed, aside, axes = [], [], CLOSE.home
+    for k in range(6000):
+        now = START + k * TICK
+        step.paused = 140 <= k < 1400
+        step.aside = asked <= k < 1200
+        command = step(pose_at(still, now), now)
+        if isinstance(command, Move):
+            axes = command.axes
+            printed += [command.checkpoint] if command.extrude and command.checkpoint not in printed else []
+        elif command.reason == LOOKS:
+            assert step.progress.wanted == LOOK
+            aside.append((se3.inverse(still(now)) @ nozzle_from_axes(CLOSE, axes))[:3, 3])
+        if step.progress.phase is PrintPhase.FINISHED:
+            break
+    low, high = path.zone
+    assert printed == [1, 3, 5, 7] and len(aside) > 100 and step.progress.wanted == ""
+    assert all(max(tip[0] - high[0], low[0] - tip[0]) > 24 and tip[2] > high[2] + 5 for tip in aside)
 
 
 @settings(max_examples=20, deadline=None)
@@ -201,6 +231,48 @@ def test_the_report_says_and_draws_what_was_found() -> None:
     page, picture = looks_section([look], path), look_picture(look, path)
     assert picture.count("<path") == len(look.laid.planned) and "10 to 18 mm" in page and picture in page
     assert "clog" not in some_look(gap=False).text and looks_section([], path) == ""
+
+
+def test_a_live_run_gathers_judges_beside_the_tracking_and_says_so_once() -> None:
+    rig, rng = arc_rig(focal=2200.0, size=(400, 300)), np.random.default_rng(4)
+    scene = Scene(body("chest", None, 1), Appearance(wetness=0.0), seed=1)
+    scene.gel = Gel(gloss=0.05)
+    path = layers(1, 3)
+    bare, places, now = views(scene, rig, rng), landmarks(scene), 100.0
+    for k, (a, b) in enumerate(path.surface_from_nozzle[:, :2, 3].reshape(3, 2, 2)):
+        way = np.linspace(a, b, 81)
+        area = np.full(80, WIDTH * HEIGHT * (k != 1))  # the middle one is clogged
+        scene.ink.flow(GelPieces(way[:-1], way[1:], 0.1 * area, np.maximum(area, 0.1)), 0.0)
+    scene.ink.flow(none_left(), 30.0)
+    printed = views(scene, rig, rng)
+    held, done = Hold(0.0, 0.1, LOOKS), list[Look]()
+    begun = PrintProgress(PrintPhase.PRINTING, 1, 6, 0.0, 30.0, 0.0, "")
+    aside = replace(begun, phase=PrintPhase.RETREATING, fraction=5.0, wanted=LOOK)
+    with ExitStack() as stack:
+        looks = LiveLooks(rig, path, stack)
+
+        def seen(view: SurfaceView, progress: PrintProgress | None, lies: Array | None) -> None:
+            nonlocal now
+            now += 0.3
+            frames = FrameSet(now, tuple(Frame(c, now, image) for c, image in view.images.items()))
+            pose = SurfacePose(now, view.base_from_surface, 1e-6 * np.eye(6), np.zeros(6), TrackState.TRACKING)
+            look = looks(progress, held, frames, pose, places, lies)
+            done.extend([] if look is None else [look])
+
+        for view in bare * 2:
+            seen(view, None, None)
+        for turn, progress in enumerate((begun, aside)):
+            for view in (bare, printed * 4)[turn]:
+                seen(view, progress, np.eye(4))
+            assert looks.busy is not None
+            wait([looks.busy])
+        for _ in range(3):
+            seen(printed[0], aside, np.eye(4))
+    (look,) = done
+    assert looks.count == 1 and looks.text == f"looked at: {look.text}" and look.seconds > 1
+    ((begin, end),) = look.laid.clogs
+    middle = look.laid.stations.begin[look.laid.stations.bead == 1]
+    assert begin == pytest.approx(middle[0], abs=1.3) and end - begin > 5
 
 
 def test_cameras_tell_how_much_was_laid_and_that_nothing_was() -> None:

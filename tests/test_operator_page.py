@@ -27,7 +27,7 @@ from tests.browser import Browser, Page
 from tests.operator_page import LIVE, OFFERED, Run
 
 SIZES = [(1024, 768), (768, 1024), (1440, 900)]
-SURE = (Wish.START, Wish.RESUME, Wish.LIFT, Wish.HOME, Wish.END)
+SURE = (Wish.START, Wish.RESUME, Wish.LOOK, Wish.LIFT, Wish.HOME, Wish.END)
 
 
 @pytest.fixture

@@ -152,7 +152,9 @@ class SurfaceLooks:
 
 
 class LiveLooks:
-    """The looks of a live run, judged in a thread while tracking goes on. count: done so far. text: of the last one.
+    """The looks of a live run, judged in a thread while tracking goes on.
+
+    count: done so far. text: of the last one. busy: what is judged now.
 
     The bare surface is measured in views from just before the print begins, when the arm stands at its home.
     """
@@ -165,7 +167,7 @@ class LiveLooks:
         self._kept = -math.inf  # s, of the last of these
         self._worker = ThreadPoolExecutor(1, "looks")
         stack.callback(self._worker.shutdown, wait=False, cancel_futures=True)
-        self._job: Future[None] | None = None
+        self.busy: Future[None] | None = None
         self._counts = False  # whether the job is a look, rather than the bare surface
         self.count, self.text = 0, ""
         self.placed: Path | None = None  # the path, in the surface frame
@@ -184,8 +186,8 @@ class LiveLooks:
         progress, command: of the motion, the last ones. landmarks: (N, 3) mm of the map. lies: (4, 4) mm
         surface_from_path, None before the print begins.
         """
-        if self._job is not None:
-            return self._finished(pose.stamp) if self._job.done() else None
+        if self.busy is not None:
+            return self._finished(pose.stamp) if self.busy.done() else None
         if lies is None or landmarks is None or progress is None or command is None:
             if pose.state is TrackState.TRACKING and len(frames.frames) > 1 and pose.stamp > self._kept + VIEW_SPACING:
                 self._kept = pose.stamp
@@ -194,16 +196,16 @@ class LiveLooks:
         if self._looks is None:
             self.placed = replace(self._path, surface_from_nozzle=lies @ self._path.surface_from_nozzle)
             self._looks, self._counts = SurfaceLooks(self._rig, self.placed, progress.fraction), False
-            self._job = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
+            self.busy = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
             self._bare.clear()
         elif self._looks.gather(progress, command, frames, pose):
             self._counts = True
-            self._job = self._worker.submit(self._looks.finish, progress.fraction, landmarks)
+            self.busy = self._worker.submit(self._looks.finish, progress.fraction, landmarks)
         return None
 
     def _finished(self, now: float) -> Look | None:
-        assert self._job is not None and self._looks is not None
-        job, self._job = self._job, None
+        assert self.busy is not None and self._looks is not None
+        job, self.busy = self.busy, None
         job.result()
         if not self._counts:
             return None
