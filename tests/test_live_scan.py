@@ -14,12 +14,14 @@ from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path, write_path
 from hardware.live.prepared import RunFiles, read_placement
 from hardware.live.prerender import prerender
+from hardware.live.recorded_run import replay_run
 from hardware.plan.run import register_in_session
 from hardware.recording.session_reader import read_poses, used_inputs
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scenario_tables import scene_from_table
 from planning.path import Path as PrintPath
 from tests.live_runs import Running, closed
+from tests.test_clearance import PART_TEXT
 
 pytestmark = pytest.mark.slow
 Start = Callable[..., Running]
@@ -162,3 +164,21 @@ def test_a_scan_that_is_not_found_for_certain_is_told_and_nothing_is_printed(
     run.wait_for("where the path belongs is not certain")
     assert run.end() == 1 and "\nprint\n" not in run.said and "\nhoming" not in run.said
     assert not RunFiles(record).surface.exists()
+
+
+def test_a_tool_with_a_body_prints_on_its_scan_and_is_recorded_with_it(
+    start: Start, cache: Path, tmp_path: Path
+) -> None:
+    arm, record = tmp_path / "arm.toml", tmp_path / "run.mcap"
+    rendered = (cache / "session").resolve().parent / "arm.toml"
+    arm.write_text(rendered.read_text(encoding="utf-8") + PART_TEXT.split('[[tool_part]]\nname = "bracket')[0])
+    given = "--scan", cache / "scan.ply", "--path", cache / "path_scan.csv", "--profile", arm
+    run = start(*given, "--record", record, "--yes")
+    run.wait_for(r"\nprint\n")
+    run.wait_for(r"\nthe path is printed")
+    assert run.end() == 0
+    profile, tissue = used_inputs(record).profile, used_inputs(record).tissue
+    assert [part.name for part in profile.parts] == ["head", "hose", "nut"] and tissue is not None
+    assert "tool in the tissue" not in run.said
+    ticks = list(replay_run(record))
+    assert len(ticks) > 100 and all(tick.frame == tick.recorded for tick in ticks)

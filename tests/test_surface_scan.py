@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,14 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.pose import identity_pose
-from estimation.scans.scan import face_normals, lattice_triangles, scan_from_triangles
+from estimation.scans.registration import register
+from estimation.scans.scan import ScanIndex, face_normals, lattice_triangles, scan_from_triangles
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench.mapping import shape_of
 from hardware.bench.scan import scan_figures
 from hardware.cli.plan import scanned_settings
-from hardware.files.mesh_file import read_raw_mesh, write_scan
+from hardware.files.mesh_file import read_mesh, read_raw_mesh, write_scan
 from hardware.live.settings import FROM_CAMERAS, LiveSettings, read_settings
 from hardware.live.surface_scan import (
     ScanOrder,
@@ -35,6 +37,8 @@ from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from perception.frames import Frame, FrameSet, Image
 from planning.layers.repair import repair_mesh
+from tests.outside_cameras import outside, wound_scene
+from tests.test_first_print import PROGRAM, region
 
 RIG = arc_rig(size=(640, 360), focal=550.0)  # a node of 0.8 mm: errors are about twice those of the bench
 SHAPE = shape_of("forearm", 1)
@@ -187,3 +191,20 @@ def test_a_run_may_scan_for_itself(tmp_path: Path) -> None:
         scanned_settings(settings, file, force=False)
     plain = LiveSettings(scan=tmp_path / "scan.ply")
     assert scanned_settings(plain, file, force=False) is plain
+
+
+@pytest.mark.slow
+def test_cameras_of_another_program_scan_the_wound_that_they_show(tmp_path: Path) -> None:
+    with outside(tmp_path, "wound") as rig:
+        corners = "\n".join(f"{name} = {polygon}" for name, polygon in region().items())
+        (tmp_path / "region.toml").write_text(f"[region]\n{corners}\n")
+        order = "scan", rig, "-o", tmp_path / "scan.ply", "--region", tmp_path / "region.toml", "--seconds", "6"
+        done = subprocess.run([*PROGRAM, *map(str, order)], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0 and "cm² scanned from" in done.stdout, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr and (tmp_path / "scan.html").stat().st_size > 10_000
+    found, true = read_mesh(tmp_path / "scan.ply").scan, scan_from_triangles(*wound_scene().shape.mesh(0.5))
+    place = register(found.vertices[:: len(found.vertices) // 800], 0.1, true, np.array([0.0, 0.0, 1.0]))
+    points = se3.transform_points(se3.inverse(place.base_from_surface), found.vertices)
+    off = np.linalg.norm(points - ScanIndex(true).closest(points).points, axis=1)
+    print("scanned", np.percentile(off, [50, 95]))
+    assert np.percentile(off, 50) < 0.1 and np.percentile(off, 95) < 0.4
