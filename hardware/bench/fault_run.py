@@ -203,7 +203,7 @@ class FaultRun:
         anew = bool(record.statements) and record.statements[-1].hold is not LinkCode.STOPPED
         if tick.status.state is ArmState.STOPPED and (not record.stopped or (anew and tick.stamp > record.stopped[-1])):
             record.stopped.append(tick.stamp)
-        if tick.stamp - self._sent_at > 1.5 * self._profile.tick or link.travels:
+        if link.travels or (tick.stamp - self._sent_at > 1.5 * self._profile.tick and self._ran_dry()):
             self._oracle.rest()  # a tick that sends nothing, just after one that did, is no rest yet
         if tick.recalled is not None:
             self._oracle.stands(tick.recalled.stands)
@@ -218,6 +218,11 @@ class FaultRun:
         text, own = tick.command.reason or reservation, link.travels or tick.hold is LinkCode.RECALLED
         moving = isinstance(tick.command, Move)
         record.statements.append(Statement(tick.stamp, text, moving, own, pose_stamp, tick.hold))
+
+    def _ran_dry(self) -> bool:
+        """Whether the arm stands before what is sent now reaches it; an arm that is behind goes on without a stop."""
+        arm, profile = self._world.arm, self._profile
+        return self._world.now() + profile.frame_time - arm.now > arm.in_flight + profile.tick / 2
 
     def rows(self, log: NozzleLog) -> None:
         """The next rows of the truth at the nozzle."""
