@@ -14,7 +14,7 @@ from estimation.pose import TrackState
 from estimation.rig import Camera, distort, pixels_from_points
 from hardware.files.images import encode
 from hardware.operator.settings import WindowLimits
-from hardware.operator.shared_state import CameraPicture, OperatorRequest, PagePictures, PageScene
+from hardware.operator.shared_state import CameraPicture, LaidDrawing, OperatorRequest, PagePictures, PageScene
 from hardware.operator.view import (
     Activity,
     CheckVerdict,
@@ -341,3 +341,23 @@ def test_everything_fits_and_stop_is_on_top_in_every_stage(run: Run, size: tuple
         assert facts[0] > 0 and facts[1] <= size[1] and facts[2] > 200, stage
         assert facts[3] and facts[4] == 0, stage
         assert facts[5] <= size[0] and facts[6] <= size[1], stage
+
+
+def test_what_a_look_found_is_drawn_in_the_scene_piece_by_piece(run: Run) -> None:
+    page = run.open((1440, 900))
+    path = np.column_stack([np.linspace(-50, 50, 11), np.zeros(11), np.zeros(11)])
+    pieces = np.array([[[x, y, 0.0], [x + 9.0, y, 0.0]] for y in (-20.0, 20.0) for x in (-40.0, -20, 0, 20)])
+    for share, wanted in ((1.0, "g"), (0.1, "r")):
+        laid = LaidDrawing(pieces, np.array([share] * 7 + [np.nan]))
+        run.served.link.scene.put(PageScene((CAMERA,), path, np.arange(11), np.ones(11, bool), laid=laid))
+        run.show(stage=RunStage.PAUSED)
+        page.until(
+            f"""(() => {{ const c = document.querySelector("#scene canvas");
+                const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data, n = {{ g: 0, r: 0 }};
+                for (let i = 0; i < d.length; i += 4) {{
+                    n.g += d[i] === 39 && d[i + 1] === 174 && d[i + 2] === 96;
+                    n.r += d[i] === 192 && d[i + 1] === 57 && d[i + 2] === 43;
+                }}
+                return n.{wanted} > 100 && n.{"r" if wanted == "g" else "g"} === 0;
+            }})()"""
+        )
