@@ -15,8 +15,7 @@ from estimation.online.surface_state import EstimatorSettings, StateSettings
 from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.movements import patch
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
 from tests.slowly import slowly
 from tests.synthetic import Motion, breathing
 from tests.test_smoother import broken
