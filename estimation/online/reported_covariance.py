@@ -194,8 +194,7 @@ class ReportedCovariance:
         parts = fit.parts
         own = self.error(window.covariance, parts, cameras.offset, cameras)
         drifted = self._drift.variance * parts.by_shift @ parts.by_shift.T
-        late = parts.by_delay @ (cameras.beyond(cameras.offset) - cameras.delays.covariance) @ parts.by_delay.T
-        self._added = self._tracks.lasting * parts.scatter * parts.tracks + drifted + (late + late.T) / 2
+        self._added = self._tracks.lasting * parts.scatter * parts.tracks + drifted
         change = own - window.covariance - parts.smear + drifted
         if self._first is not None and first is not None:
             change += self.error(*self._first, cameras) - first
