@@ -42,7 +42,8 @@ from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawin
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
-    ask_to_go_first,
+    TRACKING_PRIORITY,
+    ask_for_real_time,
     pipe_closed,
     set_up_process,
     settle_memory,
@@ -109,7 +110,8 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
     """The body of the process: track until the frames end or the lifeline does; the last report says why."""
     set_up_process("tracking", prepared.settings.cores_tracking)
     use_one_arena()
-    ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
+    if prepared.settings.real_time:  # the process of the map and the page's pictures step back behind it
+        ask_for_real_time(TRACKING_PRIORITY)
     signal.signal(signal.SIGTERM, _terminate)
     signal_at_parents_end(signal.SIGTERM)
     sender = RecorderSender(channels.recorder)

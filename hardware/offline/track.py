@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 from hardware.process.progress import Progress, ProgressReport, prepare_out
-from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
+from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent, step_back
 
 if TYPE_CHECKING:
     from estimation.pose import SurfacePose
@@ -119,7 +119,7 @@ def tracker(
             yield make_step(roi)
             return
         search = partial(network_search, rig, model) if find is None else find
-        with ThreadPoolExecutor(1) as thread:
+        with ThreadPoolExecutor(1, initializer=step_back) as thread:
             yield RegionTrackingStep(rig, make_step, search(thread))
 
 
@@ -127,7 +127,7 @@ def _start_map_process() -> None:
     """Set up the map's process: the parent ends it, also after Ctrl-C, and frames have priority over the map."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent()
-    os.nice(MAP_PROCESS_NICE)
+    step_back(MAP_PROCESS_NICE)
 
 
 DRAW_TEXT = "draw on the page where the surface is"
