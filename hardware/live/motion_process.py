@@ -95,7 +95,7 @@ class _TickReporter:
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
         self._handover: PoseHandover | None = None  # the newest
         self._unsent = False  # whether no move made of that pose went out yet
-        self._lane = TraceLane(MOTION_LANE, self._clock) if trace else None
+        self._lane = TraceLane(MOTION_LANE, self._clock, sender.put) if trace else None
         self._seen = math.nan  # s, when the handover was seen here
         self.loop: MotionLoop | None = None
         self.motion: PrintMotion | None = None
@@ -124,8 +124,13 @@ class _TickReporter:
             if self._lane is not None and self.loop is not None:
                 begun, handover = max(self.loop.begun, self._seen), self._handover
                 told = ("handed over", handover.sent, self._seen), ("waits for its tick", self._seen, begun)
-                self._sender.put(self._lane.entry(handover.pose.stamp, [*told, (ON_WIRE, begun, now)]))
+                self._lane.add(handover.pose.stamp, [*told, (ON_WIRE, begun, now)])
         self._sender.put(WireEntry(now, data, sent))
+
+    def close(self) -> None:
+        """Hand over the rest of the trace."""
+        if self._lane is not None:
+            self._lane.close()
 
     def report(self, tick: Tick) -> None:
         """Record and report a tick that is done; StillbedError, which ends the loop, where recording has failed."""
@@ -195,6 +200,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         driver.release()
         if orders.alone and orders.fingerprint:
             write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.value)
+        reporter.close()
         for entry in reporter.times.entries(clock.now()):
             sender.put(entry)
         sender.close()

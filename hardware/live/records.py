@@ -20,7 +20,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
-from hardware.live.trace import TraceEntry
+from hardware.live.trace import TraceBatch
 from hardware.motion.loop import CommandedPose, DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
 from hardware.process.clock import Histogram
@@ -221,7 +221,7 @@ class UsedEntry:
 
 # the rig comes first: nothing is written before the cameras are known
 Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
-Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceEntry
+Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceBatch
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
 
 

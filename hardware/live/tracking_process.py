@@ -10,6 +10,7 @@ from collections import deque
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import dropwhile, takewhile
+from logging import INFO
 from types import FrameType
 
 import numpy as np
@@ -27,6 +28,7 @@ from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
     CommandedHead,
+    EventEntry,
     PoseEntry,
     PoseHandover,
     ScanEntry,
@@ -71,6 +73,7 @@ HISTOGRAM_PERIOD = 30.0  # s between histograms in the recording
 EXPOSURE_STAGE = "exposure to frames handed over"
 TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
+MAP_LATE = "a part of the map is late: it counts once it is ready; stillbed track of this recording takes it when due"
 TRUE_PLACE = "placed in the true frame of the simulated world"
 
 
@@ -123,6 +126,7 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
             except (StillbedError, OSError) as error:  # reported before files are closed: the arm is stopped for it
                 channels.reports.put(replace(run.report, ended=str(error)))
             finally:
+                run.close()
                 for entry in run.times.entries(WallClock().now()):
                     sender.put(entry)
     except (StillbedError, OSError) as error:
@@ -151,7 +155,8 @@ class _TrackingLoop:
         self._clock, self.times = WallClock(), StageHistograms()
         self._commanded_head = CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
-        self._lane = TraceLane(TRACKING_LANE, self._clock) if prepared.settings.trace else None
+        self._lane = TraceLane(TRACKING_LANE, self._clock, sender.put) if prepared.settings.trace else None
+        self._late = 0  # as `TrackingStep.late` was
         self._source: FrameSource
         self._step: TrackingStep | RegionTrackingStep
         self._outline: SurfaceOutline
@@ -203,7 +208,8 @@ class _TrackingLoop:
         self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
         find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
         given = self._scan, self._clock.now, self._prepared.task.profile.tool
-        self._step = self._steps.enter_context(tracker(self._rig, timed, *given, model=settings.model, find=find))
+        how = tracker(self._rig, timed, *given, model=settings.model, find=find, waits=False)
+        self._step = self._steps.enter_context(how)
         if placement is not None and self._earlier is not None:
             new_from_old = _restore_map(self._step, placement, self._earlier, shift)
             words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
@@ -250,6 +256,11 @@ class _TrackingLoop:
             else:
                 self._track(arrived)
 
+    def close(self) -> None:
+        """Hand over the rest of the trace."""
+        if self._lane is not None:
+            self._lane.close()
+
     def _track(self, arrived: TimedFrameSet) -> None:
         frames = self._with_head(arrived.frames)
         start = self._clock.now()
@@ -268,10 +279,13 @@ class _TrackingLoop:
         self._source.learn(self._step.last.offsets)
         ready = self._clock.now()
         self.times.add(AFTER_POSE_STAGE, ready - sent)
+        if (late := self._step.late) != self._late:
+            self._late = late
+            self._sender.put(EventEntry(ready, MAP_LATE, INFO, "tracking"))
         if self._lane is not None:
             waited, last = (QUEUE_STAGE, arrived.handed, start), ("map and idle work", told, ready)
             stages = in_turn(start, STAGES, self._step.last.seconds)
-            self._sender.put(self._lane.entry(pose.stamp, [waited, *stages, ("page and record", sent, told), last]))
+            self._lane.add(pose.stamp, [waited, *stages, ("page and record", sent, told), last])
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""

@@ -5,7 +5,6 @@ The command line needs only the names, so GTSAM, OpenCV and onnxruntime are impo
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -91,6 +90,7 @@ def tracker(
     prefilter: str = "none",
     model: Path | None = None,
     find: Callable[[Executor], FindRegion] | None = None,
+    waits: bool = True,
 ) -> Iterator[TrackingStep | RegionTrackingStep]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter lock.
 
@@ -98,6 +98,8 @@ def tracker(
     search of the wound by a network. model: the network, an ONNX file; None: the one that comes along. surface: the
     scan, or its file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm,
     profile of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+
+    waits: whether a map that is not ready when it is due is waited for, so that a recording gives the same poses again.
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
@@ -113,7 +115,7 @@ def tracker(
 
         def make_step(regions: Sequence[Roi]) -> TrackingStep:
             masked = None if tool is None else Tool(tool)
-            return TrackingStep(rig, regions, now, executor, scan, masked, PREFILTERS[prefilter])
+            return TrackingStep(rig, regions, now, executor, scan, masked, PREFILTERS[prefilter], waits)
 
         if roi:
             yield make_step(roi)

@@ -87,6 +87,7 @@ class TrackingStep:
         scan: Scan | None = None,
         tool: Tool | None = None,
         prefilter: Callable[[Image], Image] = unfiltered,
+        waits: bool = True,
     ) -> None:
         """Ready for the first frame set.
 
@@ -94,6 +95,8 @@ class TrackingStep:
         clock: fills `StepReport.seconds` and nothing else.
         executor: where the map is refined; in a process of its own GTSAM does not hold up the frames. Without one the
             map is refined in `idle`. Poses are the same either way.
+        waits: whether what the executor has not done when it is due is waited for, in `idle`. Else it counts once it is
+            there: poses then depend on how fast the executor is, where it takes longer than 0.3 s.
         scan: its frame is the surface frame; without one the first map defines it (origin at the landmarks' centroid, z
             out of the surface).
         tool: shape of the print head, masked where frame sets tell its pose.
@@ -107,7 +110,8 @@ class TrackingStep:
         self._is_new = DuplicateFilter()
         self._search = Relocaliser(self._lenses)
         self._masks = TrackingMasks(self._lenses, tool)
-        self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, executor, scan)
+        parts = self._search, self._estimator, self._masks
+        self._mapping = Mapping(self._lenses, self.roi, *parts, executor, scan, waits)
         self._matcher: Matcher | None = None
         self._forget_looks()
         self._unverified: TrackedSet | None = None  # by which the verification is to learn the surface
@@ -155,6 +159,11 @@ class TrackingStep:
     def map(self) -> SurfaceMap | None:
         """The map as it is now, in the surface frame; None before there is one."""
         return self._estimator.map
+
+    @property
+    def late(self) -> int:
+        """Frame sets so far for which a part of the map was due and not ready, where nothing waits for it."""
+        return self._mapping.late
 
     @property
     def window_graph(self) -> str:
