@@ -38,11 +38,22 @@ from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import PrintMotion
 from hardware.process.clock import PoseLockedSchedule, WallClock
-from hardware.process.system import ask_for_real_time, set_up_process, take_messages
+from hardware.process.system import Bell, ask_for_real_time, set_up_process, take_messages
 from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
+
+
+class _WakingClock(WallClock):
+    """A clock whose waits also end once a pose or an order is there."""
+
+    def __init__(self, bell: Bell) -> None:
+        self._bell = bell
+
+    def wait_until(self, instant: float) -> None:
+        """Wait until `instant`, s, or for the bell."""
+        self._bell.wait(instant - self.now())
 
 
 class _OrderReceiver:
@@ -186,7 +197,8 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         arm = Arm(driver, profile, clock.now(), link_settings)
         reporter.motion = motion
         poses, report = reporter.newest_pose, reporter.report
-        loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks, material)
+        waking = _WakingClock(channels.bell)
+        loop = reporter.loop = MotionLoop(motion, arm, waking, poses, orders, report, motion.homed, ticks, material)
         try:
             loop.run()
         finally:

@@ -17,7 +17,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
-from estimation.pose import SurfacePose, TrackState, Trajectory
+from estimation.pose import SurfacePose, TrackState
 from estimation.runtime import use_one_arena
 from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
@@ -75,14 +75,6 @@ TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
 MAP_LATE = "a part of the map is late: it counts once it is ready; stillbed track of this recording takes it when due"
 TRUE_PLACE = "placed in the true frame of the simulated world"
-
-
-def _true_pose(truth: Trajectory, stamp: float) -> Array:
-    """base_from_surface (4, 4) at `stamp`, s, interpolated between the truth's own stamps."""
-    after = int(np.clip(np.searchsorted(truth.stamps, stamp), 1, len(truth) - 1))
-    before, span = after - 1, truth.stamps[after] - truth.stamps[after - 1]
-    share = (stamp - truth.stamps[before]) / span
-    return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
 
 
 def _restore_map(step: FrameSetStep, placement: SurfacePlacement, session: Session, shift: float) -> Array:
@@ -267,6 +259,7 @@ class _TrackingLoop:
         pose = self._step(frames)
         sent = self._clock.now()
         self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
+        self._channels.bell.ring()
         self._count_times(arrived, pose, start, sent)
         self._offer_outline(frames, pose)
         self._register(pose, arrived)
@@ -315,7 +308,7 @@ class _TrackingLoop:
         if scan is not None:
             placed = placement_by_scan(scan, middle, outward)
         elif self._prepared.again and self._truth is not None:
-            lies = se3.inverse(pose.base_from_surface) @ _true_pose(self._truth, arrived.source)
+            lies = se3.inverse(pose.base_from_surface) @ self._truth.at(np.array([arrived.source]))[0]
             placed = PathPlacement(lies, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
         elif (surface_map := self._step.map) is not None:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
@@ -347,7 +340,7 @@ class _TrackingLoop:
             unrecorded=self._sender.dropped,
             timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._truth is None else _true_pose(self._truth, arrived.source),
+            truth=None if self._truth is None else self._truth.at(np.array([arrived.source]))[0],
             surface=self._landmarks(pose),
             draws=self._drawn and not self._step.roi,
             outlined=self._sheet is not None,

@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
+from select import select
 from threading import Thread
 from typing import Any, Generic, TypeVar
 from zlib import crc32
@@ -202,6 +203,27 @@ def pipe_closed(lifeline: Connection) -> bool:
     except OSError:
         return True
 
+
+class Bell:
+    """Ends the wait of one process as soon as another has something for it; handed to both when they are started."""
+
+    def __init__(self) -> None:
+        self._heard, self._rung = SPAWN.Pipe(duplex=False)
+        for end in (self._heard, self._rung):
+            os.set_blocking(end.fileno(), False)
+
+    def ring(self) -> None:
+        """End the wait, or the next one; never waits itself."""
+        with suppress(OSError):  # so often rung that there is no room, or nobody is there any more
+            os.write(self._rung.fileno(), b"!")
+
+    def wait(self, patience: float) -> None:
+        """Wait `patience` s, or until it is rung."""
+        if select([self._heard.fileno()], [], [], max(patience, 0.0))[0]:
+            os.read(self._heard.fileno(), MOST_RINGS)
+
+
+MOST_RINGS = 2**16  # that a pipe holds
 
 Value = TypeVar("Value")
 
