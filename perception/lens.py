@@ -72,9 +72,9 @@ class Lenses:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
         shape = np.broadcast_shapes(np.shape(x), np.shape(depth))
-        parts = [np.require(np.broadcast_to(part, shape).ravel(), float, CONTIGUOUS) for part in (x, y, depth)]
         which = np.require(np.broadcast_to(camera, shape).ravel(), np.int64, CONTIGUOUS)
-        imaged, visible = bend_each(which, *parts, self.models, self.radius)
+        flat = [np.require(np.broadcast_to(part, shape).ravel(), float, CONTIGUOUS) for part in (x, y, depth)]
+        imaged, visible = bend_each(which, flat[0], flat[1], flat[2], self.models, self.radius)
         return imaged.reshape(2, *shape), visible.reshape(shape)
 
 
