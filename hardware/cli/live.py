@@ -71,12 +71,7 @@ def add_live(commands: Commands) -> None:
     port = "show the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
     add("--no-trace", action="store_true", help="record no /trace: where each frame set's time went")
     add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
-    add(
-        "--trace",
-        type=Path,
-        metavar="X.json",
-        help="write the recorded /trace for Perfetto; see stillbed trace",
-    )
+    add("--trace", type=Path, metavar="X.json", help="write the recorded /trace for Perfetto; see stillbed trace")
     add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
     add("--no-page", action="store_true", help="without it")
