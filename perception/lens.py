@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.rig import Camera, Rig
-from estimation.runtime import CONTIGUOUS, compiled
+from estimation.runtime import compiled
 from estimation.se3 import Array
 from perception.frames import Image
 
@@ -71,11 +71,17 @@ class Lenses:
         self, camera: int | NDArray[np.int64], x: Array, y: Array, depth: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
         """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
-        shape = np.broadcast_shapes(np.shape(x), np.shape(depth))
-        which = np.require(np.broadcast_to(camera, shape).ravel(), np.int64, CONTIGUOUS)
-        flat = [np.require(np.broadcast_to(part, shape).ravel(), float, CONTIGUOUS) for part in (x, y, depth)]
-        imaged, visible = bend_each(which, flat[0], flat[1], flat[2], self.models, self.radius)
+        shape = np.broadcast_shapes(x.shape, depth.shape)
+        which = np.full(shape, camera).ravel() if isinstance(camera, int) else np.broadcast_to(camera, shape).ravel()
+        parts = _flat(x, shape), _flat(y, shape), _flat(depth, shape)
+        imaged, visible = bend_each(which, *parts, self.models, self.radius)
         return imaged.reshape(2, *shape), visible.reshape(shape)
+
+
+def _flat(values: Array, shape: tuple[int, ...]) -> Array:
+    """Values broadcast to a shape, in one row that compiled loops take."""
+    flat = (values if values.shape == shape else np.broadcast_to(values, shape)).ravel()
+    return flat if flat.flags.writeable else flat.copy()
 
 
 @compiled("Tuple((f8, f8, b1))(f8, f8, f8, f8[::1], f8)")

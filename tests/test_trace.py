@@ -84,7 +84,7 @@ def test_the_collector_is_seen_at_work() -> None:
         lane.add(1.0, [])
     finally:
         lane.close()
-    ((first, second),) = (batch.entries for batch in batches)
+    first, second = (entry for batch in batches for entry in batch.entries)
     assert [span[0] for span in first.spans] == ["a", GARBAGE] and not second.spans
     assert first.spans[1][2] >= first.spans[1][1] and first.queued >= 0.0 <= second.faults
 

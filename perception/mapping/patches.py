@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.runtime import CONTIGUOUS, compiled
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
 from perception.frames import Image, parallel_map
 from perception.lens import Lenses, bend_one
@@ -77,7 +77,7 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     the border's value.
     """
     scale = (0.5 if half else 1.0) * spacing
-    steps = np.require(per_sample, float, CONTIGUOUS)
+    steps = contiguous(per_sample)
     return np.asarray(sample_grids(image, on_level(centre, half), steps, scale), np.float32)
 
 
@@ -85,7 +85,7 @@ def on_level(centre: Array, half: bool) -> Array:
     """Centres (N, 2) px of an image in the pixels of the image or of its half-size version."""
     # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
     # tests/test_patches.py finds fewer from 5 px away. Templates are cut alike, so what is compared is not shifted.
-    return centre * 0.5 - 0.25 if half else np.require(centre, float, CONTIGUOUS)
+    return centre * 0.5 - 0.25 if half else contiguous(centre)
 
 
 def normalise(pictures: Float32) -> tuple[Float32, Float32]:
@@ -266,7 +266,7 @@ def align_in(
     begin. least: the correlation below which a landmark is not found. coarse: begin on the half-size images, which
     reaches twice as far (5 px surely, 8 mostly) and costs as much again.
     """
-    begin, per_sample = np.require(start, float, CONTIGUOUS), np.require(where.per_sample, float, CONTIGUOUS)
+    begin, per_sample = contiguous(start), contiguous(where.per_sample)
     shift, ended = np.zeros((len(templates), 2)), np.zeros((len(templates), 3))  # shifts in samples of the template
 
     def in_one(images: Pyramid, mine: slice) -> None:
