@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.rig import Camera, Rig
-from estimation.runtime import compiled
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
 from perception.frames import Image
 
@@ -72,7 +72,7 @@ class Lenses:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
         shape = np.broadcast_shapes(x.shape, depth.shape)
-        which = np.full(shape, camera).ravel() if isinstance(camera, int) else np.broadcast_to(camera, shape).ravel()
+        which = contiguous(np.broadcast_to(camera, shape).ravel(), np.int64)
         parts = _flat(x, shape), _flat(y, shape), _flat(depth, shape)
         imaged, visible = bend_each(which, *parts, self.models, self.radius)
         return imaged.reshape(2, *shape), visible.reshape(shape)
@@ -80,8 +80,7 @@ class Lenses:
 
 def _flat(values: Array, shape: tuple[int, ...]) -> Array:
     """Values broadcast to a shape, in one row that compiled loops take."""
-    flat = (values if values.shape == shape else np.broadcast_to(values, shape)).ravel()
-    return flat if flat.flags.writeable else flat.copy()
+    return contiguous((values if values.shape == shape else np.broadcast_to(values, shape)).ravel())
 
 
 @compiled("Tuple((f8, f8, b1))(f8, f8, f8, f8[::1], f8)")

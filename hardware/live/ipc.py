@@ -110,7 +110,7 @@ def play_session(
     session: Session, again: bool, faults: Sequence[Fault], ring: FrameRing, notices: Connection, start: c_double
 ) -> None:
     """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`, s."""
-    clock, pictures = WallClock(), _PictureCache(session, again)
+    clock, pictures = WallClock(), PictureCache(session, again)
     pictures.decode_ahead()
     inject = FrameFaults(faults, session.rig, "command line")
     parent = parent_process()  # a session that is shown once begins when the tracker is ready for it
@@ -141,7 +141,7 @@ def play_session(
             notices.send(ring.put(struck, unchanged, clock.now, anchor))
 
 
-class _PictureCache:
+class PictureCache:
     """Reads and decodes pictures; of a session that is shown again and again, keeps them as they were encoded."""
 
     def __init__(self, session: Session, keep: bool) -> None:
