@@ -51,7 +51,7 @@ class DelayedJob(Generic[T]):
         """executor: it may die. delay: frame sets from the next submission until its result counts.
 
         waits: whether a result that is not ready when it is due is waited for; else it counts once it is there, and
-            `late` counts the frame sets from when it was due.
+            `late` counts it.
         """
         self._executor, self.delay, self._waits, self.late = executor, delay, waits, 0
         self._job: tuple[Callable[..., T | None], tuple[Any, ...]] | None = None
@@ -80,7 +80,7 @@ class DelayedJob(Generic[T]):
             return None
         (function, arguments), future = self._job, self._future
         if not (self._waits or future is None or future.done()):
-            self.late += 1
+            self.late += self._count == self._due
             return None
         self.cancel()
         try:
@@ -111,7 +111,7 @@ class Refiner:
 
     @property
     def late(self) -> int:
-        """Frame sets for which a refined map that was due was not ready, so far."""
+        """How many refined maps were not ready when they were due."""
         return self._work.late
 
     def begin(self, surface_map: SurfaceMap, stamp: float, pose: Array, observations: Observations) -> None:

@@ -106,7 +106,7 @@ class Mapping:
 
     @property
     def late(self) -> int:
-        """Frame sets so far for which what the executor makes was due and not ready."""
+        """How often what the executor makes was not ready when it was due."""
         return self._refiner.late + self._growth.late
 
     def start(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> tuple[Matcher, SurfacePose, TrackedSet] | str:

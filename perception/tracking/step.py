@@ -158,7 +158,7 @@ class TrackingStep:
 
     @property
     def late(self) -> int:
-        """Frame sets for which a part of the map was due and not ready."""
+        """How often a part of the map was not ready when it was due."""
         return self._mapping.late
 
     @property
