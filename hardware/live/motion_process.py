@@ -184,11 +184,11 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     """
     settings, profile = prepared.settings, prepared.task.profile
     set_up_process("motion", settings.cores_motion, outlives=True)
-    clock, sender = WallClock(), RecorderSender(channels.recorder)
+    priority = ask_for_real_time() if settings.real_time else "nothing asked for"
+    clock, sender = WallClock(), RecorderSender(channels.recorder)  # its thread shares the interpreter: as urgent
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
-    priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     reporter = _TickReporter(channels, sender, ticks, priority, settings.trace)
     motion = PrintMotion(profile, clock, channels.place, material, reporter.arm_lag)
     orders = _OrderReceiver(channels, motion, ticks)

@@ -128,8 +128,8 @@ def tracker(
 def _start_map_process() -> None:
     """Set up the map's process: the parent ends it, also after Ctrl-C, and frames have priority over the map."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    exit_with_parent()
     step_back(MAP_PROCESS_NICE)
+    exit_with_parent()
 
 
 DRAW_TEXT = "draw on the page where the surface is"
