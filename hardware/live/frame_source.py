@@ -19,7 +19,7 @@ import numpy as np
 from estimation.errors import StillbedError
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
-from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set, parallel_map
+from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set
 
 if TYPE_CHECKING:
     from hardware.cameras.feed import LiveHealth
@@ -110,7 +110,8 @@ class FrameRing:
             image: Image = memory[start : start + int(np.prod(picture.shape))].reshape(picture.shape).copy()
             return Frame(picture.camera, picture.stamp, image)
 
-        frames, encoded = parallel_map(copied, notice.pictures), dict[int, Encoded]()
+        frames = [copied(picture) for picture in notice.pictures]  # side by side it took ten times as long to wake up
+        encoded = dict[int, Encoded]()
         for picture in notice.pictures:
             start = self._start(slot, picture.camera) + self._pixels[picture.camera]
             if picture.size:

@@ -224,7 +224,7 @@ class LiveRun:
                     self._send(self._machine.end(reason, self._clock.now()))
                     return
             with suppress(OSError):  # the motion process is gone: the next cycle sees that
-                self._channels.orders.send(order)
+                self._channels.order(order)
 
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""

@@ -10,13 +10,14 @@ from collections import deque
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import dropwhile, takewhile
+from logging import INFO
 from types import FrameType
 
 import numpy as np
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
-from estimation.pose import SurfacePose, TrackState, Trajectory
+from estimation.pose import SurfacePose, TrackState
 from estimation.runtime import use_one_arena
 from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
@@ -27,6 +28,7 @@ from hardware.live.prepared import Prepared, SurfacePlacement
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
     CommandedHead,
+    EventEntry,
     PoseEntry,
     PoseHandover,
     ScanEntry,
@@ -42,7 +44,8 @@ from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawin
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
-    ask_to_go_first,
+    TRACKING_PRIORITY,
+    ask_for_real_time,
     pipe_closed,
     set_up_process,
     settle_memory,
@@ -70,15 +73,8 @@ HISTOGRAM_PERIOD = 30.0  # s between histograms in the recording
 EXPOSURE_STAGE = "exposure to frames handed over"
 TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
+MAP_LATE = "a part of the map is late: it counts once it is ready; stillbed track of this recording takes it when due"
 TRUE_PLACE = "placed in the true frame of the simulated world"
-
-
-def _true_pose(truth: Trajectory, stamp: float) -> Array:
-    """base_from_surface (4, 4) at `stamp`, s, interpolated between the truth's own stamps."""
-    after = int(np.clip(np.searchsorted(truth.stamps, stamp), 1, len(truth) - 1))
-    before, span = after - 1, truth.stamps[after] - truth.stamps[after - 1]
-    share = (stamp - truth.stamps[before]) / span
-    return np.asarray(se3.interpolate(truth.base_from_surface[before], truth.base_from_surface[after], share))
 
 
 def _restore_map(step: FrameSetStep, placement: SurfacePlacement, session: Session, shift: float) -> Array:
@@ -109,7 +105,8 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
     """The body of the process: track until the frames end or the lifeline does; the last report says why."""
     set_up_process("tracking", prepared.settings.cores_tracking)
     use_one_arena()
-    ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
+    if prepared.settings.real_time:  # the process of the map and the page's pictures step back behind it
+        ask_for_real_time(TRACKING_PRIORITY)
     signal.signal(signal.SIGTERM, _terminate)
     signal_at_parents_end(signal.SIGTERM)
     sender = RecorderSender(channels.recorder)
@@ -121,6 +118,7 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
             except (StillbedError, OSError) as error:  # reported before files are closed: the arm is stopped for it
                 channels.reports.put(replace(run.report, ended=str(error)))
             finally:
+                run.close()
                 for entry in run.times.entries(WallClock().now()):
                     sender.put(entry)
     except (StillbedError, OSError) as error:
@@ -149,7 +147,8 @@ class _TrackingLoop:
         self._clock, self.times = WallClock(), StageHistograms()
         self._commanded_head = CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
-        self._lane = TraceLane(TRACKING_LANE, self._clock) if prepared.settings.trace else None
+        self._lane = TraceLane(TRACKING_LANE, self._clock, sender.put) if prepared.settings.trace else None
+        self._late = 0  # as `TrackingStep.late` was
         self._source: FrameSource
         self._step: TrackingStep | RegionTrackingStep
         self._outline: SurfaceOutline
@@ -201,7 +200,8 @@ class _TrackingLoop:
         self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
         find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
         given = self._scan, self._clock.now, self._prepared.task.profile.tool
-        self._step = self._steps.enter_context(tracker(self._rig, timed, *given, model=settings.model, find=find))
+        how = tracker(self._rig, timed, *given, model=settings.model, find=find, waits=False)
+        self._step = self._steps.enter_context(how)
         if placement is not None and self._earlier is not None:
             new_from_old = _restore_map(self._step, placement, self._earlier, shift)
             words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
@@ -248,12 +248,18 @@ class _TrackingLoop:
             else:
                 self._track(arrived)
 
+    def close(self) -> None:
+        """Hand over the rest of the trace."""
+        if self._lane is not None:
+            self._lane.close()
+
     def _track(self, arrived: TimedFrameSet) -> None:
         frames = self._with_head(arrived.frames)
         start = self._clock.now()
         pose = self._step(frames)
         sent = self._clock.now()
         self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
+        self._channels.bell.ring()
         self._count_times(arrived, pose, start, sent)
         self._offer_outline(frames, pose)
         self._register(pose, arrived)
@@ -266,10 +272,13 @@ class _TrackingLoop:
         self._source.learn(self._step.last.offsets)
         ready = self._clock.now()
         self.times.add(AFTER_POSE_STAGE, ready - sent)
+        if (late := self._step.late) != self._late:
+            self._late = late
+            self._sender.put(EventEntry(ready, MAP_LATE, INFO, "tracking"))
         if self._lane is not None:
             waited, last = (QUEUE_STAGE, arrived.handed, start), ("map and idle work", told, ready)
             stages = in_turn(start, STAGES, self._step.last.seconds)
-            self._sender.put(self._lane.entry(pose.stamp, [waited, *stages, ("page and record", sent, told), last]))
+            self._lane.add(pose.stamp, [waited, *stages, ("page and record", sent, told), last])
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""
@@ -299,7 +308,7 @@ class _TrackingLoop:
         if scan is not None:
             placed = placement_by_scan(scan, middle, outward)
         elif self._prepared.again and self._truth is not None:
-            lies = se3.inverse(pose.base_from_surface) @ _true_pose(self._truth, arrived.source)
+            lies = se3.inverse(pose.base_from_surface) @ self._truth.at(np.array([arrived.source]))[0]
             placed = PathPlacement(lies, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
         elif (surface_map := self._step.map) is not None:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
@@ -331,7 +340,7 @@ class _TrackingLoop:
             unrecorded=self._sender.dropped,
             timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._truth is None else _true_pose(self._truth, arrived.source),
+            truth=None if self._truth is None else self._truth.at(np.array([arrived.source]))[0],
             surface=self._landmarks(pose),
             draws=self._drawn and not self._step.roi,
             outlined=self._sheet is not None,
