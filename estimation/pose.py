@@ -293,3 +293,10 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def at(self, times: Array) -> Array:
+        """base_from_surface (N, 4, 4) mm at times (N,), s, interpolated; the first and the last one beyond its ends."""
+        after = np.clip(np.searchsorted(self.stamps, times), 1, len(self.stamps) - 1)
+        share = (times - self.stamps[after - 1]) / (self.stamps[after] - self.stamps[after - 1])
+        poses = self.base_from_surface
+        return np.asarray(se3.interpolate(poses[after - 1], poses[after], np.clip(share, 0.0, 1.0)))

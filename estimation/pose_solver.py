@@ -19,7 +19,7 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.rig import Rig
-from estimation.runtime import CONTIGUOUS, compiled
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array, Index, Mask
 
 TRACK_COLUMNS = 10  # of a track's row: six of the pose, its camera's delay and two shifts, its residual
@@ -97,7 +97,7 @@ def project(rig: Rig, camera: Index, base_from_surface: Array, points: Array) ->
 
     base_from_surface: (4, 4), or (C, 4, 4) where each camera exposes at its own instant.
     """
-    camera, points = np.require(camera, np.int64, CONTIGUOUS), np.require(points, float, CONTIGUOUS)
+    camera, points = contiguous(camera, np.int64), contiguous(points)
     return project_tracks(rig.camera_from_base @ base_from_surface, rig.matrices, camera, points)
 
 
@@ -122,8 +122,8 @@ def solve_pose(
     tolerance: rad and mm, largest entry of the last step.
     shared: expected size of the errors that all tracks of a camera share.
     """
-    pose, unit, precision = start, 1.0, np.require(1 / tracks.sigma**2, float, CONTIGUOUS)
-    camera, points = np.require(tracks.camera, np.int64, CONTIGUOUS), np.require(tracks.points, float, CONTIGUOUS)
+    pose, unit, precision = start, 1.0, contiguous(1 / tracks.sigma**2)
+    camera, points = contiguous(tracks.camera, np.int64), contiguous(tracks.points)
     pixels = tracks.pixels
     predicted, depth, jacobian = project(rig, camera, pose, points)
     residual = predicted - pixels

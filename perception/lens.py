@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.rig import Camera, Rig
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
 from perception.frames import Image
 
@@ -43,14 +44,19 @@ def imaged_radius(camera: Camera) -> float:
 
 
 class Lenses:
-    """The rig's lenses, with what each needs worked out once. sizes: (C, 2) px, width and height."""
+    """The rig's lenses, with what each needs worked out once.
+
+    sizes: (C, 2) px, width and height. radius: (C,) as `imaged_radius`. models: (C, 9) distortion, focal lengths and
+    principal point, px.
+    """
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.radius = np.array([imaged_radius(c) for c in rig.cameras])
         self.sizes = np.array([c.size for c in rig.cameras], float)
         self._focal, self._centre = rig.matrices[:, [0, 1], [0, 1]], rig.matrices[:, :2, 2]
-        self._bends = np.array([c.distortion for c in rig.cameras], float)
+        bends = np.array([c.distortion for c in rig.cameras], float)
+        self.models = np.ascontiguousarray(np.hstack([bends, self._focal, self._centre]))
 
     def image(self, camera: int | NDArray[np.int64], ideal: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Imaged pixels (..., 2) of ideal ones, and whether each is in front of and inside the lens's field (...).
@@ -65,19 +71,42 @@ class Lenses:
         self, camera: int | NDArray[np.int64], x: Array, y: Array, depth: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
         """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
-        r2 = x * x + y * y
-        visible = (depth > 1.0) & (r2 < self.radius[camera] ** 2)
-        if not visible.all():
-            x, y, r2 = x * visible, y * visible, r2 * visible
-        k1, k2, p1, p2, k3 = np.moveaxis(self._bends[camera], -1, 0)
-        radial, xy = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * x * y
-        imaged = np.empty((2, *r2.shape))
-        imaged[0] = x * radial + p1 * xy + p2 * (r2 + 2 * x * x)
-        imaged[1] = y * radial + p1 * (r2 + 2 * y * y) + p2 * xy
-        for axis in (0, 1):
-            imaged[axis] *= self._focal[camera, axis]
-            imaged[axis] += self._centre[camera, axis]
-        return imaged, visible
+        shape = np.broadcast_shapes(x.shape, depth.shape)
+        which = contiguous(np.broadcast_to(camera, shape).ravel(), np.int64)
+        parts = _flat(x, shape), _flat(y, shape), _flat(depth, shape)
+        imaged, visible = bend_each(which, *parts, self.models, self.radius)
+        return imaged.reshape(2, *shape), visible.reshape(shape)
+
+
+def _flat(values: Array, shape: tuple[int, ...]) -> Array:
+    """Values broadcast to a shape, in one row that compiled loops take."""
+    return contiguous((values if values.shape == shape else np.broadcast_to(values, shape)).ravel())
+
+
+@compiled("Tuple((f8, f8, b1))(f8, f8, f8, f8[::1], f8)")
+def bend_one(x: float, y: float, depth: float, model: Array, radius: float) -> tuple[float, float, bool]:
+    """The pixel of tangents x, y at a depth, mm, and whether it is seen. model (9,), radius: as `Lenses` keeps them."""
+    r2 = x * x + y * y
+    visible = (depth > 1.0) and (r2 < radius**2)
+    if not visible:
+        x, y, r2 = x * 0.0, y * 0.0, r2 * 0.0
+    k1, k2, p1, p2, k3 = model[0], model[1], model[2], model[3], model[4]
+    radial, xy = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * x * y
+    across = x * radial + p1 * xy + p2 * (r2 + 2 * x * x)
+    down = y * radial + p1 * (r2 + 2 * y * y) + p2 * xy
+    return across * model[5] + model[7], down * model[6] + model[8], visible
+
+
+@compiled("Tuple((f8[:,::1], b1[::1]))(i8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1])")
+def bend_each(
+    camera: NDArray[np.int64], x: Array, y: Array, depth: Array, models: Array, radius: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """`bend_one` of N: pixels (2, N), and which are seen (N,). camera: (N,). models (C, 9), radius (C,)."""
+    imaged, visible = np.empty((2, len(x))), np.empty(len(x), np.bool_)
+    for n in range(len(x)):
+        c = camera[n]
+        imaged[0, n], imaged[1, n], visible[n] = bend_one(x[n], y[n], depth[n], models[c], radius[c])
+    return imaged, visible
 
 
 BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX = 10, 75.0, 750.0  # thesis Appendix A

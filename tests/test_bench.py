@@ -22,13 +22,13 @@ from hardware.bench.figures import (
     Target,
     at_least,
     at_most,
+    memory_growth,
     read_figures,
     save,
     table_text,
     this_machine,
     whole_text,
 )
-from hardware.bench.live import memory_growth
 from hardware.bench.subjects import SUBJECTS, Subject
 from hardware.bench.whole import (
     BENCH_PARTS,
@@ -154,7 +154,10 @@ def test_what_grows_is_told_process_by_process() -> None:
     grown = memory_growth(held)
     assert grown["run"] == pytest.approx((0.0, 50.0), abs=1e-6)
     assert grown["recorder"] == pytest.approx((36.0, 85.98), abs=1e-6) and grown["map"][1] == 100.0
-    assert memory_growth(held[:4]) == {}
+    warming = [(s, {"map": 100.0 + min(s, 90.0) / 6}) for s in seconds]  # fills its heap, and grows no more
+    assert memory_growth(warming)["map"] == pytest.approx((0.0, 115.0), abs=1e-6)
+    (slope, size), nothing = memory_growth(warming[:60])["map"], memory_growth([])
+    assert np.isnan(slope) and size == 115.0 and nothing == {}  # too short to tell
 
 
 def test_solve_pnp_finds_exact_tracks_exactly_and_no_pose_of_too_few() -> None:

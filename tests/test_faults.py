@@ -26,7 +26,7 @@ from estimation.synthetic.world import arc_rig
 from hardware.files.path_file import read_path
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.frame_source import FrameRing, RingSource
-from hardware.live.ipc import ProcessGroup, play_session
+from hardware.live.ipc import PictureCache, ProcessGroup, play_session
 from hardware.offline.replay import FrameFaults, tracked_sets
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import (
@@ -323,3 +323,16 @@ def test_a_feed_shows_what_struck_cameras_deliver(tmp_path: Path) -> None:
     shown.join()
     assert taken is not None and [frame.camera for frame in taken.frames.frames] == [1]
     assert taken.frames.frames[0].image.max() == 0 and not taken.encoded
+
+
+def test_a_session_that_is_shown_again_and_again_is_decoded_once(tmp_path: Path) -> None:
+    session = open_session(make_folder(tmp_path / "session", count=4, cameras=2, pictures=True))
+    kept, once = PictureCache(session, True), PictureCache(session, False)
+    for cache in (kept, once):
+        cache.decode_ahead()
+    for refs in session.sets:
+        (encoded, first), (_, again) = kept.decoded(refs), kept.decoded(refs)
+        assert all(a is b for a, b in zip(first, again, strict=True)) and set(encoded) <= {0, 1}
+        fresh = once.decoded(refs)[1]
+        assert [f.stamp for f in fresh] == [f.stamp for f in first] and not any(f in first for f in fresh)
+        assert all((a.image == b.image).all() for a, b in zip(first, fresh, strict=True))

@@ -181,6 +181,23 @@ def test_a_result_comes_into_force_a_fixed_number_of_frame_sets_later(kind: str)
         assert [work.poll() for _ in range(MIN_DELAY_SETS)] == [None] * MIN_DELAY_SETS and not work.busy
 
 
+def test_a_result_that_is_not_waited_for_counts_once_it_is_there() -> None:
+    class Slow(Executor):
+        future: Future[Any]
+
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+            self.future = Future()
+            return self.future
+
+    slow = Slow()
+    work: DelayedJob[int] = DelayedJob(slow, waits=False)
+    work.submit(square, 7)
+    assert [work.poll() for _ in range(MIN_DELAY_SETS + 4)] == [None] * (MIN_DELAY_SETS + 4)
+    assert work.busy and work.late == 1
+    slow.future.set_result(49)
+    assert work.poll() == 49 and not work.busy and work.late == 1
+
+
 def small_map(count: int, seed: int) -> SurfaceMap:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3 * count, 3 * count))

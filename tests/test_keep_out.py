@@ -20,10 +20,12 @@ from perception.mapping.masks import (
     BEAD_REACH_MM,
     BEAD_STEP_MM,
     GEL_TIME_S,
+    LIGHT_SIGMA,
     PRINT_HEAD_MARGIN_MM,
     Ink,
     Tool,
     TrackingMasks,
+    add_equations,
     highlights,
     near_bead,
     trackable,
@@ -158,3 +160,29 @@ def test_tracks_begin_neither_outside_the_region_nor_behind_the_head() -> None:
     assert not free[:, :199].any() and free.any()
     y, x = np.nonzero(free)
     assert not masks.hides(0, np.stack([x, y], -1).astype(float)).any()
+
+
+@given(st.integers(0, 10**6))
+def test_compiled_lenses_and_equations_are_those_of_the_formula(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, y, depth = rng.uniform(-1.0, 1.0, (3, 40)) * [[1.5], [1.5], [900.0]]
+    camera = int(rng.integers(3))
+    k1, k2, p1, p2, k3, fx, fy, cx, cy = LENSES.models[camera]
+    r2 = x * x + y * y
+    seen = (depth > 1.0) & (r2 < LENSES.radius[camera] ** 2)
+    u, v = x * seen, y * seen
+    r2 = u * u + v * v
+    radial, uv = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * u * v
+    across = (u * radial + p1 * uv + p2 * (r2 + 2 * u * u)) * fx + cx
+    down = (v * radial + p1 * (r2 + 2 * v * v) + p2 * uv) * fy + cy
+    for which in (camera, np.full(40, camera), np.array([camera])):
+        imaged, visible = LENSES.bend(which, x, y, depth)
+        assert (imaged.reshape(2, -1) == [across, down]).all() and (visible.ravel() == seen).all()
+    sums, free, away, dark = rng.normal(size=(40, 14)), rng.uniform(size=40) < 0.7, *rng.normal(size=(2, 40))
+    squares, slopes, added = rng.normal(size=(40, 9)), rng.normal(size=(40, 3)), sums.copy()
+    add_equations(added, free, away, dark, 0.01, squares, slopes)
+    precision = free / (0.01 + (LIGHT_SIGMA * dark) ** 2)
+    sums[:, :9] += precision[:, None] * squares
+    sums[:, 9:12] -= (precision * away)[:, None] * slopes
+    sums[:, 12:] += np.stack([precision * away * away, free], -1)
+    assert (added == sums).all()

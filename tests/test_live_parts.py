@@ -61,9 +61,10 @@ from hardware.live.settings import (
 )
 from hardware.motion.loop import RecordedTick
 from hardware.motion.step import LAG_STEP, PrintMotion
-from hardware.process.clock import SimClock
+from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import faults_from_texts
 from hardware.process.progress import cached
+from hardware.process.system import MOST_RINGS, Bell
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet
@@ -636,3 +637,36 @@ def test_the_cache_tells_its_size_and_is_cleared(
     ]  # fmt: skip
     assert main(["cache", "--clear"]) == 0 and not scene.exists()
     assert capsys.readouterr().out == f"1 scene removed from {tmp_path / 'stillbed'}: 2.5 MB\n"
+
+
+def test_a_wait_ends_with_the_bell_and_a_ring_is_not_lost() -> None:
+    bell, clock = Bell(), WallClock()
+    bell.ring()  # before the wait
+    begun = clock.now()
+    bell.wait(20.0)
+    threading.Timer(0.05, bell.ring).start()
+    bell.wait(20.0)  # while it waits
+    assert clock.now() - begun < 10.0
+    for _ in range(MOST_RINGS + 10):  # nobody hears them: ringing does not wait either
+        bell.ring()
+    bell.wait(20.0)
+    begun = clock.now()
+    bell.wait(0.05)  # all of them were heard at once
+    bell.wait(-1.0)
+    assert 0.05 <= clock.now() - begun < 10.0
+
+
+def test_what_steps_back_is_ordinary_and_each_process_is_a_session() -> None:
+    code = (
+        "import os\n"
+        "from hardware.process.system import ask_for_real_time, set_up_process, step_back\n"
+        "set_up_process('x')\n"
+        "asked = ask_for_real_time(5)\n"
+        "before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority\n"
+        "step_back(3)\n"
+        "print(os.getsid(0) == os.getpid() == os.getpgid(0), asked, *before, os.sched_getscheduler(0))\n"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    real = "real" in told
+    assert told[0] == "True" and told[-1] == str(os.SCHED_OTHER)
+    assert told[-3:-1] == ([str(os.SCHED_FIFO), "5"] if real else [str(os.SCHED_OTHER), "0"])

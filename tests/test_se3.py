@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.pose import Trajectory
 from estimation.se3 import Array
 
 
@@ -82,6 +83,14 @@ def test_interpolation_is_a_geodesic(a: Array, xi: Array, u: float) -> None:
     assert close(se3.interpolate(a, b, 1.0), b)
     assert close(middle, a @ se3.exp(u * xi), 1e-8)
     assert close(middle, se3.interpolate(b, a, 1 - u), 1e-8)
+
+
+@given(transforms, tangents(angle=3.0), st.floats(0, 1))
+def test_a_trajectory_goes_through_its_poses_and_stands_beyond_its_ends(a: Array, xi: Array, u: float) -> None:
+    poses, stamps = np.stack([a, a @ se3.exp(xi), a]), np.array([1.0, 1.5, 2.5])
+    known = Trajectory(stamps, poses, exact=True)
+    assert close(known.at(stamps), poses) and close(known.at(np.array([0.0, 9.0])), poses[[0, 2]])
+    assert close(known.at(np.array([1.0 + 0.5 * u]))[0], se3.interpolate(a, poses[1], u), 1e-8)
 
 
 @given(tangents())

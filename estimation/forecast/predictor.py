@@ -21,7 +21,7 @@ import numpy as np
 from estimation import se3
 from estimation.forecast.experts import LAGS, TURN_LEVER_MM, Experts, ExpertStack, IntervalCalibration
 from estimation.pose import Forecast, SurfacePose, body_rate, prepare
-from estimation.runtime import CONTIGUOUS, compiled
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
 
 HORIZONS = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # s
@@ -99,7 +99,7 @@ class PoseHistory:
 
 def _increments(a: Array, b: Array) -> Array:
     """log(inverse(a) @ b) (2, N, 6) of poses a (N, 4, 4) and b (2, N, 4, 4), compiled for turns below half a turn."""
-    vectors, within = _short_increments(np.require(a, float, CONTIGUOUS), np.require(b, float, CONTIGUOUS))
+    vectors, within = _short_increments(contiguous(a), contiguous(b))
     return vectors if within else np.asarray(se3.log(se3.inverse(a) @ b))
 
 

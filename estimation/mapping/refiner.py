@@ -1,7 +1,7 @@
 """Key frames, and the refined maps made of them, which come into force at a fixed frame set.
 
 The adjustment may run in another process. Its map is taken over a fixed number of frame sets later, so poses do not
-depend on how fast that process was.
+depend on how fast that process was; only where no pose may wait for it, as in a live run, a late one is taken later.
 """
 
 from __future__ import annotations
@@ -47,9 +47,13 @@ def sets_until_ready(interval: float) -> int:
 class DelayedJob(Generic[T]):
     """One job at a time, in an executor or, without one, here when it is due: the results are the same."""
 
-    def __init__(self, executor: Executor | None = None, delay: int = MIN_DELAY_SETS) -> None:
-        """executor: it may die. delay: frame sets from the next submission until its result counts."""
-        self._executor, self.delay = executor, delay
+    def __init__(self, executor: Executor | None = None, delay: int = MIN_DELAY_SETS, waits: bool = True) -> None:
+        """executor: it may die. delay: frame sets from the next submission until its result counts.
+
+        waits: whether a result that is not ready when it is due is waited for; else it counts once it is there, and
+            `late` counts it.
+        """
+        self._executor, self.delay, self._waits, self.late = executor, delay, waits, 0
         self._job: tuple[Callable[..., T | None], tuple[Any, ...]] | None = None
         self._future: Future[T | None] | None = None
         self._count = self._due = 0
@@ -75,6 +79,9 @@ class DelayedJob(Generic[T]):
         if self._job is None or self._count < self._due:
             return None
         (function, arguments), future = self._job, self._future
+        if not (self._waits or future is None or future.done()):
+            self.late += self._count == self._due
+            return None
         self.cancel()
         try:
             return function(*arguments) if future is None else future.result()
@@ -86,9 +93,10 @@ class DelayedJob(Generic[T]):
 class Refiner:
     """Keeps the key frames of one surface and asks for a new map when a new one is worth it."""
 
-    def __init__(self, rig: Rig, executor: Executor | None = None) -> None:
+    def __init__(self, rig: Rig, executor: Executor | None = None, waits: bool = True) -> None:
+        """executor, waits: of the adjustment, as `DelayedJob` takes them."""
         self._rig = rig
-        self._work: DelayedJob[AdjustedMap] = DelayedJob(executor)
+        self._work: DelayedJob[AdjustedMap] = DelayedJob(executor, waits=waits)
         self._frames: list[KeyFrame] = []
         self._stamps: list[float] = []
         self._map: SurfaceMap | None = None
@@ -100,6 +108,11 @@ class Refiner:
         self.interval = 0.0  # s between the last two, 0 before
         self._delays = Delays(np.zeros(len(rig)), np.zeros((len(rig),) * 2))  # as known now
         self._doubt = np.inf  # s, of them at the last adjustment
+
+    @property
+    def late(self) -> int:
+        """How many refined maps were not ready when they were due."""
+        return self._work.late
 
     def begin(self, surface_map: SurfaceMap, stamp: float, pose: Array, observations: Observations) -> None:
         """The first map and the frame set that it was made from, whose pose defines the surface frame."""

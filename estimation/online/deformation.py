@@ -19,7 +19,7 @@ import numpy as np
 from estimation import se3
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit
-from estimation.runtime import CONTIGUOUS, compiled
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, Warp, bells, farthest_points
 
@@ -223,11 +223,11 @@ def _mode_evidence(
     """Information (M, M) and gradient (M,) of both vectors' sum about the predicted one, pose and delays solved for."""
     count, cameras = len(modes.share), int(observations.camera.max()) + 1
     root = np.sqrt(fit.weights) / (sigma * fit.scale)
-    row = np.require(observations.track, np.int64, CONTIGUOUS)
-    camera = np.require(observations.camera, np.int64, CONTIGUOUS)
-    fitted = np.require(fit.jacobians, float, CONTIGUOUS), np.require(fit.residuals, float, CONTIGUOUS)
+    row = contiguous(observations.track, np.int64)
+    camera = contiguous(observations.camera, np.int64)
+    fitted = contiguous(fit.jacobians), contiguous(fit.residuals)
     # the fit's points hold the deformation, but not the map's error
-    fields = np.require(modes.landmarks, float, CONTIGUOUS)
+    fields = contiguous(modes.landmarks)
     whole = rows_of_modes(camera, row, *fitted, root, fields, state[count:].copy(), twist)
     normal = whole.T @ whole
     own, other = slice(0, count), slice(count, count + 6 + cameras)

@@ -22,7 +22,7 @@ from estimation import se3
 from estimation.observations import Observations
 from estimation.online.fit import FrameFit, displacement_sums, landmark_sights, solve_symmetric3, unusual_displacements
 from estimation.pose_solver import GATE
-from estimation.runtime import CONTIGUOUS, median
+from estimation.runtime import contiguous, median
 from estimation.se3 import Array, Mask
 from estimation.surface_map import LocalError, SurfaceMap, bells, farthest_points
 
@@ -206,9 +206,9 @@ class LocalMotion:
         precision = (sigma * fit.solution.scale) ** -2.0
         for camera in fit.outliers:
             precision[observations.camera == camera] = 0.0
-        row = np.require(observations.track, np.int64, CONTIGUOUS)
-        jacobian = np.require(fit.solution.jacobians, float, CONTIGUOUS)
-        residual = np.require(fit.solution.residuals, float, CONTIGUOUS)
+        row = contiguous(observations.track, np.int64)
+        jacobian = contiguous(fit.solution.jacobians)
+        residual = contiguous(fit.solution.residuals)
         normal, right, square, views = displacement_sums(len(self._points), row, jacobian, residual, precision)
         usual = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
         plain, about, explained = unusual_displacements(normal, right, square, usual, self._right)
@@ -312,9 +312,9 @@ class SupportedPlaces:
     def _sights(self, observations: Observations, fit: FrameFit) -> tuple[Mask, Mask]:
         """Which landmarks each camera (C, N) has found where the pose puts them, and has looked for."""
         shape, missed = self._rate.shape, observations.missed
-        camera, track = (np.require(a, np.int64, CONTIGUOUS) for a in (observations.camera, observations.track))
-        jacobian = np.require(fit.solution.jacobians, float, CONTIGUOUS)
-        residual = np.require(fit.solution.residuals, float, CONTIGUOUS)
+        camera, track = (contiguous(a, np.int64) for a in (observations.camera, observations.track))
+        jacobian = contiguous(fit.solution.jacobians)
+        residual = contiguous(fit.solution.residuals)
         there = fit.inlier if fit.lit is None else fit.inlier | fit.lit
         found, sought = landmark_sights(shape[0], shape[1], camera, track, jacobian, residual, there, NEAR_MM)
         sought[missed.camera, missed.track] = True

@@ -194,8 +194,7 @@ def run_part(seconds: float, seed: int, busy: int, real_time: bool, part: str) -
     context, clock = multiprocessing.get_context("spawn"), WallClock()
     poses, reports = SharedLatest[SurfacePose](), SharedLatest[MotionReport]()
     orders, theirs = context.Pipe()
-    burning = [context.Process(target=_burn, daemon=True) for _ in range(busy)]
-    with tempfile.TemporaryDirectory() as folder, _running(*burning):
+    with tempfile.TemporaryDirectory() as folder, burning(busy):
         link = Path(folder) / "arm"
         arm = _VirtualArm(link, seed, part == ROUGH_PART)
         plan = MotionPlan(_toolpath(), ArmProfile(), str(link), real_time=real_time)
@@ -330,7 +329,16 @@ def _kill(*processes: BaseProcess) -> None:
         process.join()
 
 
+@contextmanager
+def burning(count: int) -> Iterator[None]:
+    """So many processes that want a core each, of ordinary priority, as another user's."""
+    context = multiprocessing.get_context("spawn")
+    with _running(*(context.Process(target=_burn, daemon=True) for _ in range(count))):
+        yield
+
+
 def _burn() -> None:
+    os.setsid()  # Linux shares the processor among sessions
     matrix = np.random.default_rng(0).normal(size=(300, 300))
     while True:
         matrix = matrix @ matrix

@@ -161,6 +161,7 @@ _SUBJECTS = (
         number("--minutes", 1.0, "M", "of printing; 0: none; default 1"),
         number("--stops", 3, "N", "in a run of their own; default 3"),
         number("--kills", 0, "N", "of random processes; default none"),
+        number("--busy", 0, "N", "processes beside it that saturate a core each; default none"),
         number("--seed", 0, None, "of what is killed when"),
         option("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other"),
         option("--dispenser", type=Path, metavar="DISPENSER.toml", help="to tell, e.g. a virtual one; default none"),

@@ -70,9 +70,9 @@ def add_live(commands: Commands) -> None:
     add("--jpeg-quality", type=int, metavar="Q", help="record unencoded pictures smaller and not exactly")
     add("--operator", metavar="NAME", help="who runs it, as recording and reports keep it")
     port = "show the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
+    add("--no-trace", action="store_true", help="record no /trace: where each frame set's time went")
     add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
-    trace = "where each frame set's time went, for Perfetto; see stillbed trace"
-    add("--trace", type=Path, metavar="X.json", help=trace)
+    add("--trace", type=Path, metavar="X.json", help="write the recorded /trace for Perfetto; see stillbed trace")
     add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
     add("--no-page", action="store_true", help="without it")
@@ -180,7 +180,10 @@ def _run_live(a: argparse.Namespace) -> int:
 
     faults = faults_from_texts("command line", "--fault", a.fault)
     flags = {name: getattr(a, name) for name in SETTINGS_FLAGS}
-    flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": True if a.trace else None}
+    traces = False if a.no_trace else True if a.trace is not None else None
+    flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": traces}
+    if a.trace is not None and a.no_trace:
+        raise wrong_option("--trace", a.trace, "left out beside --no-trace")
     if a.trace is not None and a.trace.exists() and not a.force:
         raise wrong_option("--trace", a.trace, "a new file, or --force")
     if a.region is not None:

@@ -27,7 +27,7 @@ from estimation.pose import Trajectory
 from estimation.se3 import Array
 from hardware.files.images import decode
 from hardware.files.session import FrameReader, FrameRef, Session
-from hardware.live.frame_source import Encoded, FrameRing
+from hardware.live.frame_source import COLOUR_CHANNELS, Encoded, FrameRing
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender, record
 from hardware.live.records import (
@@ -44,7 +44,7 @@ from hardware.offline.replay import FrameFaults
 from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock, WatchedClock
 from hardware.process.faults import Fault
-from hardware.process.system import SPAWN, SharedLatest, ask_for_real_time, blocked_sigint, set_up_process
+from hardware.process.system import SPAWN, Bell, SharedLatest, ask_for_real_time, blocked_sigint, set_up_process
 from hardware.recording.session_reader import open_session
 from perception.frames import Frame, FrameSet, frame_set
 
@@ -54,6 +54,7 @@ TURN_SEARCH_SHARE = 0.25  # share of a session at each end in which a turn is lo
 DECODE_LEAD = 1.5  # of the time that decoding takes: so long before a set is due it is begun
 DECODE_DECAY = 0.9  # of that time, from set to set
 PICTURE_CACHE_BYTES = 2**30  # of encoded pictures, kept where a session is shown again and again
+DECODED_CACHE_BYTES = 2**29  # of decoded ones: a session of so many is decoded before it begins, as a camera has no CPU
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +111,8 @@ def play_session(
     session: Session, again: bool, faults: Sequence[Fault], ring: FrameRing, notices: Connection, start: c_double
 ) -> None:
     """Put the sets of a session into the ring in real time. faults: of cameras, counted from `start`, s."""
-    clock, pictures = WallClock(), _PictureCache(session, again)
+    clock, pictures = WallClock(), PictureCache(session, again)
+    pictures.decode_ahead()
     inject = FrameFaults(faults, session.rig, "command line")
     parent = parent_process()  # a session that is shown once begins when the tracker is ready for it
     while not ring.requested.value and (parent is None or parent.is_alive()):
@@ -140,15 +142,28 @@ def play_session(
             notices.send(ring.put(struck, unchanged, clock.now, anchor))
 
 
-class _PictureCache:
+class PictureCache:
     """Reads and decodes pictures; of a session that is shown again and again, keeps them as they were encoded."""
 
     def __init__(self, session: Session, keep: bool) -> None:
         self._session, self._keep, self._cache, self._size = session, keep, dict[FrameRef, Encoded](), 0
         self._reader: FrameReader = session.open_reader()
+        self._decoded = dict[tuple[FrameRef, ...], tuple[dict[int, Encoded], list[Frame]]]()
+
+    def decode_ahead(self) -> None:
+        """Decode the whole session now, where it is shown again and again and fits into memory.
+
+        Then its decoding takes nothing from the run that is measured: what is left is to copy a set into the ring.
+        """
+        sizes = [camera.size for camera in self._session.rig.cameras]
+        pixels = sum(sizes[ref.camera][0] * sizes[ref.camera][1] for refs in self._session.sets for ref in refs)
+        if self._keep and COLOUR_CHANNELS * pixels <= DECODED_CACHE_BYTES:
+            self._decoded = {refs: self.decoded(refs) for refs in self._session.sets}
 
     def decoded(self, refs: tuple[FrameRef, ...]) -> tuple[dict[int, Encoded], list[Frame]]:
         """The pictures of a set, as stored and as arrays."""
+        if refs in self._decoded:
+            return self._decoded[refs]
         encoded, frames = dict[int, Encoded](), list[Frame]()
         for ref in refs:
             stored = self._encoded(ref)
@@ -306,7 +321,8 @@ class RunChannels:
     tracking: SharedLatest[TrackingReport]
     motion: SharedLatest[LiveMotionReport]
     recorder: SharedLatest[RecorderReport]
-    orders: Connection  # to the motion process
+    orders: Connection  # to the motion process,
+    bell: Bell  # which waits for them
     lifeline: Connection  # nothing is sent: its end tells the tracking process that this one is gone
     arm_lifeline: Connection  # the same for a virtual arm
     sender: RecorderSender
@@ -316,6 +332,11 @@ class RunChannels:
     looks: c_uint64  # how often the surface is to be looked for anew
     outline: SharedLatest[OutlineOrder]  # put before `looks` is set
     placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of what is printed, put when it is begun
+
+    def order(self, order: object) -> None:
+        """Give the motion process an order; OSError where it is gone."""
+        self.orders.send(order)
+        self.bell.ring()
 
     def end(self) -> None:
         """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
@@ -342,21 +363,21 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
         poses, tracking = SharedLatest[PoseHandover](), SharedLatest[TrackingReport]()
         motion, recorder = SharedLatest[LiveMotionReport](), SharedLatest[RecorderReport]()
-        trouble = SharedLatest[str](TROUBLE_BYTES)
+        trouble, bell = SharedLatest[str](TROUBLE_BYTES), Bell()
         to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
         lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
         ends = [end for end, _ in to_recorder]
         processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
-        mover = MotionChannels(url, place, poses, motion, orders[0], link.requests, trouble, to_recorder[0][1])
+        mover = MotionChannels(url, place, poses, motion, orders[0], bell, link.requests, trouble, to_recorder[0][1])
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:
             processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
         looks, outline, placed = RawValue(c_uint64, 0), SharedLatest[OutlineOrder](), SharedLatest[Array]()
         ends_of_tracking = to_recorder[1][1], looks, outline, placed, lifeline[0]
-        track = TrackingChannels(ring, notices[0], poses, tracking, motion, link, *ends_of_tracking)
+        track = TrackingChannels(ring, notices[0], poses, bell, tracking, motion, link, *ends_of_tracking)
         processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
         sender = RecorderSender(to_recorder[2][1])
-        own_ends = orders[1], lifeline[1], arm_lifeline[1], sender, link, trouble
+        own_ends = orders[1], bell, lifeline[1], arm_lifeline[1], sender, link, trouble
         stack.pop_all()
     return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, start, looks, outline, placed)
 

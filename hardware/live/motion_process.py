@@ -38,11 +38,22 @@ from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.step import PrintMotion
 from hardware.process.clock import PoseLockedSchedule, WallClock
-from hardware.process.system import ask_for_real_time, set_up_process, take_messages
+from hardware.process.system import Bell, ask_for_real_time, set_up_process, take_messages
 from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
+
+
+class _WakingClock(WallClock):
+    """A clock whose waits also end once a pose or an order is there."""
+
+    def __init__(self, bell: Bell) -> None:
+        self._bell = bell
+
+    def wait_until(self, instant: float) -> None:
+        """Wait until `instant`, s, or for the bell."""
+        self._bell.wait(instant - self.now())
 
 
 class _OrderReceiver:
@@ -97,7 +108,7 @@ class _TickReporter:
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
         self._handover: PoseHandover | None = None  # the newest
         self._unsent = False  # whether no move made of that pose went out yet
-        self._lane = TraceLane(MOTION_LANE, self._clock) if trace else None
+        self._lane = TraceLane(MOTION_LANE, self._clock, sender.put) if trace else None
         self._seen = math.nan  # s, when the handover was seen here
         self.loop: MotionLoop | None = None
         self.motion: PrintMotion | None = None
@@ -126,8 +137,13 @@ class _TickReporter:
             if self._lane is not None and self.loop is not None:
                 begun, handover = max(self.loop.begun, self._seen), self._handover
                 told = ("handed over", handover.sent, self._seen), ("waits for its tick", self._seen, begun)
-                self._sender.put(self._lane.entry(handover.pose.stamp, [*told, (ON_WIRE, begun, now)]))
+                self._lane.add(handover.pose.stamp, [*told, (ON_WIRE, begun, now)])
         self._sender.put(WireEntry(now, data, sent))
+
+    def close(self) -> None:
+        """Hand over the rest of the trace."""
+        if self._lane is not None:
+            self._lane.close()
 
     def report(self, tick: Tick) -> None:
         """Record and report a tick that is done; StillbedError, which ends the loop, where recording has failed."""
@@ -170,11 +186,11 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     """
     settings, profile = prepared.settings, prepared.task.profile
     set_up_process("motion", settings.cores_motion, outlives=True)
-    clock, sender = WallClock(), RecorderSender(channels.recorder)
+    priority = ask_for_real_time() if settings.real_time else "nothing asked for"
+    clock, sender = WallClock(), RecorderSender(channels.recorder)  # its thread shares the interpreter: as urgent
     link_settings = LinkSettings(pause_frame=settings.pause_frame)
     ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
-    priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     reporter = _TickReporter(channels, sender, ticks, priority, settings.trace)
     motion = PrintMotion(profile, clock, channels.place, material, reporter.arm_lag)
     orders = _OrderReceiver(channels, motion, ticks)
@@ -183,7 +199,8 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         arm = Arm(driver, profile, clock.now(), link_settings)
         reporter.motion = motion
         poses, report = reporter.newest_pose, reporter.report
-        loop = reporter.loop = MotionLoop(motion, arm, clock, poses, orders, report, motion.homed, ticks, material)
+        waking = _WakingClock(channels.bell)
+        loop = reporter.loop = MotionLoop(motion, arm, waking, poses, orders, report, motion.homed, ticks, material)
         try:
             loop.run()
         finally:
@@ -197,6 +214,7 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         driver.release()
         if orders.alone and orders.fingerprint:
             write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.value)
+        reporter.close()
         for entry in reporter.times.entries(clock.now()):
             sender.put(entry)
         sender.close()

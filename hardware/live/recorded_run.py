@@ -13,7 +13,6 @@ from pathlib import Path as File
 
 import numpy as np
 
-from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
@@ -172,15 +171,11 @@ class _TrueMotion:
     """A motion known at some instants."""
 
     def __init__(self, rows: Array) -> None:
-        known = trajectory_from_rows(rows, True)
-        self._stamps, self._poses = known.stamps, known.base_from_surface
+        self._known = trajectory_from_rows(rows, True)
 
     def __call__(self, times: Array) -> Array:
         """(N, 4, 4) at times (N,), s."""
-        after = np.clip(np.searchsorted(self._stamps, times), 1, len(self._stamps) - 1)
-        span = self._stamps[after] - self._stamps[after - 1]
-        share = np.clip((times - self._stamps[after - 1]) / span, 0.0, 1.0)
-        return se3.interpolate(self._poses[after - 1], self._poses[after], share)
+        return self._known.at(times)
 
     def twist(self, times: Array) -> Array:
         """Nobody asks for it here."""

@@ -39,7 +39,7 @@ from hardware.live.records import (
     WireEntry,
 )
 from hardware.live.settings import LOOPBACK, LiveSettings, used_files
-from hardware.live.trace import MIN_WRITE_S, RECORDER_LANE, TraceEntry
+from hardware.live.trace import MIN_WRITE_S, RECORDER_LANE, TraceBatch, TraceLane
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
 from hardware.process.system import SharedLatest, set_up_process, state_inputs
@@ -265,7 +265,6 @@ class _EntryWriter:
 
         assert settings.record is not None
         self._file, self._reports, quality = settings.record, reports, settings.jpeg_quality or None
-        self._trace = settings.trace
         self._clock, self._processor = WallClock(), ProcessorClock()
         began = round((utc_now() - self._clock.now()) * 1e9)
         self._server = FoxgloveServer(settings.foxglove_port) if settings.foxglove_port else None
@@ -279,6 +278,7 @@ class _EntryWriter:
             began=began,
             listener=listener,
         )
+        self._lane = TraceLane(RECORDER_LANE, self._clock, self._write) if settings.trace else None
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
         self._early: list[Entry] = []
@@ -298,8 +298,8 @@ class _EntryWriter:
                     self._clock.wait_until(self._clock.now() + GATHER_TIME)
                 begun = self._clock.now()
                 crowded = any([self._take(key.fileobj, selector) for key, _ in selector.select(0)])
-                if self._trace and (now := self._clock.now()) > begun + MIN_WRITE_S:
-                    self._write(TraceEntry(RECORDER_LANE, now, (("a batch is written", begun, now),)))
+                if self._lane is not None and (now := self._clock.now()) > begun + MIN_WRITE_S:
+                    self._lane.add(now, (("a batch is written", begun, now),))
                 if self._clock.now() > self._reported + FLUSH_AFTER:
                     self.report()
 
@@ -335,6 +335,8 @@ class _EntryWriter:
         """Close the file, and report."""
         if self._server is not None:
             self._server.close()
+        if self._lane is not None:
+            self._lane.close()
         if self._recorder is not None:
             self._recorder.close()
         self.report()
@@ -357,8 +359,8 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.event(entry.stamp, entry.text, entry.level, entry.name)
     elif isinstance(entry, LatencyEntry):
         recorder.latency(entry.stamp, entry.stage, entry.width, entry.counts, entry.largest)
-    elif isinstance(entry, TraceEntry):
-        recorder.trace(entry.stamp, entry.message)
+    elif isinstance(entry, TraceBatch):
+        recorder.trace(entry.entries[-1].stamp, entry.message)
     elif isinstance(entry, UsedEntry):
         _write_used(recorder, entry)
     elif isinstance(entry, SurfaceEntry):
@@ -389,11 +391,10 @@ def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:
     from hardware.files.folder_tables import rows_from_trajectory
     from hardware.files.session import row_from_head
 
-    stamp = entry.pose.stamp
     if entry.truth is not None:
-        known = Trajectory(np.array([stamp]), entry.truth[None], exact=True)
+        known = Trajectory(np.array([entry.pose.stamp]), entry.truth[None], exact=True)
         recorder.truth_row(rows_from_trajectory(known)[0], exact=True)
     if entry.head is not None:
-        recorder.head_row(row_from_head(stamp, entry.head), entry.head.extruding, shown=False)
+        recorder.head_row(row_from_head(entry.pose.stamp, entry.head), entry.head.extruding, shown=False)
     recorder.write(entry.observations)
     recorder.write(entry.pose)

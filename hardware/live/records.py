@@ -20,11 +20,11 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
-from hardware.live.trace import TraceEntry
+from hardware.live.trace import TraceBatch
 from hardware.motion.loop import CommandedPose, DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
 from hardware.process.clock import Histogram
-from hardware.process.system import SharedLatest
+from hardware.process.system import Bell, SharedLatest
 from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
 from planning.clearance import TissueGuard
 from planning.laid_beads import Look
@@ -225,7 +225,7 @@ class UsedEntry:
 
 # the rig comes first: nothing is written before the cameras are known
 Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
-Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceEntry | Look
+Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceBatch | Look
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
 
 
@@ -264,7 +264,8 @@ class TrackingChannels:
 
     ring: FrameRing  # frames of a session that is shown, with their notices
     notices: Connection
-    poses: SharedLatest[PoseHandover]  # to the motion
+    poses: SharedLatest[PoseHandover]  # to the motion,
+    bell: Bell  # which waits for this
     reports: SharedLatest[TrackingReport]
     motion: SharedLatest[LiveMotionReport]
     link: OperatorLink
@@ -284,6 +285,7 @@ class MotionChannels:
     poses: SharedLatest[PoseHandover]
     reports: SharedLatest[LiveMotionReport]
     orders: Connection
+    bell: Bell  # rung once a pose or an order is there
     requests: RequestLine  # of the operator's page
     trouble: SharedLatest[str]  # why the arm cannot be used at all
     recorder: Connection

@@ -223,7 +223,7 @@ class LiveRun:
                     reason = f"what lies on the surface cannot be printed: {why}"
                     return self._send(self._machine.end(reason, self._clock.now()))
             with suppress(OSError):  # the motion process is gone: the next cycle sees that
-                self._channels.orders.send(order)
+                self._channels.order(order)
 
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""

@@ -85,7 +85,7 @@ class LiveSettings:
     jpeg_quality: int = _key(  # three cameras' exact pictures take three cores to encode
         "record.jpeg_quality", "90", "of pictures that come unencoded, 1 to 100; 0: exact", 90
     )
-    trace: bool = _key("record.trace", "true", "where the time of each frame set went: stillbed trace", False)
+    trace: bool = _key("record.trace", "true", "where the time of each frame set went: stillbed trace", True)
     operator: str = _key("record.operator", '"A. Name"', "who runs it, as recording and reports keep it", "")
     foxglove_port: int = _key(
         "record.foxglove_port", "8765", "port on which Foxglove sees the run on this machine; 0: none", 0

@@ -1,18 +1,21 @@
 """Where the time of each frame set went: spans by process, in the recording, and what they say about the slowest sets.
 
 Each process notes when it took a set over and handed it on, on the machine's monotonic clock, and what held it up: the
-collector of Python's garbage, the scheduler (the kernel's run-queue delay of the thread), page faults. The topic
-/trace holds a message a set and process. A set's way goes from its pixels in memory to the first move on the wire that
-was made of it; what the processes did meanwhile is what it waited for.
+collector of Python's garbage, the scheduler (the kernel's run-queue delay of the thread), page faults. It keeps that
+and hands it to the recorder once a second: the topic /trace holds a message a second and process. A set's way goes from
+its pixels in memory to the first move on the wire that was made of it; what the processes did meanwhile is what it
+waited for.
 """
 
 from __future__ import annotations
 
 import gc
 import json
+import os
 import resource
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from html import escape
 from itertools import islice, takewhile
@@ -32,6 +35,7 @@ MIN_WRITE_S = 0.005  # s of a batch of the recorder, from which it is in the tra
 SLOWEST_SHARE = 0.01  # of all sets
 DRAWN_SETS = 12  # of the slowest, in the picture
 DRAWN_BEFORE_S, LANE_PX, CHART_PX = 0.03, 16, 900  # s drawn before a set is handed over
+BATCH_S = 1.0  # s of entries that are handed to the recorder as one: what a set's entry costs is then 0.03 ms
 SCHEDULER_FILE = Path("/proc/thread-self/schedstat")  # ns run, ns in the run queue, time slices: Linux
 TOPIC = "/trace"
 
@@ -40,7 +44,7 @@ Span = tuple[str, float, float]  # what, from, until: s
 
 @dataclass(frozen=True, slots=True)
 class TraceEntry:
-    """What one process did of one frame set, or a batch of the recorder."""
+    """What one process did of one frame set; of the recorder, a batch that it wrote."""
 
     lane: str
     stamp: float  # s, of the set
@@ -48,46 +52,78 @@ class TraceEntry:
     queued: float = 0.0  # s for which its thread was ready and did not run
     faults: int = 0  # page faults of its thread
 
+
+@dataclass(frozen=True, slots=True)
+class TraceBatch:
+    """What one process did of the frame sets of a second."""
+
+    entries: tuple[TraceEntry, ...]
+
     @property
     def message(self) -> dict[str, object]:
         """As it is recorded."""
-        spans = [[name, begin, end] for name, begin, end in self.spans]
-        return {"stamp": self.stamp, "lane": self.lane, "spans": spans, "queued": self.queued, "faults": self.faults}
+        entries = [[e.stamp, e.queued, e.faults, e.spans] for e in self.entries]
+        return {"lane": self.entries[0].lane, "entries": entries}
 
 
-def _run_queue_delay() -> float:
-    """Seconds for which this thread was ready and did not run so far; 0 where the system does not say."""
-    try:
-        return int(SCHEDULER_FILE.read_bytes().split()[1]) * 1e-9
-    except (OSError, IndexError, ValueError):
-        return 0.0
+class _RunQueue:
+    """How long the thread that made it was ready and did not run."""
+
+    def __init__(self) -> None:
+        self._file: int | None = None
+        with suppress(OSError):  # the system does not say
+            self._file = os.open(SCHEDULER_FILE, os.O_RDONLY | os.O_CLOEXEC)
+
+    def delay(self) -> float:
+        """Seconds so far; 0 where the system does not say."""
+        if self._file is None:
+            return 0.0
+        return int(os.pread(self._file, 100, 0).split()[1]) * 1e-9
+
+    def close(self) -> None:
+        """Ask no more."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
 
 
 class TraceLane:
-    """Counts what holds up the thread that made it, between one entry and the next."""
+    """Keeps what the thread that made it does of each set, and what holds it up between one set and the next."""
 
-    def __init__(self, name: str, clock: Clock) -> None:
-        self._name, self._clock = name, clock
+    def __init__(self, name: str, clock: Clock, put: Callable[[TraceBatch], None]) -> None:
+        """put: hands a batch to the recorder."""
+        self._name, self._clock, self._put = name, clock, put
         self._garbage: list[Span] = []
-        self._collecting = 0.0
+        self._entries: list[TraceEntry] = []
+        self._collecting, self._due = 0.0, clock.now() + BATCH_S
+        self._queue = _RunQueue()
         self._last = self._counts()
         gc.callbacks.append(self._collected)
 
-    def entry(self, stamp: float, spans: Iterable[Span]) -> TraceEntry:
-        """The entry of a set at `stamp`, s: its spans, and what held this thread up since the last entry."""
+    def add(self, stamp: float, spans: Iterable[Span]) -> None:
+        """The set at `stamp`, s, has these spans; hand over what there is, once a second."""
         delay, faults = self._counts()
         queued, since = delay - self._last[0], faults - self._last[1]
         self._last = delay, faults
         garbage, self._garbage = self._garbage, []
-        return TraceEntry(self._name, stamp, (*spans, *garbage), queued, since)
+        self._entries.append(TraceEntry(self._name, stamp, (*spans, *garbage), queued, since))
+        if self._clock.now() > self._due:
+            self._hand_over()
 
     def close(self) -> None:
-        """Count no more."""
+        """Hand over what there is, and count no more."""
+        self._hand_over()
         gc.callbacks.remove(self._collected)
+        self._queue.close()
+
+    def _hand_over(self) -> None:
+        entries, self._entries, self._due = self._entries, [], self._clock.now() + BATCH_S
+        if entries:
+            self._put(TraceBatch(tuple(entries)))
 
     def _counts(self) -> tuple[float, int]:
         usage = resource.getrusage(resource.RUSAGE_THREAD)
-        return _run_queue_delay(), usage.ru_minflt + usage.ru_majflt
+        return self._queue.delay(), usage.ru_minflt + usage.ru_majflt
 
     def _collected(self, phase: str, information: Mapping[str, int]) -> None:
         now = self._clock.now()
@@ -163,11 +199,11 @@ def read_trace(record: Path) -> RunTrace:
         for stored in part.messages if isinstance(part, ChunkMessages) else ():
             if stored.topic == TOPIC:
                 told = parse(record, stored)
-                spans = tuple((str(name), float(begin), float(end)) for name, begin, end in told["spans"])
-                counts = float(told["queued"]), int(told["faults"])
-                trace.entries.append(TraceEntry(str(told["lane"]), float(told["stamp"]), spans, *counts))
+                for stamp, queued, faults, spans in told["entries"]:
+                    read = tuple((str(name), float(begin), float(end)) for name, begin, end in spans)
+                    trace.entries.append(TraceEntry(str(told["lane"]), float(stamp), read, float(queued), int(faults)))
     if not trace.entries:
-        raise InputError(record, TOPIC, "no trace", "the recording of a live run with record.trace = true")
+        raise InputError(record, TOPIC, "no trace", "the recording of a live run without record.trace = false")
     return trace
 
 

@@ -9,7 +9,7 @@ import signal
 from collections import deque
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from itertools import dropwhile, takewhile
+from logging import INFO
 from types import FrameType
 
 import numpy as np
@@ -22,11 +22,19 @@ from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
 from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
-from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet, true_pose
-from hardware.live.prepared import Prepared, SurfacePlacement
+from hardware.live.frame_source import (
+    SETTLING_TIME,
+    FrameSource,
+    LiveCameraSource,
+    RingSource,
+    TimedFrameSet,
+    restore_map,
+)
+from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
     CommandedHead,
+    EventEntry,
     PoseEntry,
     PoseHandover,
     ScanEntry,
@@ -38,19 +46,20 @@ from hardware.live.records import (
 )
 from hardware.live.trace import QUEUE_STAGE, TRACKING_LANE, TraceLane, in_turn
 from hardware.offline.looks import LiveLooks, station_places
-from hardware.offline.track import FrameSetStep, region_search, tracker
+from hardware.offline.track import region_search, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.operator.shared_state import LaidDrawing
 from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
-    ask_to_go_first,
+    TRACKING_PRIORITY,
+    ask_for_real_time,
     pipe_closed,
     set_up_process,
     settle_memory,
     signal_at_parents_end,
 )
-from hardware.recording.session_reader import open_session, read_poses
+from hardware.recording.session_reader import open_session
 from perception.frames import FrameSet, Roi, region_since
 from perception.tracking.step import STAGES, TrackingStep
 from perception.tracking.wound_step import RegionTrackingStep
@@ -63,7 +72,6 @@ from planning.placement import (
     placement_by_scan,
 )
 
-SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
 FRAME_WAIT = 0.1  # s of a wait for frames, after which the lifeline is looked at
 MAP_REFRESH_SETS = 15  # sets between two looks at the map for the page
 SHOWN_LANDMARKS = 300  # landmarks that the page shows, about
@@ -72,38 +80,16 @@ HISTOGRAM_PERIOD = 30.0  # s between histograms in the recording
 EXPOSURE_STAGE = "exposure to frames handed over"
 TRACKING_STAGE, HANDED_TO_POSE_STAGE = "tracking", "frames handed over to pose"
 AFTER_POSE_STAGE = "pose handed over to ready for frames"
+MAP_LATE = "a part of the map is late: it counts once it is ready; stillbed track of this recording takes it when due"
 TRUE_PLACE = "placed in the true frame of the simulated world"
-
-
-def _restore_map(step: FrameSetStep, placement: SurfacePlacement, session: Session, shift: float) -> Array:
-    """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
-
-    shift: s, added to their stamps.
-
-    Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
-    runs' poses at the last of them. InputError where the surface is not found in its own pictures.
-    """
-    record, until = placement.map, placement.until
-    poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
-    later = dropwhile(lambda frames: frames.stamp < placement.since, session.frame_sets())
-    sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, later)
-    new_from_old: Array | None = None
-    for frames in sets:
-        shifted = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
-        pose, old = step(FrameSet(frames.stamp + shift, shifted, frames.head)), poses.get(frames.stamp)
-        step.idle()
-        if old is not None and old.state.measured and pose.state.measured and old.state is pose.state:
-            new_from_old = se3.inverse(pose.base_from_surface) @ old.base_from_surface
-    if new_from_old is None:
-        raise InputError(record, "recording", "no surface", "pictures in which it is found again")
-    return new_from_old
 
 
 def track(prepared: Prepared, channels: TrackingChannels) -> None:
     """The body of the process: track until the frames end or the lifeline does; the last report says why."""
     set_up_process("tracking", prepared.settings.cores_tracking)
     use_one_arena()
-    ask_to_go_first()  # the process of the map, which stands back behind this one, is then an ordinary one
+    if prepared.settings.real_time:  # the process of the map and the page's pictures step back behind it
+        ask_for_real_time(TRACKING_PRIORITY)
     signal.signal(signal.SIGTERM, _terminate)
     signal_at_parents_end(signal.SIGTERM)
     sender = RecorderSender(channels.recorder)
@@ -115,6 +101,7 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
             except (StillbedError, OSError) as error:  # reported before files are closed: the arm is stopped for it
                 channels.reports.put(replace(run.report, ended=str(error)))
             finally:
+                run.close()
                 for entry in run.times.entries(WallClock().now()):
                     sender.put(entry)
     except (StillbedError, OSError) as error:
@@ -143,7 +130,8 @@ class _TrackingLoop:
         self._clock, self.times = WallClock(), StageHistograms()
         self._commanded_head = CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
-        self._lane = TraceLane(TRACKING_LANE, self._clock) if prepared.settings.trace else None
+        self._lane = TraceLane(TRACKING_LANE, self._clock, sender.put) if prepared.settings.trace else None
+        self._late = 0  # as `TrackingStep.late` was
         self._source: FrameSource
         self._step: TrackingStep | RegionTrackingStep
         self._outline: SurfaceOutline
@@ -196,9 +184,10 @@ class _TrackingLoop:
         self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
         find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
         given = self._scan, self._clock.now, self._prepared.task.profile.tool
-        self._step = self._steps.enter_context(tracker(self._rig, timed, *given, model=settings.model, find=find))
+        how = tracker(self._rig, timed, *given, model=settings.model, find=find, waits=False)
+        self._step = self._steps.enter_context(how)
         if placement is not None and self._earlier is not None:
-            new_from_old = _restore_map(self._step, placement, self._earlier, shift)
+            new_from_old = restore_map(self._step, placement, self._earlier, shift)
             words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
             lies = new_from_old @ placement.surface_from_path
             placed = PathPlacement(lies, PlacedBy.EARLIER, words, placement.certain, True)
@@ -243,12 +232,18 @@ class _TrackingLoop:
             else:
                 self._track(arrived)
 
+    def close(self) -> None:
+        """Hand over the rest of the trace."""
+        if self._lane is not None:
+            self._lane.close()
+
     def _track(self, arrived: TimedFrameSet) -> None:
         frames = self._with_head(arrived.frames)
         start = self._clock.now()
         pose = self._step(frames)
         sent = self._clock.now()
         self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
+        self._channels.bell.ring()
         self._count_times(arrived, pose, start, sent)
         self._offer_outline(frames, pose)
         self._look_at_print(frames, pose)
@@ -262,10 +257,13 @@ class _TrackingLoop:
         self._source.learn(self._step.last.offsets)
         ready = self._clock.now()
         self.times.add(AFTER_POSE_STAGE, ready - sent)
+        if (late := self._step.late) != self._late:
+            self._late = late
+            self._sender.put(EventEntry(ready, MAP_LATE, INFO, "tracking"))
         if self._lane is not None:
             waited, last = (QUEUE_STAGE, arrived.handed, start), ("map and idle work", told, ready)
             stages = in_turn(start, STAGES, self._step.last.seconds)
-            self._sender.put(self._lane.entry(pose.stamp, [waited, *stages, ("page and record", sent, told), last]))
+            self._lane.add(pose.stamp, [waited, *stages, ("page and record", sent, told), last])
 
     def _look_at_print(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Look at what was laid where the nozzle stands aside for it."""
@@ -308,7 +306,7 @@ class _TrackingLoop:
         if scan is not None:
             placed = placement_by_scan(scan, middle, outward)
         elif self._prepared.again and self._truth is not None:
-            lies = se3.inverse(pose.base_from_surface) @ true_pose(self._truth, arrived.source)
+            lies = se3.inverse(pose.base_from_surface) @ self._truth.at(np.array([arrived.source]))[0]
             placed = PathPlacement(lies, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
         elif (surface_map := self._step.map) is not None:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
@@ -340,7 +338,7 @@ class _TrackingLoop:
             unrecorded=self._sender.dropped,
             timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._truth is None else true_pose(self._truth, arrived.source),
+            truth=None if self._truth is None else self._truth.at(np.array([arrived.source]))[0],
             surface=self._landmarks(pose),
             draws=self._drawn and not self._step.roi,
             outlined=self._sheet is not None,

@@ -5,7 +5,6 @@ The command line needs only the names, so GTSAM, OpenCV and onnxruntime are impo
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 from hardware.process.progress import Progress, ProgressReport, prepare_out
-from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent
+from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent, step_back
 
 if TYPE_CHECKING:
     from estimation.pose import SurfacePose
@@ -91,6 +90,7 @@ def tracker(
     prefilter: str = "none",
     model: Path | None = None,
     find: Callable[[Executor], FindRegion] | None = None,
+    waits: bool = True,
 ) -> Iterator[TrackingStep | RegionTrackingStep]:
     """TrackingStep for these cameras; the map is refined in a process of its own, as GTSAM holds the interpreter lock.
 
@@ -98,6 +98,8 @@ def tracker(
     search of the wound by a network. model: the network, an ONNX file; None: the one that comes along. surface: the
     scan, or its file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm,
     profile of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+
+    waits: whether a map that is not ready when it is due is waited for, so that a recording gives the same poses again.
     """
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
@@ -113,21 +115,21 @@ def tracker(
 
         def make_step(regions: Sequence[Roi]) -> TrackingStep:
             masked = None if tool is None else Tool(tool)
-            return TrackingStep(rig, regions, now, executor, scan, masked, PREFILTERS[prefilter])
+            return TrackingStep(rig, regions, now, executor, scan, masked, PREFILTERS[prefilter], waits)
 
         if roi:
             yield make_step(roi)
             return
         search = partial(network_search, rig, model) if find is None else find
-        with ThreadPoolExecutor(1) as thread:
+        with ThreadPoolExecutor(1, initializer=step_back) as thread:
             yield RegionTrackingStep(rig, make_step, search(thread))
 
 
 def _start_map_process() -> None:
     """Set up the map's process: the parent ends it, also after Ctrl-C, and frames have priority over the map."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    step_back(MAP_PROCESS_NICE)
     exit_with_parent()
-    os.nice(MAP_PROCESS_NICE)
 
 
 DRAW_TEXT = "draw on the page where the surface is"

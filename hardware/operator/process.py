@@ -24,7 +24,7 @@ from estimation.se3 import Array
 from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
 from hardware.process.clock import WallClock
-from hardware.process.system import SPAWN, SharedLatest
+from hardware.process.system import SPAWN, SharedLatest, step_back
 from perception.frames import Image
 
 PAGE_NICENESS = 5  # below the loops, above what may wait for minutes
@@ -130,7 +130,7 @@ class Thumbnailer:
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
         self.made = self.dropped = 0
-        self._thread = ThreadPoolExecutor(1, "live pictures")
+        self._thread = ThreadPoolExecutor(1, "live pictures", step_back)
         self._job: Future[None] | None = None  # the last one
 
     def offer(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None = None) -> bool:

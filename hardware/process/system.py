@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
+from select import select
 from threading import Thread
 from typing import Any, Generic, TypeVar
 from zlib import crc32
@@ -120,6 +121,7 @@ def fill_standard_streams() -> None:
 
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
+TRACKING_PRIORITY = 5  # of those: the arm's motion goes before the tracking that it waits for
 NICE_LEVEL = -10  # before all that asked for nothing
 NO_PRIORITY = "nothing: an ordinary process"  # what is granted where no priority is
 
@@ -130,12 +132,15 @@ def settle_memory() -> None:
     gc.freeze()
 
 
-def ask_for_real_time() -> str:
-    """Take the best priority that is granted, and leave what is loaded out of garbage collection; what was granted."""
+def ask_for_real_time(priority: int = REAL_TIME_PRIORITY) -> str:
+    """Take the best priority that is granted, and leave what is loaded out of garbage collection; what was granted.
+
+    Threads and processes that this thread starts have it as well, unless they `step_back`.
+    """
     settle_memory()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
-        return f"real time, priority {REAL_TIME_PRIORITY}"
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return f"real time, priority {priority}"
     except (AttributeError, OSError):
         pass
     return ask_to_go_first()
@@ -149,8 +154,19 @@ def ask_to_go_first() -> str:
         return NO_PRIORITY
 
 
+def step_back(nice: int = 0) -> None:
+    """Work for which nothing waits: this thread is an ordinary one from now on. nice: to be added to its priority."""
+    with suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    if nice:
+        os.nice(nice)
+
+
 def set_up_process(name: str, cores: Sequence[int] = (), nice: int = 0, outlives: bool = False) -> None:
-    """Be a process group of one's own and leave Ctrl-C and a closed terminal to whoever conducts the run.
+    """Be a session of one's own, and leave Ctrl-C and a closed terminal to whoever conducts the run.
+
+    A session is a process group that can be killed as one; and Linux shares the processor among sessions first
+    (sched_autogroup): niceness counts within one only.
 
     name: by which ps and top show the process. cores: to run on, all without any. nice: to be added to the priority.
     outlives: whether it ends by itself, in order, once its parent has ended; else the kernel kills it then.
@@ -159,7 +175,7 @@ def set_up_process(name: str, cores: Sequence[int] = (), nice: int = 0, outlives
         outlive_parent()
     with suppress(OSError):
         Path("/proc/self/comm").write_text(f"sb-{name}", encoding="ascii")
-        os.setpgid(0, 0)
+        os.setsid()
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     if cores:
@@ -187,6 +203,27 @@ def pipe_closed(lifeline: Connection) -> bool:
     except OSError:
         return True
 
+
+class Bell:
+    """Ends the wait of one process as soon as another has something for it; handed to both when they are started."""
+
+    def __init__(self) -> None:
+        self._heard, self._rung = SPAWN.Pipe(duplex=False)
+        for end in (self._heard, self._rung):
+            os.set_blocking(end.fileno(), False)
+
+    def ring(self) -> None:
+        """End the wait, or the next one; never waits itself."""
+        with suppress(OSError):  # so often rung that there is no room, or nobody is there any more
+            os.write(self._rung.fileno(), b"!")
+
+    def wait(self, patience: float) -> None:
+        """Wait `patience` s, or until it is rung."""
+        if select([self._heard.fileno()], [], [], max(patience, 0.0))[0]:
+            os.read(self._heard.fileno(), MOST_RINGS)
+
+
+MOST_RINGS = 2**16  # that a pipe holds
 
 Value = TypeVar("Value")
 

@@ -252,7 +252,7 @@ class Recorder:
         self._message("/latency", stamp, message)
 
     def trace(self, stamp: float, message: Message) -> None:
-        """Write what a process did of the frame set at `stamp`, s, as `hardware/live/trace.py` has it."""
+        """Write what a process did of frame sets until `stamp`, s, as `hardware/live/trace.py` has it."""
         self._message("/trace", stamp, message)
 
     def attach(self, name: str, data: bytes) -> None:

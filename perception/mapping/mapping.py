@@ -75,32 +75,39 @@ class Mapping:
         masks: TrackingMasks,
         executor: Executor | None = None,
         scan: Scan | None = None,
+        waits: bool = True,
     ) -> None:
         """roi: where the surface is when it first comes into view. search: learns each view that is mapped.
 
         masks: where no landmark may begin. executor: where the map is refined. scan: its frame is the surface frame.
+        waits: whether what the executor has not done when it is due is waited for.
         """
         self._lenses, self._roi, self._search = lenses, tuple(roi), search
         self._estimator, self._masks = estimator, masks
         self._placing = None if scan is None else ScanPlacing(scan)
         self._place: Registration | None = None  # of the scan at the first instant
         self.registration: Registration | None = None
-        self._refiner = Refiner(lenses.rig, executor)
+        self._refiner = Refiner(lenses.rig, executor, waits)
         self._cameras = np.mean([c.base_from_camera[:3, 3] for c in lenses.rig.cameras], axis=0)
         self._tries, self._failure = 0, ""  # to make a first map, and why the last one failed
         self._mapped = 0.0  # s, stamp of the first map
         self._caveat = ""  # of every pose on this map, in words
         self._refinements = 0  # of this map
         self._seemed_bent = False  # whether the surface seemed to deform while the first map could be the cause
-        self._hint: DelayedJob[tuple[frozenset[int], str]] = DelayedJob(executor)
+        self._hint: DelayedJob[tuple[frozenset[int], str]] = DelayedJob(executor, waits=waits)
         self._hint_due, self._hinted = 0, ""  # tries until the next search for a hint; the last one's words
         self._unmapped: tuple[dict[int, Image], dict[int, Array], frozenset[int]] | None = None  # to be looked into
         # whether a first map has been looked into, whether that is still open, and why there is none in the end
         self._checked, self._doubted, self._refuted = False, False, ""
         self._unseen: frozenset[int] = frozenset()  # cameras whose pictures show nothing of the map
-        self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor)
+        self._growth: DelayedJob[NewLandmarks] = DelayedJob(executor, waits=waits)
         self._probation: Probation | None = None
         self._offered: tuple[TrackedSet, bool] | None = None  # the last frame set, and whether the map may learn of it
+
+    @property
+    def late(self) -> int:
+        """How often what the executor makes was not ready when it was due."""
+        return self._refiner.late + self._growth.late
 
     def start(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> tuple[Matcher, SurfacePose, TrackedSet] | str:
         """Begin with a first map of these images (by camera): its matcher, its pose, and the frame set tracked with it.

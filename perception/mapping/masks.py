@@ -20,7 +20,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from estimation import se3
 from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces
-from estimation.runtime import median
+from estimation.runtime import compiled, median
 from estimation.se3 import Array, Mask
 from estimation.surface_map import SurfaceMap, Warp, bells
 from perception.frames import SYRINGE, Image, PrintHead, check_profile
@@ -214,6 +214,27 @@ class _FirstPicture:
     noise: Array  # (2,) one sigma
 
 
+@compiled("void(f8[:,::1], b1[::1], f8[::1], f8[::1], f8, f8[:,::1], f8[:,::1])")
+def add_equations(
+    sums: Array, free: Mask, away: Array, dark: Array, variance: float, squares: Array, slopes: Array
+) -> None:
+    """Add one ratio's normal equations at P places to `sums` (P, 14), as `Colours` keeps them.
+
+    free: (P,) where it counts. away: (P,) logarithms off the first picture. dark: (P,) how fast it changes with light.
+    variance: of its noise. squares (P, 9), slopes (P, 3): of the first picture.
+    """
+    for p in range(len(away)):
+        light = LIGHT_SIGMA * dark[p]
+        precision = (1.0 if free[p] else 0.0) / (variance + light * light)
+        pull = precision * away[p]
+        for i in range(9):
+            sums[p, i] += precision * squares[p, i]
+        for i in range(3):
+            sums[p, 9 + i] -= pull * slopes[p, i]
+        sums[p, 12] += pull * away[p]
+        sums[p, 13] += 1.0 if free[p] else 0.0
+
+
 class Colours:
     """Remembers the colours of one surface, and where they stand off its texture."""
 
@@ -267,11 +288,8 @@ class Colours:
                 away = now[k] - first.ratios[k]
                 away -= median(away[free])
                 first.noise[k] += (1.4826 * median(np.abs(away[free])) - first.noise[k]) / NOISE_MEMORY_SETS
-                precision = free / (max(first.noise[k], MIN_NOISE) ** 2 + (LIGHT_SIGMA * dark[k]) ** 2)
-                sums[:, :9] += precision[:, None] * first.squares[k]
-                sums[:, 9:12] -= (precision * away)[:, None] * first.slopes[k]
-                sums[:, 12] += precision * away * away
-                sums[:, 13] += free
+                variance = max(first.noise[k], MIN_NOISE) ** 2
+                add_equations(sums, free, away, dark[k], variance, first.squares[k], first.slopes[k])
             pulls.append(self._bells @ (sums[:, 9:12] - before))
         if not pulls:
             return NOTHING_DISPLACED

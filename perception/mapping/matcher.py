@@ -346,6 +346,8 @@ class Matcher:
         self, images: Pyramid, where: Projection, spots: Array, rows: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """Which landmarks (rows, (M,)) show their grain at spots (M, 2) px: a shadow's edge hides the rest of them."""
+        if not len(rows):
+            return np.zeros(0, bool)
         now = grain_of(sample(images[0], spots, where.per_sample))
         first = grain_of(self.templates.picture[rows])
         alike, sizes = (now * first).sum(1), (now * now).sum(1) * (first * first).sum(1)

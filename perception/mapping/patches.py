@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.runtime import CONTIGUOUS
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
 from perception.frames import Image, parallel_map
-from perception.lens import Lenses
+from perception.lens import Lenses, bend_one
 from perception.mapping.alignment_kernels import PATCH_RADIUS, PATCH_SIDE, Float32, descend, sample_grids
 
 MIN_PATCH_CONTRAST = 3.0  # grey levels: a patch with less contrast is not worth a track
@@ -77,7 +77,7 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     the border's value.
     """
     scale = (0.5 if half else 1.0) * spacing
-    steps = np.require(per_sample, float, CONTIGUOUS)
+    steps = contiguous(per_sample)
     return np.asarray(sample_grids(image, on_level(centre, half), steps, scale), np.float32)
 
 
@@ -85,7 +85,7 @@ def on_level(centre: Array, half: bool) -> Array:
     """Centres (N, 2) px of an image in the pixels of the image or of its half-size version."""
     # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
     # tests/test_patches.py finds fewer from 5 px away. Templates are cut alike, so what is compared is not shifted.
-    return centre * 0.5 - 0.25 if half else np.require(centre, float, CONTIGUOUS)
+    return centre * 0.5 - 0.25 if half else contiguous(centre)
 
 
 def normalise(pictures: Float32) -> tuple[Float32, Float32]:
@@ -140,26 +140,56 @@ def project_into(
     """Squares projected into cameras, each with its base_from_surface (C, 4, 4); row c N + i: square i of camera c."""
     which = np.asarray(cameras, np.int64)
     camera_from_surface = lenses.rig.camera_from_base[which] @ base_from_surface
-    count, step = len(which), 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding
+    step = 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding
     corners = np.stack([points, points + step * axes[:, :, 0], points + step * axes[:, :, 1]]).reshape(-1, 3)
     in_camera = camera_from_surface[:, :3, :3] @ corners.T + camera_from_surface[:, :3, 3:]  # (C, 3, 3N)
-    x, y, depth = in_camera.reshape(count, 3, 3, -1).swapaxes(0, 1)  # each (C, 3, N)
-    inverse_depth = 1 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-    imaged, in_lens = lenses.bend(which[:, None, None], x * inverse_depth, y * inverse_depth, depth)  # (2, C, 3, N)
-    per_sample = (imaged[:, :, 1:] - imaged[:, :, :1]) / step  # (2, C, 2, N)
     turned = camera_from_surface[:, :3, :3] @ normals.T  # (C, 3, N)
-    from_eye = in_camera[:, :, : len(points)]
-    facing = -(turned * from_eye).sum(1) / np.maximum(np.sqrt((from_eye * from_eye).sum(1)), 1e-9)
-    reach = PATCH_RADIUS * np.abs(per_sample).sum(2) + 2
-    centre = imaged[:, :, 0]
-    limit = lenses.sizes[which].T[..., None] - 1 - reach
-    visible = in_lens.all(1) & ((centre >= reach) & (centre < limit)).all(0) & (facing > 0.15)
-    return Projection(
-        np.ascontiguousarray(centre.reshape(2, -1).T),
-        np.ascontiguousarray(per_sample.transpose(1, 3, 0, 2).reshape(-1, 2, 2)),
-        visible.ravel(),
-        facing.ravel(),
-    )
+    models, radius, sizes = lenses.models[which], lenses.radius[which], lenses.sizes[which]
+    return Projection(*project_corners(in_camera, turned, models, radius, sizes, step))
+
+
+@compiled(
+    "Tuple((f8[:,::1], f8[:,:,::1], b1[::1], f8[::1]))(f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8)"
+)
+def project_corners(
+    in_camera: Array, turned: Array, models: Array, radius: Array, sizes: Array, step: float
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """The parts of a `Projection` of N squares into C cameras, one after the other.
+
+    in_camera: (C, 3, 3N) mm, their places, and what lies `step` samples along both sides. turned: (C, 3, N) normals.
+    models, radius, sizes: of the cameras, as `Lenses` has them.
+    """
+    count, squares = len(in_camera), turned.shape[2]
+    centre, per_sample = np.empty((count * squares, 2)), np.empty((count * squares, 2, 2))
+    visible, facing = np.empty(count * squares, np.bool_), np.empty(count * squares)
+    for c in range(count):
+        for n in range(squares):
+            row = c * squares + n
+            seen, across, down = True, 0.0, 0.0
+            for corner in range(3):
+                k = corner * squares + n
+                depth = in_camera[c, 2, k]
+                inverse = 1 / (1e-6 if abs(depth) < 1e-6 else depth)
+                x, y = in_camera[c, 0, k] * inverse, in_camera[c, 1, k] * inverse
+                u, v, in_lens = bend_one(x, y, depth, models[c], radius[c])
+                seen = seen and in_lens
+                if corner == 0:
+                    across, down = u, v
+                else:
+                    per_sample[row, 0, corner - 1] = (u - across) / step
+                    per_sample[row, 1, corner - 1] = (v - down) / step
+            along = turned[c, 0, n] * in_camera[c, 0, n] + turned[c, 1, n] * in_camera[c, 1, n]
+            along += turned[c, 2, n] * in_camera[c, 2, n]
+            far = in_camera[c, 0, n] * in_camera[c, 0, n] + in_camera[c, 1, n] * in_camera[c, 1, n]
+            far += in_camera[c, 2, n] * in_camera[c, 2, n]
+            facing[row] = -along / max(np.sqrt(far), 1e-9)
+            centre[row, 0], centre[row, 1] = across, down
+            for axis in range(2):
+                reach = PATCH_RADIUS * (abs(per_sample[row, axis, 0]) + abs(per_sample[row, axis, 1])) + 2
+                limit = sizes[c, axis] - 1 - reach
+                seen = seen and centre[row, axis] >= reach and centre[row, axis] < limit
+            visible[row] = seen and facing[row] > 0.15
+    return centre, per_sample, visible, facing
 
 
 def square_axes(lenses: Lenses, camera: int, base_from_surface: Array, points: Array, normals: Array) -> Array:
@@ -236,7 +266,7 @@ def align_in(
     begin. least: the correlation below which a landmark is not found. coarse: begin on the half-size images, which
     reaches twice as far (5 px surely, 8 mostly) and costs as much again.
     """
-    begin, per_sample = np.require(start, float, CONTIGUOUS), np.require(where.per_sample, float, CONTIGUOUS)
+    begin, per_sample = contiguous(start), contiguous(where.per_sample)
     shift, ended = np.zeros((len(templates), 2)), np.zeros((len(templates), 3))  # shifts in samples of the template
 
     def in_one(images: Pyramid, mine: slice) -> None:

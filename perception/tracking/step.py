@@ -87,6 +87,7 @@ class TrackingStep:
         scan: Scan | None = None,
         tool: Tool | None = None,
         prefilter: Callable[[Image], Image] = unfiltered,
+        waits: bool = True,
     ) -> None:
         """Ready for the first frame set.
 
@@ -94,6 +95,7 @@ class TrackingStep:
         clock: fills `StepReport.seconds` and nothing else.
         executor: where the map is refined; in a process of its own GTSAM does not hold up the frames. Without one the
             map is refined in `idle`. Poses are the same either way.
+        waits: whether `idle` waits for what is due; else it counts once it is there, and poses depend on when that is.
         scan: its frame is the surface frame; without one the first map defines it (origin at the landmarks' centroid, z
             out of the surface).
         tool: shape of the print head, masked where frame sets tell its pose.
@@ -105,9 +107,9 @@ class TrackingStep:
         found = any(roi.found for roi in self.roi)
         self._estimator = Estimator(rig, region="none" if whole else "found" if found else "drawn")
         self._is_new = DuplicateFilter()
-        self._search = Relocaliser(self._lenses)
-        self._masks = TrackingMasks(self._lenses, tool)
-        self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, executor, scan)
+        self._search, self._masks = Relocaliser(self._lenses), TrackingMasks(self._lenses, tool)
+        how = executor, scan, waits
+        self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, *how)
         self._matcher: Matcher | None = None
         self._forget_looks()
         self._unverified: TrackedSet | None = None  # by which the verification is to learn the surface
@@ -116,8 +118,7 @@ class TrackingStep:
         self._searched: dict[int, Pyramid] = {}  # images of cameras that `idle` is to search for the surface
         self._relocalised: Array | None = None  # (4, 4), where the last search saw the surface
         self._absent = 0  # frame sets since the surface was last measured
-        self._spent = np.zeros(len(STAGES))
-        self._lap = 0.0
+        self._spent, self._lap = np.zeros(len(STAGES)), 0.0
 
     def _forget_looks(self) -> None:
         """Know nothing of how the surface looks, as before its map."""
@@ -126,8 +127,7 @@ class TrackingStep:
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp` from this frame set and the ones before."""
-        self._spent = np.zeros(len(STAGES))
-        self._lap = self._clock()
+        self._spent, self._lap = np.zeros(len(STAGES)), self._clock()
         last = self._estimator.pose
         if last is not None and frames.stamp <= last.stamp:  # the same instant again
             self.last = self._report(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64))
@@ -155,6 +155,11 @@ class TrackingStep:
     def map(self) -> SurfaceMap | None:
         """The map as it is now, in the surface frame; None before there is one."""
         return self._estimator.map
+
+    @property
+    def late(self) -> int:
+        """How often a part of the map was not ready when it was due."""
+        return self._mapping.late
 
     @property
     def window_graph(self) -> str:

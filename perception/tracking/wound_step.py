@@ -217,6 +217,11 @@ class RegionTrackingStep:
         return None if self._step is None else self._step.map
 
     @property
+    def late(self) -> int:
+        """As `TrackingStep.late`."""
+        return 0 if self._step is None else self._step.late
+
+    @property
     def window_graph(self) -> str:
         """The factor graph of the last poses in Graphviz's language; '' before the region is known."""
         return "" if self._step is None else self._step.window_graph
