@@ -272,8 +272,10 @@ class _Taken:
             return frames.stamp < since + MAX_FIND_TIME
         self._began = frames.stamp if self._began is None else self._began
         part = int((frames.stamp - self._began) / self._seconds * self._sets)
-        if part >= self._sets:
+        if part >= self._sets and len(self) >= MIN_TRACKED_SETS:
             return False
+        if part >= self._sets:  # of live cameras one set alone, as the first take long: once more
+            self._bins, self._began, part = {-1: next(iter(self._bins.values()))}, frames.stamp, 0
         before = self._bins.get(part)
         if before is None or self._worth(frames, pose) > self._worth(before.frames, before.pose):
             self._bins[part] = TrackedFrames(frames, pose, exposed())
