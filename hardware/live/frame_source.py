@@ -26,7 +26,6 @@ from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set
 if TYPE_CHECKING:
     from hardware.cameras.feed import LiveHealth
     from hardware.files.session import Session
-    from hardware.live.prepared import SurfacePlacement
     from hardware.offline.track import FrameSetStep
 
 SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
@@ -204,19 +203,18 @@ class LiveCameraSource:
 FrameSource = RingSource | LiveCameraSource
 
 
-def restore_map(step: FrameSetStep, placement: SurfacePlacement, session: Session, shift: float) -> Array:
+def restore_map(step: FrameSetStep, record: Path, since: float, until: float, session: Session, shift: float) -> Array:
     """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
 
-    shift: s, added to their stamps.
+    record, since, until: of the earlier run, s. shift: s, added to their stamps.
 
     Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
     runs' poses at the last of them. InputError where the surface is not found in its own pictures.
     """
     from hardware.recording.session_reader import read_poses  # of a run that resumes alone
 
-    record, until = placement.map, placement.until
     poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
-    later = dropwhile(lambda frames: frames.stamp < placement.since, session.frame_sets())
+    later = dropwhile(lambda frames: frames.stamp < since, session.frame_sets())
     sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, later)
     new_from_old: Array | None = None
     for frames in sets:

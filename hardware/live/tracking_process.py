@@ -187,7 +187,9 @@ class _TrackingLoop:
         how = tracker(self._rig, timed, *given, model=settings.model, find=find, waits=False)
         self._step = self._steps.enter_context(how)
         if placement is not None and self._earlier is not None:
-            new_from_old = restore_map(self._step, placement, self._earlier, shift)
+            new_from_old = restore_map(
+                self._step, placement.map, placement.since, placement.until, self._earlier, shift
+            )
             words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
             lies = new_from_old @ placement.surface_from_path
             placed = PathPlacement(lies, PlacedBy.EARLIER, words, placement.certain, True)
