@@ -203,10 +203,15 @@ class RunOutcome:
         return 0.0 if dry or not ways[-1] > 0 else float(np.interp(place, np.arange(len(path)), ways) / ways[-1])
 
     @property
+    def recorded(self) -> bool:
+        """Whether there is a recording: of a run that ended while its processes loaded there is none."""
+        return self.reports.recorder is not None and self.reports.recorder.written > 0
+
+    @property
     def again(self) -> str:
-        """The command that goes on; "" where nothing is left, or nothing was printed on purpose."""
+        """The command that goes on; "" where nothing is left, recorded, or to be printed at all."""
         task = self.prepared.task
-        left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1
+        left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1 and self.recorded
         return f"stillbed live --resume {self.prepared.files.record}" if left else ""
 
     def result(self) -> RunResult:
@@ -241,6 +246,8 @@ class RunOutcome:
             lines.append(f"{self.place:.2f} of {total} checkpoints {done}; the arm is at rest")
             if not dry:
                 nothing = "the path is printed; there is nothing to go on with"
+                if not self.recorded:
+                    nothing = "nothing was recorded yet: begin it again as before"
                 lines.append(f"go on with: {self.again}" if self.again else nothing)
         return "\n".join([*lines, f"report: {files.report}"])
 

@@ -58,7 +58,6 @@ from planning.placement import PlacedBy
 POLL_PERIOD = 0.02  # s between looks while nothing happens
 VIEW_PERIOD = 0.15  # s between views for the page
 STATUS_PERIOD = 5.0  # s between status lines
-REPORT_FETCH_TIME = 1.0  # s in which open windows take the report, before the page is closed
 REST_TIMEOUT = 1.0  # s in which the arm has to report that it is at rest
 MOTION_HANG_TIMEOUT = 2.0  # s without a report, after which the motion process is ended and the arm stopped for it
 SIGNAL_TEXTS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "the terminal was closed"}
@@ -110,14 +109,14 @@ class LiveRun:
             self._put_view(self._clock.now(), self._outcome().result())
             self._shut_down()
             outcome = self._outcome().write()
-            if self._page is not None and channels.link.requests.windows:
+            if self._page is not None:
                 self._put_view(self._clock.now(), outcome.result())
-                self._clock.wait_until(self._clock.now() + REPORT_FETCH_TIME)
+                self._page.hand_out_report()
         return outcome
 
     def _outcome(self) -> RunOutcome:
-        ended = self._signal, self._channels.place.value, self._channels.link.pictures.get()
-        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *ended)
+        end = self._signal, self._channels.place.value, self._channels.link.pictures.get()
+        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *end)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal that asks the run to end."""
@@ -127,8 +126,7 @@ class LiveRun:
 
     def _cycle(self, wake: socket.socket, progress_writer: ProgressWriter) -> None:
         terminal = [] if self._console.file is None else [self._console.file]
-        ready = wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)
-        if wake in ready:
+        if wake in (ready := wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)):
             wake.recv(64)
         requests = self._requests_by_key(ready) + self._channels.link.take()
         reports, channels, now = self._reports, self._channels, self._clock.now()
@@ -376,6 +374,8 @@ class LiveRun:
         with suppress(OSError):
             channels.orders.send(Order.QUIT)
         channels.end()
+        if channels.motion.get() is None:  # ended while it loaded, perhaps between a dispenser and its first tick
+            self._switch_off_material()
         reports.tracking = channels.tracking.get() or reports.tracking
         reports.motion = channels.motion.get() or reports.motion
         reports.recorder = channels.recorder.get()
