@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from aiohttp import web_app
 
 from estimation.pose import TrackState
 from hardware.operator.server import serve
@@ -88,6 +89,7 @@ class Served:
         self._loop.call_soon_threadsafe(self._ended.set)
         self._thread.join(10)
         assert not self._thread.is_alive()
+        web_app._cached_build_middleware.cache_clear()  # holds the server, and with it a dozen files of the link
 
     def put(self, view: OperatorView) -> None:
         """Show a view."""

@@ -53,6 +53,7 @@ from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawi
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
 from hardware.process.system import state_inputs
+from planning.material import with_offsets
 from planning.placement import PlacedBy
 
 POLL_PERIOD = 0.02  # s between looks while nothing happens
@@ -122,8 +123,6 @@ class LiveRun:
         """Handle a signal that asks the run to end."""
         self._signal = number
 
-    # -- one cycle
-
     def _cycle(self, wake: socket.socket, progress_writer: ProgressWriter) -> None:
         terminal = [] if self._console.file is None else [self._console.file]
         if wake in (ready := wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)):
@@ -140,9 +139,8 @@ class LiveRun:
         if channels.looks.value != machine.looks:
             channels.outline.put(OutlineOrder(machine.looks, machine.outline))
             channels.looks.value = machine.looks
-        arm = None if machine.placed_path is None else machine.placed_path.profile.arm
-        self._statistics.update(now, machine.stage, reports, arm)
-        self._statistics.add_true_error(self._view_builder.update(reports, self._profile))
+        self._statistics.update(now, machine.stage, reports)
+        self._statistics.add_true_error(*self._view_builder.update(reports, self._profile, self._statistics.claim))
         self._show_surface()
         self._announce(now)  # before the view: a new stage is in this one
         self._show_view(now)
@@ -231,6 +229,7 @@ class LiveRun:
         for name, text in texts.items():
             self._channels.sender.put(UsedEntry(name, text))
         self._profile = order.profile
+        self._statistics.begin(with_offsets(order.path, order.outlets), order.profile)
         lag = 1000 * order.profile.lag
         self._log(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {lag:.0f} ms")
         return order

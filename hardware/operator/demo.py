@@ -302,6 +302,7 @@ class DemoRun:
             reason="predicted error 0.62 mm at the nozzle, limit 0.50 mm: the surface moves too fast" if held else "",
             error=float(error) if moves else nan,
             limit=0.5,
+            sigma=float(0.45 * error) if moves else nan,
             true_error=float(0.8 * error + 0.03 * np.sin(11 * now)) if moves else nan,
             in_flight=0.031 if moves else 0.0,
             most_in_flight=0.05,
