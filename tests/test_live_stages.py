@@ -743,7 +743,7 @@ def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
         statistics.errors.add(0.2 + 0.001 * k)
         statistics.add_true_error(0.1 + 0.001 * k, 0.1795)
     statistics.add_true_error(float("nan"))
-    statistics.stretches[300:350] = 0.3
+    statistics.stretches[300:350] = statistics.largest = 0.3
     prepared = replace(views_of(run, 2.5).prepared, files=RunFiles(tmp_path / "run.mcap"))
     seen = PagePictures(1.0, (CameraPicture("left", b"whole", near=b"near"), CameraPicture("right", b"whole")), None)
     outcome = RunOutcome(prepared, run.conductor, statistics, run.seen, 0, 4.0, seen).write()

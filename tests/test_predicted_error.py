@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from estimation.pose import SurfacePose
+from estimation import se3
+from estimation.pose import SurfacePose, radius
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.live.outcome import RunStatistics
