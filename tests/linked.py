@@ -68,6 +68,13 @@ class Linked:
         self.run(seconds, each)
         return refused
 
+    @property
+    def backlog(self) -> float:
+        """Seconds that the arm is behind the model, as its answers say."""
+        queue = self.arm._queue
+        assert queue is not None
+        return self.arm._feedback.backlog(queue, self.clock.now())
+
     def executed(self) -> Array:
         """Where the virtual arm is now (6,)."""
         self.virtual.advance(self.clock.now())

@@ -256,6 +256,13 @@ MUTANTS = (
         ("test_arm_link.py::test_what_the_link_does_not_hold_back_it_takes_and_never_has_to_stop_the_arm",),
     ),
     Mutant(
+        "what an arm has made good counts as under way",
+        "hardware/arm/feedback.py",
+        "return behind - queue.idle(since, now) if",
+        "return behind if",
+        ("test_arm_link.py::test_the_backlog_is_never_taken_for_more_than_it_is",),
+    ),
+    Mutant(
         "a command of any length is sent",
         "hardware/arm/queue.py",
         "if flight > self.flight",

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from estimation.errors import InputError
 from hardware.arm.device import ArmState
 from hardware.arm.driver import G1, G4, Pause, Reply, ReplyKind
+from hardware.arm.feedback import LAG_SPREAD
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.protocol import Dialect, decode, encode
 from hardware.arm.queue import ArmQueue, FlowControl
@@ -487,6 +488,22 @@ def test_a_lag_that_was_learned_of_a_stalled_arm_alone_is_learned_anew() -> None
     assert link.arm.lag == pytest.approx(0.02, abs=0.004)
 
 
+@settings(max_examples=8)
+@given(seconds=st.floats(0.012, 0.029), start=st.floats(2.0, 2.1))
+def test_the_backlog_is_never_taken_for_more_than_it_is(seconds: float, start: float) -> None:
+    stall = arm_fault(f"stall {1000 * seconds:.1f}ms at {start}s")  # less than what is called back
+    link = linked(ANSWERING, stall, link=LinkSettings(flight=0.036))
+    link.follow(1.9)
+    known, waited = [], 0
+    for _ in range(40):  # ticks
+        waited += len(link.follow(0.02))
+        true = link.virtual.in_flight - link.arm.in_flight(link.clock.now())
+        known.append(link.backlog)
+        assert known[-1] <= max(true, 0.0) + LAG_SPREAD
+    assert waited <= 2, "what it has made good while nothing was sent is known before its next answer"
+    assert waited or seconds < 0.022
+
+
 def test_what_a_stall_piled_up_counts_as_motion_under_way() -> None:
     flow, queue = FlowControl(ArmProfile(), LinkSettings()), ArmQueue(HOME.tolist(), 0.004, 0.0)
     line = linked().arm.driver
@@ -495,7 +512,7 @@ def test_what_a_stall_piled_up_counts_as_motion_under_way() -> None:
     link = linked(ANSWERING, arm_fault("stall 28ms at 2s"))  # less than what is called back
     assert link.follow(2.0) == []
     assert link.follow(0.15) == []
-    assert 0.02 < link.arm._feedback.backlog < 0.035
+    assert 0.02 < link.backlog < 0.035
     assert "under way" in str(link.follow(0.3)) and link.arm.lag == pytest.approx(0.02, abs=0.004)
     link.follow(1.0)
-    assert link.arm._feedback.backlog < 0.022  # with a tick of 24 ms no more than 50 ms are under way
+    assert link.backlog < 0.022  # with a tick of 24 ms no more than 50 ms are under way

@@ -72,7 +72,7 @@ class ArmFeedback:
     _period: float = math.nan  # s between places, smoothed
     _place: _AnsweredAxes = field(default_factory=_AnsweredAxes)
     _turn: _AnsweredAxes = field(default_factory=_AnsweredAxes)
-    _delays: tuple[float, float] = (0.0, 0.0)  # s, at least, of the last two answers; 0: it hardly moved
+    _delays: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=2))  # s: when, and how late
     _sums: tuple[float, float] = (0.0, 0.0)  # of the open stretch: (mm/s)^2 s and (mm/s)^2
     _stretches: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_LAG_BLOCKS))
 
@@ -103,14 +103,15 @@ class ArmFeedback:
         near = [lag for lag in lags if lag <= quick + LAG_SPREAD]
         return sum(near) / len(near)
 
-    @property
-    def backlog(self) -> float:
+    def backlog(self, queue: ArmQueue, now: float) -> float:
         """Seconds of motion that the arm has yet to do beside what the model says, by its last two answers; 0 or more.
 
-        It is never taken for more than it is, as far as rounding goes; 0 while the lag is not known.
+        An answer tells of a place of some time ago; what the arm has made good since, while the model had nothing to
+        do, is taken off. It is never taken for more than it is, as far as rounding goes; 0 while the lag is not known.
         """
-        delay = min(self._delays) - self.lag
-        return delay if delay > LAG_SPREAD else 0.0
+        if len(self._delays) < 2 or math.isnan(lag := self.lag):
+            return 0.0
+        return max(0.0, min(_left(delay - lag, stamp - delay, queue, now) for stamp, delay in self._delays))
 
     @property
     def off(self) -> float:
@@ -171,7 +172,7 @@ class ArmFeedback:
     def forgive(self) -> None:
         """Forget deviations and delays: it counts as standing where it should."""
         self.behind = self.lasting = 0.0
-        self._delays = 0.0, 0.0
+        self._delays.clear()
         for part in (self._place, self._turn):
             part.off = part.before = 0.0
 
@@ -198,7 +199,7 @@ class ArmFeedback:
         """Forget all answers: the device was away, or the operator said where the arm stands."""
         self.count, self.behind, self.lasting, self._period, self._sums = 0, 0.0, 0.0, math.nan, (0.0, 0.0)
         self._stretches.clear()
-        self._delays = 0.0, 0.0
+        self._delays.clear()
         self._place, self._turn = _AnsweredAxes(), _AnsweredAxes()
 
     def _deviation(self, values: Array, axes: slice, queue: ArmQueue, now: float) -> float:
@@ -224,15 +225,20 @@ class ArmFeedback:
         lead = [a - p for a, p in zip(ahead, place.tolist(), strict=True)]
         fast = math.hypot(*speed)
         if fast < MIN_LAG_SPEED or self._place.before > self.settings.off:
-            self._delays = 0.0, 0.0
+            self._delays.clear()
             return
         product = sum(v * e for v, e in zip(speed, lead, strict=True))
         square = sum(v * v for v in speed)
-        self._delays = self._delays[1], product / square - float(ANSWER_ROUNDING[0]) / fast
+        self._delays.append((now, product / square - float(ANSWER_ROUNDING[0]) / fast))
         self._sums = self._sums[0] + product, self._sums[1] + square
         if self._sums[1] >= LAG_BLOCK:
             self._stretches.append(self._sums)
             self._sums = 0.0, 0.0
+
+
+def _left(behind: float, since: float, queue: ArmQueue, now: float) -> float:
+    """Seconds of work left at `now`, s, to an arm that was so far behind at the set-point of `since`; 0 if rounding."""
+    return behind - queue.idle(since, now) if behind > LAG_SPREAD else 0.0
 
 
 def near(answered: Array | None, axes: Array | None) -> bool:

@@ -268,7 +268,8 @@ class Arm(ArmDevice):
     def _wait(self, now: float) -> Reason:
         """Why no command of a tick may go out now."""
         assert self._online and self._queue is not None
-        if words := self._flow.full(self.driver, self._queue, self.profile.tick, now, self._feedback.backlog):
+        backlog = self._feedback.backlog(self._queue, now)
+        if words := self._flow.full(self.driver, self._queue, self.profile.tick, now, backlog):
             return Reason(words, LinkCode.FLOW_CONTROL)
         return Reason(self._feedback.doubt(now), LinkCode.FEEDBACK)
 

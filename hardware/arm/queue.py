@@ -105,6 +105,11 @@ class ArmQueue:
         """The same if a command of `duration` s were given out at `now`."""
         return max(max(self._wire, now) + self._frame_time, self._commands[-1].end) + duration - now
 
+    def idle(self, since: float, until: float) -> float:
+        """Seconds between two instants, s, no more than a second ago, in which no command is being done."""
+        ways = (command for command in self._commands if command.end > since and command.start < until)
+        return until - since - sum(min(way.end, until) - max(way.start, since) for way in ways)
+
     def frames(self, now: float) -> int:
         """Commands that are not done, those on the wire included."""
         return sum(command.end > now for command in self._commands)

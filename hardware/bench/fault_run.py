@@ -38,6 +38,7 @@ from perception.frames import FrameSet
 from perception.tracking.step import StepReport
 from planning.command import MotionLimits, Move
 from planning.kinematics import axes_from_nozzle
+from planning.motion.planner import STALL_TICKS
 from planning.path import Path, PrintProgress
 
 AXES_LIMITS = "speed", "acceleration", "jerk", "jump", "turn"
@@ -81,6 +82,7 @@ class AxesOracle:
 MAIN_PERIOD = 0.02  # s between the main process's checks of the others
 START_HEIGHT = 3.0  # mm over its first checkpoint, where the nozzle begins
 MAX_RUN_S = 30.0  # of a run at most
+MISSED_TICK = 1.5  # ticks without a command: one was left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,8 +205,9 @@ class FaultRun:
         anew = bool(record.statements) and record.statements[-1].hold is not LinkCode.STOPPED
         if tick.status.state is ArmState.STOPPED and (not record.stopped or (anew and tick.stamp > record.stopped[-1])):
             record.stopped.append(tick.stamp)
-        if tick.stamp - self._sent_at > 1.5 * self._profile.tick or link.travels:
-            self._oracle.rest()  # a tick that sends nothing, just after one that did, is no rest yet
+        silent = (tick.stamp - self._sent_at) / self._profile.tick  # ticks since one was sent
+        if link.travels or silent > STALL_TICKS or (silent > MISSED_TICK and self._ran_dry()):
+            self._oracle.rest()
         if tick.recalled is not None:
             self._oracle.stands(tick.recalled.stands)
         axes = tick.command.axes if isinstance(tick.command, Move) else None
@@ -218,6 +221,11 @@ class FaultRun:
         text, own = tick.command.reason or reservation, link.travels or tick.hold is LinkCode.RECALLED
         moving = isinstance(tick.command, Move)
         record.statements.append(Statement(tick.stamp, text, moving, own, pose_stamp, tick.hold))
+
+    def _ran_dry(self) -> bool:
+        """Whether the arm has done all that was sent before; one that is behind goes on without a stop."""
+        arm = self._world.arm
+        return arm.now + arm.in_flight <= self._world.now()
 
     def rows(self, log: NozzleLog) -> None:
         """The next rows of the truth at the nozzle."""
