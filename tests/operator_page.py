@@ -41,7 +41,9 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: RunStage = RunStage.PRIN
     """A view with something in every place."""
     pose = np.eye(4)
     tracking = TrackingView(TrackState.TRACKING, "three cameras agree", 0.018, 0.052, pose, np.diag([1e-3] * 3), 182)
-    motion = MotionView(Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0, error_age=0.0)
+    motion = MotionView(
+        Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0, error_age=0.0, sigma=0.12
+    )
     made = OperatorView(
         stamp,
         turn,

@@ -283,7 +283,10 @@ def _add_simulate(commands: Commands) -> None:
 
 
 def _simulate(a: argparse.Namespace) -> int:
+    from hardware.process.checks import read_toml
     from hardware.process.faults import faults_from_texts
+
+    read_toml(a.scenario)  # what cannot be one is told before the simulator is loaded
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)
