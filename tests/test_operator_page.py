@@ -181,7 +181,7 @@ def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
     run.show(motion=motion, notes=("dry run",), log=log)
     body = "".join(page.js("document.body.innerText").split())
     for words in (
-        "Holding", "The surface moves too fast", "Good", "three cameras agree", "0.62 mm", "σ 0.12 of 0.5", "0.19 mm",
+        "Holding", "The surface moves too fast", "Good", "three cameras agree", "0.62 mm", "mm, 95 %", "predicted, σ 0.12/0.5", "0.19 mm",
         "18 ms", "14 / 27 ms", "31 ms", "0.052 mm", "35.2 %", "checkpoint 1204 of 3420", "layer 3 of 12",
         "about 13 min left", "12 min to 14 min", "30 Hz", "60 tracks", "dry run", "live", "6.0 mm/s", "it is back",
     ):  # fmt: skip
