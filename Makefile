@@ -23,12 +23,15 @@ slow: $(STAMP)
 	HYPOTHESIS_PROFILE=many $(BIN)/python -m pytest -m "slow or law" --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 # Machines that others wrote: what can be installed is, what is missing is skipped, with what to install.
-COUNTERPARTS := tests/test_arm_laws.py tests/test_franka_live.py tests/test_urdf.py tests/test_genicam.py tests/test_rtsp.py
+COUNTERPARTS := tests/test_arm_laws.py tests/test_gcode.py tests/test_franka_live.py tests/test_urdf.py tests/test_genicam.py tests/test_rtsp.py
+PRINTER := OctoPrint==1.11.8
 CAMERAS := aravis-tools gir1.2-aravis-0.8 python3-gi nftables faketime gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-good gstreamer1.0-plugins-ugly
 
 counterparts: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[counterparts]'
 	@$(call apt,$(CAMERAS),command -v arv-fake-gv-camera-0.8)
+	test -x .octoprint/bin/python || $(PYTHON) -m venv .octoprint
+	.octoprint/bin/python -m pip install --quiet '$(PRINTER)' # in a place of its own: AGPL, and with pins of its own
 	$(BIN)/python -m pytest -m "slow or not slow" -rs $(COUNTERPARTS)
 
 mutants: $(STAMP)

@@ -11,6 +11,10 @@ X Y Z are the nozzle tip in the arm's frame, mm. A B C (the arm's J4 J5 J6) are 
   own rotation since then: the thesis adds exactly that to its angles (6.3, J5 and J6).
 * `joints`: the angles of the last three joints of a kinematic model, in one posture that the arm keeps.
 
+A machine that does not turn, such as a gantry, keeps A B C of its home: its tip goes where the path wants it, and its
+tool leans against the path's by what the surface has turned, up to `max_lean`. How the tool stands about its own axis
+is of no account.
+
 The model follows the distal Denavit-Hartenberg convention (Spong, Hutchinson and Vidyasagar 2006, 3.2): the i-th row
 a, alpha, d, theta is Rz(joint + theta) Tz(d) Tx(a) Rx(alpha). It must be an elbow arm with a spherical wrist, as nearly
 all six-axis arms are: joints 2 and 3 parallel, the last three axes through one point. Then the inverse is exact in all
@@ -35,6 +39,7 @@ from planning.command import MotionLimits
 SHOULDERS, ELBOWS, WRISTS = ("front", "back"), ("up", "down"), ("positive", "negative")
 POSTURES = np.array(list(product([1.0, -1.0], repeat=3)))  # (8, 3): shoulder, elbow, wrist; see JointModel.signs
 ELBOW_ARM_LAYOUT = "alpha +-90 0 +-90 +-90 +-90 0 degrees, a4 = a5 = a6 = d5 = 0, a2 > 0, a3 or d4 not 0"
+MAX_LEAN = float(np.deg2rad(45))  # rad: a needle that leans more scrapes rather than prints
 MAX_TOOL_OFFSET = 200.0  # mm: a tip farther from where the arm assumes it is another tool
 SINGULAR_REGULARISATION = 1e-6  # added to divisors near a singularity
 
@@ -254,6 +259,7 @@ class SimpleArm:
     joints: JointModel | None = None
     angles: AngleMode = AngleMode.SURFACE  # what A B C are
     tool_offset: Array = field(default_factory=lambda: np.zeros(3))  # (3,) mm, the true tip in the assumed nozzle frame
+    max_lean: float | None = None  # rad that the tool may lean, of a machine that does not turn; None: it turns
 
     def __post_init__(self) -> None:
         if not se3.is_transform(self.arm_from_base):
@@ -265,8 +271,19 @@ class SimpleArm:
         if self.tool_offset.shape != (3,) or not (np.abs(self.tool_offset) <= MAX_TOOL_OFFSET).all():
             allowed = f"3 numbers within {MAX_TOOL_OFFSET:g} mm"
             raise InputError("arm", "tool_offset", self.tool_offset.tolist(), allowed)
+        if self.max_lean is not None and not 0 < self.max_lean <= MAX_LEAN:
+            allowed = f"above 0, at most {np.rad2deg(MAX_LEAN):g} degrees"
+            raise InputError("arm", "max_lean", float(np.rad2deg(self.max_lean)), allowed)
+        if self.max_lean is not None and self.joints is not None:
+            raise InputError("arm", "max_lean", float(np.rad2deg(self.max_lean)), "no table [kinematics] beside it")
         if self.angles is AngleMode.JOINTS and self.joints is None:
             raise InputError("arm", "angles", self.angles.value, "surface, where there is no model of the joints")
+
+    @property
+    def beyond(self) -> str:
+        """Why `axes_from_nozzle` gives NaN, where it does."""
+        turns = self.max_lean is None
+        return "the arm has no such posture" if turns else "this machine does not turn: its tool would lean too far"
 
     @property
     def jointed(self) -> JointModel | None:
@@ -277,14 +294,33 @@ class SimpleArm:
 def axes_from_nozzle(arm: SimpleArm, base_from_nozzle: Array) -> Array:
     """Machine axes (..., 6), mm and rad, that bring the nozzle to base_from_nozzle (..., 4, 4).
 
-    In the simple mode A and C are in +-pi. With joints, angles are NaN where the arm's posture does not reach.
+    In the simple mode A and C are in +-pi. With joints, angles are NaN where the arm's posture does not reach; of a
+    machine that does not turn, where its tool would lean too far.
     """
+    if arm.max_lean is not None:
+        return _unturned_axes(arm, arm.arm_from_base @ base_from_nozzle, arm.max_lean)
     arm_from_nozzle = _offset_tool(arm, arm.arm_from_base @ base_from_nozzle, -1.0)
     if arm.jointed is not None:
         angles = joints_from_nozzle(arm.jointed, arm_from_nozzle)[..., 3:]
     else:
         angles = se3.euler_from_rotation(arm_from_nozzle[..., :3, :3] @ arm.arm_from_upright.T)
     return np.concatenate([arm_from_nozzle[..., :3, 3], angles], axis=-1)
+
+
+def tool_lean(arm: SimpleArm, arm_from_nozzle: Array) -> Array:
+    """Angle (...), rad, between a path's tool (..., 4, 4) and that of a machine that does not turn."""
+    upright = se3.rotation_from_euler(arm.home[3:]) @ arm.arm_from_upright
+    along = arm_from_nozzle[..., :3, 2] @ upright[:, 2]
+    across = np.linalg.norm(np.cross(arm_from_nozzle[..., :3, 2], upright[:, 2]), axis=-1)
+    return np.asarray(np.arctan2(across, along))
+
+
+def _unturned_axes(arm: SimpleArm, arm_from_nozzle: Array, max_lean: float) -> Array:
+    """Machine axes (..., 6) of a machine that does not turn."""
+    upright = se3.rotation_from_euler(arm.home[3:]) @ arm.arm_from_upright
+    tip = arm_from_nozzle[..., :3, 3] - upright @ arm.tool_offset
+    angles = np.where(tool_lean(arm, arm_from_nozzle)[..., None] <= max_lean, arm.home[3:], np.nan)
+    return np.concatenate([tip, angles], axis=-1)
 
 
 def nozzle_from_axes(arm: SimpleArm, axes: Array) -> Array:
@@ -319,6 +355,9 @@ def limited_axes(arm: SimpleArm, base_from_nozzle: Array) -> Array:
 
 def max_axis_change(arm: SimpleArm, limited: Array) -> tuple[Array, Array]:
     """Largest change of each of `limited_axes` (..., D) as the tip moves, per mm, and as it turns, per rad."""
+    if arm.max_lean is not None:
+        moved = np.broadcast_to([1.0, 1, 1, 0, 0, 0], limited.shape)
+        return moved, np.zeros_like(moved)
     if arm.jointed is None:
         # of A and C, as B nears the gimbal lock
         steep = 1 / np.maximum(np.abs(np.cos(limited[..., 4:5])), SINGULAR_REGULARISATION)

@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from planning.kinematics import POSTURES, JointDistance, JointModel, jacobian, joint_distance, joints_from_nozzle
+from planning.kinematics import (
+    POSTURES,
+    JointDistance,
+    JointModel,
+    SimpleArm,
+    jacobian,
+    joint_distance,
+    joints_from_nozzle,
+    tool_lean,
+)
 
 LEVER_ARM = 10.0  # mm per rad: the length that a turn counts as, and so the time that a turn on the spot takes
 MIN_SPACING = 1e-3  # mm: checkpoints that are nearer, turn included, have no direction between them
@@ -218,7 +227,8 @@ MIN_SHOULDER_DISTANCE = 20.0
 SPIN_CANDIDATES = 24  # candidates all round: 15 degrees apart
 REACHABLE = "ok"
 TISSUE = "tool meets tissue"
-REACH_REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed", TISSUE)
+LEANS = "tool leans too far"
+REACH_REASONS = (REACHABLE, "too far", "joint range", "singular", "joint speed", TISSUE, LEANS)
 UNREACHABLE_COST = 1e3  # no smoothness is worth a checkpoint that cannot be printed
 SPIN_STEP_COST = 1.0  # of a spin by one candidate from one checkpoint to the next
 RANGE_END_COST = 1.0  # per rad that a joint is nearer than RANGE_END_ANGLE to the end of its range
@@ -258,6 +268,7 @@ class Reach:
     speed: Array  # (N,) largest share of a joint's speed limit, for path and surface together
     reason: NDArray[np.int64]  # (N,) index into REACH_REASONS, 0 where it can be printed
     spin: Array  # (N,) rad that the tool is spun about its axis
+    lean: Array | None = None  # (N,) rad that the tool of a machine that does not turn leans against the path's
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
@@ -286,6 +297,19 @@ def reach_of(
     reason = np.select(wrong, list(range(1, len(wrong) + 1)), 0)
     unspun = np.zeros(len(path))
     return Reach(joints[0], bound, wrist, elbow, shoulder, manipulability, speed, reason.astype(np.int64), unspun)
+
+
+def unturned_reach(arm: SimpleArm, speed: Array, arm_from_surface: Array, path: Path, motion: SurfaceMotion) -> Reach:
+    """The reach of a machine that does not turn and has no joints. speed: (3,) mm/s that its X Y Z may do."""
+    poses = np.stack([arm_from_surface @ place @ path.surface_from_nozzle for place in motion.places])
+    lean = tool_lean(arm, poses).max(axis=0)
+    tip = np.broadcast_to(np.eye(6)[3:], (len(path), 3, 6))
+    share = joint_speed_share(tip, speed, arm_from_surface, path, motion)
+    assert arm.max_lean is not None
+    reason = np.select([lean > arm.max_lean, ~(share <= 1)], [REACH_REASONS.index(LEANS), 4], 0).astype(np.int64)
+    unknown = np.full(len(path), np.nan)
+    joints, spin = np.full((len(path), 6), np.nan), np.zeros(len(path))
+    return Reach(joints, unknown, unknown, unknown, unknown, unknown, share, reason, spin, lean)
 
 
 def best_posture(model: JointModel, arm_from_surface: Array, path: Path, motion: SurfaceMotion) -> tuple[int, int]:

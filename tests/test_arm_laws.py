@@ -20,8 +20,10 @@ from hardware.arm.device import ArmState, LinkCode
 from hardware.arm.driver import UnpluggedError
 from hardware.arm.profile import ArmProfile
 from planning.command import Hold, Move
+from tests import octoprint_bench
 from tests.arm_benches import ArmBench, ExampleBench, PtyBench, VirtualTimeBench, closing_bench
 from tests.franka_bench import MISSING, FrankaBench, fr3, installed
+from tests.octoprint_bench import GcodeBench
 
 BENCHES = [
     pytest.param(lambda folder: VirtualTimeBench(), id="s6h4d"),
@@ -29,6 +31,14 @@ BENCHES = [
     pytest.param(lambda folder: ExampleBench(), id="the-example"),
     pytest.param(
         FrankaBench, id="franka", marks=[pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
+    ),
+    pytest.param(
+        GcodeBench,
+        id="gcode",
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.skipif(not octoprint_bench.installed(), reason=octoprint_bench.MISSING),
+        ],
     ),
 ]
 LEGS = np.array([[0, 0, 0], [6, 0, 0], [6, 6, 0], [0, 6, 3], [0, 0, 0]], float)  # mm from where it stands

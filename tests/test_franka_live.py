@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, install
 from tests.light_live import HOME, TILT, prepare_files
 from tests.live_runs import CLOCK, Running, messages
 from tests.moving import breathing
+from tests.octoprint_bench import OctoPrintServer
 from tests.test_arm_laws import straight
 from tests.test_live_run import confirmed
 
@@ -33,21 +34,26 @@ STANDSTILL = 0.05  # mm from where it comes to rest
 
 
 class Live:
-    """A simulated Franka and the runs that print with it."""
+    """An arm that others imitate and the runs that print with it. serve: starts it in a folder, with its home (6,)."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.runs = folder, list[Running]()
+    def __init__(
+        self,
+        folder: Path,
+        serve: Callable[[Path, Array], FrankaServer | OctoPrintServer] = lambda folder, home: FrankaServer(folder),
+        address: str = ADDRESS,
+    ) -> None:
+        self.folder, self.address, self.runs = folder, address, list[Running]()
         prepare_files(folder, lines=12, speed=5.0)
-        profile = arm_over(ArmProfile(), ADDRESS)
+        profile = arm_over(ArmProfile(), address)
         home = profile.arm.home.copy()
         home[2] += HOME - ArmProfile().arm.home[2]
         self.profile = replace(profile, arm=replace(profile.arm, home=home))
         write_arm(folder / "arm.toml", self.profile, "near the surface")
-        self.server = FrankaServer(folder)
+        self.server = serve(folder, home)
 
     def start(self, record: Path, *flags: str) -> Running:
         program = "tests.light_live", str(self.folder), str(record), *flags
-        self.runs.append(Running(ADDRESS, f"--height={HEIGHT}", cache=self.folder, program=program))
+        self.runs.append(Running(self.address, f"--height={HEIGHT}", cache=self.folder, program=program))
         return self.runs[-1]
 
     def close(self) -> None:
@@ -102,6 +108,7 @@ def test_a_breathing_surface_is_printed_and_the_true_flange_says_how_well(live: 
     run.wait_for(r"\nprint\n")
     run.wait_for("done|finished|ended")
     code = run.end()
+    assert isinstance(live.server, FrankaServer)
     stamps, axes = live.server.truth(live.profile)
     errors, duty = nozzle_errors(record, live.folder / "path.csv", live.profile, stamps, axes)
     p95, most, load = float(np.percentile(errors, 95)), float(errors.max()), os.getloadavg()[0]
@@ -160,6 +167,7 @@ def test_a_motion_process_that_is_killed_leaves_the_robot_at_rest(live: Live) ->
     run.wait_for("the motion process was killed by SIGKILL")
     assert run.end() == 1
     CLOCK.wait_until(killed + 2.0)
+    assert isinstance(live.server, FrankaServer)
     stamps, axes = live.server.truth(live.profile)
     before, after = axes[(stamps > killed - 0.5) & (stamps < killed)], axes[stamps > killed + 0.3]
     assert np.ptp(before[:, :3], axis=0).max() > 0.5 and np.ptp(after[:, :3], axis=0).max() < 0.2

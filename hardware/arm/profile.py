@@ -257,6 +257,9 @@ DRIVERS = (
         *("Franka FR3, Panda", ("franka",), "hardware.arm.franka", "franka://172.16.0.2"),
         *("franka", "franky", "fr3.toml"),
     ),
+    DriverKind(
+        *("G-code machine (Marlin)", ("gcode",), "hardware.arm.gcode", "gcode:///dev/ttyACM0"), file="gantry.toml"
+    ),
 )
 
 

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from contextlib import closing
 
 import numpy as np
 
-from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import (
     G1,
@@ -25,15 +23,11 @@ from hardware.arm.driver import (
     ReplyKind,
     Reported,
     Sent,
-    UnpluggedError,
 )
-from hardware.arm.port import Opener, Port, PortOpener, serial_ports
+from hardware.arm.port import Opener, Port, PortOpener, serial_ports, write_last
 from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH, REPLY_LENGTH, encode, reply_stream
-from hardware.process.clock import WallClock
 
-LINE_TAKEOVER_TIME = 0.5  # s in which the kernel takes the line from a process that was killed
-TAKEOVER_RETRY_PERIOD = 0.002  # s between tries
 STOP_FRAMES = 2  # the first one may complete a frame that was torn when the process died
 
 
@@ -179,25 +173,5 @@ def find_arms() -> list[tuple[str, str]]:
 
 
 def emergency_stop(address: str, profile: ArmProfile) -> tuple[float, str]:
-    """Tries until the line is free and has taken the whole stop: when it was on the wire, s, and why it was not."""
-    clock, device = WallClock(), PortOpener(address, profile.baud)
-    stop = encode(Pause(), profile.dialect) * STOP_FRAMES
-    until, reason = clock.now() + LINE_TAKEOVER_TIME, ""
-    try:
-        while clock.now() < until:
-            try:
-                with closing(device()) as port:
-                    unsent = stop
-                    while (unsent := unsent[port.write(unsent) :]) and clock.now() < until:
-                        clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
-                    if not unsent:
-                        sent = clock.now() + profile.frame_time
-                        clock.wait_until(sent + profile.frame_time)
-                        return sent, ""
-                    reason = f"its line is full and took {len(stop) - len(unsent)} of the stop's {len(stop)} bytes"
-            except (InputError, UnpluggedError) as error:
-                reason = str(error)
-                clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
-    finally:
-        device.release()
-    return clock.now(), reason
+    """Stop it with the pause frame: when that was on the wire, s, and why it was not."""
+    return write_last(address, profile.baud, encode(Pause(), profile.dialect) * STOP_FRAMES, profile.frame_time)

@@ -13,6 +13,7 @@ baud = 115200                                 # or 9600, at which a frame takes 
 tick_s = 0.02                                 # at least a frame's time on the wire, which is the default where longer
 dead_time_s = 0.0                             # optional, that a command takes to an arm without such a line
 flange_from_nozzle = [[...], ...]             # optional, 4x4, mm, for an arm that is told where its flange goes
+max_lean_deg = 15                             # optional, of a machine that does not turn: how far its tool may lean
 flight_s = 0.05                               # optional, motion that may be under way at once
 lag_s = 0.024                                 # from the end of a tick until the arm is where it was sent in it
 tool_mm = [[0, 0.5], [12.7, 0.5], [27, 4.8]]  # height above the tip and radius of what hangs on the arm, and turns
@@ -35,8 +36,7 @@ name = "nominal six-axis desktop arm"
 nominal = true                                # the numbers are made up, not a maker's
 angles = "surface"                            # A B C are the surface's turn (thesis 6.3), or "joints": J4 J5 J6
 dh_mm_deg = [[30, 90, 160, 0], ...]           # six rows a, alpha, d, theta: Rz(joint + theta) Tz(d) Tx(a) Rx(alpha)
-low_deg, high_deg = [...]                     # six joints
-speed_deg_s, acceleration_deg_s2 = [...]
+low_deg, high_deg, speed_deg_s, acceleration_deg_s2 = [...] # six joints
 arm_from_foot = [[...], ...]                  # 4x4, mm, from where the table starts to the arm's frame
 flange_from_nozzle = [[...], ...]             # 4x4, mm
 posture = ["front", "up", "negative"]
@@ -186,18 +186,17 @@ def _zone(where: object, table: checks.Table) -> NoGo:
 MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
 _ARRAYS = {  # shapes
     **{"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)},
-    "flange_from_nozzle": (4, 4),
+    **{"flange_from_nozzle": (4, 4)},
 }
 ARM_KEYS = (
     *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
-    *("dead_time_s", "flight_s"),
-    *("tool_part", "limits", "no_go", "kinematics"),
+    *("dead_time_s", "flight_s", "max_lean_deg", "tool_part", "limits", "no_go", "kinematics"),
 )
 # of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
 PART_PREFIXES = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}
 FILE_KEYS = {
     **{"home": "home_mm_deg", "tool_offset": "tool_offset_mm", "tick": "tick_s", "lag": "lag_s", "tool": "tool_mm"},
-    **{"dead_time": "dead_time_s", "flight": "flight_s"},
+    **{"dead_time": "dead_time_s", "flight": "flight_s", "max_lean": "max_lean_deg"},
     "kinematics.dh": "kinematics.dh_mm_deg",
     **{f"kinematics.{name}": f"kinematics.{key}" for key, name in JOINT_KEYS.items()},
 }
@@ -236,6 +235,8 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
         by_urdf = isinstance(kinematics, dict) and "urdf" in kinematics
         default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
         arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _ARRAYS.items() if key in table}
+        keys = "max_lean_deg", "dead_time_s", "flight_s"
+        lean, dead_time, flight = (checks.number(path, k, table[k]) if k in table else None for k in keys)
         return ArmProfile(
             arm=SimpleArm(
                 arrays.get("arm_from_base", default.arm.arm_from_base),
@@ -243,6 +244,7 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
                 arrays["home_mm_deg"] * AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
                 *_kinematics(path, None if by_urdf else kinematics),
                 tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
+                max_lean=None if lean is None else lean * _RAD,
             ),
             limits=_limits(path, table.get("limits", {}), table.get("no_go")),
             dialect=_dialect(path, table),
@@ -251,8 +253,8 @@ def _profile(path: Path, table: checks.Table) -> ArmProfile:
             lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
             flange_from_nozzle=arrays.get("flange_from_nozzle"),
             urdf=_urdf(path, table["kinematics"]) if by_urdf else None,
-            dead_time=checks.number(path, "dead_time_s", table["dead_time_s"]) if "dead_time_s" in table else None,
-            flight=checks.number(path, "flight_s", table["flight_s"]) if "flight_s" in table else None,
+            dead_time=dead_time,
+            flight=flight,
             tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
             parts=_parts(path, table.get("tool_part")),
         )
@@ -270,6 +272,9 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
 def arm_text(profile: ArmProfile, remark: str = "") -> str:
     """The text of an arm file, as `write_arm` writes it."""
     arm, dialect, limits = profile.arm, profile.dialect, profile.limits
+    lean = arm.max_lean and np.rad2deg(arm.max_lean)
+    flange = [] if (at := profile.flange_from_nozzle) is None else [f"flange_from_nozzle = {checks.toml_numbers(at)}"]
+    optional = {"dead_time_s": profile.dead_time, "flight_s": profile.flight, "max_lean_deg": lean}
     lines = [f"# {line}" for line in remark.splitlines()] + [
         f"home_mm_deg = {checks.toml_numbers(arm.home / AXIS_UNITS)}",
         f"arm_from_base = {checks.toml_numbers(arm.arm_from_base)}",
@@ -283,13 +288,8 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         f"baud = {profile.baud}",
         f"tick_s = {checks.toml_number(profile.tick)}",
         f"lag_s = {checks.toml_number(profile.lag)}",
-        *([] if profile.dead_time is None else [f"dead_time_s = {checks.toml_number(profile.dead_time)}"]),
-        *(
-            []
-            if profile.flange_from_nozzle is None
-            else [f"flange_from_nozzle = {checks.toml_numbers(profile.flange_from_nozzle)}"]
-        ),
-        *([] if profile.flight is None else [f"flight_s = {checks.toml_number(profile.flight)}"]),
+        *flange,
+        *(f"{key} = {checks.toml_number(value)}" for key, value in optional.items() if value is not None),
         f"tool_mm = {checks.toml_numbers(profile.tool)}",
         "",
         "[limits] # X Y Z in mm, A B C in degrees",

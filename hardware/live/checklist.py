@@ -136,6 +136,8 @@ def reach_problem(path: Path, pose: SurfacePose, profile: ArmProfile) -> str:
     """Why the arm cannot reach all checkpoints where the surface is now, with the planner's margins; "" if it can."""
     limits, arm = profile.limits, profile.arm
     axes = axes_from_nozzle(arm, pose.base_from_surface @ path.surface_from_nozzle)
+    if not np.isfinite(axes).all():
+        return f"checkpoint {int(np.argmin(np.isfinite(axes).all(axis=1)))}: {arm.beyond}"
     if reason := _outside(axes, limits.low + AXIS_MARGIN, limits.high - AXIS_MARGIN, AXIS_LETTERS):
         return reason
     if (model := arm.jointed) is None:

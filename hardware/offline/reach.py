@@ -28,12 +28,14 @@ from hardware.report.page import (
     line_key,
     section,
     spanning,
+    two_views,
 )
 from planning.clearance import BASE_MARGIN
-from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel, link_chain
+from planning.kinematics import ELBOWS, POSTURES, SHOULDERS, WRISTS, JointModel, SimpleArm, link_chain
 from planning.layers.clearing import path_rooms
 from planning.motion.retime import run_times
 from planning.path import (
+    LEANS,
     MIN_SHOULDER_DISTANCE,
     MIN_SINGULAR_ANGLE,
     REACH_REASONS,
@@ -45,6 +47,7 @@ from planning.path import (
     best_spin,
     reach_at_spin,
     spin_path,
+    unturned_reach,
 )
 from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
 
@@ -57,15 +60,13 @@ REMEDIES = {  # by REACH_REASONS
     "joint range": "let the tool spin (--spin), take the better posture, or turn the surface",
     "singular": "let the tool spin (--spin), or lay the surface elsewhere or a little tilted",
     "joint speed": "print slower there (speed_mm_s of the path), or keep the surface calmer",
+    LEANS: "lay the surface more level, keep it calmer, or allow more (max_lean_deg in the arm file)",
     TISSUE: "plan with --arm, which tilts the tool or leaves the bead out; or a longer needle",
 }
-ARM_WIDTH_PX, ARM_HEIGHT_PX = 440, 300  # of a picture of the arm, two of which stand side by side
 MAX_STRETCHES = 60  # of red checkpoints that are listed; the table reach.csv has all
 
 
-def reach_page(
-    path_name: str, arm: str, text: str, path: Path, reach: Reach, model: JointModel | UrdfKinematics | None = None
-) -> str:
+def reach_page(path_name: str, arm: str, text: str, path: Path, reach: Reach, model: ArmModel | None = None) -> str:
     """The whole page as HTML. text: the answer as the terminal has it. model: of the arm that is drawn."""
     good, count = int(reach.feasible.sum()), len(reach.reason)
     rows = [[name, str(int((reach.reason == i).sum()))] for i, name in enumerate(REACH_REASONS)]
@@ -75,7 +76,7 @@ def reach_page(
         body.append(section("The arm", words, _arm_picture(model, reach)))
     words = "The worst over where the surface may be; by checkpoint. Dashed: what it must stay above, or below."
     body += [
-        section("Along the path", words, _along(reach)),
+        section("Along the path", words, _along(reach, model)),
         section("Why", "Checkpoints by what the arm lacks there.", figures_table(("", "checkpoints"), rows)),
     ]
     if good < count:
@@ -109,35 +110,9 @@ def _arm_picture(model: JointModel, reach: Reach) -> str:
     if not len(red):  # the nearest to an end of a range
         worst = int(known[np.argmin(np.where(np.isfinite(reach.bound[known]), reach.bound[known], np.inf))])
     shown = {int(known[0]): PRINTABLE_CLASS, worst: BLOCKED_CLASS if len(red) else TRUTH_CLASS}
-    places = {k: np.vstack([np.zeros((1, 3)), link_chain(model, reach.joints[k])[:, :3, 3]]) for k in shown}
-    every = np.concatenate(list(places.values()))
-    forward = every[np.argmax(np.hypot(every[:, 0], every[:, 1])), :2]
-    forward = forward / max(float(np.hypot(*forward)), 1e-9)
-    plots = []
-    views = {
-        "from the side, mm": np.array([[*forward, 0.0], [0.0, 0.0, 1.0]]),
-        "from above, mm": np.eye(3)[:2],
-    }
-    for label, axes in views.items():
-        x, y = axes @ every.T
-        half = max(float(np.ptp(x)), 1.6 * float(np.ptp(y)), 1.0) * 0.55
-        middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
-        span = (float(middle[0] - half), float(middle[0] + half))
-        plot = Plot(ARM_WIDTH_PX, ARM_HEIGHT_PX, span, _square(span, float(middle[1])), label=label)
-        for k, style in shown.items():
-            across, up = axes @ places[k].T
-            plot.way(across, up, style)
-            plot.dots(across, up, style, 3.5)
-        plots.append(plot.svg())
+    links = [(np.vstack([np.zeros((1, 3)), link_chain(model, reach.joints[k])[:, :3, 3]]), shown[k]) for k in shown]
     keys = [line_key(style, f"checkpoint {k}: {REACH_REASONS[reach.reason[k]]}") for k, style in shown.items()]
-    return f'{legend(keys)}<div class="two">{"".join(plots)}</div>'
-
-
-def _square(span: tuple[float, float], middle: float) -> tuple[float, float]:
-    """The y of a picture of ARM_WIDTH_PX x ARM_HEIGHT_PX whose scale is that of x."""
-    wide, tall = ARM_WIDTH_PX - Plot.left - Plot.right, ARM_HEIGHT_PX - Plot.top - Plot.bottom
-    half = (span[1] - span[0]) / 2 * tall / wide
-    return middle - half, middle + half
+    return legend(keys) + two_views(links)
 
 
 def _above(path: Path, reach: Reach) -> str:
@@ -157,14 +132,18 @@ def _above(path: Path, reach: Reach) -> str:
     return legend([*keys, dot_key(BLOCKED_CLASS, "cannot")]) + plot.svg()
 
 
-def _along(reach: Reach) -> str:
+def _along(reach: Reach, model: ArmModel | None) -> str:
     angle = float(np.rad2deg(MIN_SINGULAR_ANGLE))
+    lean, most = np.full_like(reach.speed, np.nan), 0.0
+    if isinstance(model, SimpleArm) and reach.lean is not None:
+        lean, most = np.rad2deg(reach.lean), float(np.rad2deg(model.max_lean or 0.0))
     curves = {
         "to the end of a joint's range, degrees": (np.rad2deg(reach.bound), 0.0),
         "to a singular wrist, degrees": (np.rad2deg(reach.wrist), angle),
         "to a singular elbow, degrees": (np.rad2deg(reach.elbow), angle),
         "wrist to the first axis, mm": (reach.shoulder, MIN_SHOULDER_DISTANCE),
-        "of a joint's speed, %": (100 * reach.speed, 100.0),
+        "of an axis's speed, %": (100 * reach.speed, 100.0),
+        "tool leans by, degrees": (lean, most),
     }
     plots, span = [], (0.0, float(max(len(reach.speed) - 1, 1)))
     for label, (values, limit) in curves.items():
@@ -177,6 +156,7 @@ def _along(reach: Reach) -> str:
     return "".join(plots)
 
 
+ArmModel = JointModel | UrdfKinematics | SimpleArm  # the last: a machine that does not turn
 REACH_COLUMNS = (
     *("checkpoint", "feasible", "reason", *(f"j{i}_deg" for i in range(1, 7)), "to_range_end_deg"),
     *("to_wrist_singularity_deg", "to_elbow_singularity_deg", "to_first_axis_mm", "manipulability"),
@@ -228,11 +208,11 @@ def run_reach(
         progress.note = "how long it takes"
         progress(3, 4)
         seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
-    text = reach_text(model, reach, best, question, seconds)
+    text = reach_text(model, reach, best, question, seconds, float(profile.tool[0, 1]))
     text = "\n".join(filter(None, [text, met, far_limits_text(profile.limits), unreached_limits_text(profile)]))
     if out is not None:
         _write(out, with_feasible_column(checkpoints, reach), reach)
-        page = reach_page(path.name, model.name, text, checkpoints, reach, model)
+        page = reach_page(path.name, _name(model), text, checkpoints, reach, model)
         (out / "reach.html").write_text(page, encoding="utf-8")
     return ReachAnswer(text, bool(reach.feasible.all()))
 
@@ -269,14 +249,17 @@ def with_feasible(path: Path, arm: File) -> tuple[Path, str]:
     """The path with the column `feasible` for the arm in a file over a surface at rest, and a sentence about it."""
     model, _, reach = _evaluated(path, arm, ReachQuestion())
     count = f"{int(reach.feasible.sum())} of {len(path)} checkpoints can be printed, the surface at rest"
-    return with_feasible_column(path, reach), f"arm {model.name}: {count}; how, and on a moving one: stillbed reach"
+    return with_feasible_column(path, reach), f"arm {_name(model)}: {count}; how, and on a moving one: stillbed reach"
 
 
-def _evaluated(
-    path: Path, arm: File, question: ReachQuestion
-) -> tuple[JointModel | UrdfKinematics, SurfaceMotion, Reach]:
+def _evaluated(path: Path, arm: File, question: ReachQuestion) -> tuple[ArmModel, SurfaceMotion, Reach]:
     """The arm's model, the surface's motion, and the arm's reach along the path over that motion."""
     profile = read_arm(arm)
+    if profile.arm.max_lean is not None:
+        motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
+        place = _arm_from_surface(question, profile)
+        reach = unturned_reach(profile.arm, profile.limits.speed[:3], place, path, motion)
+        return profile.arm, motion, _within(profile, place, path, motion, reach)
     if profile.urdf is not None:
         return _evaluated_by_urdf(profile, profile.urdf, path, question)
     profile, model = read_jointed_arm(arm)
@@ -315,42 +298,30 @@ def with_feasible_column(path: Path, reach: Reach) -> Path:
 
 
 def reach_text(
-    model: JointModel | UrdfKinematics,
+    model: ArmModel,
     reach: Reach,
     best: tuple[int, int] | None,
     question: ReachQuestion,
     seconds: float,
+    edge: float = 0.0,
 ) -> str:
     """The answer as a table of text.
 
     best: posture by its row of POSTURES, and its number of printable checkpoints; None of an arm by a URDF file.
-    seconds: that a run takes.
+    seconds: that a run takes. edge: mm from the tool's axis to the edge of its tip.
     """
-    if not isinstance(model, JointModel):
-        posture, nominal = f"near {', '.join(f'{angle:.0f}' for angle in np.rad2deg(model.ready))} degrees", False
-    else:
-        posture, nominal = ", ".join(model.posture), model.nominal
-    singular = [("least manipulability", f"{np.nanmin([*reach.manipulability, np.inf]):.3f}")]
-    if isinstance(model, JointModel):
-        singular = [
-            ("nearest to a singular wrist", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
-            ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
-            ("wrist to the first axis", f"{_smallest(reach.shoulder)} mm"),
-        ]
     count, good = len(reach.reason), int(reach.feasible.sum())
     speed = reach.speed[np.isfinite(reach.speed)]
     swing = f"{question.amplitude_mm:g} mm and {question.turn_deg:g} degrees at {question.rate_hz:g} Hz"
+    nominal = isinstance(model, JointModel) and model.nominal
     rows = [
-        ("arm", model.name + (" (NOMINAL: its numbers are made up)" if nominal else "")),
-        ("posture", posture),
+        ("arm", _name(model) + (" (NOMINAL: its numbers are made up)" if nominal else "")),
         ("surface moves by", f"+-{swing}" if question.amplitude_mm or question.turn_deg else "nothing"),
         ("checkpoints", f"{good} of {count} can be printed"),
         *((f"  {name}", str(int((reach.reason == i).sum()))) for i, name in enumerate(REACH_REASONS) if i),
-        ("nearest to a joint's end", f"{_smallest(np.rad2deg(reach.bound))} degrees"),
-        *singular,
-        ("most of a joint's speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
+        *_stance(model, reach, edge),
+        ("most of an axis's speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
         ("a run over a surface at rest", f"{duration_text(seconds)} once it is at the first checkpoint"),
-        ("spin of the tool", f"{np.rad2deg(reach.spin.min()):.0f} to {np.rad2deg(reach.spin.max()):.0f} degrees"),
     ]
     if best is not None and best[1] > good:
         names = zip(POSTURES[best[0]], (SHOULDERS, ELBOWS, WRISTS), strict=True)
@@ -358,6 +329,32 @@ def reach_text(
         rows.append(("better posture", f"{posture}: {best[1]} of {count}, without spin"))
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+def _name(model: ArmModel) -> str:
+    return "a machine that does not turn" if isinstance(model, SimpleArm) else model.name
+
+
+def _stance(model: ArmModel, reach: Reach, edge: float) -> list[tuple[str, str]]:
+    """How the arm stands, and how far it is from where it cannot; of one that does not turn, what that costs."""
+    if isinstance(model, SimpleArm):
+        assert reach.lean is not None and model.max_lean is not None
+        lean, nearer = float(reach.lean.max()), edge * float(np.sin(reach.lean.max()))
+        allowed = f"{np.rad2deg(model.max_lean):g} allowed"
+        cost = f"{np.rad2deg(lean):.1f} degrees ({allowed}): an edge of its tip is {nearer:.2f} mm nearer to the tissue"
+        return [("tool leans by up to", cost)]
+    ends = [("nearest to a joint's end", f"{_smallest(np.rad2deg(reach.bound))} degrees")]
+    if isinstance(model, UrdfKinematics):
+        near = f"near {', '.join(f'{angle:.0f}' for angle in np.rad2deg(model.ready))} degrees"
+        return [("posture", near), *ends, ("least manipulability", f"{_smallest(reach.manipulability, 3)}")]
+    return [
+        ("posture", ", ".join(model.posture)),
+        *ends,
+        ("nearest to a singular wrist", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
+        ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
+        ("wrist to the first axis", f"{_smallest(reach.shoulder)} mm"),
+        ("spin of the tool", f"{np.rad2deg(reach.spin.min()):.0f} to {np.rad2deg(reach.spin.max()):.0f} degrees"),
+    ]
 
 
 def _arm_from_surface(question: ReachQuestion, profile: ArmProfile | None = None) -> Array:
@@ -395,6 +392,6 @@ def _write(out: File, path: Path, reach: Reach) -> None:
             writer.writerow([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])
 
 
-def _smallest(values: Array) -> str:
+def _smallest(values: Array, digits: int = 1) -> str:
     finite = values[np.isfinite(values)]
-    return f"{finite.min():.1f}" if len(finite) else "unknown"
+    return f"{finite.min():.{digits}f}" if len(finite) else "unknown"

@@ -78,6 +78,7 @@ def legend(keys: Sequence[str]) -> str:
 
 
 NAMELESS = "chart, as the words above it say"  # for a screen reader, of a chart without a label
+VIEW_WIDTH_PX, VIEW_HEIGHT_PX = 440, 300  # of one of two pictures that stand side by side
 MAX_LINE_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
 CURVE_SPACING = 2.0  # px between the points of a curve that is drawn
 
@@ -299,3 +300,28 @@ def camera_pictures(pictures: Iterable[tuple[str, bytes]]) -> str:
         for name, data in pictures
     )
     return f'<div class="pictures">{figures}</div>'
+
+
+def two_views(ways: Sequence[tuple[Array, str]]) -> str:
+    """Ways (N, 3), mm, each with its class, from the side that shows their farthest place, and from above."""
+    every = np.concatenate([way for way, _ in ways])
+    forward = every[np.argmax(np.hypot(every[:, 0], every[:, 1])), :2]
+    forward = forward / max(float(np.hypot(*forward)), 1e-9)
+    plots = []
+    for label, axes in (
+        ("from the side, mm", np.array([[*forward, 0.0], [0.0, 0.0, 1.0]])),
+        ("from above, mm", np.eye(3)[:2]),
+    ):
+        x, y = axes @ every.T
+        half = max(float(np.ptp(x)), 1.6 * float(np.ptp(y)), 1.0) * 0.55
+        middle_x, middle_y = float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2
+        wide, tall = VIEW_WIDTH_PX - Plot.left - Plot.right, VIEW_HEIGHT_PX - Plot.top - Plot.bottom
+        high = half * tall / wide
+        spans = (middle_x - half, middle_x + half), (middle_y - high, middle_y + high)
+        plot = Plot(VIEW_WIDTH_PX, VIEW_HEIGHT_PX, *spans, label=label)
+        for way, style in ways:
+            across, up = axes @ way.T
+            plot.way(across, up, style)
+            plot.dots(across, up, style, 3.5)
+        plots.append(plot.svg())
+    return f'<div class="two">{"".join(plots)}</div>'

@@ -394,7 +394,7 @@ class Planner:
         axis, got, low, high = names[i], values[rows[0], i], lows[i], highs[i]
         where = f"checkpoint {self._checkpoint()} is out of reach"
         if not np.isfinite(got):
-            return f"{where}: the arm has no such posture"
+            return f"{where}: {self._arm.beyond}"
         unit = "mm" if axis in "XYZ" else "degrees"
         got, low, high = (got, low, high) if unit == "mm" else np.rad2deg([got, low, high])
         return f"{where}: {axis} = {got:.1f}, allowed {low:g} to {high:g} {unit}"

@@ -1,0 +1,307 @@
+"""The driver of a machine that speaks Marlin's G-code, such as a bioprinter on a gantry: gcode:///dev/ttyACM0.
+
+Each line has a number and a checksum; the firmware answers `ok` once a move is in its planner, or asks for it again. No
+more than LINES are unanswered at a time, so that little but the motion in flight stands between a stop and rest. A
+stop is M410, which a firmware with an emergency parser obeys ahead of all that waits: the axes halt and know where they
+are. Where nobody is left to drive it, it is M112, which halts the firmware until it is reset.
+
+M114 tells twice where the machine is: X Y Z, where its planner ends, and Count, the steps that its motors have made.
+With Count and the steps per mm (M92) its place is known at each instant; a firmware that gives no Count in steps of X Y
+Z is taken by its word, and its lag is then not what it tells. It does not turn: A B C stay where the arm file has them,
+and X Y Z alone are sent. It is never homed from here, as G28 drives the needle down to where Z ends.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimation.errors import InputError
+from estimation.se3 import Array
+from hardware.arm.driver import G1, G4, ArmDriver, ByteListener, Pause, Reply, ReplyKind, Reported, Sent
+from hardware.arm.port import Opener, Port, PortOpener, serial_ports, write_last
+from hardware.arm.profile import ArmProfile
+
+SCHEME = "gcode://"
+LINES = 2  # that may be unanswered: a move, and the question where it is
+ASK_PERIOD = 0.05  # s between questions where it is
+ANSWER_TIME = 0.08  # s after which a line or its answer counts as lost: a quick firmware takes 2 ms, a slow one 20
+MAX_ANSWER_TIME = 1.0  # s, likewise of one that says nothing: it doubles with each line that was lost
+GREETING_TIME = 1.0  # s between greetings of a machine that has said nothing yet: a board starts for as long
+REMEMBERED = 64  # lines that may be asked for again: a second of them
+MIN_STEPS_PER_MM = 1.0  # of an axis: fewer are no machine's that prints
+PLACE_DIGITS = 4  # of mm, in a line
+STOP = b"M410\n"  # without a number: it overtakes lines that have one
+GREETING = "M115", "G21", "G90", "M92", "M400", "M114"  # who it is; mm; absolute; steps per mm; at rest, where is it?
+FIRMWARE = re.compile(r"FIRMWARE_NAME: ?(.*?)(?= [A-Z_]+:|$)")
+PLACE = re.compile(r"X: ?(-?[\d.]+) +Y: ?(-?[\d.]+) +Z: ?(-?[\d.]+)")
+COUNT = re.compile(r"Count:? *X: ?(-?\d+) +Y: ?(-?\d+) +Z: ?(-?\d+)")
+STEPS = re.compile(r"M92 X([\d.]+) Y([\d.]+) Z([\d.]+)")
+RESEND = re.compile(r"(?:Resend|rs):? *N?:?(\d+)", re.IGNORECASE)
+HALTED = re.compile(
+    r"halted|kill|fatal|(max|min)temp|thermal|stopped|^!!", re.IGNORECASE
+)  # in a line that tells of an error
+KNOWN = "marlin"  # in the name of the firmware
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """What is given out as one line."""
+
+    text: str
+    instruction: G1 | None = None
+    anchor: bool = False  # of an M114: the machine rests, so that its planner and its steps are at one place
+
+
+class GcodeMachine(ArmDriver):
+    """Marlin, through a serial port. port: that is open; None before `connect` and after `close`."""
+
+    def __init__(self, address: str, opener: Opener, profile: ArmProfile, listener: ByteListener | None = None) -> None:
+        """opener: opens the device, and again after it was away. listener: is told all bytes that pass."""
+        self._address, self._opener, self._listener = address, opener, listener
+        self._turn = profile.arm.home[3:].copy()
+        self.port: Port | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        self._waits: deque[Line] = deque()  # to be given out
+        self._since = 0.0  # s, when the first of them was to go
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=REMEMBERED)  # number and bytes, to be asked for again
+        self._again: deque[bytes] = deque()  # that were asked for
+        self._unanswered: deque[tuple[int, float]] = deque()  # number, and s when it went
+        self._question: tuple[float, bool] | None = None  # s, when M114 went, and whether the machine rests
+        self._stops = False  # a stop is on its way out
+        self._number, self._resend = 0, 0  # of the last line; from which to send again, 0: none
+        self._rest, self._half = b"", b""  # of a line from the machine, and to it
+        self._firmware = self._fault = ""
+        self._steps: Array | None = None  # (3,) per mm
+        self._offset: Array | None = None  # (3,) mm, place less steps made
+        self._asked, self._greeted = 0.0, -np.inf  # s
+        self._patience = ANSWER_TIME  # s, for an answer
+        self._known = False  # whether it has said where it is
+
+    def connect(self, now: float) -> None:
+        """Open the port; the machine is greeted by `state`."""
+        self.port = self._opener()
+
+    def close(self) -> None:
+        """Close the port; what waits is dropped."""
+        if self.port is not None:
+            self.port.close()
+        self.port = None
+        self._reset()
+
+    def release(self) -> None:
+        """Let the device's lock go, where its opener holds one."""
+        if isinstance(self._opener, PortOpener):
+            self._opener.release()
+
+    # -- the machine's words
+
+    def state(self, now: float) -> Reported:
+        """Where it is, by what has come; greet it, ask it again, or send again what was lost."""
+        assert self.port is not None
+        data = self.port.read()
+        if data and self._listener is not None:
+            self._listener(data, False)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        replies: list[Reply] = []
+        stamp = now
+        for line in lines:
+            if (place := self._take(line.decode("ascii", "replace").strip(), now)) is not None:
+                stamp, axes = place
+                replies = [Reply(ReplyKind.PLACE, axes), Reply(ReplyKind.TOOL, self._turn)]
+        self._look_after(now)
+        return Reported(stamp, replies, b"", self._fault)
+
+    def _take(self, line: str, now: float) -> tuple[float, Array] | None:
+        """Take a line; the instant, s, and the place (3,) that it tells of, None where it tells of none."""
+        place = PLACE.search(line)
+        if line.startswith("ok"):
+            self._answered()
+        elif line == "start":
+            if self._known:
+                self._fault = "the machine has started anew and may not know where it is: home it, then arm"
+            self._greet(now)
+        elif found := RESEND.match(line):
+            self._resend = int(found[1])
+        elif (line.startswith(("Error", "echo:", "fatal", "!!"))) and HALTED.search(line):
+            self._fault = f"the machine says: {line}; it has to be reset"
+        if found := FIRMWARE.search(line):
+            self._firmware = found[1]
+        if found := STEPS.search(line):
+            steps = np.array(found.groups(), float)
+            self._steps = steps if (steps >= MIN_STEPS_PER_MM).all() else None
+        if place is None or self._question is None:
+            return None
+        (asked, rests), self._question = self._question, None
+        return (asked + now) / 2, self._place(np.array(place.groups(), float), COUNT.search(line), rests)
+
+    def _place(self, planned: Array, count: re.Match[str] | None, rests: bool) -> Array:
+        """The place (3,), mm, from where the planner ends and the steps that were made."""
+        self._known = True
+        if self._steps is None or count is None:
+            return planned
+        made = np.array(count.groups(), float) / self._steps
+        if rests or self._offset is None:
+            self._offset = planned - made
+        return np.asarray(made + self._offset)
+
+    def _answered(self) -> None:
+        self._patience = ANSWER_TIME
+        if self._unanswered:
+            self._unanswered.popleft()
+        if self._resend and not self._unanswered:
+            self._again = deque(data for number, data in self._sent if number >= self._resend)
+            self._resend = 0
+
+    def _look_after(self, now: float) -> None:
+        """Greet a machine that says nothing, send again what was lost, and ask where it is."""
+        if not self._known and now > self._greeted + GREETING_TIME:
+            self._greet(now)
+        if self._known and self._unanswered and now > self._unanswered[0][1] + self._patience:
+            first = self._unanswered[0][0]
+            first, self._resend = min(first, self._resend or first), 0
+            self._again = deque(data for number, data in self._sent if number >= first)
+            self._unanswered.clear()  # a line that it has had already, it answers by asking for the next one
+            self._patience = min(2 * self._patience, MAX_ANSWER_TIME)
+        if self._known and not self._waits and now > self._asked + ASK_PERIOD:
+            self._waits.append(Line("M114"))
+
+    def _greet(self, now: float) -> None:
+        """Count lines from 1, learn who it is, and where."""
+        self._greeted, self._known, self._offset = now, False, None
+        self._count_anew(GREETING, now)
+
+    def _count_anew(self, texts: Sequence[str], now: float) -> None:
+        """Number lines from 0, with `texts` next; nothing that was given before is sent, or sent again."""
+        for lines in (self._waits, self._sent, self._again, self._unanswered):
+            lines.clear()
+        self._number, self._resend, self._question = -1, 0, None
+        self._waits.extend(Line(text, anchor=text == "M114") for text in ("M110 N0", *texts))
+        self._since = now
+
+    # -- what it is given
+
+    def send(self, instruction: G1 | G4, now: float) -> Sequence[Sent]:
+        """Give out a move; in a pause nothing is sent."""
+        if isinstance(instruction, G4):
+            return (Sent(instruction),)
+        if np.abs(instruction.axes[3:] - self._turn).max() > 1e-6:
+            got, allowed = np.rad2deg(instruction.axes[3:]).tolist(), f"{np.rad2deg(self._turn).tolist()} degrees"
+            raise InputError("arm", "A B C", got, f"{allowed}: a G-code machine does not turn")
+        axes = np.concatenate([np.round(instruction.axes[:3], PLACE_DIGITS), self._turn])
+        x, y, z = (f"{v:.{PLACE_DIGITS}f}" for v in axes[:3])
+        feed = max(round(60 * instruction.feed, 1), 0.1)  # mm/min
+        return self._put(Line(f"G1 X{x} Y{y} Z{z} F{feed:g}", replace(instruction, axes=axes, feed=feed / 60)), now)
+
+    def stop(self, now: float) -> Sequence[Sent]:
+        """Halt the axes; what it was given and has not read is not sent again."""
+        assert self.port is not None
+        self._half += STOP
+        self._count_anew(("M400", "M114"), now)
+        self._stops = True
+        return self._write(now)
+
+    def enable(self, now: float) -> str:
+        """Whether it is a Marlin, has said where it is, and does not stand halted."""
+        if self._fault:
+            self._fault = ""
+            self._greet(now)
+            return "the machine is greeted again: see that it is homed, then arm once more"
+        if not self._known:
+            return (
+                f"nothing at {self._address} answers as a G-code machine: is it on, and `baud` of the arm file its own?"
+            )
+        if KNOWN not in self._firmware.lower():
+            return f"its firmware is {self._firmware or 'unnamed'}: only Marlin's stop, M410, is known here"
+        return ""
+
+    def flush(self, now: float) -> Sequence[Sent]:
+        """Give out what waits."""
+        return self._write(now)
+
+    def recall(self) -> None:
+        """Take back the moves of which no byte is out."""
+        self._waits = deque(line for line in self._waits if line.instruction is None)
+
+    def blocked_for(self, now: float) -> float | None:
+        """Seconds that a move has waited."""
+        waits = self._stops or any(line.instruction is not None for line in self._waits)
+        return now - self._since if waits else None
+
+    def waiting(self) -> float:
+        """Bytes in the system's output buffer."""
+        return 0.0 if self.port is None else self.port.waiting()
+
+    def _put(self, line: Line, now: float) -> Sequence[Sent]:
+        if not self._waits:
+            self._since = now
+        self._waits.append(line)
+        return self._write(now)
+
+    def _write(self, now: float) -> Sequence[Sent]:
+        """Write what was asked for again, then what waits, while few lines are unanswered."""
+        out: list[Sent] = []
+        while self._write_rest(out) and len(self._unanswered) < LINES and not self._resend:
+            if self._again:
+                self._half = self._again.popleft()
+                self._unanswered.append((int(self._half[1 : self._half.index(b" ")]), now))
+                continue
+            asks = bool(self._waits) and self._waits[0].text == "M114"
+            if not self._waits or (asks and self._question is not None and now < self._question[0] + ANSWER_TIME):
+                break
+            line = self._waits.popleft()
+            self._since, self._number = now, self._number + 1
+            self._half = numbered(self._number, line.text)
+            self._sent.append((self._number, self._half))
+            self._unanswered.append((self._number, now))
+            if asks:
+                self._question, self._asked = (now, line.anchor), now
+            if line.instruction is not None:
+                out.append(Sent(line.instruction))
+        return out
+
+    def _write_rest(self, out: list[Sent]) -> bool:
+        """Write what is left of the last line, or of a stop; whether all of it is out."""
+        assert self.port is not None
+        if self._half:
+            written = self.port.write(self._half)
+            if self._listener is not None and written:
+                self._listener(self._half[:written], True)
+            self._half = self._half[written:]
+        if self._stops and not self._half:
+            self._stops = False
+            out.append(Sent(Pause()))
+        return not self._half
+
+
+def numbered(number: int, text: str) -> bytes:
+    """A line with its number and its checksum, the exclusive or of all bytes before the asterisk (RepRap)."""
+    line = f"N{number} {text}".encode("ascii")
+    checksum = 0
+    for byte in line:
+        checksum ^= byte
+    return line + f"*{checksum}\n".encode("ascii")
+
+
+def open_arm(address: str, profile: ArmProfile, listener: ByteListener | None = None) -> GcodeMachine:
+    """The machine at gcode://DEVICE."""
+    device = address.removeprefix(SCHEME)
+    if not device:
+        raise InputError("arm", "address", address, f"{SCHEME}DEVICE, such as {SCHEME}/dev/ttyACM0")
+    return GcodeMachine(address, PortOpener(device, profile.baud), profile, listener)
+
+
+def find_arms() -> list[tuple[str, str]]:
+    """The serial ports that the system shows: a machine may hang on each."""
+    return [(f"{SCHEME}{device}", text) for device, text in serial_ports()]
+
+
+def emergency_stop(address: str, profile: ArmProfile) -> tuple[float, str]:
+    """Halt it for good, by M112, after the rest of a line that was torn: when that was out, s, and why it was not."""
+    return write_last(address.removeprefix(SCHEME), profile.baud, b"\nM112\n", profile.frame_time)

@@ -1,0 +1,93 @@
+"""OctoPrint's virtual printer as a G-code machine that the laws are tried on, in a process and a Python of its own."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile, open_arm
+from hardware.files.arm_file import read_arm
+from hardware.process.clock import WallClock
+from tests.arm_benches import ArmBench
+
+ROOT = Path(__file__).parents[1]
+PYTHON = ROOT / ".octoprint/bin/python"
+PARKED = np.array([110.0, 110.0, 60.0])  # mm
+GREETED_TIME = 5.0  # s in which it has said who it is, on a busy machine
+MISSING = "OctoPrint is not installed in .octoprint: make counterparts"
+
+
+def installed() -> bool:
+    return PYTHON.exists()
+
+
+def gantry() -> ArmProfile:
+    return read_arm(ROOT / "data/arms/gantry.toml")
+
+
+class OctoPrintServer:
+    """The virtual printer on the pseudo-terminal `link`."""
+
+    def __init__(self, folder: Path, place: Array = PARKED, errors: Sequence[str] = ()) -> None:
+        """place: (3,) mm, where it was left. errors: that it makes; see `octoprint_server.py`."""
+        self.link, self.log = folder / "printer", folder / "places.txt"
+        self._arguments = [str(self.link), str(self.log), *map(str, place[:3].tolist()), *errors]
+        self.process: subprocess.Popen[str] | None = None
+        self.start()
+
+    def start(self) -> None:
+        script = str(ROOT / "tests/octoprint_server.py")
+        self.process = subprocess.Popen([PYTHON, script, *self._arguments], stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "ready\n", "OctoPrint's virtual printer did not start"
+
+    def end(self, number: int = signal.SIGTERM) -> None:
+        if self.process is not None:
+            self.process.send_signal(number)
+            self.process.send_signal(signal.SIGCONT)
+            self.process.wait(20.0)
+        self.process = None
+        self.link.unlink(missing_ok=True)
+
+    def truth(self) -> Array:
+        """End it; rows (N, 4) of s, X Y Z mm."""
+        self.end()
+        return np.loadtxt(self.log)
+
+
+class GcodeBench(ArmBench):
+    """The driver of G-code machines before OctoPrint's virtual printer."""
+
+    tolerance, rest_time, rest_way, silent_time = 0.5, 0.15, 1.0, 0.5
+
+    def __init__(self, folder: Path, errors: Sequence[str] = ()) -> None:
+        self.server, profile = OctoPrintServer(folder, PARKED, errors), gantry()
+        super().__init__(open_arm(f"gcode://{self.server.link}", profile), profile, WallClock())
+
+    def begin(self) -> Array:
+        until = self.clock.now() + GREETED_TIME
+        while self.arm.driver.enable(self.clock.now()) and self.clock.now() < until:
+            self.run(0.1)
+        return super().begin()
+
+    def truth(self) -> tuple[Array, Array]:
+        rows = self.server.truth()
+        return rows[:, 0], np.hstack([rows[:, 1:], np.zeros((len(rows), 3))])
+
+    def silence(self) -> None:
+        assert self.server.process is not None
+        self.server.process.send_signal(signal.SIGSTOP)
+
+    def unplug(self) -> None:
+        self.server.end(signal.SIGKILL)
+
+    def plug(self) -> None:
+        self.server.start()
+
+    def end(self) -> None:
+        self.server.end(signal.SIGKILL)
