@@ -109,7 +109,7 @@ class PredictedError:
     within: float  # mm, distance that holds CLAIMED_SHARE
 
 
-ERROR_SHARES = tuple((np.arange(10) + 0.5) / 10)  # tenths of the cases, each by its middle
+ERROR_SHARES = (np.arange(10) + 0.5) / 10  # tenths of the cases, each by its middle
 
 
 def predicted_error(
@@ -127,7 +127,7 @@ def predicted_error(
     near, far = path.surface_from_nozzle[before : before + 2, :3, 3]
     offset = (tip - near - (fraction - before) * (far - near))[None]
     sigma, place = float(then.error_at(tip[None])[0]), tip[None]
-    radii = np.array([then.radius_at(place, share, offset)[0] for share in (*ERROR_SHARES, CLAIMED_SHARE)])
+    radii = then.radius_at(place, np.append(ERROR_SHARES, CLAIMED_SHARE), offset)
     return PredictedError(due, tip, sigma, radii[:-1], float(radii[-1]))
 
 
