@@ -15,8 +15,7 @@ from estimation.online.camera_errors import Delays
 from estimation.pose_solver import PointTracks, solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.movements import patch
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
 from tests.test_estimator import joined
 
 RIG = arc_rig()

@@ -1,4 +1,4 @@
-"""The first pose, the window and every pose given out claim what is known of cameras and tracks, wide after trouble."""
+"""The newest pose and the first one claim what is known now of cameras and tracks, and so does the twist."""
 
 from __future__ import annotations
 
@@ -9,14 +9,7 @@ import pytest
 
 from estimation.online.camera_errors import CameraErrors
 from estimation.online.fit import FitCovariance, FrameFit
-from estimation.online.reported_covariance import (
-    CALM_BEFORE_NARROWING_S,
-    NOISE_SHARE_OF_TWIST,
-    FrameOriginError,
-    ReportedCovariance,
-    TrackNoise,
-    WindowNoise,
-)
+from estimation.online.reported_covariance import NOISE_SHARE_OF_TWIST, ReportedCovariance, rescaling
 from estimation.online.window import PRIOR_REVISION, WindowEstimate
 from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.pose_solver import PoseFit, SharedFit
@@ -30,8 +23,8 @@ def spread(seed: int, columns: int = 12) -> Array:
     return root @ root.T / columns
 
 
-def first(window: float, cameras: CameraErrors) -> tuple[FrameOriginError, FrameFit]:
-    """A first pose whose window knows a part of what its last fit does, and that fit."""
+def first_fit(cameras: CameraErrors) -> FrameFit:
+    """A fit whose noise is that of tracks and of images as restless as `cameras` believe."""
     rng = np.random.default_rng(2)
     bias, late, tracks = rng.normal(size=(6, 2 * CAMERAS)), 20 * rng.normal(size=(6, CAMERAS)), 1e-3 * spread(3)
     noise = tracks + cameras.unrest * bias @ bias.T
@@ -39,8 +32,13 @@ def first(window: float, cameras: CameraErrors) -> tuple[FrameOriginError, Frame
     zero, none = np.zeros((6, 6)), np.zeros(CAMERAS)
     counts, kept = np.zeros(CAMERAS, np.int64), np.zeros(0, bool)
     parts = FitCovariance(noise, zero, zero, 1.0, tracks, late, bias)
-    fit = FrameFit(0.0, solution, parts, np.zeros(6), np.zeros(6), kept, counts, "", none, none)
-    return FrameOriginError(window * noise, fit, cameras), fit
+    return FrameFit(0.0, solution, parts, np.zeros(6), np.zeros(6), kept, counts, "", none, none)
+
+
+def error(fit: FrameFit, window: float, cameras: CameraErrors) -> Array:
+    """(6, 6) of a pose of which the window knew a part of what this fit did, before any clock was known."""
+    parts = fit.parts
+    return ReportedCovariance(CAMERAS).error(window * parts.noise, parts, np.zeros(CAMERAS), cameras)
 
 
 def rested(quiet: float) -> CameraErrors:
@@ -56,38 +54,35 @@ def rested(quiet: float) -> CameraErrors:
 @pytest.mark.parametrize("window", [0.3, 1.0])
 def test_at_once_it_is_what_the_window_said_and_what_late_cameras_make_of_it(window: float) -> None:
     cameras = CameraErrors(CAMERAS)
-    pose, fit = first(window, cameras)
+    fit = first_fit(cameras)
     late = fit.parts.by_delay @ cameras.delays.covariance @ fit.parts.by_delay.T
-    assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(window * fit.parts.noise + late, rel=1e-6)
+    assert error(fit, window, cameras) == pytest.approx(window * fit.parts.noise + late, rel=1e-6)
 
 
 def test_once_the_images_are_known_to_rest_it_is_what_the_tracks_make_of_it() -> None:
-    pose, fit = first(0.5, CameraErrors(CAMERAS))
-    cameras = rested(0.005)
+    fit, cameras = first_fit(CameraErrors(CAMERAS)), rested(0.005)
     late = fit.parts.by_delay @ cameras.delays.covariance @ fit.parts.by_delay.T
     expected = 0.5 * (fit.parts.tracks + cameras.unrest * fit.parts.by_shift @ fit.parts.by_shift.T) + late
-    assert pose.covariance(cameras, TrackNoise(CAMERAS)) == pytest.approx(expected, rel=1e-6)
+    assert error(fit, 0.5, cameras) == pytest.approx(expected, rel=1e-6)
     assert cameras.unrest < 0.1 * CameraErrors(CAMERAS).unrest
 
 
 def test_images_found_less_at_rest_than_was_believed_make_it_larger() -> None:
-    pose, _ = first(0.5, CameraErrors(CAMERAS))
-    noise = TrackNoise(CAMERAS)
-    restless, believed = pose.covariance(rested(0.3), noise), pose.covariance(rested(0.05), noise)
+    fit = first_fit(CameraErrors(CAMERAS))
+    restless, believed = error(fit, 0.5, rested(0.3)), error(fit, 0.5, rested(0.05))
     assert np.linalg.eigvalsh(restless - believed)[0] > -1e-12 and np.trace(restless) > 2 * np.trace(believed)
 
 
 def test_an_offset_that_was_not_corrected_then_is_claimed_when_it_is_known() -> None:
     cameras = CameraErrors(CAMERAS)
-    pose, fit = first(0.5, cameras)
+    fit = first_fit(cameras)
     information = np.diag(np.repeat([1 / 1e-3**2, 1e-9], [CAMERAS, 2 * CAMERAS]))
     true = np.array([0.016, 0.0, -0.016])
     for _ in range(200):
         found = np.r_[true - cameras.offset, np.zeros(2 * CAMERAS)]
         cameras.learn(SharedFit(information, information @ found), 1 / 30)
-    claimed = pose.covariance(cameras, TrackNoise(CAMERAS))
     off = fit.parts.by_delay @ true
-    assert off @ np.linalg.solve(claimed, off) < 2.0
+    assert off @ np.linalg.solve(error(fit, 0.5, cameras), off) < 2.0
 
 
 BELIEVED = 0.04 * np.eye(6)  # of the first pose, before the images are known to rest
@@ -103,7 +98,7 @@ WINDOW = window_of(LITTLE)
 
 
 def fit_at(stamp: float, tracks: int = 300, scatter: float = 1.0) -> FrameFit:
-    _, fit = first(0.5, CameraErrors(CAMERAS))
+    fit = first_fit(CameraErrors(CAMERAS))
     shared = SharedFit(np.diag(np.full(3 * CAMERAS, 1e4)), np.zeros(3 * CAMERAS))
     used = np.full(CAMERAS, tracks // CAMERAS)
     small = {"by_delay": 1e-3 * fit.parts.by_delay, "by_shift": 1e-3 * fit.parts.by_shift}
@@ -116,7 +111,7 @@ def pose_at(stamp: float, state: TrackState = TrackState.TRACKING, reason: str =
 
 
 def quiet(seconds: float) -> tuple[ReportedCovariance, Array]:
-    """A claim after so long without trouble, and what it last claimed."""
+    """A claim after so long, and what it last claimed."""
     claim, cameras, believed = ReportedCovariance(CAMERAS), CameraErrors(CAMERAS), BELIEVED
     given = claim.measured(pose_at(0.0), fit_at(0.0), cameras, believed, WINDOW)
     for k in range(1, round(30 * seconds) + 1):
@@ -132,39 +127,26 @@ def size(covariance: Array) -> float:
     return float(np.trace(covariance))
 
 
-def test_for_a_second_all_that_was_believed_is_claimed() -> None:
-    _, claimed = quiet(0.8 * CALM_BEFORE_NARROWING_S)
-    assert size(claimed) >= size(BELIEVED)
+def test_the_first_pose_claims_what_the_window_says_and_the_next_the_first_ones_error_as_it_is_known() -> None:
+    claim, believed = ReportedCovariance(CAMERAS), CameraErrors(CAMERAS)
+    fit = fit_at(0.0)
+    fit = replace(fit, parts=replace(fit.parts, noise=first_fit(believed).parts.noise))
+    marginal = 0.5 * fit.parts.noise
+    pose = replace(pose_at(0.0), covariance=marginal)
+    alone = claim.measured(pose, fit, believed, marginal, window_of(marginal)).covariance
+    pose = replace(pose, covariance=2 * marginal)  # with the first one's error, as the estimator gives it
+    both = claim.measured(pose, fit, believed, marginal, window_of(marginal)).covariance
+    assert both == pytest.approx(2 * alone, rel=1e-6)
 
 
 def test_once_the_images_are_known_to_rest_less_is_claimed() -> None:
-    _, claimed = quiet(1.2 * CALM_BEFORE_NARROWING_S)
+    _, claimed = quiet(0.1)
     assert size(claimed) < 0.5 * size(BELIEVED) and np.linalg.eigvalsh(claimed)[0] > 0
 
 
-@pytest.mark.parametrize(
-    ("pose", "fit"),
-    [
-        (pose_at(2.0, TrackState.DEGRADED, "one camera alone"), fit_at(2.0)),
-        (pose_at(2.0, reason="just back"), fit_at(2.0)),
-        (pose_at(2.0), fit_at(2.0, tracks=200)),
-        (pose_at(2.0), fit_at(2.0, scatter=3.0)),
-    ],
-    ids=["degraded", "reserved", "fewer tracks", "worse tracks"],
-)
-def test_whatever_is_unlike_before_brings_the_wide_claim_back_for_a_second(pose: SurfacePose, fit: FrameFit) -> None:
-    claim, narrow = quiet(1.5 * CALM_BEFORE_NARROWING_S)
-    assert size(narrow) < 0.5 * size(BELIEVED) <= size(claim.measured(pose, fit, RESTED, BELIEVED, WINDOW).covariance)
-    for later in (0.1, 0.9):
-        stamp = 2.0 + later * CALM_BEFORE_NARROWING_S
-        claimed = claim.measured(pose_at(stamp), fit_at(stamp), RESTED, BELIEVED, WINDOW).covariance
-        assert size(claimed) >= size(BELIEVED)
-
-
-def test_a_pose_that_is_only_predicted_keeps_its_wide_claim_and_so_does_the_next() -> None:
-    claim, _ = quiet(1.5 * CALM_BEFORE_NARROWING_S)
+def test_a_pose_that_is_only_predicted_keeps_what_decisions_are_made_by() -> None:
+    claim, _ = quiet(0.1)
     assert size(claim.missed(pose_at(2.0, TrackState.COASTING)).covariance) >= size(BELIEVED)
-    assert size(claim.measured(pose_at(2.1), fit_at(2.1), RESTED, BELIEVED, WINDOW).covariance) >= size(BELIEVED)
 
 
 def test_of_tracks_that_scatter_less_than_they_claim_the_window_is_claimed_smaller() -> None:
@@ -187,7 +169,7 @@ def test_a_twist_is_claimed_by_its_noise_alone_once_hindsight_changes_nothing_of
         claim.measured(pose_at(2.03), alike, RESTED, BELIEVED, window_of(LITTLE, revision)).twist_covariance
         for revision in (0.0, PRIOR_REVISION, 2 * PRIOR_REVISION)
     ]
-    assert claimed[0] == pytest.approx(NOISE_SHARE_OF_TWIST * 4 * np.eye(6))
+    assert claimed[0] == pytest.approx(NOISE_SHARE_OF_TWIST * 4 * np.eye(6), abs=1e-7)
     assert size(claimed[1]) == pytest.approx(size(4 * np.eye(6)), rel=0.1)  # as the window says
     assert size(claimed[2]) > 1.8 * size(claimed[1])
 
@@ -198,18 +180,11 @@ def test_a_twist_is_claimed_wider_where_the_cameras_expose_late() -> None:
     sharp = claim.measured(pose_at(2.03), fit, RESTED, BELIEVED, window_of(LITTLE, 0.0)).twist_covariance
     fit = replace(fit, parts=replace(fit.parts, smear=2 * fit.parts.noise * late))
     smeared = claim.measured(pose_at(2.03), fit, RESTED, BELIEVED, window_of(LITTLE, 0.0)).twist_covariance
-    assert smeared - sharp == pytest.approx(NOISE_SHARE_OF_TWIST * 2 * 4 * late)
-
-
-def test_a_twist_is_claimed_as_the_window_says_for_a_second_after_trouble() -> None:
-    claim, _ = quiet(0.5 * CALM_BEFORE_NARROWING_S)
-    pose = replace(pose_at(0.52), twist_covariance=4 * np.eye(6))
-    given = claim.measured(pose, fit_at(0.52), RESTED, BELIEVED, window_of(LITTLE, 0.0))
-    assert np.array_equal(given.twist_covariance, pose.twist_covariance)
+    assert smeared - sharp == pytest.approx(NOISE_SHARE_OF_TWIST * 2 * 4 * late, abs=1e-7)
 
 
 def test_a_forecast_is_claimed_as_its_pose_is() -> None:
-    claim, _ = quiet(1.5 * CALM_BEFORE_NARROWING_S)
+    claim, _ = quiet(1.5)
     pose = pose_at(2.0)
     ahead = Forecast(np.array([0.1, 0.2]), np.zeros((2, 6)), np.stack([pose.covariance, 2 * pose.covariance]))
     given = claim.measured(replace(pose, forecast=ahead), fit_at(2.0), RESTED, BELIEVED, WINDOW)
@@ -217,22 +192,16 @@ def test_a_forecast_is_claimed_as_its_pose_is() -> None:
     assert given.forecast.covariances == pytest.approx(ahead.covariances + less)
 
 
-CAMERA_ERRORS = CameraErrors(CAMERAS)
-
-
 @pytest.mark.parametrize("scatter", [1.0, 0.1])
 @pytest.mark.parametrize("rest", [1.0, 0.05])
-def test_each_part_of_the_noise_is_resized_by_itself(scatter: float, rest: float) -> None:
-    _, fit = first(1.0, CAMERA_ERRORS)
-    unrest = CAMERA_ERRORS.unrest
-    averaged = WindowNoise(replace(fit, parts=replace(fit.parts, scatter=scatter)), unrest)
-    expected = 0.3 * (scatter * fit.parts.tracks + rest * unrest * fit.parts.by_shift @ fit.parts.by_shift.T)
-    found = averaged.rescaled(0.3 * fit.parts.noise, TrackNoise(CAMERAS), rest * unrest)
-    assert found == pytest.approx(expected, rel=1e-6)
+def test_a_marginal_that_is_a_part_of_the_noise_stays_that_part(scatter: float, rest: float) -> None:
+    cameras = CameraErrors(CAMERAS)
+    parts = first_fit(cameras).parts
+    known = scatter * parts.tracks + rest * cameras.unrest * parts.by_shift @ parts.by_shift.T
+    rescaled = rescaling(parts.noise, known)
+    assert rescaled @ (0.3 * parts.noise) @ rescaled.T == pytest.approx(0.3 * known, rel=1e-6)
 
 
-def test_a_window_that_knows_some_axes_better_keeps_its_shape_where_nothing_is_resized() -> None:
-    _, fit = first(1.0, CAMERA_ERRORS)
-    window = np.linalg.inv(np.linalg.inv(fit.parts.noise) + np.diag([1e3, 0, 1e5, 0, 1e4, 0]))
-    found = WindowNoise(fit, CAMERA_ERRORS.unrest).rescaled(window, TrackNoise(CAMERAS), CAMERA_ERRORS.unrest)
-    assert found == pytest.approx(window, rel=1e-6)
+def test_where_nothing_is_known_anew_a_marginal_stays_as_it_is() -> None:
+    noise = first_fit(CameraErrors(CAMERAS)).parts.noise
+    assert rescaling(noise, noise) == pytest.approx(np.eye(6), abs=1e-9)

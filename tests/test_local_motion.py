@@ -22,8 +22,7 @@ from estimation.online.local_motion import (
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.movements import patch
-from estimation.synthetic.world import arc_rig, observations
+from estimation.synthetic.world import arc_rig, observations, patch
 from hardware.simulator.scene.shape import Deformation
 from hardware.simulator.truth import FOLD_SIGMA
 from tests.slowly import slowly

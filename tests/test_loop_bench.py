@@ -76,11 +76,14 @@ OTHER = se3.exp(np.array([0.3, -0.2, 0.5, 12.0, -7.0, 3.0]))  # true_from_own, o
 def poses(claimed: float, truth: Array, waiting: int = 5) -> list[SurfacePose]:
     """Poses with noise of SIGMA in their own surface frame, claimed `claimed` times as wide, TRACKING after a while."""
     draw, covariance = np.random.default_rng(3), np.diag((claimed * SIGMA) ** 2)
+    own = truth @ OTHER
+    rates = se3.log(se3.inverse(own) @ np.roll(own, -1, axis=0)) * 30
     made = []
-    for k, pose in enumerate(truth):
+    for k, pose in enumerate(own):
         noise = np.zeros(6) if k <= waiting else SIGMA * draw.normal(size=6)
         state = TrackState.TRACKING if k >= waiting else TrackState.INITIALISING
-        made.append(SurfacePose(k / 30, pose @ OTHER @ se3.exp(noise), covariance, np.zeros(6), state))
+        twist = (rates[k - 1] + rates[k]) / 2 + 30 * SIGMA * draw.normal(size=6)
+        made.append(SurfacePose(k / 30, pose @ se3.exp(noise), covariance, twist, state, 900 * covariance))
     return made
 
 
@@ -95,6 +98,7 @@ def figures(claimed: float, count: int = COUNT, waiting: int = 5) -> dict[str, f
 def test_the_claim_is_held_against_the_error(claimed: float, inside: float) -> None:
     found = figures(claimed)
     assert found["x: NEES/6"] == pytest.approx(1 / claimed**2, rel=0.1)
+    assert found["x: twist NEES/6"] == pytest.approx(1 / claimed**2, rel=0.1)
     assert found["x: inside 95 %"] == pytest.approx(inside, abs=0.02)
     assert found["x: claim of an axis"] / found["x: error of an axis"] == pytest.approx(claimed, rel=0.1)
     assert found["x: measured"] == 100.0

@@ -22,8 +22,7 @@ from estimation.pose_solver import (
 )
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from estimation.synthetic.movements import patch
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
 from tests.test_estimator import joined
 
 RIG = arc_rig()

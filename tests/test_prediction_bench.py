@@ -82,10 +82,11 @@ def test_a_recording_too_short_to_be_judged_is_refused(tmp_path: Path) -> None:
 
 
 def test_errors_of_worlds_are_pooled_by_their_squares() -> None:
-    ratio, nees = pair_figures("still", [MovementErrors(1e-6, 4e-6, 0.8), MovementErrors(9e-6, 36e-6, 1.6)])
+    pairs = [MovementErrors(1e-6, 4e-6, 0.8, 0.7), MovementErrors(9e-6, 36e-6, 1.6, 0.9)]
+    ratio, nees, twist = pair_figures("still", pairs)
     assert ratio.value == pytest.approx(0.5) and ratio.verdict == "met"
-    assert nees.value == pytest.approx(1.2)
-    assert pair_figures("still", [MovementErrors(1e-6, 1e-6, 2.0)])[0].verdict == "MISSED"
+    assert nees.value == pytest.approx(1.2) and twist.value == pytest.approx(0.8)
+    assert pair_figures("still", [MovementErrors(1e-6, 1e-6, 2.0, 1.0)])[0].verdict == "MISSED"
 
 
 def test_a_small_run_has_a_value_for_every_figure() -> None:
@@ -94,7 +95,7 @@ def test_a_small_run_has_a_value_for_every_figure() -> None:
     words += " --scenarios --landmarks"
     figures = run_smoothing(subject_parser("smoothing", subject).parse_args(words.split()))
     assert [f.what for f in figures][:2] == ["still: error by the causal one's", "still: NEES/6"]
-    assert len(figures) == 6 and all(np.isfinite(f.value) for f in figures)
+    assert len(figures) == 7 and all(np.isfinite(f.value) for f in figures)
 
 
 def test_pictures_are_judged_with_and_without_what_was_found_besides() -> None:

@@ -19,15 +19,18 @@ from estimation.synthetic.follow import filtered_bound, pose_bound, pose_informa
 from estimation.synthetic.movements import (
     MAX_DRAW_SIGMAS,
     BreathingSpec,
+    Sine,
+    StepWave,
+    Waveform,
     draw_breathing,
     draw_noise,
     draw_pulse,
     draw_walk,
 )
-from estimation.synthetic.waveforms import Levels, RoundedCorners, Sine, StepWave, Waveform, Zigzag
 from estimation.synthetic.world import BASE_FROM_REST, World, arc_rig, synthetic_world
 from hardware.files.folder_tables import read_tum
 from hardware.recording.session_reader import open_session
+from hardware.simulator.motion_table import Levels, RoundedCorners, Zigzag
 from hardware.simulator.scene.scene import rois
 from perception.mapping.features import grey
 from tests.slowly import slowly

@@ -20,8 +20,8 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from estimation.synthetic.movements import MOVEMENTS, SURFACES
-from estimation.synthetic.world import BASE_FROM_REST, World, arc_rig, observations
+from estimation.synthetic.movements import MOVEMENTS
+from estimation.synthetic.world import BASE_FROM_REST, SURFACES, World, arc_rig, observations
 from estimation.synthetic.world import synthetic_world as made
 
 ROOT = Path(__file__).parents[1]

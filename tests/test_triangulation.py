@@ -24,8 +24,7 @@ from estimation.pose_solver import project
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, local_normals
-from estimation.synthetic.movements import patch
-from estimation.synthetic.world import BASE_FROM_REST, WOUND_CENTRE, arc_rig
+from estimation.synthetic.world import BASE_FROM_REST, WOUND_CENTRE, arc_rig, patch
 
 RIG = arc_rig()
 seeds = st.integers(0, 10_000)

@@ -18,8 +18,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.pose_solver import PointTracks, solve_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, Warp
-from estimation.synthetic.movements import patch
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
 from hardware.simulator.scene.shape import Deformation
 from tests.synthetic import Motion, breathing, still
 

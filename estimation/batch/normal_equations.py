@@ -15,7 +15,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.batch.initialisation import TrackArrays
-from estimation.batch.smoothed import STATE_DOF, CorrectedCameras, States, right_jacobian
+from estimation.batch.smoothed import STATE_DOF, CorrectedCameras, States
 from estimation.pose_solver import EFFICIENCY, GATE
 from estimation.runtime import compiled
 from estimation.se3 import Array, Index, Mask
@@ -304,7 +304,7 @@ def _columns(states: States, cameras: CorrectedCameras, ahead: Array, camera_fro
     """How the ten columns of each camera's sums (F, C, 10, M) move with state, own delay and shifts, corrections."""
     frames, n = len(states), len(cameras)
     late = cameras.offsets[:, None, None]
-    carried = right_jacobian(ahead)
+    carried = se3.right_jacobian(ahead)
     speed = states.twists[:, None] + cameras.offsets[:, None] * states.accelerations[:, None]
     along = (carried @ speed[..., None])[..., 0]  # (F, C, 6)
     each, lens = np.arange(n), np.arange(4)

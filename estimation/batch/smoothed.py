@@ -133,19 +133,6 @@ class PriorFactors:
         return out.reshape(-1, STATE_DOF, STATE_DOF)
 
 
-def right_jacobian(xi: Array) -> Array:
-    """(..., 6, 6): exp(xi + d) = exp(xi) exp(J d), to third order: enough for what a surface moves in a delay."""
-    ad = se3.small_adjoint(xi)
-    return np.asarray(np.eye(6) - ad / 2 + ad @ ad / 6 - ad @ ad @ ad / 24)
-
-
-def inverse_right_jacobian(xi: Array) -> Array:
-    """(..., 6, 6), the inverse of it, by its Bernoulli series: exact to 1e-7 up to half a radian."""
-    ad = se3.small_adjoint(xi)
-    square = ad @ ad
-    return np.asarray(np.eye(6) + ad / 2 + square / 12 - square @ square / 720 + square @ square @ square / 30240)
-
-
 def transition(seconds: Array) -> Array:
     """(..., 3, 3) of position, velocity and acceleration of an axis over seconds (...)."""
     t = np.asarray(seconds, float)
@@ -182,7 +169,7 @@ def prior_factors(states: States, stamps: Array) -> PriorFactors:
     there, moved = in_tangent_space(before, after)
     here = np.concatenate([np.zeros_like(moved), before.twists, before.accelerations], axis=-1)
     forward = np.asarray(np.kron(transition(seconds), np.eye(6)), float)
-    by_after, by_before = inverse_right_jacobian(moved), -inverse_right_jacobian(-moved)
+    by_after, by_before = se3.inverse_right_jacobian(moved), -se3.inverse_right_jacobian(-moved)
     bent = np.eye(6) + se3.small_adjoint(moved) / 2
     later, earlier = np.zeros((len(moved), STATE_DOF, STATE_DOF)), -forward
     later[:, :6, :6], later[:, 6:12, 6:12], later[:, 12:, 12:] = by_after, bent, bent
@@ -295,14 +282,14 @@ class Smoothed:
         on_the_way = (early @ here[..., None] + late @ there[..., None])[..., 0]
         # how the later state's own errors show in the earlier one's tangent space, (M, 18, 18)
         carried = np.zeros((len(moved), STATE_DOF, STATE_DOF))
-        carried[:, :6, :6] = inverse_right_jacobian(moved)
+        carried[:, :6, :6] = se3.inverse_right_jacobian(moved)
         carried[:, 6:12, 6:12] = carried[:, 12:, 12:] = np.eye(6) + se3.small_adjoint(moved) / 2
         late = late @ carried
         mixed = early @ self.next[k] @ np.swapaxes(late, 1, 2)
         spread = early @ self.own[k] @ np.swapaxes(early, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
         spread = spread + late @ self.own[k + 1] @ np.swapaxes(late, 1, 2)
         axes = np.einsum("mij,ma,ab->miajb", left, self.psd[k], np.eye(6)).reshape(-1, STATE_DOF, STATE_DOF)
-        bend = right_jacobian(on_the_way[:, :6])
+        bend = se3.right_jacobian(on_the_way[:, :6])
         turned = np.swapaxes(bend, 1, 2)
         part = ((times - self.stamps[k]) / (self.stamps[k + 1] - self.stamps[k]))[:, None, None]
         share, spread = (1 - part) * self.share[k] + part * self.share[k + 1], spread + axes

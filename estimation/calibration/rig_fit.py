@@ -65,10 +65,10 @@ def interpolate_board(poses: Array, who: Stencils, instant: Index, delay: Array)
     way = se3.log(se3.inverse(own)[:, None] @ others)  # (V, K, 6)
     weight, slope = _lagrange(times, delay)
     xi, rate = np.einsum("vk,vki->vi", weight, way), np.einsum("vk,vki->vi", slope, way)
-    right = _right(xi)
+    right = se3.right_jacobian(xi)
     by_pose = np.empty((len(own), 6, 6 + 6 * STENCIL_WIDTH))
-    there = weight[..., None, None] * _right_inverse(way)
-    here = (weight[..., None, None] * _right_inverse(-way)).sum(1)
+    there = weight[..., None, None] * se3.inverse_right_jacobian(way)
+    here = (weight[..., None, None] * se3.inverse_right_jacobian(-way)).sum(1)
     step = se3.exp(xi)
     by_pose[:, :, :6] = se3.adjoint(se3.inverse(step)) - right @ here
     by_pose[:, :, 6:] = (right[:, None] @ there).transpose(0, 2, 1, 3).reshape(-1, 6, 6 * STENCIL_WIDTH)
@@ -89,20 +89,6 @@ def _lagrange(times: Array, at: Array) -> tuple[Array, Array]:
         slope = slope * factor + np.where(used, weight / gap, 0.0)
         weight = weight * factor
     return np.where(there, weight, 0.0), np.where(there, slope, 0.0)
-
-
-def _right(xi: Array) -> Array:
-    """Right Jacobian (..., 6, 6) by its series: exact to 1e-6 up to 0.3 rad, more than a hand turns between frames."""
-    ad = se3.small_adjoint(xi)
-    two = ad @ ad
-    return np.asarray(np.eye(6) - ad / 2 + two / 6 - two @ ad / 24 + two @ two / 120)
-
-
-def _right_inverse(xi: Array) -> Array:
-    """Inverse of the right Jacobian (..., 6, 6), by its series."""
-    ad = se3.small_adjoint(xi)
-    two = ad @ ad
-    return np.asarray(np.eye(6) + ad / 2 + two / 12 - two @ two / 720)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

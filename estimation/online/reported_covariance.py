@@ -1,12 +1,10 @@
-"""Reported covariance of a pose: window marginal + map error + calibration error + smear, refined while running.
+"""Reported covariance of a pose: the window's marginal for the noise known now, and what a window cannot average.
 
-The estimator's own decisions (which camera is an outlier, where a landmark is searched, what enters the window) use
-covariances from the first frame set on, when little is known of the cameras: wide, and good for deciding. The reported
-covariance is refined:
-
-- the error of the first pose and the window's marginal shrink once images are known to rest and tracks to scatter less;
-- the lasting part of the tracks' errors, and the drift of the images' shifts, are added;
-- after trouble the wide covariance is reported again, until a second has passed without any.
+The window holds what is new in each frame set, with the noise that was believed when it came. The estimator's decisions
+(which camera is an outlier, where a landmark is searched, what enters the window) use its marginal as it is: wide, and
+good for deciding. What is reported is the same marginal, for the noise known now, of the newest pose and of the first
+one, in which the path is placed, and all that does not average out: late exposures, map and lenses, the lasting part of
+the tracks' errors, the drift of the images' shifts.
 """
 
 from __future__ import annotations
@@ -17,9 +15,9 @@ import numpy as np
 
 from estimation.observations import Observations
 from estimation.online.camera_errors import CameraErrors
-from estimation.online.fit import FrameFit
+from estimation.online.fit import FitCovariance, FrameFit
 from estimation.online.window import WindowEstimate
-from estimation.pose import SurfacePose, TrackState
+from estimation.pose import SurfacePose
 from estimation.pose_solver import INLIER_WEIGHT, PoseFit, SharedFit
 from estimation.se3 import Array, Index
 
@@ -39,10 +37,6 @@ NOISE_REVISED, MOTION_REVISED = 1.25, 2 / 3
 CLEAR_SHIFT_PX = 0.02  # shifts known better than that show the size of all of them
 MIN_LASTING_SHARE = 0.01  # of the variance claimed of tracks: something in them lasts
 DRIFT_MEMORY_SETS = 100  # over which the drift of the shifts is averaged
-
-CALM_BEFORE_NARROWING_S = 1.0  # without trouble: what slid over the wound is gone by then, and the window is new
-USUAL_MEMORY_S = 2.0  # over which it is learned what is usual
-FEWER_TRACKS, WORSE_SCATTER = 0.8, 2.0  # times the usual tracks and the usual scatter: something is there
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,50 +96,12 @@ def _squared_changes(now: _TrackResiduals, then: _TrackResiduals) -> Array:
     return np.array([(value**2).sum(), (change**2).sum() / 2]) / 2
 
 
-class WindowNoise:
-    """Rescales what the window says of a frame set, when tracks' and images' noise are known better.
+def rescaling(believed: Array, known: Array) -> Array:
+    """S (6, 6): S @ M @ S.T is a marginal M of the window where the noise is `known` (6, 6), not what was believed.
 
-    The window uses both noises as assumed at first. In the axes in which the two are independent its marginal is a part
-    of the fit's covariance whatever their sizes, so each axis is rescaled by itself.
+    In axes in which both noises are independent the marginal is a part of the noise, whatever its size.
     """
-
-    def __init__(self, fit: FrameFit, unrest: float) -> None:
-        """fit: the newest of those averaged in the window. unrest: px^2, as assumed in it."""
-        root = np.linalg.cholesky((fit.parts.noise + fit.parts.noise.T) / 2)
-        back = np.linalg.inv(root)
-        whitened = back @ fit.parts.tracks @ back.T
-        share, axes = np.linalg.eigh((whitened + whitened.T) / 2)
-        self._by_tracks = np.clip(share, 0.0, 1.0)  # (6,) of the fit's variance, axis by axis
-        self._pose_from_axes, self._whitening = root @ axes, (back, axes)  # (6, 6) each
-        self._scatter, self._unrest = fit.parts.scatter, unrest
-
-    def rescaled(self, marginal: Array, tracks: TrackNoise, unrest: float) -> Array:
-        """A marginal (6, 6) of the window by what is known of the tracks now, and of the images' unrest, px^2."""
-        by_images = (1 - self._by_tracks) * (unrest / self._unrest)
-        scaled = self._pose_from_axes * np.sqrt(self._by_tracks * (tracks.new * self._scatter) + by_images)
-        back, axes = self._whitening
-        inner = axes.T @ back @ marginal @ back.T @ axes
-        return np.asarray(scaled @ ((inner + inner.T) / 2) @ scaled.T)
-
-
-class FrameOriginError:
-    """The error of the first pose given out: the path is placed in it, so all later poses share it.
-
-    At that moment the images' unrest and the cameras' delays are hardly known, and assumed large. The error was drawn
-    once and stays; its expected size is known better with every frame set.
-    """
-
-    def __init__(self, window: Array, fit: FrameFit, cameras: CameraErrors) -> None:
-        """window: (6, 6), the window's marginal, with `fit` the newest of the fits averaged there."""
-        self._window, self._averaged = window, WindowNoise(fit, cameras.unrest)
-        self._tracks = fit.parts.scatter * fit.parts.tracks
-        self._late, self._corrected = fit.parts.by_delay, cameras.offset
-
-    def covariance(self, cameras: CameraErrors, tracks: TrackNoise) -> Array:
-        """(6, 6) of the error, by what is known of cameras and tracks now."""
-        late = self._late @ cameras.beyond(self._corrected) @ self._late.T
-        averaged = self._averaged.rescaled(self._window, tracks, cameras.unrest)
-        return np.asarray(averaged + tracks.lasting * self._tracks + late)
+    return np.asarray(np.linalg.cholesky(known) @ np.linalg.inv(np.linalg.cholesky(believed)))
 
 
 class ImageShiftDrift:
@@ -217,9 +173,8 @@ class ReportedCovariance:
 
     def __init__(self, cameras: int) -> None:
         self._tracks, self._drift = TrackNoise(cameras), ImageShiftDrift()
-        self._first: tuple[FrameOriginError, Array] | None = None  # its covariance (6, 6) as assumed at the start
-        self._usual = np.zeros(2)  # tracks that carry the pose; their scatter
-        self._stamp, self._trouble = -np.inf, -np.inf  # s, of the last pose, and of the last with trouble
+        # the first pose given out: the window's marginal, the fit's parts, the clocks' corrections (C,) s, all as then
+        self._first: tuple[Array, FitCovariance, Array] | None = None
         self._added = np.zeros((6, 6))  # the last pose's lasting errors beyond its own covariance
 
     def learn(self, observations: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
@@ -233,58 +188,52 @@ class ReportedCovariance:
     ) -> SurfacePose:
         """The pose of an accepted fit with its reported covariance.
 
-        first: (6, 6) covariance of the first pose as it was assumed then. window: of whose covariance that of `pose`
-        is made.
+        first: (6, 6) covariance of the first pose as it was believed then, a part of all later ones. window: of whose
+        covariance that of `pose` is made.
         """
-        self._watch(pose, fit)
-        if self._first is None and first is not None:
-            assert fit.solution.shared is not None
-            self._first = FrameOriginError(first - fit.parts.smear, fit, cameras), first
-            self._drift.start(fit.solution.shared, cameras.shift)
-            self._trouble = fit.stamp
-        # added: lasting part of the tracks' errors, drift of the shifts, clock offsets that are not corrected yet
         parts = fit.parts
-        late = cameras.beyond(cameras.offset) - cameras.delays.covariance
+        own = self.error(window.covariance, parts, cameras.offset, cameras)
         drifted = self._drift.variance * parts.by_shift @ parts.by_shift.T
-        more = self._tracks.lasting * parts.scatter * parts.tracks + drifted + parts.by_delay @ late @ parts.by_delay.T
-        self._added = (more + more.T) / 2
-        if self._first is None or pose.stamp - self._trouble < CALM_BEFORE_NARROWING_S:  # or it is the first pose
-            return widened(pose, self._added)
-        # subtracted: by how much the first pose's error and the window's marginal were assumed too large
-        error, assumed = self._first
-        first_change = error.covariance(cameras, self._tracks) - assumed
-        noise = WindowNoise(fit, cameras.unrest)
-        window_change = noise.rescaled(window.covariance, self._tracks, cameras.unrest) - window.covariance
-        given = widened(pose, self._added + first_change + window_change)
-        by_noise = noise.rescaled(window.twist_covariance, self._tracks, cameras.unrest)
-        return replace(given, twist_covariance=_of_twist(window, fit, by_noise))
+        self._added = self._tracks.lasting * parts.scatter * parts.tracks + drifted
+        change = own - window.covariance - parts.smear + drifted
+        if self._first is not None and first is not None:
+            change += self.error(*self._first, cameras) - first
+        elif first is not None:
+            assert fit.solution.shared is not None
+            self._first = window.covariance, parts, cameras.offset
+            self._drift.start(fit.solution.shared, cameras.shift)
+        return replace(widened(pose, (change + change.T) / 2), twist_covariance=self._of_twist(window, parts, cameras))
+
+    def error(self, marginal: Array, parts: FitCovariance, corrected: Array, cameras: CameraErrors) -> Array:
+        """Covariance (6, 6) of a pose, map and lenses apart, by what is known of tracks, images and clocks now.
+
+        marginal: (6, 6), the window's. parts: of the newest of the fits averaged there. corrected: (C,) s, the delays
+        that were taken out of them. The error of the first pose was drawn once and stays; its size is known better
+        with every frame set.
+        """
+        rescaled = rescaling(parts.noise, self._noise(parts, cameras))
+        late = parts.by_delay @ cameras.beyond(corrected) @ parts.by_delay.T
+        lasting = self._tracks.lasting * parts.scatter * parts.tracks
+        return np.asarray(rescaled @ marginal @ rescaled.T + lasting + late)
+
+    def _noise(self, parts: FitCovariance, cameras: CameraErrors) -> Array:
+        """What is new in a frame set (6, 6), as known now."""
+        shifted = cameras.unrest * parts.by_shift @ parts.by_shift.T
+        return np.asarray(self._tracks.new * parts.scatter * parts.tracks + shifted)
+
+    def _of_twist(self, window: WindowEstimate, parts: FitCovariance, cameras: CameraErrors) -> Array:
+        """(6, 6) of the window's twist: by noise and late exposures as known now, and by motion as hindsight shows."""
+        claimed, rescaled = window.twist_covariance, rescaling(parts.noise, self._noise(parts, cameras))
+        by_pose = np.sqrt(np.diag(claimed) / np.diag(parts.noise))  # 1/s, of the window's noise
+        by_noise = rescaled @ claimed @ rescaled.T + by_pose[:, None] * parts.smear * by_pose
+        by_noise = NOISE_SHARE_OF_TWIST * by_noise
+        moved = window.revision - NOISE_REVISED * np.diag(by_noise) / np.diag(claimed)
+        by_motion = np.sqrt(np.maximum(moved, 0.0) / MOTION_REVISED)
+        return np.asarray(by_noise + by_motion[:, None] * claimed * by_motion)
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
         """A pose that is only predicted, with its reported covariance."""
-        self._trouble = pose.stamp
         return widened(pose, self._added)
-
-    def _watch(self, pose: SurfacePose, fit: FrameFit) -> None:
-        """Note trouble: a reason, a state below TRACKING, or fewer or worse tracks than usual."""
-        now = np.array([float(fit.used.sum()), fit.parts.scatter])
-        share = min(1.0, (pose.stamp - self._stamp) / USUAL_MEMORY_S)
-        unlike = now[0] < FEWER_TRACKS * self._usual[0] or now[1] > WORSE_SCATTER * self._usual[1]
-        if pose.state is not TrackState.TRACKING or pose.reason or unlike:
-            self._trouble = pose.stamp
-        self._usual, self._stamp = self._usual + share * (now - self._usual), pose.stamp
-
-
-def _of_twist(window: WindowEstimate, fit: FrameFit, by_noise: Array) -> Array:
-    """(6, 6) of the window's twist: by noise and late exposures, as known now, and by motion, as hindsight shows.
-
-    by_noise: (6, 6), the window's marginal as the noise of tracks and images rescales it.
-    """
-    claimed = window.twist_covariance
-    by_pose = np.sqrt(np.diag(claimed) / np.diag(fit.parts.noise))  # 1/s, of the window's noise
-    by_noise = NOISE_SHARE_OF_TWIST * (by_noise + by_pose[:, None] * fit.parts.smear * by_pose)
-    moved = window.revision - NOISE_REVISED * np.diag(by_noise) / np.diag(claimed)
-    by_motion = np.sqrt(np.maximum(moved, 0.0) / MOTION_REVISED)
-    return np.asarray(by_noise + by_motion[:, None] * claimed * by_motion)
 
 
 def widened(pose: SurfacePose, more: Array) -> SurfacePose:

@@ -26,7 +26,7 @@ MAX_PRIOR_CHI2 = 4.0  # squared sigmas of an axis, mean: a prior that is off by 
 
 HINDSIGHT_S = 0.3  # after which a twist is looked at again: half the window, what comes later hardly changes it
 REVISION_MEMORY_SETS = 300.0  # ten seconds, over which it is learned how far twists are revised then
-PRIOR_REVISION, PRIOR_REVISIONS = 0.75, 10.0  # that of a motion as the prior has it, and for how many twists it counts
+PRIOR_REVISION, PRIOR_REVISIONS = 0.75, 7.0  # that of a motion as the prior has it, and for how many twists it counts
 
 GRID_RATIO = 10**0.5  # between densities of the grid: closer ones cannot be told apart in a second
 ROTATION_PSD_GRID = 1e-7 * GRID_RATIO ** np.arange(18)  # rad^2/s^3, from a surface at rest to a shaken one

@@ -4,4 +4,4 @@
 fixture of the same name does. Nothing is drawn as a picture: a world gives what a matcher would make of the pictures.
 """
 
-__all__ = ["follow", "movements", "plugin", "waveforms", "world"]
+__all__ = ["follow", "movements", "plugin", "world"]

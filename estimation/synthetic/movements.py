@@ -1,8 +1,9 @@
-"""Synthetic surfaces: landmarks of simple shapes, and movements by name (chests, hands, test benches).
+"""Movements of synthetic surfaces by name (chests, hands, test benches), and the waveforms that drive them.
 
 A movement is a displacement of the surface from its rest pose: an exact, smooth function of time. Its numbers are
 measured ones: breathing of 10 mm and 3 degrees at 15 breaths a minute with a pulse; the thesis's shaking table (4.6)
-and its steps of 300 um (main requirement).
+and its steps of 300 um (main requirement). Random numbers are drawn when a waveform is made; after that its value
+depends on the time alone.
 """
 
 from __future__ import annotations
@@ -17,18 +18,8 @@ from scipy.interpolate import CubicSpline
 
 from estimation import se3
 from estimation.se3 import Array
-from estimation.synthetic.waveforms import (
-    PULSE_BUMPS,
-    WALK_SECONDS,
-    BandNoise,
-    Bump,
-    Cycles,
-    Sine,
-    StepWave,
-    Walk,
-    Waveform,
-)
 
+WALK_SECONDS = 600  # length of a random walk; after it the walk is played backwards
 FRAMES_PER_S = 29.91  # of the camera above the thesis's shaking table (thesis 4.6)
 DRAWN_SECONDS = 600.0  # length of the drawn breaths and beats; then they repeat, at rest as they began
 MAX_DRAW_SIGMAS = 2.5  # standard deviations at which a draw is cut, so that every amplitude is bounded
@@ -38,8 +29,135 @@ BREATH_SIZE = (0.045, 0.01, 0.004, 1.2, 2.5, 9.6)  # rad, mm: about 3 degrees, 1
 DRIFT_RMS = (0.0, 0.0, 0.003, 0.6, 0.6, 0.4)  # rad, mm: RMS after a minute
 PULSE_SIZE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.15)  # mm
 UNIT_AXES = np.eye(6)
-PATCH_SIZE, PATCH_RADIUS = (60.0, 45.0), 70.0  # mm: a wound's surroundings on an arm
-CUBE_EDGE = 40.0  # mm
+
+
+class Waveform:
+    """A smooth scalar function of time with its derivative; each kind computes both in `_evaluate`."""
+
+    __slots__ = ()
+
+    def __call__(self, times: Array) -> Array:
+        """Values (N,) at times (N,), s."""
+        return self._evaluate(times)[0]
+
+    def rate(self, times: Array) -> Array:
+        """Derivatives (N,), 1/s, at times (N,), s."""
+        return self._evaluate(times)[1]
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        raise NotImplementedError
+
+
+def ease(u: Array) -> Array:
+    """0 before u = 0, 1 after u = 1, and between them the quintic with zero speed and acceleration at its ends."""
+    u = np.clip(u, 0.0, 1.0)
+    return np.asarray(u**3 * (10 + u * (6 * u - 15)))
+
+
+def ease_rate(u: Array) -> Array:
+    """Derivative of `ease`; never above 1.875."""
+    u = np.clip(u, 0.0, 1.0)
+    return np.asarray(30 * (u * (1 - u)) ** 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Sine(Waveform):
+    """sin(2 pi rate t + phase)."""
+
+    rate_hz: float
+    phase: float = 0.0  # rad
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        omega = 2 * np.pi * self.rate_hz
+        return np.sin(omega * times + self.phase), np.asarray(omega * np.cos(omega * times + self.phase))
+
+
+@dataclass(frozen=True, slots=True)
+class Bump:
+    """A rise from 0 and a fall back within one cycle: sin^exponent about a peak that need not be in the middle."""
+
+    start: float  # share of the cycle, as peak and end: 0 <= start < peak < end <= 1
+    peak: float
+    end: float
+    exponent: float  # >= 2; larger values stay longer near 0 at both ends
+    height: float = 1.0  # of the peak
+
+    def __call__(self, u: Array) -> tuple[Array, Array]:
+        """Values (N,) at phases u (N,), and their derivatives (N,) by the phase."""
+        u = np.clip(u, self.start, self.end)
+        # the angle is 0 at the start, pi/2 at the peak, pi at the end, linear between: it bends where sin has no slope
+        slope = np.pi / 2 / np.where(u < self.peak, self.peak - self.start, self.end - self.peak)
+        angle = np.clip(np.pi / 2 + (u - self.peak) * slope, 0.0, np.pi)
+        value = np.asarray(self.height * np.sin(angle) ** self.exponent)
+        rate = self.height * self.exponent * np.sin(angle) ** (self.exponent - 1) * np.cos(angle) * slope
+        return value, np.asarray(rate)
+
+
+PULSE_BUMPS = (Bump(0.0, 0.15, 0.55, 2.0), Bump(0.38, 0.5, 0.95, 2.0, 0.35))  # systole; the wave after the notch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cycles(Waveform):
+    """Cycles of one shape, each with its own start, length and depth; 0 between them."""
+
+    starts: Array  # (K + 1,) s, starts[0] = 0; at the last one everything repeats from the first
+    lengths: Array  # (K,) s, at most up to the next start
+    depths: Array  # (K,)
+    bumps: tuple[Bump, ...]  # of a cycle of depth 1
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        within = np.mod(times, self.starts[-1])
+        k = np.clip(np.searchsorted(self.starts, within, side="right") - 1, 0, len(self.lengths) - 1)
+        u = np.clip((within - self.starts[k]) / self.lengths[k], 0.0, 1.0)
+        values, rates = zip(*(bump(u) for bump in self.bumps), strict=True)
+        return np.asarray(self.depths[k] * sum(values)), np.asarray(self.depths[k] / self.lengths[k] * sum(rates))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BandNoise(Waveform):
+    """A sum of sines of random frequency and phase."""
+
+    omegas: Array  # (M,) rad/s
+    amplitudes: Array  # (M,)
+    phases: Array  # (M,) rad
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        angles = np.outer(times, self.omegas) + self.phases
+        values, rates = np.sin(angles) * self.amplitudes, np.cos(angles) * (self.amplitudes * self.omegas)
+        return np.asarray(values.sum(axis=1)), np.asarray(rates.sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class StepWave(Waveform):
+    """Periodic steps, each along `ease`."""
+
+    first: float  # s: start of the first step
+    every: float  # s: period
+    rise: float  # s: duration of a step, at most `every`
+    stairs: bool  # True: every step goes up by 1; False: up and down in turn
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        since = times - self.first
+        done = np.maximum(np.floor(since / self.every), 0.0)
+        u = (since - done * self.every) / self.rise
+        up, speed = ease(u), ease_rate(u) / self.rise
+        if self.stairs:
+            return np.asarray(done + up), speed
+        rises = done % 2 == 0
+        return np.where(rises, up, 1 - up), np.where(rises, speed, -speed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walk(Waveform):
+    """A smoothed random walk, played backwards after WALK_SECONDS."""
+
+    spline: CubicSpline  # 0 at 0 s, zero slope at both ends
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        within = np.mod(times, 2 * WALK_SECONDS)
+        mirrored = WALK_SECONDS - np.abs(within - WALK_SECONDS)
+        sign = np.where(within < WALK_SECONDS, 1.0, -1.0)
+        return np.asarray(self.spline(mirrored)), np.asarray(sign * self.spline(mirrored, 1))
 
 
 class MotionPart(Protocol):
@@ -258,36 +376,3 @@ def _breathing(spec: BreathingSpec, rng: np.random.Generator) -> ComposedMotion:
 
 def _driven(waves: Sequence[Waveform], directions: Sequence[Array] | Array) -> ComposedMotion:
     return ComposedMotion((WaveformMotion(tuple(waves), np.array(directions), np.zeros(3), from_start=True),))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceLandmarks:
-    """Landmarks on a surface, in the surface frame."""
-
-    points: Array  # (N, 3) mm
-    normals: Array  # (N, 3) unit, outwards
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
-Surface = Callable[[int, np.random.Generator], SurfaceLandmarks]
-
-
-def patch(count: int, rng: np.random.Generator) -> SurfaceLandmarks:
-    """`count` random landmarks on a patch of 60 x 45 mm, bent about its x axis to a radius of 70 mm."""
-    x, y = (rng.uniform(-0.5, 0.5, (count, 2)) * PATCH_SIZE).T
-    up = np.sqrt(PATCH_RADIUS**2 - y**2)
-    return SurfaceLandmarks(np.stack([x, y, up - PATCH_RADIUS], -1), np.stack([0 * x, y, up], -1) / PATCH_RADIUS)
-
-
-def cube(count: int, rng: np.random.Generator) -> SurfaceLandmarks:
-    """`count` random landmarks on a cube of 40 mm without its bottom; the origin is the middle of its top."""
-    outward = np.array([[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
-    normals = outward[rng.integers(0, len(outward), count)]
-    points = rng.uniform(-CUBE_EDGE / 2, CUBE_EDGE / 2, (count, 3))
-    points = np.where(normals != 0, normals * CUBE_EDGE / 2, points)
-    return SurfaceLandmarks(points - [0, 0, CUBE_EDGE / 2], normals)
-
-
-SURFACES: dict[str, Surface] = {draw.__name__: draw for draw in (patch, cube)}

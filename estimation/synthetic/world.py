@@ -19,7 +19,7 @@ from estimation.pose import Trajectory
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array, Mask
 from estimation.surface_map import SurfaceMap
-from estimation.synthetic.movements import MOVEMENTS, SURFACES, Surface, SurfaceLandmarks
+from estimation.synthetic.movements import MOVEMENTS
 
 Displacement = Callable[[Array], Array]  # times (...), s -> rest_from_surface (..., 4, 4), mm
 Outage = tuple[float, float] | tuple[float, float, int]  # from, to, s; the camera, all cameras without one
@@ -41,10 +41,46 @@ WOUND_TILT = np.deg2rad(-38.0)  # of the wound, so that its normal stands amid t
 BASE_FROM_REST = se3.make(se3.exp_rotation([WOUND_TILT, 0.0, 0.0]), WOUND_CENTRE)  # base_from_surface at rest
 WEBCAM_DISTORTION = (-0.12, 0.06, 6e-4, -4e-4, 0.0)  # a plain webcam's
 
+PATCH_SIZE, PATCH_RADIUS = (60.0, 45.0), 70.0  # mm: a wound's surroundings on an arm
+CUBE_EDGE = 40.0  # mm
+
 # Proportions of the errors that a calibration with a board leaves, before they are scaled to the wanted RMS
 DISTORTION_ERROR = np.array([2e-3, 4e-3, 2e-4, 2e-4, 0.0])  # k1 k2 p1 p2 k3
 FOCAL_ERROR, CENTRE_ERROR = 1.0, 1.0  # px
 ROTATION_ERROR, POSITION_ERROR = 1e-3, 0.2  # rad, mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceLandmarks:
+    """Landmarks on a surface, in the surface frame."""
+
+    points: Array  # (N, 3) mm
+    normals: Array  # (N, 3) unit, outwards
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+Surface = Callable[[int, np.random.Generator], SurfaceLandmarks]
+
+
+def patch(count: int, rng: np.random.Generator) -> SurfaceLandmarks:
+    """`count` random landmarks on a patch of 60 x 45 mm, bent about its x axis to a radius of 70 mm."""
+    x, y = (rng.uniform(-0.5, 0.5, (count, 2)) * PATCH_SIZE).T
+    up = np.sqrt(PATCH_RADIUS**2 - y**2)
+    return SurfaceLandmarks(np.stack([x, y, up - PATCH_RADIUS], -1), np.stack([0 * x, y, up], -1) / PATCH_RADIUS)
+
+
+def cube(count: int, rng: np.random.Generator) -> SurfaceLandmarks:
+    """`count` random landmarks on a cube of 40 mm without its bottom; the origin is the middle of its top."""
+    outward = np.array([[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
+    normals = outward[rng.integers(0, len(outward), count)]
+    points = rng.uniform(-CUBE_EDGE / 2, CUBE_EDGE / 2, (count, 3))
+    points = np.where(normals != 0, normals * CUBE_EDGE / 2, points)
+    return SurfaceLandmarks(points - [0, 0, CUBE_EDGE / 2], normals)
+
+
+SURFACES: dict[str, Surface] = {draw.__name__: draw for draw in (patch, cube)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,8 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import pose_information
-from estimation.synthetic.movements import irregular, patch
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, synthetic_world
+from estimation.synthetic.movements import irregular
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch, synthetic_world
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress
 from hardware.cameras.feed import Arrival, FrameWatch
 from hardware.cameras.live import FrameSetBuilder

@@ -294,6 +294,7 @@ class SceneRun:
 
     errors: Array  # (N, 6) rad and mm, surface frame
     covariances: Array  # (N, 6, 6) as reported
+    twist_squares: Array  # (N,) NEES of the twists, over 6
     late: NDArray[np.int64]  # (N,) frame sets since the first TRACKING pose
     share: float  # of the frame sets that were measured
 
@@ -320,19 +321,23 @@ def run_consistency(options: argparse.Namespace) -> list[Figure]:
 def scene_errors(poses: list[SurfacePose], truth: Array) -> SceneRun:
     """Errors of poses against truth (N, 4, 4), base_from_surface, after the transform at the first TRACKING one."""
     first = next((i for i, p in enumerate(poses) if p.state is TrackState.TRACKING), len(poses))
-    rows = np.array([i for i in range(first + 1, len(poses)) if poses[i].state.measured], np.int64)
+    rows = np.array([i for i in range(first + 1, len(poses) - 1) if poses[i].state.measured], np.int64)
     if not len(rows):
-        return SceneRun(np.zeros((0, 6)), np.zeros((0, 6, 6)), rows, 0.0)
-    constant = se3.inverse(truth[first]) @ poses[first].base_from_surface
+        return SceneRun(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros(0), rows, 0.0)
+    expected = truth @ se3.inverse(truth[first]) @ poses[first].base_from_surface
     estimated = np.stack([poses[i].base_from_surface for i in rows])
-    errors = se3.log(se3.inverse(estimated) @ truth[rows] @ constant)
-    share = len(rows) / (len(poses) - first - 1)
-    return SceneRun(errors, np.stack([poses[i].covariance for i in rows]), rows - first, share)
+    errors = se3.log(se3.inverse(estimated) @ expected[rows])
+    twists = se3.log(se3.inverse(expected[rows - 1]) @ expected[rows + 1]) * (FRAME_RATE_HZ / 2)
+    twist_errors = twists - np.stack([poses[i].twist for i in rows])
+    twist_squares = nees(twist_errors, np.stack([poses[i].twist_covariance for i in rows])) / 6
+    share = len(rows) / (len(poses) - first - 2)
+    return SceneRun(errors, np.stack([poses[i].covariance for i in rows]), twist_squares, rows - first, share)
 
 
 def consistency_figures(name: str, runs: list[SceneRun]) -> list[Figure]:
     """Of all poses but those of the first second, whose covariance is still that of unknown cameras."""
     errors, covariances = (np.concatenate([getattr(r, n) for r in runs]) for n in ("errors", "covariances"))
+    twist_squares = np.concatenate([run.twist_squares for run in runs])
     settled = np.concatenate([run.late for run in runs]) > SETTLING_SETS
     if not settled.any():
         return [Figure(f"{name}: NEES/6", math.nan, "", CONSISTENT_NEES, note="not followed for longer than a second")]
@@ -342,6 +347,7 @@ def consistency_figures(name: str, runs: list[SceneRun]) -> list[Figure]:
     note = f"{len(errors)} poses; {squares[~settled].mean():.3f} in the first second" if (~settled).any() else ""
     return [
         Figure(f"{name}: NEES/6", float(squares[settled].mean()), "", CONSISTENT_NEES, "", note),
+        Figure(f"{name}: twist NEES/6", float(twist_squares[settled].mean()), "", CONSISTENT_NEES),
         Figure(f"{name}: NEES/6, largest", float(squares[settled].max()), "", None, "", "of one pose"),
         Figure(f"{name}: inside 95 %", _inside_95(errors, covariances), "", INSIDE_95, "", "of six axes"),
         Figure(f"{name}: error of an axis", 1000 * rms(errors[:, 3:]), "um"),

@@ -37,6 +37,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import synthetic_world
+from hardware.bench.estimator import nees
 from hardware.bench.figures import CONSISTENT_NEES, Figure, at_least, at_most, columns, rms
 from hardware.files.session import Session
 from hardware.live.prerender import prerender
@@ -290,11 +291,12 @@ MAX_SECONDS, MAX_GIGABYTES, TARGET_MINUTES = 60.0, 2.0, 10.0
 
 @dataclass(frozen=True, slots=True)
 class MovementErrors:
-    """One world: mean squared error, mm^2, of smoothed and of causal poses, aligned; NEES/6 of the smoothed ones."""
+    """One world: mean squared error, mm^2, of smoothed and causal poses, aligned; NEES/6 of the smoothed."""
 
     smoothed: float
     causal: float
-    nees: float
+    nees: float  # of the poses
+    twist_nees: float
 
 
 def run_smoothing(options: argparse.Namespace) -> list[Figure]:
@@ -317,12 +319,14 @@ def run_smoothing(options: argparse.Namespace) -> list[Figure]:
 
 def pair_figures(movement: str, pairs: list[MovementErrors]) -> list[Figure]:
     """The figures of one movement, over all its worlds."""
-    smoothed, causal, nees = (float(values.mean()) for values in columns(pairs, "smoothed", "causal", "nees"))
+    means = columns(pairs, "smoothed", "causal", "nees", "twist_nees")
+    smoothed, causal, consistency, twist_consistency = (float(values.mean()) for values in means)
     ours, theirs = (1000 * float(np.sqrt(square)) for square in (smoothed, causal))
     note = f"{ours:.1f} against {theirs:.1f} um RMS, aligned"
     return [
         Figure(f"{movement}: error by the causal one's", ours / theirs, "", at_most(0.6), "", note),
-        Figure(f"{movement}: NEES/6", nees, "", CONSISTENT_NEES, "", "from the first pose"),
+        Figure(f"{movement}: NEES/6", consistency, "", CONSISTENT_NEES, "", "from the first pose"),
+        Figure(f"{movement}: twist NEES/6", twist_consistency, "", CONSISTENT_NEES),
     ]
 
 
@@ -334,10 +338,15 @@ def _movement_errors(movement: str, seed: int, options: argparse.Namespace) -> M
     poses, truth = result.states.poses, world.truth.base_from_surface
     theirs = np.stack([pose.base_from_surface for pose in causal])
     # the first pose is aligned with the truth, as smoothing aligns its frame
-    error = se3.log(se3.inverse(poses) @ truth @ se3.inverse(truth[0]) @ poses[0])[1:]
-    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(result.covariance[1:, :6, :6]), error)
-    smoothed, nees = _squared_error(poses[rows], truth[rows]), float(squares.mean() / 6)
-    return MovementErrors(smoothed, _squared_error(theirs, truth[rows]), nees)
+    true_from_smoothed = se3.inverse(truth[0]) @ poses[0]
+    error = se3.log(se3.inverse(poses) @ truth @ true_from_smoothed)[1:]
+    twist_error = world.twists(world.stamps) @ se3.adjoint(se3.inverse(true_from_smoothed)).T - result.states.twists
+    return MovementErrors(
+        _squared_error(poses[rows], truth[rows]),
+        _squared_error(theirs, truth[rows]),
+        float(nees(error, result.covariance[1:, :6, :6]).mean() / 6),
+        float(nees(twist_error, result.covariance[:, 6:12, 6:12]).mean() / 6),
+    )
 
 
 def _squared_error(poses: Array, truth: Array) -> float:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -28,11 +29,20 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from estimation.synthetic import movements
-from estimation.synthetic.movements import BreathingSpec, ComposedMotion, MotionPart, WaveformMotion
-from estimation.synthetic.waveforms import Levels, RoundedCorners, Sine, StepWave, Waveform, Zigzag
+from estimation.synthetic.movements import (
+    BreathingSpec,
+    ComposedMotion,
+    MotionPart,
+    Sine,
+    StepWave,
+    Waveform,
+    WaveformMotion,
+    ease,
+    ease_rate,
+)
 from hardware.process.checks import Table
 from hardware.simulator.scenario_tables import TableReader
-from hardware.simulator.trace_file import played_trace, read_trace
+from hardware.simulator.trace_file import corner, corner_rate, folded, folded_rate, played_trace, read_trace
 
 MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
 ZERO, SURFACE_NORMAL = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -189,6 +199,49 @@ def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
     period = float(starts[-1] + duration) if keys.flag("repeat", True) else math.inf
     reach = np.deg2rad(np.append(axis, np.zeros(3)))[None]
     return WaveformMotion((Levels(starts, steps, duration, period),), reach, pivot)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Levels(Waveform):
+    """Changes of level, each along `ease`; 0 before the first."""
+
+    starts: Array  # (K,) s: when each change begins
+    steps: Array  # (K,): size of each change
+    rise: float  # s: duration of each change
+    period: float = np.inf  # s after which everything repeats (from level 0), inf for never
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        within = times if np.isinf(self.period) else np.where(times < 0, times, np.mod(times, self.period))
+        u = (within[:, None] - self.starts) / self.rise
+        rates = (ease_rate(u) * self.steps / self.rise).sum(axis=1)
+        return np.asarray((ease(u) * self.steps).sum(axis=1)), np.asarray(rates)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoundedCorners(Waveform):
+    """Straight lines with rounded corners; the first line has slope 0."""
+
+    times: Array  # (K,) s: when the slope changes
+    bends: Array  # (K,) 1/s: change of the slope
+    rounding: float  # s: duration of each change, half of it before its time
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        x = times[:, None] - self.times
+        values, rates = corner(x, self.rounding) * self.bends, corner_rate(x, self.rounding) * self.bends
+        return np.asarray(values.sum(axis=1)), np.asarray(rates.sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Zigzag(Waveform):
+    """A triangle wave of slope +-1 with rounded corners: 0 at t = 0, up to `reach`, down to -reach, and back."""
+
+    reach: float  # s, as the slope is 1/s
+    rounding: float  # s: at most 2 * reach
+
+    def _evaluate(self, times: Array) -> tuple[Array, Array]:
+        x, length = times - self.reach, 2 * self.reach
+        values = self.reach - folded(x, length, self.rounding)
+        return np.asarray(values), np.asarray(-folded_rate(x, length, self.rounding))
 
 
 def _trace(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> MotionPart:

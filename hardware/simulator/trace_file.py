@@ -19,7 +19,6 @@ from scipy.signal import butter, filtfilt
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from estimation.synthetic.waveforms import corner, corner_rate, folded, folded_rate
 from hardware.files.folder_tables import read_rows
 from hardware.process import checks
 
@@ -234,3 +233,28 @@ def _smoothed(stamps: Array, coordinates: Array, step: float, smooth: float) -> 
     # of two passes each keeps 1 / sqrt(2) of the amplitude at its corner frequency
     b, a = butter(2, 1 / smooth, fs=(count - 1) / stamps[-1])
     return even, np.asarray(filtfilt(b, a, values, axis=0, padlen=min(count - 1, 3 * round(smooth / step) + 6)))
+
+
+def corner(x: Array, rounding: float) -> Array:
+    """max(x, 0) with its corner rounded over `rounding` about 0: exact outside, second derivative continuous."""
+    u = np.clip(x / rounding + 0.5, 0.0, 1.0)
+    return np.asarray(rounding * u**3 * (1 - u / 2) + np.maximum(x - rounding / 2, 0.0))
+
+
+def corner_rate(x: Array, rounding: float) -> Array:
+    """Derivative of `corner`: 0 to 1 along the cubic smoothstep."""
+    u = np.clip(x / rounding + 0.5, 0.0, 1.0)
+    return np.asarray(u * u * (3 - 2 * u))
+
+
+def folded(x: Array, length: float, rounding: float) -> Array:
+    """Distance (N,) from x to the nearest even multiple of `length`, 0 to `length`, with rounded corners."""
+    y = np.mod(x + length / 2, 2 * length) - length / 2
+    high = y - length
+    return np.where(y < length / 2, 2 * corner(y, rounding) - y, length - (2 * corner(high, rounding) - high))
+
+
+def folded_rate(x: Array, length: float, rounding: float) -> Array:
+    """Derivative of `folded`."""
+    y = np.mod(x + length / 2, 2 * length) - length / 2
+    return np.where(y < length / 2, 2 * corner_rate(y, rounding) - 1, 1 - 2 * corner_rate(y - length, rounding))
