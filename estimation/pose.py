@@ -20,7 +20,7 @@ from estimation.surface_map import LocalError, Warp
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-_normal_quantile = lru_cache(maxsize=8)(NormalDist().inv_cdf)
+_normal_quantile = lru_cache(maxsize=32)(NormalDist().inv_cdf)
 
 MIN_FORECAST_S = 0.01  # a shorter rest of a forecast says no more than the velocity there
 
@@ -97,17 +97,26 @@ def _bracket(a: Array, b: Array) -> Array:
     return np.concatenate([turn, shift], axis=-1)
 
 
-def radius(covariance: Array, share: float = 0.9) -> Array:
-    """Radius (...) of the ball that holds `share` of a normal error with covariance (..., 3, 3) about its mean.
+def radius(covariance: Array, share: float | Array = 0.9, offset: Array | None = None) -> Array:
+    """Radius (...) of the ball that holds `share` of a normal error with covariance (..., 3, 3).
+
+    share: of one covariance (1, 3, 3) also several (M,), for as many radii.
+    offset: (..., 3) of its mean from the ball's centre; None: about its mean.
 
     The sum of three weighted squares is taken as one scaled chi-square (Satterthwaite 1946), whose quantile is Wilson
     and Hilferty's (1931): within 2 % of the exact one for every shape of the covariance at 0.9.
     """
     trace = np.maximum(np.trace(covariance, axis1=-2, axis2=-1), 0.0)
     squares = (covariance**2).sum((-2, -1))
+    if offset is not None:  # the mean of the squared length, and its variance over 2
+        squares = squares + 2 * np.einsum("...i,...ij,...j", offset, covariance, offset)
+        trace = trace + (offset**2).sum(-1)
     safe = np.where(trace > 0, trace, 1.0)
     part = 2 * np.where(trace > 0, squares, 1.0) / (9 * safe**2)
-    return np.asarray(np.sqrt(trace) * np.maximum(1 - part + _normal_quantile(share) * np.sqrt(part), 0.0) ** 1.5)
+    quantile = (
+        np.array(list(map(_normal_quantile, share))) if isinstance(share, np.ndarray) else _normal_quantile(share)
+    )
+    return np.asarray(np.sqrt(trace) * np.maximum(1 - part + quantile * np.sqrt(part), 0.0) ** 1.5)
 
 
 class TrackState(Enum):
@@ -249,9 +258,13 @@ class SurfacePose:
         local = None if self.local is None else self.local.later(dt)
         return replace(self, covariance=covariance, warp=warp, local=local).error_at(points_surface)
 
-    def radius_at(self, points_surface: Array, share: float = 0.9) -> Array:
-        """Radius (N,), mm, about points (N, 3), surface frame, that holds their true places in `share` of cases."""
-        return radius(self._spread(points_surface), share)
+    def radius_at(self, points_surface: Array, share: float | Array = 0.9, offsets: Array | None = None) -> Array:
+        """Radius (N,), mm, about points (N, 3), surface frame, that holds their true places in `share` of cases.
+
+        share: as `radius` takes it.
+        offsets: (N, 3) mm, of the points from the centres of those balls, None: none.
+        """
+        return radius(self._spread(points_surface), share, offsets)
 
     def _spread(self, points_surface: Array) -> Array:
         """Covariances (N, 3, 3), mm^2, of the positions of points (N, 3)."""

@@ -38,9 +38,20 @@ def broken_links(folder: Path) -> Iterator[str]:
 
 
 def build(folder: Path) -> None:
-    """Write the pages: all packages and modules but those that need torch. pdoc is looked for in PYTHONPATH."""
+    """Write the pages: all packages and modules but those that need torch, or the system's Python.
+
+    pdoc is looked for in PYTHONPATH.
+    """
     own = [f"estimation.{each.name}" for each in iter_modules([str(ROOT / "estimation")])]  # beyond its __all__
-    names = ["estimation", *own, "perception", "!perception.training", "planning", "hardware"]
+    names = [
+        "estimation",
+        *own,
+        "perception",
+        "!perception.training",
+        "planning",
+        "hardware",
+        "!hardware.cameras.aravis_process",
+    ]
     command = [sys.executable, "-m", "pdoc", "--output-directory", str(folder)]
     subprocess.run([*command, *names], cwd=ROOT, check=True)
 

@@ -91,7 +91,9 @@ def main(link, log, *place):
     while True:
         *lines, rest = (rest + os.read(ours, 4096)).split(b"\n")
         for line in lines:  # it looks at one line of what it is given at a time
-            printer.write(line + b"\n")
+            left = line + b"\n"
+            while left:
+                left = left[printer.write(left) :]
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from aiohttp import web_app
 
 from estimation.pose import TrackState
 from hardware.operator.server import serve
@@ -40,7 +41,9 @@ def full_view(stamp: float = 1.0, turn: int = 1, stage: RunStage = RunStage.PRIN
     """A view with something in every place."""
     pose = np.eye(4)
     tracking = TrackingView(TrackState.TRACKING, "three cameras agree", 0.018, 0.052, pose, np.diag([1e-3] * 3), 182)
-    motion = MotionView(Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0, error_age=0.0)
+    motion = MotionView(
+        Activity.PRINTING, "", 0.21, 0.5, 0.19, 0.031, 0.05, pose, "armed", 6.0, error_age=0.0, sigma=0.12
+    )
     made = OperatorView(
         stamp,
         turn,
@@ -88,6 +91,7 @@ class Served:
         self._loop.call_soon_threadsafe(self._ended.set)
         self._thread.join(10)
         assert not self._thread.is_alive()
+        web_app._cached_build_middleware.cache_clear()  # holds the server, and with it a dozen files of the link
 
     def put(self, view: OperatorView) -> None:
         """Show a view."""

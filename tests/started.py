@@ -21,3 +21,10 @@ def started(arguments: Sequence[str]) -> subprocess.Popen[str]:
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
+
+
+def spoken(run: subprocess.Popen[str]) -> str:
+    """The next line that a command says on standard error, but that it loads."""
+    assert run.stderr is not None
+    line = run.stderr.readline()
+    return spoken(run) if line.endswith(": loading\n") else line

@@ -25,7 +25,7 @@ from hardware.process.progress import Progress
 from perception.frames import Frame, FrameSet, Image, StampedBy
 from tests.board_session import BOARD, LENSES, rendered, small_rig
 from tests.boards import motion
-from tests.started import started
+from tests.started import spoken, started
 from tests.streams import CLOCK, HttpCamera, served
 
 SIZE, RATE = (640, 480), 8.0
@@ -120,7 +120,7 @@ def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(still: lis
     urls, file = [camera.url for camera in still], board_file(tmp_path)
     command = ["calibrate", "cameras", *urls, "--board", str(file), "-o", str(out), "--no-page"]
     run = started(command)
-    assert "the board" in run.stderr.readline()  # where to hold it, or how to tilt it
+    assert "the board" in spoken(run)  # where to hold it, or how to tilt it
     run.send_signal(signal.SIGINT)
     told = run.stderr.read()
     assert run.wait(SOON) == 130

@@ -276,6 +276,7 @@ def test_halted_octoprint_s_printer_stands_until_it_is_reset(tmp_path: Path) -> 
         bench.begin()
         bench.follow(straight(bench.arm.target), 0.5)
         bench.arm.close()
+        bench.arm.driver.release()
         assert emergency_stop(f"gcode://{bench.server.link}", bench.profile)[1] == ""
         bench.run(0.3)
         end = bench.clock.now()

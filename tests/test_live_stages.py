@@ -760,7 +760,9 @@ def test_a_pause_does_not_count_against_the_time_left_and_little_is_said_of_few_
 
 def test_what_a_run_came_to_counts_what_runs_before_it_printed() -> None:
     run = Staged(start=2.5)
-    prepared, seen = views_of(run, 2.5).prepared, run.seen
+    prepared, seen = views_of(run, 2.5).prepared, replace(run.seen, recorder=RecorderReport(1000, 0.0, ""))
+    nothing = RunOutcome(prepared, run.conductor, RunStatistics(), replace(seen, recorder=None), 0, 4.0)
+    assert nothing.again == "" and "nothing was recorded yet" in nothing.words  # what is not there cannot be resumed
     for fraction, printed in ((float("nan"), 2.5), (4.0, 4.0)):
         outcome = RunOutcome(prepared, run.conductor, RunStatistics(), seen, 0, fraction)
         result = outcome.result()
@@ -776,9 +778,9 @@ def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
     statistics.holds = {"pose is … s old": HoldTotal(3, 12.5), "paused by the operator": HoldTotal(1, 2.5)}
     for k in range(100):
         statistics.errors.add(0.2 + 0.001 * k)
-        statistics.add_true_error(0.1 + 0.001 * k)
+        statistics.add_true_error(0.1 + 0.001 * k, 0.1795)
     statistics.add_true_error(float("nan"))
-    statistics.stretches[300:350] = 0.3
+    statistics.stretches[300:350] = statistics.largest = 0.3
     prepared = replace(views_of(run, 2.5).prepared, files=RunFiles(tmp_path / "run.mcap"))
     seen = PagePictures(1.0, (CameraPicture("left", b"whole", near=b"near"), CameraPicture("right", b"whole")), None)
     outcome = RunOutcome(prepared, run.conductor, statistics, run.seen, 0, 4.0, seen).write()
@@ -789,9 +791,11 @@ def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
     assert [rows[name] for name in parts] == ["12.50", "2.50", "40.00", "5.00"]
     assert rows["since the approach"] == "60.00"
     assert b64encode(b"near").decode() in page and "<figcaption>right</figcaption>" in page
-    for words in ("true error, 95 % / largest", "printed by the runs before", "the beads from above", "var(--amber)"):
+    figures = "true error, 95 % / largest", "within what was predicted", "printed by the runs before"
+    for words in (*figures, "the beads from above", "var(--amber)"):
         assert words in page
     summary = json.loads((tmp_path / "run.summary.json").read_text())
+    assert summary["within_claim"] == 0.8
     assert summary["true_error_mm"]["max"] == pytest.approx(0.199) and summary["printed_share"] > 0.5
 
 

@@ -23,7 +23,7 @@ from hardware.operator.view import (
     RunStage,
     Wish,
 )
-from tests.browser import Browser, Page
+from tests.browser import Browser, Page, axe_findings
 from tests.operator_page import LIVE, OFFERED, Run
 
 SIZES = [(1024, 768), (768, 1024), (1440, 900)]
@@ -181,7 +181,8 @@ def test_state_and_why_and_all_figures_are_there_in_words(run: Run) -> None:
     run.show(motion=motion, notes=("dry run",), log=log)
     body = "".join(page.js("document.body.innerText").split())
     for words in (
-        "Holding", "The surface moves too fast", "Good", "three cameras agree", "0.62 mm", "limit 0.5", "0.19 mm",
+        "Holding", "The surface moves too fast", "Good", "three cameras agree", "0.62 mm", "predicted, σ 0.12/0.5",
+            "0.19 mm",
         "18 ms", "14 / 27 ms", "31 ms", "0.052 mm", "35.2 %", "checkpoint 1204 of 3420", "layer 3 of 12",
         "about 13 min left", "12 min to 14 min", "30 Hz", "60 tracks", "dry run", "live", "6.0 mm/s", "it is back",
     ):  # fmt: skip
@@ -223,7 +224,9 @@ def test_old_news_are_greyed_and_said_to_be_old_and_stop_still_stops(browser: Br
     run.pages.append(page)
     page.until('document.body.dataset.news === "old"')
     assert "No news from the run" in page.text("#alarm") and "old" in page.text("#alarm")
-    assert float(page.js("getComputedStyle(document.querySelector('main')).opacity")) < 0.5
+    assert "grayscale" in page.js("getComputedStyle(document.querySelector('main')).filter")
+    assert float(page.js("getComputedStyle(document.querySelector('main canvas')).opacity")) < 0.5
+    assert axe_findings(page) == []  # what is grey can be read
     enabled = page.js('[...document.querySelectorAll("footer button:not(:disabled)")].map((b) => b.dataset.wish)')
     assert enabled == ["stop"]
     page.click('[data-wish="stop"]')

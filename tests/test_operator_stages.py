@@ -340,7 +340,7 @@ def test_the_chart_knows_the_whole_run_and_is_zoomed_by_hand_and_key(run: Run) -
         page._tell("Input.dispatchMouseEvent", type=kind, x=x + at * width, y=y, button="left", clickCount=1, buttons=1)
     page.until(f"{label}.length === 0")
     page._tell("Input.dispatchMouseEvent", type="mouseMoved", x=x + 0.6 * width, y=y)
-    page.until("/predicted:?\\s*0\\.\\d\\d mm/.test(document.querySelector('.u-legend').textContent)")
+    page.until("/predicted, 95 %:?\\s*0\\.\\d\\d mm/.test(document.querySelector('.u-legend').textContent)")
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -16,7 +16,7 @@ from estimation.rig import Camera, Rig, pixels_from_points
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ArmProfile
 from hardware.files.images import decode
-from hardware.live.records import LiveMotionReport, TrackingReport
+from hardware.live.records import LiveMotionReport, RunReports, TrackingReport
 from hardware.live.view import NozzleErrorEstimate
 from hardware.motion.loop import Tick
 from hardware.operator.overlays import SurfaceOutline
@@ -188,15 +188,15 @@ def reports(now: float, off: float, extrude: bool) -> tuple[TrackingReport, Live
 def test_the_true_error_is_the_way_from_the_nozzle_to_its_place(off: float) -> None:
     error = NozzleErrorEstimate(raster())
     for k in range(60):
-        error.update(*reports(0.02 * k, off, extrude=True), PROFILE)
+        error.update(RunReports(*reports(0.02 * k, off, extrude=True)), PROFILE)
     assert error.last == pytest.approx(off, abs=0.02)
 
 
 def test_there_is_no_true_error_without_truth_or_while_nothing_is_printed() -> None:
     error = NozzleErrorEstimate(raster())
     for k in range(20):
-        error.update(*reports(0.02 * k, 1.0, extrude=False), PROFILE)
+        error.update(RunReports(*reports(0.02 * k, 1.0, extrude=False)), PROFILE)
         assert np.isnan(error.last)
         tracking, motion = reports(0.02 * k, 1.0, extrude=True)
-        error.update(replace(tracking, truth=None), motion, PROFILE)
+        error.update(RunReports(replace(tracking, truth=None), motion), PROFILE)
         assert np.isnan(error.last)

@@ -124,7 +124,7 @@ def test_its_file_is_read_again_and_needs_no_repair(scanned: SurfaceScan, tmp_pa
 
 def test_its_page_shows_it(scanned: SurfaceScan) -> None:
     page = scan_page(scanned, "a scan")
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     for words in ("from above", "Who saw it", "cam_2", "Where to put a camera", "standard deviation, 95 %"):
         assert words in page
 

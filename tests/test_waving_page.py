@@ -21,7 +21,7 @@ from perception.frames import Frame, FrameSet
 from tests.board_session import BOARD, LENSES, RATE, rendered, small_rig
 from tests.boards import motion
 from tests.browser import Browser, Page
-from tests.started import started
+from tests.started import spoken, started
 
 CLOCK = WallClock()
 SIZE = (640, 480)
@@ -114,7 +114,7 @@ def test_a_waved_board_becomes_a_rig(browser: Browser, tmp_path: Path, monkeypat
     board, out, cameras = tmp_path / "board.toml", tmp_path / "rig.toml", videos(tmp_path)
     write_board(board, BOARD)
     run = started(["calibrate", "cameras", *cameras, "--board", str(board), "-o", str(out), "--limit-mm", "1"])
-    page = browser.page(run.stderr.readline().split()[1])
+    page = browser.page(spoken(run).split()[1])
     page.until('parseInt(document.querySelector("#looked")?.textContent) >= 30', timeout=PATIENCE)
     page.until('[...document.querySelectorAll("canvas")].every((each) => each.dataset.drawn)', timeout=PATIENCE)
     assert not page.js('document.querySelector("[data-wish=end]").disabled')

@@ -16,6 +16,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.files.path_file import read_path
 from hardware.motion.loop import Tick
+from hardware.offline.track import FrameSetStep
 from hardware.process.clock import SimClock
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
@@ -25,7 +26,7 @@ from hardware.simulator.scenario import Scenario, read_scenario
 from hardware.simulator.scene.appearance import Appearance
 from hardware.simulator.scene.scene import UNDEFORMED, Scene
 from hardware.simulator.scene.shape import Deformation, flat
-from hardware.simulator.simulate import OracleTracker
+from hardware.simulator.simulate import LandmarkTracker, OracleTracker
 from hardware.simulator.truth import Truth
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, PrintHead
@@ -156,13 +157,19 @@ def patch(deformation: Deformation = UNDEFORMED) -> Scene:
 def world_of(
     scenario: Scenario, sink: Heard, line: Callable[[bytes], bytes] = bytes, deformation: Deformation = UNDEFORMED
 ) -> SimulatedWorld:
-    """A world without pictures whose tracker knows the truth, as `stillbed simulate` builds it, on a flat surface."""
+    """A world without pictures, as `stillbed simulate` builds it, on a flat surface; its tracker knows the truth or is
+    given tracks, as the scenario has it."""
     assert not scenario.tracking.pictures
     exposures: Exposures = {}
     scene = patch(deformation)
     truth = Truth(scenario.rest, scenario.motion, deformation, scenario.strain, scene.shape.surface_from_grid)
     offset = scenario.known_rig.cameras[0].base_from_camera @ se3.inverse(scenario.rig.cameras[0].base_from_camera)
-    step = OracleTracker(truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig))
+    step: FrameSetStep = OracleTracker(
+        truth, offset, lambda camera, stamp: exposures[camera, stamp].exposed, len(scenario.rig)
+    )
+    if scenario.tracking.tracks:
+        rigs = scenario.rig, scenario.known_rig
+        step = LandmarkTracker(*rigs, truth, scene.shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
     path = read_path(scenario.path)
     return SimulatedWorld(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line)
 

@@ -172,10 +172,7 @@ def add_init(commands: Commands) -> None:
 def _run_live(a: argparse.Namespace) -> int:
     from hardware.cli.plan import scanned_settings
     from hardware.files.region_table import read_region
-    from hardware.live.prepared import prepare, prepare_resumed
-    from hardware.live.run import LiveRun
     from hardware.live.settings import LiveSettings, named_by_flag, override_settings, parse_host_names, read_settings
-    from hardware.live.view import Console
     from hardware.process.faults import faults_from_texts
 
     faults = faults_from_texts("command line", "--fault", a.fault)
@@ -194,12 +191,15 @@ def _run_live(a: argparse.Namespace) -> int:
         raise wrong_option("--resume", a.resume, "without session.toml and --record")
     if a.resume is None and a.settings is None and a.rig is None and a.simulated is None:
         raise wrong_option("session.toml", "missing", LIVE_ALLOWED)
+    settings, where = LiveSettings() if a.settings is None else read_settings(a.settings), a.settings or "command line"
+    from hardware.live.prepared import prepare, prepare_resumed  # which loads for a second, the run for two more
+    from hardware.live.run import LiveRun
+    from hardware.live.view import Console
+
     try:
         if a.resume is not None:
             prepared = prepare_resumed(a.resume, flags, faults)
         else:
-            settings = LiveSettings() if a.settings is None else read_settings(a.settings)
-            where = a.settings or "command line"
             settings = scanned_settings(override_settings(settings, flags), where, a.force)
             prepared = prepare(settings, where, a.force, faults)
     except InputError as error:

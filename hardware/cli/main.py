@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,15 @@ from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Pars
 from hardware.cli.plan import add_plan, add_reach, add_scan, add_segment, add_train
 from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
 from hardware.process.clock import WallClock
-from hardware.process.progress import BAD, cache_folder, left_files_text, painted, prepare_out, write_error_text
+from hardware.process.progress import (
+    BAD,
+    FirstWord,
+    cache_folder,
+    left_files_text,
+    painted,
+    prepare_out,
+    write_error_text,
+)
 from hardware.process.system import fill_standard_streams, state_inputs
 from perception import named_path
 
@@ -184,6 +192,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         argcomplete.autocomplete(commands)
     arguments = commands.parse_args(argv)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
+    with nullcontext() if argv is not None else FirstWord(arguments.command):  # only where the process is the command's
+        return _run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Run the command that was read; its exit code."""
     state_inputs(input_files(arguments))
     code: int | None = None
     out: Path | None = getattr(arguments, "out", None)
@@ -269,7 +283,10 @@ def _add_simulate(commands: Commands) -> None:
 
 
 def _simulate(a: argparse.Namespace) -> int:
+    from hardware.process.checks import read_toml
     from hardware.process.faults import faults_from_texts
+
+    read_toml(a.scenario)  # what cannot be one is told before the simulator is loaded
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)

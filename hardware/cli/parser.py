@@ -75,7 +75,7 @@ class Commands:
             epilog=f"example{'s' if len(examples) > 1 else ''}:{lines}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        parser.set_defaults(run=run)
+        parser.set_defaults(run=run, command=parser.prog)
         return parser
 
 

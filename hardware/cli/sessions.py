@@ -87,6 +87,9 @@ def add_export(commands: Commands) -> None:
 
 
 def _track(a: argparse.Namespace) -> int:
+    from hardware.files.session import check_exists
+
+    check_exists(a.session)
     from hardware.files.arm_file import read_arm
     from hardware.offline.track import run_track
 
@@ -188,6 +191,10 @@ def add_smooth(commands: Commands) -> None:
 
 
 def _smooth(a: argparse.Namespace) -> int:
+    from hardware.files.session import check_exists
+
+    for session in a.sessions:
+        check_exists(session)
     from hardware.offline.smooth import Cluster, SmoothOptions, run_smooth
 
     if a.workers is not None and a.scheduler != "local":
@@ -246,6 +253,9 @@ def add_view(commands: Commands) -> None:
 
 
 def _view(a: argparse.Namespace) -> None:
+    from hardware.files.session import check_exists
+
+    check_exists(a.session)
     from hardware.offline.viewer import run_view
 
     run_view(a.session, a.poses, a.path, a.port, a.open)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.pose import Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -108,6 +109,12 @@ class Session:
                 yield replace(frames, head=self.heads.at(frames.stamp))
         finally:
             reader.close()
+
+
+def check_exists(path: Path) -> None:
+    """InputError where there is no such session: known before what reads it is loaded."""
+    if not path.exists():
+        raise InputError(path, "session", "no such file or folder", "a session folder (with rig.toml) or an .mcap file")
 
 
 def damage_text(damage: str) -> str:

@@ -186,6 +186,7 @@ class PictureCache:
 
 
 EXIT_TIMEOUT = 10.0  # s that a process gets to close its files, on a busy machine
+EARLY_EXIT_TIMEOUT = 0.7  # s that the tracker gets before a path is begun: it may be within a map's adjustment
 ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device
 ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy machine
 ARM_AFTERLIFE = 2.0  # s that a virtual arm goes on without the run: it has to come to rest by itself
@@ -230,15 +231,15 @@ class ProcessGroup:
         """What becomes ready once a process ends."""
         return [member.sentinel for member in self.members.values() if member.is_alive()]
 
-    def end(self, name: str, patience: float = EXIT_TIMEOUT) -> None:
-        """Wait `patience` s for a process to end, ask it to, and then end it, with all that it has started."""
+    def end(self, name: str, patience: float = EXIT_TIMEOUT, grace: float = EXIT_TIMEOUT) -> None:
+        """Wait `patience` s for a process to end, ask it to, and `grace` s later end it, with all that it started."""
         member = self.members.get(name)
         if member is None:
             return
         member.join(0 if not member.is_alive() else patience)
         if member.is_alive():
             member.terminate()
-            member.join(EXIT_TIMEOUT)
+            member.join(grace)
         self.kill(name)
 
     def kill(self, name: str) -> None:
@@ -339,13 +340,19 @@ class RunChannels:
         self.bell.ring()
 
     def end(self) -> None:
-        """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last."""
-        self.processes.end("motion")
-        self.lifeline.close()
-        self.processes.end("tracking")
-        self.processes.end("feed", 1.0)
+        """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last.
+
+        One that has reported nothing still loads its libraries, which nobody has to wait for; before a path is begun
+        there is little to lose either.
+        """
+        self.lifeline.close()  # the motion process was told to end: it needs no poses any more
+        begun, tracks = self.place.value == self.place.value, self.tracking.get() is not None
+        self.processes.end("motion", 0.0 if self.motion.get() is None else EXIT_TIMEOUT)
+        patience = EXIT_TIMEOUT if begun else EARLY_EXIT_TIMEOUT
+        self.processes.end("tracking", patience if tracks else 0.0, patience)
+        self.processes.end("feed", 0.0)  # it keeps nothing
         self.sender.close()
-        self.processes.end("recorder", 30.0)
+        self.processes.end("recorder", 30.0 if tracks or self.recorder.get() is not None else 0.0)
         self.processes.end("arm", 0.1)
 
 

@@ -167,7 +167,8 @@ class _TickReporter:
         last_stop = stops[-1] if stops else None
         counts = loop.skipped, len(stops), last_stop, self._sender.dropped
         material = None if loop.material is None else loop.material.status
-        self._reports.put(LiveMotionReport(tick, progress, material, events, timings, *counts, self._priority))
+        used = math.nan if self._handover is None else self._handover.pose.stamp, motion.arm_lag
+        self._reports.put(LiveMotionReport(tick, progress, material, events, timings, *counts, self._priority, *used))
 
 
 def material_control(path: Path, dispensers: str, start: float, now: float) -> MaterialControl | None:

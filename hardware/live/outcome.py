@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+from collections import deque
 from dataclasses import dataclass, field, replace
 from html import escape
 from math import nan
@@ -15,25 +16,21 @@ from typing import Any
 
 import numpy as np
 
-from estimation import se3
+from estimation.pose import SurfacePose
 from estimation.se3 import Array
+from hardware.arm.profile import ArmProfile
+from hardware.live import records
 from hardware.live.checklist import checks_table
 from hardware.live.prepared import Prepared
-from hardware.live.records import (
-    ErrorTimeline,
-    NozzleTrack,
-    RunReports,
-    StageHistograms,
-    StageTiming,
-)
+from hardware.live.records import HoldTotal, LiveMotionReport, RunReports
 from hardware.live.state_machine import RunStateMachine
+from hardware.motion.step import predicted_error
 from hardware.operator.shared_state import PagePictures
-from hardware.operator.view import HoldRow, RunResult, RunStage
+from hardware.operator.view import ONE_DIRECTION, HoldRow, RunResult, RunStage
 from hardware.process.clock import Histogram
 from hardware.process.system import provenance
 from planning.command import Move
-from planning.kinematics import SimpleArm, nozzle_from_axes
-from planning.path import PrintPhase, way_lengths
+from planning.path import Path, PrintPhase, way_lengths
 
 _NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 MAX_REASONS = 40  # kinds of holds that are counted apart
@@ -43,17 +40,11 @@ STRETCHES = 500  # of equal checkpoints, of each of which the largest error is k
 MAX_TICK_GAP = 0.5  # s from tick to tick that is counted: nobody knows what happened in a longer gap
 MAX_SHOWN_HOLDS = 12  # reasons on the page's end, the longest first
 EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
-BEADS_CAPTION = "The path from above, by the largest predicted error of each stretch while material left."
+BEADS_CAPTION = "The path from above, by the largest predicted error (95 %) of each stretch while material left."
 TRACK_CAPTION = "Where the nozzle was led on the surface while material left, as it was tracked, over the path."
-TIMELINE_CAPTION = "Predicted, the largest of each moment while material left, over the seconds since the approach."
-
-
-@dataclass(slots=True)
-class HoldTotal:
-    """Holds for one reason."""
-
-    count: int = 0
-    seconds: float = 0.0
+TIMELINE_CAPTION = """How far the nozzle was to be off at most, in 95 % of cases, over the seconds since the approach.
+Beyond the limit the surface alone may be known too badly to print on."""
+POSES_KEPT = 4  # the motion's last pose is among so many of the newest
 
 
 @dataclass(slots=True)
@@ -65,36 +56,60 @@ class RunStatistics:
     holds: dict[str, HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
     extruding: float = 0.0  # s in which material left
     due: float = 0.0  # s in which it should have left
-    times: StageHistograms = field(default_factory=StageHistograms)
+    times: records.StageHistograms = field(default_factory=records.StageHistograms)
     errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # predicted at the nozzle, mm
+    largest: float = nan  # mm, claim
     true_errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # of a simulated world, mm
-    last_error: float = nan  # mm, the newest predicted
+    judged: int = 0  # true errors of which something was claimed
+    held: int = 0  # of those, within it
+    claim: float = nan  # mm, of the last tick; NaN where no material left
+    last_error: float = nan  # mm, the newest claim
+    last_sigma: float = nan  # mm, of the surface alone, as the guard limits it
     error_stamp: float = nan  # s, when that was
     ink: float = 0.0  # mm^3 that the dispensers were told
     stretches: Array = field(default_factory=lambda: np.full(STRETCHES, np.nan))  # mm, largest error of each
-    timeline: ErrorTimeline = field(default_factory=ErrorTimeline)
-    track: NozzleTrack = field(default_factory=NozzleTrack)  # on the surface, while material left
+    timeline: records.ErrorTimeline = field(default_factory=records.ErrorTimeline)
+    track: records.NozzleTrack = field(default_factory=records.NozzleTrack)  # on the surface, while material left
+    _begun: tuple[ArmProfile, Path] | None = None  # that the nozzle follows, in the tracker's surface frame
+    _poses: deque[SurfacePose] = field(default_factory=lambda: deque(maxlen=POSES_KEPT))
     _updated: float = nan
     _ticked: float = nan
     _sets: int = 0
     _reason: str = ""
 
-    def update(self, now: float, stage: RunStage, reports: RunReports, arm: SimpleArm | None) -> None:
-        """Count the newest reports at `now`, s. arm: where it stands, once that is known."""
+    def begin(self, path: Path, profile: ArmProfile) -> None:
+        """Judge moves by the path (tracker's surface frame) that the nozzle follows from now on."""
+        self._begun = profile, path
+
+    def update(self, now: float, stage: RunStage, reports: RunReports) -> None:
+        """Count the newest reports at `now`, s."""
         if not np.isnan(self._updated):
             self.stages[stage.value] = self.stages.get(stage.value, 0.0) + now - self._updated
         self._updated = now
         if (tracking := reports.tracking) is not None and tracking.pose is not None and tracking.sets != self._sets:
             self._sets = tracking.sets
+            self._poses.append(tracking.pose)
             state = tracking.pose.state.value
             self.states[state] = self.states.get(state, 0) + 1
         if reports.motion is not None and reports.motion.tick.stamp != self._ticked:
-            self._tick(reports, stage, arm)
+            self._tick(reports.motion, stage)
 
-    def add_true_error(self, error: float) -> None:
-        """Count the true error at the nozzle, mm, of a simulated world; NaN where none is known."""
+    def add_true_error(self, error: float, claim: float = nan) -> None:
+        """Count the true error at the nozzle of a simulated world and what was claimed of it, mm; NaN: not known."""
         if not np.isnan(error):
             self.true_errors.add(error)
+            if not np.isnan(claim):
+                self.judged, self.held = self.judged + 1, self.held + (error <= claim)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the true errors that were within what was claimed of them; NaN where none is known."""
+        return self.held / self.judged if self.judged else nan
+
+    @property
+    def predicted(self) -> dict[str, float]:
+        """The error over the run as it was predicted: median and 95 % of all cases, and the largest claim; mm."""
+        return percentiles(self.errors) | {"max": self.largest}
 
     @property
     def active(self) -> float:
@@ -113,10 +128,9 @@ class RunStatistics:
         """Share of the time since printing began in which material left; NaN before."""
         return self.extruding / self.due if self.due > 0 else nan
 
-    def _tick(self, reports: RunReports, stage: RunStage, arm: SimpleArm | None) -> None:
-        assert reports.motion is not None
-        motion, before = reports.motion, self._ticked
-        self._ticked = motion.tick.stamp
+    def _tick(self, motion: LiveMotionReport, stage: RunStage) -> None:
+        before = self._ticked
+        self._ticked, self.claim = motion.tick.stamp, nan
         step = min(self._ticked - before, MAX_TICK_GAP) if not np.isnan(before) else 0.0
         command, progress = motion.tick.command, motion.progress
         if progress is None or stage not in (RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED):
@@ -130,30 +144,29 @@ class RunStatistics:
         self._reason = reason
         if progress.place > 0 and progress.phase not in (PrintPhase.LEAVING, PrintPhase.FINISHED):
             self.due += step
-        error = nan
         if isinstance(command, Move) and command.extrude:
             self.extruding += step
             self.ink += command.flow * step
-            if arm is not None:
-                error = self._error(reports, command, arm)
-                at = min(int(progress.fraction / max(progress.total - 1, 1) * STRETCHES), STRETCHES - 1)
-                self.stretches[at] = np.fmax(self.stretches[at], error)
+            self._claim(motion, command, progress.fraction)
+            at = min(int(STRETCHES * progress.fraction / max(progress.total - 1, 1)), STRETCHES - 1)
+            self.stretches[at] = np.fmax(self.stretches[at], self.claim)
         else:
             self.track.lift()
-        self.timeline.add(self._ticked, error, step if reason else 0.0)
+        self.timeline.add(self._ticked, self.claim, step if reason else 0.0)
 
-    def _error(self, reports: RunReports, move: Move, arm: SimpleArm) -> float:
-        """One standard deviation, mm, of the place under the nozzle, where it is to be after this move; NaN of none."""
-        assert reports.tracking is not None
-        if (pose := reports.tracking.pose) is None:
-            return nan
-        then = pose.predict(max(move.stamp, pose.stamp), onwards=False)
-        self.track.add((se3.inverse(then.base_from_surface) @ nozzle_from_axes(arm, move.axes))[:3, 3])
-        nozzle = se3.inverse(pose.base_from_surface) @ nozzle_from_axes(arm, move.axes)
-        error = float(then.error_at(nozzle[None, :3, 3])[0])
-        self.errors.add(error)
-        self.last_error, self.error_stamp = error, move.stamp
-        return error
+    def _claim(self, motion: LiveMotionReport, move: Move, fraction: float) -> None:
+        """Say how far the nozzle will be from its place after this move, by the pose that the move was made of."""
+        pose = next((pose for pose in reversed(self._poses) if pose.stamp <= motion.pose_stamp), None)
+        if pose is None or self._begun is None:
+            return
+        due = motion.tick.stamp + self._begun[0].tick + motion.lag
+        said = predicted_error(move, due, pose, *self._begun, fraction)
+        self.track.add(said.tip)
+        for radius in said.radii.tolist():
+            self.errors.add(radius)
+        self.claim = self.last_error = said.within
+        self.largest = float(np.fmax(self.largest, said.within))
+        self.last_sigma, self.error_stamp = said.sigma, move.stamp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,16 +216,21 @@ class RunOutcome:
         return 0.0 if dry or not ways[-1] > 0 else float(np.interp(place, np.arange(len(path)), ways) / ways[-1])
 
     @property
+    def recorded(self) -> bool:
+        """Whether there is a recording: of a run that ended while its processes loaded there is none."""
+        return self.reports.recorder is not None and self.reports.recorder.written > 0
+
+    @property
     def again(self) -> str:
-        """The command that goes on; "" where nothing is left, or nothing was printed on purpose."""
+        """The command that goes on; "" where nothing is left, recorded, or to be printed at all."""
         task = self.prepared.task
-        left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1
+        left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1 and self.recorded
         return f"stillbed live --resume {self.prepared.files.record}" if left else ""
 
     def result(self) -> RunResult:
         """For the operator's page."""
         task, statistics, files = self.prepared.task, self.statistics, self.prepared.files
-        two = [(h.percentile(95), h.most if h.count else nan) for h in (statistics.errors, statistics.true_errors)]
+        two = [(p["p95"], p["max"]) for p in (statistics.predicted, percentiles(statistics.true_errors))]
         return RunResult(
             printed=self.printed,
             fraction=self.place,
@@ -241,6 +259,8 @@ class RunOutcome:
             lines.append(f"{self.place:.2f} of {total} checkpoints {done}; the arm is at rest")
             if not dry:
                 nothing = "the path is printed; there is nothing to go on with"
+                if not self.recorded:
+                    nothing = "nothing was recorded yet: begin it again as before"
                 lines.append(f"go on with: {self.again}" if self.again else nothing)
         return "\n".join([*lines, f"report: {files.report}"])
 
@@ -251,7 +271,7 @@ class RunOutcome:
         files.report.write_text(self._page(summary), encoding="utf-8")
         return replace(self, written=True)
 
-    def timings(self) -> tuple[StageTiming, ...]:
+    def timings(self) -> tuple[records.StageTiming, ...]:
         """All stages that were timed."""
         tracking, motion = self.reports.tracking, self.reports.motion
         tracked = () if tracking is None else tracking.timings
@@ -262,7 +282,7 @@ class RunOutcome:
         from hardware.report.evaluation import finite
 
         statistics, reports, task = self.statistics, self.reports, self.prepared.task
-        tracking, motion, recorder, errors = reports.tracking, reports.motion, reports.recorder, statistics.errors
+        tracking, motion, recorder = reports.tracking, reports.motion, reports.recorder
         cleaned: dict[str, Any] = finite(
             {
                 "ended": self.machine.ended,
@@ -274,8 +294,9 @@ class RunOutcome:
                 "fraction": self.fraction,
                 "duty": statistics.duty,
                 "extruding_s": statistics.extruding,
-                "predicted_error_mm": percentiles(errors),
+                "predicted_error_mm": statistics.predicted,
                 "true_error_mm": percentiles(statistics.true_errors),
+                "within_claim": statistics.coverage,
                 "ink_mm3": statistics.ink if self.inked else None,
                 "printed_share": self.printed,
                 "stages_s": statistics.stages,
@@ -304,16 +325,17 @@ class RunOutcome:
         from hardware.report.report import bead_map, error_timeline
 
         duty, task, timeline = self.statistics.duty, self.prepared.task, self.statistics.timeline
-        limit, count = task.profile.limits.pose_error, len(timeline.stamps)
+        limit, count, covered = task.profile.limits.pose_error, len(timeline.stamps), self.statistics.coverage
         tiles = [
             tile(percent(self.printed), "", f"printed, checkpoint {self.place:.1f} of {len(task.path) - 1}"),
             tile(percent(duty) if duty == duty else "–", "", "of the time material left the nozzle"),
         ]
         for name in ("true", "predicted"):
-            error = summary[f"{name}_error_mm"]
-            if error["p95"] is not None:
+            if (error := summary[f"{name}_error_mm"])["p95"] is not None:
                 values = f"{figure(error['p95'])} / {figure(error['max'])}"
                 tiles.append(tile(values, "mm", f"{name} error, 95 % / largest"))
+        within = tile(percent(covered), "", "of the true errors within what was predicted for 95 %")
+        tiles += [within] if covered == covered else []
         tiles += [tile(figure(self.statistics.ink), "mm³", "of ink")] if self.inked else []
         tiles += [tile(percent(self.printed_before), "", "printed by the runs before")] if task.start else []
         rows = [
@@ -326,9 +348,8 @@ class RunOutcome:
         checks = f"<pre>{escape(checks_table(self.machine.checks))}</pre>" if self.machine.checks else ""
         timings = figures_table(("stage", "times", "median", "99 %", "largest"), rows)
         reasons = figures_table(("what", "times", "s"), [*holds, *self._other_times()], last_total=True)
-        drawn = error_timeline(
-            timeline.error[:count], timeline.held[:count] > timeline.width / 2, timeline.width, limit
-        )
+        bins = timeline.error[:count], timeline.held[:count] > timeline.width / 2, timeline.width
+        drawn = error_timeline(*bins, ONE_DIRECTION * limit)
         points = task.path.surface_from_nozzle[:, :3, 3]
         beads = bead_map(points, task.path.extrude, self.statistics.stretches, limit)
         body = [
@@ -355,8 +376,8 @@ class RunOutcome:
         track, placed = self.statistics.track.places, self.machine.placed_path
         if placed is None or not len(track):
             return []
-        drawn = track_map(track, placed.path.surface_from_nozzle[:, :3, 3], placed.path.extrude)
-        return [section("Nozzle track", TRACK_CAPTION, drawn)]
+        points, extrude = placed.path.surface_from_nozzle[:, :3, 3], placed.path.extrude
+        return [section("Nozzle track", TRACK_CAPTION, track_map(track, points, extrude))]
 
     def _look_section(self) -> list[str]:
         """What looks found between layers, or when the operator asked for one."""
@@ -372,13 +393,12 @@ class RunOutcome:
 
         if self.pictures is None or not self.pictures.pictures:
             return []
-        shown = camera_pictures([(each.camera, each.near or each.jpeg) for each in self.pictures.pictures])
-        return [section("What the cameras saw", "As the page showed it last.", shown)]
+        shown = [(each.camera, each.near or each.jpeg) for each in self.pictures.pictures]
+        return [section("What the cameras saw", "As the page showed it last.", camera_pictures(shown))]
 
     def _other_times(self) -> list[list[str]]:
         """Rows of the time that is no hold, and of the sum."""
-        statistics = self.statistics
-        held = sum(row.seconds for row in statistics.holds_by_time)
+        statistics, held = self.statistics, sum(row.seconds for row in self.statistics.holds_by_time)
         rest = max(statistics.active - held - statistics.extruding, 0.0)
         times = ("material left", statistics.extruding), ("on the way without material", rest)
         rows = [[name, "", f"{seconds:.2f}"] for name, seconds in times]

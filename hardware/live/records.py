@@ -119,6 +119,8 @@ class LiveMotionReport:
     stop: tuple[float, float] | None  # the last one's decision and the end of its frame on the wire, s
     unrecorded: int  # entries for which the recorder had no room
     priority: str  # of the process, as granted
+    pose_stamp: float = nan  # s, of the pose that the tick was made of; NaN of none
+    lag: float = nan  # s, of the arm, as the motion has it; NaN before a path was begun
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,6 +229,14 @@ class UsedEntry:
 Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
 Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceBatch | Look
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
+
+
+@dataclass(slots=True)
+class HoldTotal:
+    """Holds for one reason."""
+
+    count: int = 0
+    seconds: float = 0.0
 
 
 class StageHistograms:

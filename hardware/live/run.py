@@ -53,12 +53,12 @@ from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawi
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
 from hardware.process.system import state_inputs
+from planning.material import with_offsets
 from planning.placement import PlacedBy
 
 POLL_PERIOD = 0.02  # s between looks while nothing happens
 VIEW_PERIOD = 0.15  # s between views for the page
 STATUS_PERIOD = 5.0  # s between status lines
-REPORT_FETCH_TIME = 1.0  # s in which open windows take the report, before the page is closed
 REST_TIMEOUT = 1.0  # s in which the arm has to report that it is at rest
 MOTION_HANG_TIMEOUT = 2.0  # s without a report, after which the motion process is ended and the arm stopped for it
 SIGNAL_TEXTS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "the terminal was closed"}
@@ -110,25 +110,22 @@ class LiveRun:
             self._put_view(self._clock.now(), self._outcome().result())
             self._shut_down()
             outcome = self._outcome().write()
-            if self._page is not None and channels.link.requests.windows:
+            if self._page is not None:
                 self._put_view(self._clock.now(), outcome.result())
-                self._clock.wait_until(self._clock.now() + REPORT_FETCH_TIME)
+                self._page.hand_out_report()
         return outcome
 
     def _outcome(self) -> RunOutcome:
-        ended = self._signal, self._channels.place.value, self._channels.link.pictures.get()
-        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *ended)
+        end = self._signal, self._channels.place.value, self._channels.link.pictures.get()
+        return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *end)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal that asks the run to end."""
         self._signal = number
 
-    # -- one cycle
-
     def _cycle(self, wake: socket.socket, progress_writer: ProgressWriter) -> None:
         terminal = [] if self._console.file is None else [self._console.file]
-        ready = wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)
-        if wake in ready:
+        if wake in (ready := wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)):
             wake.recv(64)
         requests = self._requests_by_key(ready) + self._channels.link.take()
         reports, channels, now = self._reports, self._channels, self._clock.now()
@@ -142,9 +139,8 @@ class LiveRun:
         if channels.looks.value != machine.looks:
             channels.outline.put(OutlineOrder(machine.looks, machine.outline))
             channels.looks.value = machine.looks
-        arm = None if machine.placed_path is None else machine.placed_path.profile.arm
-        self._statistics.update(now, machine.stage, reports, arm)
-        self._statistics.add_true_error(self._view_builder.update(reports, self._profile))
+        self._statistics.update(now, machine.stage, reports)
+        self._statistics.add_true_error(*self._view_builder.update(reports, self._profile, self._statistics.claim))
         self._show_surface()
         self._announce(now)  # before the view: a new stage is in this one
         self._show_view(now)
@@ -234,6 +230,7 @@ class LiveRun:
         for name, text in texts.items():
             self._channels.sender.put(UsedEntry(name, text))
         self._profile = order.profile
+        self._statistics.begin(with_offsets(order.path, order.outlets), order.profile)
         self._log(f"begun at checkpoint {order.start:.2f}, the arm's lag taken as {1000 * order.profile.lag:.0f} ms")
         return order
 
@@ -376,6 +373,8 @@ class LiveRun:
         with suppress(OSError):
             channels.orders.send(Order.QUIT)
         channels.end()
+        if channels.motion.get() is None:  # ended while it loaded, perhaps between a dispenser and its first tick
+            self._switch_off_material()
         reports.tracking = channels.tracking.get() or reports.tracking
         reports.motion = channels.motion.get() or reports.motion
         reports.recorder = channels.recorder.get()

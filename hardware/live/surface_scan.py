@@ -335,12 +335,10 @@ VIEWS = (  # title, and where it is seen from, surface frame
 )
 VIEW_PIXELS = 460  # width and height of a picture
 WEAK_SIGMA_MM = 0.1  # beyond, another camera is worth its place
+SHADED_PERCENT = 98.0  # of standard deviations that the colours tell apart
 WEAK_SHARE = 0.02  # of the region, below which no camera is missed
 MIN_APART_DEG = 20.0  # between two cameras: nearer ones tell little about depth
-TILTS_DEG, TURNS = (
-    (0.0, 20.0, 40.0, 60.0),
-    12,
-)  # places of a camera that are tried, off the surface's normal and round it
+TILTS_DEG, TURNS = (0.0, 20.0, 40.0, 60.0), 12  # camera places that are tried, off the surface's normal, round it
 
 
 def scan_page(scanned: SurfaceScan, name: str) -> str:
@@ -353,19 +351,17 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     limits = np.percentile(sigma, [50, 95])
     rows = [(camera.name, _share(surface.seen[c], surface)) for c, camera in enumerate(scanned.rig.cameras)]
     rows += [("two cameras or more", _share(surface.seen.sum(0) >= 2, surface)), ("scanned", f"{scanned.coverage:.0%}")]
-    shade = np.clip(surface.sigma / (2 * WEAK_SIGMA_MM), 0, 1)[::-1, :, None]
-    colours = np.array([150.0, 110, 60]) * (1 - shade) + np.array([40.0, 60, 220]) * shade  # BGR: blue to red
-    colours[~surface.sure[::-1]] = 255
-    explained = "White was not seen by two cameras alike, or lies outside the region, and is open in the mesh."
-    known = f"Standard deviation across the surface, blue: 0, red: {2 * WEAK_SIGMA_MM:g} mm. {explained}"
-    tiles = (f"{scanned.area / 100:.1f}", "cm²", "scanned"), (f"{scanned.coverage:.0%}", "", "of the region")
-    sigmas = zip(limits, ("median", "95 %"), strict=True)
+    most = max(2 * WEAK_SIGMA_MM, float(np.percentile(sigma, SHADED_PERCENT)))
+    colours = np.where(surface.sure[::-1, :, None], _shaded(surface.sigma[::-1] / most), 255)
+    scale = _figure(f"0 to {most:.2g} mm", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8))
+    known = "Standard deviation across the surface. White lies outside, or no two cameras saw it alike."
+    from_above = _figure("from above", np.asarray(colours, np.uint8))
+    sigmas = [(f"{v:.3f}", "mm", f"standard deviation, {w}") for v, w in zip(limits, ("median", "95 %"), strict=True)]
+    tiles = (f"{scanned.area / 100:.1f}", "cm²", "scanned"), (f"{scanned.coverage:.0%}", "", "of the region"), *sigmas
     body = [
-        row_of_tiles(
-            [tile(*t) for t in (*tiles, *((f"{v:.3f}", "mm", f"standard deviation, {w}") for v, w in sigmas))]
-        ),
-        section("The scan", "In plain light, from three sides.", f'<div class="tiles">{pictures}</div>'),
-        section("How well it is known", known, _figure("from above", np.asarray(colours, np.uint8))),
+        row_of_tiles([tile(*each) for each in tiles]),
+        section("The scan", "In plain light, from three sides.", f'<div class="pictures">{pictures}</div>'),
+        section("How well it is known", known, f'<div class="pictures">{from_above}{scale}</div>'),
         section("Who saw it", "Share of the region that each camera shows.", figures_table(("camera", "share"), rows)),
         section("Where to put a camera", camera_advice(scanned), ""),
     ]
@@ -380,8 +376,14 @@ def _figure(title: str, image: NDArray[np.uint8]) -> str:
     from hardware.files.images import encode
 
     data = base64.b64encode(encode(image)[1]).decode("ascii")
-    picture = f'<img alt="the scan {title}" style="width:100%" src="data:image/png;base64,{data}">'
-    return f'<figure style="margin:0">{picture}<figcaption class="caption">{title}</figcaption></figure>'
+    picture = f'<img alt="the scan: {title}" src="data:image/png;base64,{data}">'
+    return f"<figure>{picture}<figcaption>{title}</figcaption></figure>"
+
+
+def _shaded(share: Array) -> Array:
+    """Colours (..., 3), BGR, of shares (...) from 0 to 1: from blue by pale yellow to red."""
+    stops = np.array([[150.0, 110, 60], [150, 225, 245], [40, 60, 200]])
+    return np.stack([np.interp(share, [0, 0.5, 1], stops[:, k]) for k in range(3)], -1)
 
 
 def camera_advice(scanned: SurfaceScan) -> str:

@@ -83,31 +83,33 @@ class NozzleErrorEstimate:
 
     path: Path  # as its file has it, in the true surface frame
     last: float = nan  # mm, NaN while it is unknown or nothing is printed
-    _commands: deque[tuple[float, Array, float]] = field(default_factory=lambda: deque(maxlen=MAX_COMMANDS_KEPT))
+    claimed: float = nan  # mm within which it was said to be; NaN where nothing was
+    _commands: deque[tuple[float, Array, float, float]] = field(default_factory=lambda: deque(maxlen=MAX_COMMANDS_KEPT))
     compared: float = nan  # s, stamp of the last pose that it was compared at
     _ticked: float = nan  # s, stamp of the last tick
 
-    def update(
-        self, tracking: TrackingReport | None, motion: LiveMotionReport | None, profile: ArmProfile | None
-    ) -> None:
-        """Take what is new. profile: of the arm since the path was begun; None before."""
+    def update(self, reports: RunReports, profile: ArmProfile | None, claim: float = nan) -> None:
+        """Take what is new. profile: of the arm since the path was begun; None before. claim: mm, of the last tick."""
+        tracking, motion = reports.tracking, reports.motion
         if profile is None or motion is None or tracking is None or tracking.truth is None or tracking.pose is None:
             return
         if motion.tick.stamp != self._ticked:
             self._ticked, command = motion.tick.stamp, motion.tick.command
             if isinstance(command, Move) and command.extrude and motion.progress is not None:
                 due = command.stamp + profile.tick + profile.lag
-                self._commands.append((due, command.axes, motion.progress.fraction))
+                self._commands.append((due, command.axes, motion.progress.fraction, claim))
         if tracking.pose.stamp != self.compared:
             self.compared = tracking.pose.stamp
             self.last = self._error(tracking.pose.stamp, tracking.truth, profile)
 
     def _error(self, stamp: float, base_from_surface: Array, profile: ArmProfile) -> float:
         """Distance, mm, from the nozzle to its place at `stamp`, s; NaN where it was not printing then."""
-        after = next((i for i, (due, _, _) in enumerate(self._commands) if due >= stamp), 0)
+        self.claimed = nan
+        after = next((i for i, (due, *_) in enumerate(self._commands) if due >= stamp), 0)
         if not after or self._commands[after][0] - self._commands[after - 1][0] > MAX_COMMAND_GAP:
             return nan
-        (begin, axes, place), (end, next_axes, next_place) = self._commands[after - 1], self._commands[after]
+        (begin, axes, place, _), following = self._commands[after - 1], self._commands[after]
+        end, next_axes, next_place, self.claimed = following
         share = (stamp - begin) / (end - begin)
         nozzle = nozzle_from_axes(profile.arm, axes + share * (next_axes - axes))
         position = (se3.inverse(base_from_surface) @ nozzle)[:3, 3]
@@ -139,18 +141,18 @@ class ViewBuilder:
         lengths = way_lengths(path.surface_from_nozzle)
         self._ways = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
 
-    def update(self, reports: RunReports, profile: ArmProfile | None) -> float:
-        """Take the newest reports; the true error at the nozzle, mm, where a new one is known, else NaN.
+    def update(self, reports: RunReports, profile: ArmProfile | None, claim: float) -> tuple[float, float]:
+        """Take the newest reports; the true error at the nozzle and what was claimed of it, mm; NaN where none is new.
 
-        profile: of the arm since the path was begun; None before.
+        profile: of the arm since the path was begun; None before. claim: mm, of the last tick.
         """
         for event in () if reports.motion is None else reports.motion.events:
             if event.stamp > self._logged:
                 self._logged = event.stamp
                 self.log(event.stamp, event.text)
-        before = self._true_error.compared
-        self._true_error.update(reports.tracking, reports.motion, profile)
-        return self._true_error.last if self._true_error.compared != before else nan
+        true, before = self._true_error, self._true_error.compared
+        true.update(reports, profile, claim)
+        return (true.last, true.claimed) if true.compared != before else (nan, nan)
 
     def log(self, stamp: float, text: str, warning: bool = False) -> None:
         """A line for the page's log."""
@@ -218,6 +220,7 @@ class ViewBuilder:
             activity=_activity(motion, machine.stage),
             reason=machine.silence or command.reason,
             error=statistics.last_error,
+            sigma=statistics.last_sigma,
             limit=self.prepared.task.profile.limits.pose_error,
             true_error=self._true_error.last,
             in_flight=status.in_flight,

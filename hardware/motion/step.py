@@ -10,8 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from ctypes import c_double
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from estimation import se3
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile, measured_lag
@@ -19,6 +22,7 @@ from hardware.motion.loop import MaterialControl
 from hardware.process.clock import Clock
 from planning.clearance import TissueGuard
 from planning.command import Command, Hold, Move
+from planning.kinematics import nozzle_from_axes
 from planning.material import Outlets, with_offsets
 from planning.motion.guard import Guard
 from planning.motion.planner import LOOKS, Planner
@@ -100,6 +104,42 @@ class MotionStep:
         return self._planner.progress
 
 
+CLAIMED_SHARE = 0.95  # of cases that a predicted error holds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictedError:
+    """How far the nozzle will be from its place on the path once it has followed a move, as it is known before."""
+
+    due: float  # s, when that is
+    tip: Array  # (3,) mm, where the tip is led on the surface
+    sigma: float  # mm, standard deviation of the place under it along its worst direction, as the guard limits it
+    radii: Array  # mm, distances that hold the shares of `ERROR_SHARES`
+    within: float  # mm, distance that holds CLAIMED_SHARE
+
+
+ERROR_SHARES = (np.arange(10) + 0.5) / 10  # tenths of the cases, each by its middle
+
+
+def predicted_error(
+    move: Move, due: float, pose: SurfacePose, profile: ArmProfile, path: Path, fraction: float
+) -> PredictedError:
+    """The error of `move`, made of `pose`, at `due`, s: a tick and the arm's lag after it was sent.
+
+    It is uncertain as the pose is until then, and known as far as the move itself misses the place at `fraction` of
+    `path`, in checkpoints: its jerk is limited, and it was made of an older prediction. What the arm itself misses
+    beside its lag is not in it.
+    """
+    then = pose.predict(max(due, pose.stamp), onwards=False)
+    tip = (se3.inverse(then.base_from_surface) @ nozzle_from_axes(profile.arm, move.axes))[:3, 3]
+    before = min(int(fraction), len(path) - 2)
+    near, far = path.surface_from_nozzle[before : before + 2, :3, 3]
+    offset = (tip - near - (fraction - before) * (far - near))[None]
+    sigma, place = float(then.error_at(tip[None])[0]), tip[None]
+    radii = then.radius_at(place, np.append(ERROR_SHARES, CLAIMED_SHARE), offset)
+    return PredictedError(due, tip, sigma, radii[:-1], float(radii[-1]))
+
+
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"
 LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
@@ -177,6 +217,11 @@ class PrintMotion:
         """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
         if self._step is not None:
             self._step.recalled(place, stands)
+
+    @property
+    def arm_lag(self) -> float:
+        """The arm's lag that is reckoned with, s; NaN before a path was begun."""
+        return math.nan if self._step is None else self._step.lag
 
     @property
     def progress(self) -> PrintProgress | None:

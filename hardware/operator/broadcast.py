@@ -20,6 +20,7 @@ import numpy as np
 from estimation.rig import Camera
 from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene, RecordingView, WavingView
 from hardware.operator.view import (
+    ONE_DIRECTION,
     Activity,
     LogLine,
     MoveRequest,
@@ -218,7 +219,8 @@ class Broadcast:
             return
         aged = motion.error_age > AGED  # nothing is extruded: the errors are of earlier
         errors = (nan, nan) if aged else (motion.error, motion.true_error)
-        self._history.add(TimelineRow(view.stamp, *errors, motion.limit, motion.activity is Activity.HOLDING))
+        limit, held = ONE_DIRECTION * motion.limit, motion.activity is Activity.HOLDING
+        self._history.add(TimelineRow(view.stamp, *errors, limit, held))
 
 
 @dataclass(frozen=True, slots=True)

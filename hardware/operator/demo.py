@@ -294,13 +294,13 @@ class DemoRun:
         held = self.stage is RunStage.PRINT and _held(now)
         error = DEMO_HOLD_ERROR if held else 0.17 + 0.06 * np.sin(2.1 * now) + 0.03 * np.sin(7 * now)
         lift = {RunStage.PRINT: 0.0, RunStage.APPROACH: max(12 - 5 * (now - self._since), 0.0)}.get(self.stage, 25.0)
-        activity = Activity.ENTERING if self.stage is RunStage.APPROACH else Activity.PRINTING
-        activity = Activity.HOLDING if held else activity if moves else Activity.RESTING
+        led = Activity.ENTERING if self.stage is RunStage.APPROACH else Activity.PRINTING
         return MotionView(
-            activity=activity,
+            activity=Activity.HOLDING if held else led if moves else Activity.RESTING,
             reason="predicted error 0.62 mm at the nozzle, limit 0.50 mm: the surface moves too fast" if held else "",
             error=float(error) if moves else nan,
             limit=0.5,
+            sigma=float(0.45 * error) if moves else nan,
             true_error=float(0.8 * error + 0.03 * np.sin(11 * now)) if moves else nan,
             in_flight=0.031 if moves else 0.0,
             most_in_flight=0.05,

@@ -24,11 +24,12 @@ from estimation.se3 import Array
 from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
 from hardware.process.clock import WallClock
-from hardware.process.system import SPAWN, SharedLatest, step_back
+from hardware.process.system import SPAWN, SharedLatest, blocked_sigint, step_back
 from perception.frames import Image
 
 PAGE_NICENESS = 5  # below the loops, above what may wait for minutes
 RESTART_AFTER = 1.0  # s between two starts of a page that died
+REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
 CROP_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
@@ -72,8 +73,16 @@ class OperatorPage:
         self._started = now
         arguments = (self._link, self._settings, self._listener)
         self.process = SPAWN.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
-        self.process.start()
+        with blocked_sigint():
+            self.process.start()
         return True
+
+    def hand_out_report(self) -> None:
+        """Wait until each open window has taken the report of the run that is over, for REPORT_FETCH_TIME at most."""
+        clock, requests = WallClock(), self._link.requests
+        until = clock.now() + REPORT_FETCH_TIME
+        while requests.reports < requests.windows and clock.now() < until:
+            clock.wait_until(clock.now() + REPORT_POLL_PERIOD)
 
     def close(self) -> None:
         """End the process and give the port back."""

@@ -279,6 +279,7 @@ class OperatorServer:
         result = getattr(self.broadcast.view, "result", None)
         if result is None or not result.report or not (file := Path(result.report)).is_file():
             raise web.HTTPNotFound
+        self._link.requests.report_taken()
         headers = self._headers | {"Content-Disposition": "attachment"}
         return web.Response(body=file.read_bytes(), content_type="text/html", charset="utf-8", headers=headers)
 

@@ -42,8 +42,9 @@ SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras, 1280 px at most
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
 _RECORD = struct.Struct("=QQBdddI")  # the same, and its check sum
-_LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS, _FINE = range(6)  # last number given, last stop, records written and taken,
-# windows, whether pictures are wanted as fine as they are
+# last number given, last stop, records written and taken, windows, whether pictures are wanted as fine as they are, and
+# how often the report was handed out
+_LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS, _FINE, _REPORTS = range(7)
 _WISHES = tuple(Wish)
 
 Polygons = tuple[tuple[str, Corners], ...]  # px, by camera's name
@@ -64,7 +65,7 @@ class RequestLine:
     """The line of requests in shared memory: one page asks, one run takes."""
 
     def __init__(self) -> None:
-        self._counts: Any = RawArray(c_uint64, 6)  # each is written whole, or not at all
+        self._counts: Any = RawArray(c_uint64, 7)  # each is written whole, or not at all
         self._records: Any = RawArray("B", REQUEST_SLOTS * _RECORD.size)
         self._stops_seen = 0
 
@@ -124,6 +125,15 @@ class RequestLine:
     @fine.setter
     def fine(self, wanted: bool) -> None:
         self._counts[_FINE] = wanted
+
+    @property
+    def reports(self) -> int:
+        """How often the report of a run that is over was handed out."""
+        return int(self._counts[_REPORTS])
+
+    def report_taken(self) -> None:
+        """Count a report that is handed out."""
+        self._counts[_REPORTS] += 1
 
     def _waiting(self) -> list[OperatorRequest]:
         taken, written, requests = self._counts[_TAKEN], self._counts[_WRITTEN], []

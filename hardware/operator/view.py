@@ -195,6 +195,7 @@ class HoldCause:
     limit: float = nan
 
 
+ONE_DIRECTION = 1.96  # standard deviations that hold 95 % of errors of one direction: the limit as that
 CAUSE_TILES = {  # tile of the page, what is measured, its unit, and how many of that the guard's unit is
     RefusalCode.POSE_AGE: ("age", "age of pose", "ms", 1000.0),
     RefusalCode.POSE_ERROR: ("error", "predicted error", "mm", 1.0),
@@ -237,8 +238,8 @@ class MotionView:
 
     activity: Activity
     reason: str = ""  # why the nozzle is held
-    error: float = nan  # mm, predicted at the nozzle when it will be there
-    limit: float = nan  # mm of that, beyond which nothing is extruded
+    error: float = nan  # mm, predicted: the nozzle will be within it of its place in 95 % of cases
+    limit: float = nan  # mm of `sigma`, beyond which nothing is extruded
     true_error: float = nan  # mm, known in a simulated world
     in_flight: float = nan  # s of motion under way in the arm
     most_in_flight: float = nan  # s, its limit
@@ -249,6 +250,7 @@ class MotionView:
     error_age: float = nan  # s since the two errors were taken: while nothing is extruded they are of earlier
     cause: HoldCause | None = None  # of a hold, where a figure is the cause
     rest: RestView | None = None  # of a nozzle that stands where it was stopped or paused
+    sigma: float = nan  # mm, standard deviation of the place under the nozzle then, along its worst direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,7 +343,7 @@ class RunResult:
     begun: float  # place where this run went on, in checkpoints
     seconds: float  # s from the approach on
     duty: float  # 0 to 1
-    error: tuple[float, float]  # predicted, 95 % and largest
+    error: tuple[float, float]  # predicted: 95 % over the run, and the largest claim
     true_error: tuple[float, float]  # the same of the true error, where the world is simulated
     ink: float  # mm^3, NaN of none
     holds: tuple[HoldRow, ...]  # the longest first

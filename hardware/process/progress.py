@@ -8,11 +8,12 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO, cast
 
 from estimation.errors import InputError
 
@@ -30,6 +31,66 @@ def painted(text: str, colour: int, stream: TextIO) -> str:
     """A text in a colour where `stream` is a terminal and nobody has set NO_COLOR (no-color.org)."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty()
     return text if plain else f"\x1b[{colour}m{text}\x1b[0m"
+
+
+FIRST_WORD_DELAY = 0.5  # s: heard within a second of the start, and what ends sooner says its own word alone
+
+
+class FirstWord:
+    """Says that a command loads where it has said nothing itself for FIRST_WORD_DELAY; a context.
+
+    On a terminal the word goes as soon as the command says something, so that an error stays one line.
+    """
+
+    def __init__(self, command: str) -> None:
+        self._streams, self._said, self._lock = (sys.stdout, sys.stderr), False, threading.Lock()
+        self._watched = [_WatchedStream(stream, self._heard) for stream in self._streams]
+        self._timer = threading.Timer(FIRST_WORD_DELAY, self._say, (f"{command}: loading",))
+        self._timer.daemon = True
+
+    def __enter__(self) -> FirstWord:
+        sys.stdout, sys.stderr = cast(list[TextIO], self._watched)
+        self._timer.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._heard()
+
+    def _say(self, word: str) -> None:
+        stream = self._streams[1]
+        with self._lock, suppress(OSError, ValueError):
+            if sys.stderr is self._watched[1]:
+                self._said = stream.isatty()
+                stream.write(f"\r\x1b[K{word}" if self._said else f"{word}\n")
+                stream.flush()
+
+    def _heard(self) -> None:
+        """The command says something itself, or ends."""
+        with self._lock:
+            self._timer.cancel()
+            for name, stream, watched in zip(("stdout", "stderr"), self._streams, self._watched, strict=True):
+                if getattr(sys, name) is watched:
+                    setattr(sys, name, stream)
+            if self._said:
+                self._said = False
+                with suppress(OSError, ValueError):
+                    self._streams[1].write("\r\x1b[K")
+                    self._streams[1].flush()
+
+
+class _WatchedStream:
+    """A text stream that tells before it writes."""
+
+    def __init__(self, stream: TextIO, tell: Callable[[], None]) -> None:
+        self._stream, self._tell = stream, tell
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """As the stream's."""
+        self._tell()
+        return self._stream.write(text)
 
 
 class Progress:

@@ -23,6 +23,7 @@ from estimation.pose import SurfacePose, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
+from hardware.files import session as sessions
 from hardware.files.arm_file import arm_from_text, arm_text
 from hardware.files.dispenser_file import dispensers_from_text, outlets_from
 from hardware.files.folder_tables import check_polygon, checked_rows, trajectory_from_rows
@@ -86,8 +87,7 @@ def open_session(path: str | Path) -> Session:
     path = Path(path)
     if path.is_dir():
         return open_folder(path)
-    if not path.exists():
-        raise InputError(path, "session", "no such file or folder", "a session folder (with rig.toml) or an .mcap file")
+    sessions.check_exists(path)
     return open_recording(path)
 
 

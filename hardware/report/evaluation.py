@@ -33,7 +33,7 @@ def calibration_words(nees: float) -> str:
     """What a mean NEES/6 says of the covariances."""
     low, high = CALIBRATED_NEES
     if low <= nees <= high:
-        return "1 where covariances are honest"
+        return "which is 1 where covariances are honest"
     return f"so the covariances are not calibrated: errors are {nees**0.5:.2g} times what they claim"
 
 

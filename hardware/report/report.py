@@ -17,6 +17,7 @@ from hardware.report.evaluation import (
     NEES_BOUND,
     Comparison,
     Evaluation,
+    calibration_words,
     clocks_learned,
     figure,
     measured_share,
@@ -220,6 +221,8 @@ def _consistency(comparison: Comparison) -> str:
         f"and {figure(aligned.mean_nees / 6)} aligned. "
         f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}, where 95 % should be. "
     )
+    if comparison.exact and math.isfinite(aligned.mean_nees):
+        text += f"Aligned, {calibration_words(aligned.mean_nees / 6)}. "
     if not comparison.exact:
         text += "It says little here: it holds the reference's own error against the tracker's covariance."
     return f'<p class="note">{escape(text)}</p>'

@@ -21,11 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
-from toppra import constraint
-from toppra.constants import MAX_TRIES, SMALL, TINY
-from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
-from toppra.interpolator import AbstractGeometricPath
-from toppra.solverwrapper import seidelWrapper
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
@@ -33,8 +28,16 @@ from estimation.se3 import Array
 from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axis_limits, limited_axes, max_axis_change, nozzle_from_axes
 from planning.material import material_plan
+from planning.motion import plots_left_out
 from planning.motion.curve import HORIZON_TIME, Gridpoints, PathCurve, curve_through, gridpoints_on
 from planning.path import Path
+
+with plots_left_out():
+    from toppra import constraint
+    from toppra.constants import MAX_TRIES, SMALL, TINY
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
+    from toppra.interpolator import AbstractGeometricPath
+    from toppra.solverwrapper import seidelWrapper
 
 DIFFERENCE_STEP = 0.05  # mm along the path between differences: what a slow tool moves in one tick
 DIFFERENCE_TIME = 0.02  # s between differences: one tick

@@ -6,6 +6,7 @@ import uPlot from "./uplot.js";
 
 const MINUTE = 60; // s
 const ROWS = 2400; // two become one when all are full, as on the other side
+const ONE_DIRECTION = 1.96; // standard deviations that hold 95 %: the limit is one of a standard deviation
 const ZOOM = 0.5; // of what is shown, for a key
 const STAMP = 0, ERROR = 1, TRUTH = 2, LIMIT = 3, HELD = 4; // columns of a row
 
@@ -26,7 +27,7 @@ export class ErrorChart {
   add(view) {
     const motion = view.motion, rows = this.rows, last = rows[rows.length - 1];
     if (!motion || (last && last[STAMP] >= view.stamp)) return;
-    const aged = motion.error_age > 1, row = [view.stamp, aged ? null : motion.error, aged ? null : motion.true_error, motion.limit, motion.activity === "holding"];
+    const aged = motion.error_age > 1, row = [view.stamp, aged ? null : motion.error, aged ? null : motion.true_error, ONE_DIRECTION * motion.limit, motion.activity === "holding"];
     if (last && view.stamp - last[STAMP] < this.step) return merge(last, row);
     rows.push(row);
     if (rows.length <= ROWS) return;
@@ -77,9 +78,9 @@ export class ErrorChart {
       ],
       series: [
         { label: "time", value: (u, value) => (value === null || value === undefined ? "–" : duration(value)) },
-        { label: "predicted", stroke: c.blue, width: 1.8, points: { show: false }, value: mm },
+        { label: "predicted, 95 %", stroke: c.blue, width: 1.8, points: { show: false }, value: mm },
         { label: "true", stroke: c.true, width: 1.8, points: { show: false }, value: mm, show: this.rows.some((row) => row[TRUTH] !== null) },
-        { label: "limit", stroke: c.rose, width: 1.4, dash: [6, 4], points: { show: false }, value: mm },
+        { label: "limit, 95 %", stroke: c.rose, width: 1.4, dash: [6, 4], points: { show: false }, value: mm },
       ],
       hooks: {
         drawClear: [(u) => this.shade(u)],
@@ -138,7 +139,7 @@ export class ErrorChart {
     else this.chart.setData(this.data());
     for (const button of this.spans) button.setAttribute("aria-pressed", String(!this.zoomed && button.dataset.span === this.span));
     const [, error, , limit] = this.rows[this.rows.length - 1];
-    this.root.setAttribute("aria-label", `error over the run: predicted ${figure(error, 2)} mm now, limit ${figure(limit, 2)} mm. Plus and minus zoom, arrow keys move, Escape shows all again`);
+    this.root.setAttribute("aria-label", `error over the run: predicted ${figure(error, 2)} mm (95 %) now, limit ${figure(limit, 2)} mm. Plus and minus zoom, arrow keys move, Escape shows all again`);
   }
 }
 

@@ -259,8 +259,9 @@ function tiles(seen) {
   };
   const beyond = (value, limit) => value !== null && limit !== null && value > limit;
   const old = motion && motion.error !== null && (motion.error_age === null || motion.error_age > AGED), ago = old && motion.error_age !== null ? `, ${duration(motion.error_age)} ago` : "";
-  put("error", figure(motion && motion.error, 2), motion && motion.limit !== null ? `mm, limit ${motion.limit}` : "mm", old ? `predicted${ago}` : "predicted error", motion && beyond(motion.error, motion.limit), old);
-  put("truth", figure(motion && motion.true_error, 2), "mm", old ? `true${ago}` : "true error", motion && beyond(motion.true_error, motion.limit), old);
+  const known = motion && motion.sigma !== null ? `, σ ${figure(motion.sigma, 2)}/${motion.limit}` : "";
+  put("error", figure(motion && motion.error, 2), "mm, 95 %", old ? `predicted${ago}` : `predicted${known}`, motion && beyond(motion.sigma, motion.limit), old);
+  put("truth", figure(motion && motion.true_error, 2), "mm", old ? `true${ago}` : "true error", motion && beyond(motion.true_error, motion.error), old);
   document.querySelector("[data-tile=truth]").hidden = !motion || motion.true_error === null;
   put("sigma", figure(tracking && tracking.sigma, 3), "mm", "uncertainty");
   put("age", milliseconds(tracking && tracking.age), "ms", "age of pose");
