@@ -20,6 +20,7 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from hardware.files.folder_tables import rows_from_trajectory
 from hardware.files.images import encode
+from hardware.live.trace import TraceBatch, TraceEntry
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.recording import ros_messages
 from hardware.recording.mcap_file import ChunkMessages, Damage, walk
@@ -133,7 +134,7 @@ def test_every_message_has_the_fields_that_the_page_describes(tmp_path: Path) ->
         recorder.write(DispenserRecord(0.0, "needle", "on", 1.0))
         recorder.write(some_look())
         recorder.latency(0.0, "track", 0.001, np.zeros(3, np.int64), 0.0)
-        recorder.trace(0.0, {"stamp": 0.0, "lane": "tracking", "spans": [], "queued": 0.0, "faults": 0})
+        recorder.trace(0.0, TraceBatch((TraceEntry("tracking", 0.0, ()),)).message)
         recorder.sent(0.0, b"1")
         recorder.received(0.0, b"2")
     described, seen = described_channels(), set[str]()
