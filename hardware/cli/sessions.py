@@ -193,8 +193,8 @@ def add_smooth(commands: Commands) -> None:
 def _smooth(a: argparse.Namespace) -> int:
     from hardware.files.session import check_exists
 
-    for session in a.sessions:
-        check_exists(session)
+    if len(a.sessions) == 1:  # of several, one that is missing stops no other
+        check_exists(a.sessions[0])
     from hardware.offline.smooth import Cluster, SmoothOptions, run_smooth
 
     if a.workers is not None and a.scheduler != "local":
