@@ -233,7 +233,7 @@ def add_arm(commands: Commands) -> None:
         "arm",
         _run_arm,
         "see what answers on the arm's port, home it; or serve a virtual one",
-        "Listen to an arm and tell what answers, how often and from where; nothing is sent unless a move is\n"
+        "Listen to an arm and tell what answers, how often and from where; nothing moves unless a move is\n"
         "asked for, and a move needs --yes. Without DEVICE, list the drivers of arms, what each finds, and how\n"
         "to install what is missing. With --virtual, serve a virtual SEED S6H4D on a pseudo-terminal instead,\n"
         "for any client that speaks its protocol; Ctrl-C ends it with a summary.",
