@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import signal
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from html import escape
 from math import nan
@@ -22,7 +22,6 @@ from hardware.arm.profile import ArmProfile
 from hardware.live import records
 from hardware.live.checklist import checks_table
 from hardware.live.prepared import Prepared
-from hardware.live.records import HoldTotal, LiveMotionReport, RunReports
 from hardware.live.state_machine import RunStateMachine
 from hardware.motion.step import predicted_error
 from hardware.operator.shared_state import PagePictures
@@ -33,8 +32,7 @@ from planning.command import Move
 from planning.path import Path, PrintPhase, way_lengths
 
 _NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
-MAX_REASONS = 40  # kinds of holds that are counted apart
-OTHER_REASONS = "other reasons"
+MAX_REASONS, OTHER_REASONS = 40, "other reasons"  # kinds of holds that are counted apart, and the name of the rest
 ERROR_BIN, ERROR_BINS = 0.005, 400  # mm of a bin, and how many
 STRETCHES = 500  # of equal checkpoints, of each of which the largest error is kept: 0.2 % of the path
 MAX_TICK_GAP = 0.5  # s from tick to tick that is counted: nobody knows what happened in a longer gap
@@ -42,8 +40,10 @@ MAX_SHOWN_HOLDS = 12  # reasons on the page's end, the longest first
 EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
 BEADS_CAPTION = "The path from above, by the largest predicted error (95 %) of each stretch while material left."
 TRACK_CAPTION = "Where the nozzle was led on the surface while material left, as it was tracked, over the path."
-TIMELINE_CAPTION = """How far the nozzle was to be off at most, in 95 % of cases, over the seconds since the approach.
-Beyond the limit the surface alone may be known too badly to print on."""
+TIMELINE_CAPTION = (
+    "How far the nozzle was to be off, in 95 % of cases, over the seconds since the approach; see docs/live.md."
+)
+UNDER_WAY = RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED  # whose time counts
 POSES_KEPT = 4  # the motion's last pose is among so many of the newest
 
 
@@ -52,8 +52,8 @@ class RunStatistics:
     """Sums of a run."""
 
     stages: dict[str, float] = field(default_factory=dict)  # s in each stage
-    states: dict[str, int] = field(default_factory=dict)  # frame sets in each state of the tracker
-    holds: dict[str, HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
+    states: Counter[str] = field(default_factory=Counter)  # frame sets in each state of the tracker
+    holds: dict[str, records.HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
     extruding: float = 0.0  # s in which material left
     due: float = 0.0  # s in which it should have left
     times: records.StageHistograms = field(default_factory=records.StageHistograms)
@@ -81,7 +81,7 @@ class RunStatistics:
         """Judge moves by the path (tracker's surface frame) that the nozzle follows from now on."""
         self._begun = profile, path
 
-    def update(self, now: float, stage: RunStage, reports: RunReports) -> None:
+    def update(self, now: float, stage: RunStage, reports: records.RunReports) -> None:
         """Count the newest reports at `now`, s."""
         if not np.isnan(self._updated):
             self.stages[stage.value] = self.stages.get(stage.value, 0.0) + now - self._updated
@@ -89,8 +89,7 @@ class RunStatistics:
         if (tracking := reports.tracking) is not None and tracking.pose is not None and tracking.sets != self._sets:
             self._sets = tracking.sets
             self._poses.append(tracking.pose)
-            state = tracking.pose.state.value
-            self.states[state] = self.states.get(state, 0) + 1
+            self.states[tracking.pose.state.value] += 1
         if reports.motion is not None and reports.motion.tick.stamp != self._ticked:
             self._tick(reports.motion, stage)
 
@@ -98,8 +97,7 @@ class RunStatistics:
         """Count the true error at the nozzle of a simulated world and what was claimed of it, mm; NaN: not known."""
         if not np.isnan(error):
             self.true_errors.add(error)
-            if not np.isnan(claim):
-                self.judged, self.held = self.judged + 1, self.held + (error <= claim)
+            self.judged, self.held = self.judged + (not np.isnan(claim)), self.held + (error <= claim)
 
     @property
     def coverage(self) -> float:
@@ -109,13 +107,12 @@ class RunStatistics:
     @property
     def predicted(self) -> dict[str, float]:
         """The error over the run as it was predicted: median and 95 % of all cases, and the largest claim; mm."""
-        return percentiles(self.errors) | {"max": self.largest}
+        return self.errors.summary | {"max": self.largest}
 
     @property
     def active(self) -> float:
         """Seconds since the approach in which it went to the wound, printed, was held or waited."""
-        stages = RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED
-        return sum(self.stages.get(stage.value, 0.0) for stage in stages)
+        return sum(self.stages.get(stage.value, 0.0) for stage in UNDER_WAY)
 
     @property
     def holds_by_time(self) -> list[HoldRow]:
@@ -128,17 +125,15 @@ class RunStatistics:
         """Share of the time since printing began in which material left; NaN before."""
         return self.extruding / self.due if self.due > 0 else nan
 
-    def _tick(self, motion: LiveMotionReport, stage: RunStage) -> None:
-        before = self._ticked
-        self._ticked, self.claim = motion.tick.stamp, nan
+    def _tick(self, motion: records.LiveMotionReport, stage: RunStage) -> None:
+        before, self._ticked, self.claim = self._ticked, motion.tick.stamp, nan
         step = min(self._ticked - before, MAX_TICK_GAP) if not np.isnan(before) else 0.0
         command, progress = motion.tick.command, motion.progress
-        if progress is None or stage not in (RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED):
+        if progress is None or stage not in UNDER_WAY:
             return
-        reason = _NUMBER_PATTERN.sub("…", command.reason)
-        if reason:
+        if reason := _NUMBER_PATTERN.sub("…", command.reason):
             counted = reason if reason in self.holds or len(self.holds) < MAX_REASONS else OTHER_REASONS
-            hold = self.holds.setdefault(counted, HoldTotal())
+            hold = self.holds.setdefault(counted, records.HoldTotal())
             hold.count += counted != self._reason
             hold.seconds += step
         self._reason = reason
@@ -154,7 +149,7 @@ class RunStatistics:
             self.track.lift()
         self.timeline.add(self._ticked, self.claim, step if reason else 0.0)
 
-    def _claim(self, motion: LiveMotionReport, move: Move, fraction: float) -> None:
+    def _claim(self, motion: records.LiveMotionReport, move: Move, fraction: float) -> None:
         """Say how far the nozzle will be from its place after this move, by the pose that the move was made of."""
         pose = next((pose for pose in reversed(self._poses) if pose.stamp <= motion.pose_stamp), None)
         if pose is None or self._begun is None:
@@ -176,7 +171,7 @@ class RunOutcome:
     prepared: Prepared
     machine: RunStateMachine
     statistics: RunStatistics
-    reports: RunReports
+    reports: records.RunReports
     signal: int  # that ended it, 0 without
     fraction: float  # place on the path, counted in checkpoints, NaN before any
     pictures: PagePictures | None = None  # the last that a window of the page was shown
@@ -230,7 +225,7 @@ class RunOutcome:
     def result(self) -> RunResult:
         """For the operator's page."""
         task, statistics, files = self.prepared.task, self.statistics, self.prepared.files
-        two = [(p["p95"], p["max"]) for p in (statistics.predicted, percentiles(statistics.true_errors))]
+        two = [(p["p95"], p["max"]) for p in (statistics.predicted, statistics.true_errors.summary)]
         return RunResult(
             printed=self.printed,
             fraction=self.place,
@@ -295,7 +290,7 @@ class RunOutcome:
                 "duty": statistics.duty,
                 "extruding_s": statistics.extruding,
                 "predicted_error_mm": statistics.predicted,
-                "true_error_mm": percentiles(statistics.true_errors),
+                "true_error_mm": statistics.true_errors.summary,
                 "within_claim": statistics.coverage,
                 "ink_mm3": statistics.ink if self.inked else None,
                 "printed_share": self.printed,
@@ -400,11 +395,6 @@ class RunOutcome:
         """Rows of the time that is no hold, and of the sum."""
         statistics, held = self.statistics, sum(row.seconds for row in self.statistics.holds_by_time)
         rest = max(statistics.active - held - statistics.extruding, 0.0)
-        times = ("material left", statistics.extruding), ("on the way without material", rest)
-        rows = [[name, "", f"{seconds:.2f}"] for name, seconds in times]
-        return [*rows, ["since the approach", "", f"{held + statistics.extruding + rest:.2f}"]]
-
-
-def percentiles(errors: Histogram) -> dict[str, float]:
-    """Median, 95 % and largest of a histogram; NaN of none."""
-    return {"p50": errors.percentile(50), "p95": errors.percentile(95), "max": errors.most if errors.count else nan}
+        times = {"material left": statistics.extruding, "on the way without material": rest}
+        times["since the approach"] = held + statistics.extruding + rest
+        return [[name, "", f"{seconds:.2f}"] for name, seconds in times.items()]

@@ -349,8 +349,10 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
         for title, way in VIEWS
     )
     limits = np.percentile(sigma, [50, 95])
-    rows = [(camera.name, _share(surface.seen[c], surface)) for c, camera in enumerate(scanned.rig.cameras)]
-    rows += [("two cameras or more", _share(surface.seen.sum(0) >= 2, surface)), ("scanned", f"{scanned.coverage:.0%}")]
+    masks = {camera.name: surface.seen[c] for c, camera in enumerate(scanned.rig.cameras)}
+    masks["two cameras or more"], wanted = surface.seen.sum(0) >= 2, surface.wanted
+    rows = [(name, f"{(mask & wanted).sum() / max(1, wanted.sum()):.0%}") for name, mask in masks.items()]
+    rows.append(("scanned", f"{scanned.coverage:.0%}"))
     most = max(2 * WEAK_SIGMA_MM, float(np.percentile(sigma, SHADED_PERCENT)))
     colours = np.where(surface.sure[::-1, :, None], _shaded(surface.sigma[::-1] / most), 255)
     scale = _figure(f"0 to {most:.2g} mm", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8))
@@ -366,10 +368,6 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
         section("Where to put a camera", camera_advice(scanned), ""),
     ]
     return document("scan", name, scanned.words + ".", body, name)
-
-
-def _share(mask: NDArray[np.bool_], surface: DenseSurface) -> str:
-    return f"{(mask & surface.wanted).sum() / max(1, surface.wanted.sum()):.0%}"
 
 
 def _figure(title: str, image: NDArray[np.uint8]) -> str:

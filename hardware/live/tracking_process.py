@@ -30,10 +30,10 @@ from hardware.live.frame_source import (
     TimedFrameSet,
     restore_map,
 )
+from hardware.live.motion_process import CommandedHead
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
-    CommandedHead,
     EventEntry,
     PoseEntry,
     PoseHandover,

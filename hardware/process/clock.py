@@ -250,6 +250,12 @@ class Histogram:
         step = int(np.searchsorted(np.cumsum(self._tail), rank - before))
         return min(self._end * TAIL_STEP ** (step + 1), self.most)
 
+    @property
+    def summary(self) -> dict[str, float]:
+        """Median, 95 % and largest; NaN of none."""
+        most = self.most if self.count else math.nan
+        return {"p50": self.percentile(50), "p95": self.percentile(95), "max": most}
+
 
 PROBE_CALLS = 20  # of each kind in a piece of work: a quarter of a millisecond, a fraction of a tick of the motion
 SLOW_RATIO = 3.0  # times the usual
