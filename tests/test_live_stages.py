@@ -17,11 +17,12 @@ from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.live.checklist import FIRST_PICTURE_TIME, PrintTask, run_checks
-from hardware.live.outcome import HoldTotal, RunOutcome, RunStatistics
+from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, RunFiles
 from hardware.live.records import (
     TRACK_PLACES,
     BeginPrint,
+    HoldTotal,
     LiveMotionReport,
     NozzleTrack,
     PauseOrder,
