@@ -200,6 +200,13 @@ def test_what_is_no_marlin_or_says_nothing_is_not_driven() -> None:
     assert "`baud` of the arm file" in driven.machine.enable(driven.now)
 
 
+def test_a_stop_before_it_has_said_who_it_is_greets_it_again() -> None:
+    driven = Driven(Board(["lost"] * 5))
+    driven.machine.stop(driven.now)
+    driven.run(2.0)
+    assert driven.machine.enable(driven.now) == "" and driven.places[-1] == pytest.approx(PARKED)
+
+
 def test_a_turn_is_refused() -> None:
     driven = Driven(Board())
     with pytest.raises(InputError, match="does not turn"):

@@ -35,6 +35,7 @@ GREETING_TIME = 1.0  # s between greetings of a machine that has said nothing ye
 REMEMBERED = 64  # lines that may be asked for again: a second of them
 MIN_STEPS_PER_MM = 1.0  # of an axis: fewer are no machine's that prints
 PLACE_DIGITS = 4  # of mm, in a line
+MAX_LINE = 512  # bytes of a line from the machine: what is longer came at another baud rate
 STOP = b"M410\n"  # without a number: it overtakes lines that have one
 GREETING = "M115", "G21", "G90", "M92", "M400", "M114"  # who it is; mm; absolute; steps per mm; at rest, where is it?
 FIRMWARE = re.compile(r"FIRMWARE_NAME: ?(.*?)(?= [A-Z_]+:|$)")
@@ -42,9 +43,8 @@ PLACE = re.compile(r"X: ?(-?[\d.]+) +Y: ?(-?[\d.]+) +Z: ?(-?[\d.]+)")
 COUNT = re.compile(r"Count:? *X: ?(-?\d+) +Y: ?(-?\d+) +Z: ?(-?\d+)")
 STEPS = re.compile(r"M92 X([\d.]+) Y([\d.]+) Z([\d.]+)")
 RESEND = re.compile(r"(?:Resend|rs):? *N?:?(\d+)", re.IGNORECASE)
-HALTED = re.compile(
-    r"halted|kill|fatal|(max|min)temp|thermal|stopped|^!!", re.IGNORECASE
-)  # in a line that tells of an error
+# in a line that tells of an error
+HALTED = re.compile(r"halted|kill|fatal|(max|min)temp|thermal|stopped|^!!", re.IGNORECASE)
 KNOWN = "marlin"  # in the name of the firmware
 
 
@@ -108,7 +108,8 @@ class GcodeMachine(ArmDriver):
         data = self.port.read()
         if data and self._listener is not None:
             self._listener(data, False)
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        *lines, rest = (self._rest + data).split(b"\n")
+        self._rest = rest[-MAX_LINE:]
         replies: list[Reply] = []
         stamp = now
         for line in lines:
@@ -203,7 +204,7 @@ class GcodeMachine(ArmDriver):
         """Halt the axes; what it was given and has not read is not sent again."""
         assert self.port is not None
         self._half += STOP
-        self._count_anew(("M400", "M114"), now)
+        self._count_anew(("M400", "M114") if self._known else GREETING, now)
         self._stops = True
         return self._write(now)
 
