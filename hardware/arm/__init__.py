@@ -1,6 +1,6 @@
 """The arm: the link that any arm has above the seam, and the drivers below it, one for each make."""
 
 __all__ = [
-    "console", "device", "driver", "feedback", "franka", "jog", "link", "port", "profile", "protocol", "queue",
-    "s6h4d",
+    "console", "device", "driver", "feedback", "franka", "gcode", "jog", "link", "port", "profile", "protocol", "queue",
+    "s6h4d", "serial_driver",
 ]  # fmt: skip

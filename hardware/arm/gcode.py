@@ -22,9 +22,10 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.arm.driver import G1, G4, ArmDriver, ByteListener, Pause, Reply, ReplyKind, Reported, Sent
-from hardware.arm.port import Opener, Port, PortOpener, serial_ports, write_last
+from hardware.arm.driver import G1, G4, ByteListener, Pause, Reply, ReplyKind, Reported, Sent
+from hardware.arm.port import Opener, PortOpener, serial_ports, write_last
 from hardware.arm.profile import ArmProfile
+from hardware.arm.serial_driver import SerialDriver
 
 SCHEME = "gcode://"
 LINES = 2  # that may be unanswered: a move, and the question where it is
@@ -57,15 +58,13 @@ class Line:
     anchor: bool = False  # of an M114: the machine rests, so that its planner and its steps are at one place
 
 
-class GcodeMachine(ArmDriver):
-    """Marlin, through a serial port. port: that is open; None before `connect` and after `close`."""
+class GcodeMachine(SerialDriver):
+    """Marlin, on a serial line; `state` greets it."""
 
     def __init__(self, address: str, opener: Opener, profile: ArmProfile, listener: ByteListener | None = None) -> None:
-        """opener: opens the device, and again after it was away. listener: is told all bytes that pass."""
-        self._address, self._opener, self._listener = address, opener, listener
-        self._turn = profile.arm.home[3:].copy()
-        self.port: Port | None = None
-        self._reset()
+        """address: as the operator gave it. Otherwise as SerialDriver's."""
+        self._address, self._turn = address, profile.arm.home[3:].copy()
+        super().__init__(opener, listener)
 
     def _reset(self) -> None:
         self._waits: deque[Line] = deque()  # to be given out
@@ -84,31 +83,12 @@ class GcodeMachine(ArmDriver):
         self._patience = ANSWER_TIME  # s, for an answer
         self._known = False  # whether it has said where it is
 
-    def connect(self, now: float) -> None:
-        """Open the port; the machine is greeted by `state`."""
-        self.port = self._opener()
-
-    def close(self) -> None:
-        """Close the port; what waits is dropped."""
-        if self.port is not None:
-            self.port.close()
-        self.port = None
-        self._reset()
-
-    def release(self) -> None:
-        """Let the device's lock go, where its opener holds one."""
-        if isinstance(self._opener, PortOpener):
-            self._opener.release()
-
     # -- the machine's words
 
     def state(self, now: float) -> Reported:
         """Where it is, by what has come; greet it, ask it again, or send again what was lost."""
         assert self.port is not None
-        data = self.port.read()
-        if data and self._listener is not None:
-            self._listener(data, False)
-        *lines, rest = (self._rest + data).split(b"\n")
+        *lines, rest = (self._rest + self.port.read()).split(b"\n")
         self._rest = rest[-MAX_LINE:]
         replies: list[Reply] = []
         stamp = now
@@ -235,10 +215,6 @@ class GcodeMachine(ArmDriver):
         waits = self._stops or any(line.instruction is not None for line in self._waits)
         return now - self._since if waits else None
 
-    def waiting(self) -> float:
-        """Bytes in the system's output buffer."""
-        return 0.0 if self.port is None else self.port.waiting()
-
     def _put(self, line: Line, now: float) -> Sequence[Sent]:
         if not self._waits:
             self._since = now
@@ -271,10 +247,7 @@ class GcodeMachine(ArmDriver):
         """Write what is left of the last line, or of a stop; whether all of it is out."""
         assert self.port is not None
         if self._half:
-            written = self.port.write(self._half)
-            if self._listener is not None and written:
-                self._listener(self._half[:written], True)
-            self._half = self._half[written:]
+            self._half = self._half[self.port.write(self._half) :]
         if self._stops and not self._half:
             self._stops = False
             out.append(Sent(Pause()))

@@ -16,7 +16,6 @@ from hardware.arm.driver import (
     G1,
     G4,
     G54,
-    ArmDriver,
     ByteListener,
     Pause,
     Reply,
@@ -24,25 +23,22 @@ from hardware.arm.driver import (
     Reported,
     Sent,
 )
-from hardware.arm.port import Opener, Port, PortOpener, serial_ports, write_last
+from hardware.arm.port import Opener, PortOpener, serial_ports, write_last
 from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH, REPLY_LENGTH, encode, reply_stream
+from hardware.arm.serial_driver import SerialDriver
 
 STOP_FRAMES = 2  # the first one may complete a frame that was torn when the process died
 
 
-class S6H4D(ArmDriver):
-    """Frames on their way out through one port, and answers in.
-
-    port: that is open; None before `connect` and after `close`.
-    """
+class S6H4D(SerialDriver):
+    """Frames on their way out through one port, and answers in."""
 
     def __init__(self, opener: Opener, profile: ArmProfile, listener: ByteListener | None = None) -> None:
-        """opener: opens the device, and opens it again after it was away. listener: is told all bytes that pass."""
-        self.opener, self._dialect, self._listener = opener, profile.dialect, listener
+        """As SerialDriver's."""
+        self._dialect = profile.dialect
         self._reply_time = REPLY_LENGTH * BITS_PER_BYTE / profile.baud  # s that an answer takes on the wire
-        self.port: Port | None = None
-        self._reset()
+        super().__init__(opener, listener)
 
     def _reset(self) -> None:
         self.origin = np.zeros(3)
@@ -50,23 +46,6 @@ class S6H4D(ArmDriver):
         self._done = 0  # bytes of the first frame that went out
         self._since = 0.0  # s, when the first frame was to go
         self._stream = reply_stream()
-
-    def connect(self, now: float) -> None:
-        """Open the port."""
-        port = self.opener()
-        self.port = port if self._listener is None else _LoggedPort(port, self._listener)
-
-    def close(self) -> None:
-        """Close the port; what waits is dropped."""
-        if self.port is not None:
-            self.port.close()
-        self.port = None
-        self._reset()
-
-    def release(self) -> None:
-        """Let the device's lock go, where its opener holds one."""
-        if isinstance(self.opener, PortOpener):
-            self.opener.release()
 
     def state(self, now: float) -> Reported:
         """Answers that have come, and the bytes known to be in none."""
@@ -136,30 +115,6 @@ class S6H4D(ArmDriver):
     def blocked_for(self, now: float) -> float | None:
         """Seconds that the first frame has waited."""
         return now - self._since if self._frames else None
-
-    def waiting(self) -> float:
-        """Bytes in the system's output buffer."""
-        return 0.0 if self.port is None else self.port.waiting()
-
-
-class _LoggedPort:
-    """A port whose listener is called with all bytes that pass."""
-
-    def __init__(self, port: Port, listener: ByteListener) -> None:
-        self._port, self._listener = port, listener
-        self.waiting, self.close = port.waiting, port.close
-
-    def write(self, data: bytes) -> int:
-        count = self._port.write(data)
-        if count:
-            self._listener(data[:count], True)
-        return count
-
-    def read(self) -> bytes:
-        data = self._port.read()
-        if data:
-            self._listener(data, False)
-        return data
 
 
 def open_arm(address: str, profile: ArmProfile, listener: ByteListener | None = None) -> S6H4D:

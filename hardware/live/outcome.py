@@ -25,7 +25,7 @@ from hardware.live.prepared import Prepared
 from hardware.live.state_machine import RunStateMachine
 from hardware.motion.step import predicted_error
 from hardware.operator.shared_state import PagePictures
-from hardware.operator.view import ONE_DIRECTION, HoldRow, RunResult, RunStage
+from hardware.operator.view import NORMAL_95, HoldRow, RunResult, RunStage
 from hardware.process.clock import Histogram
 from hardware.process.system import provenance
 from planning.command import Move
@@ -40,9 +40,8 @@ MAX_SHOWN_HOLDS = 12  # reasons on the page's end, the longest first
 EXIT_DONE, EXIT_CUT_SHORT, EXIT_SIGNAL = 0, 1, 128
 BEADS_CAPTION = "The path from above, by the largest predicted error (95 %) of each stretch while material left."
 TRACK_CAPTION = "Where the nozzle was led on the surface while material left, as it was tracked, over the path."
-TIMELINE_CAPTION = (
-    "How far the nozzle was to be off, in 95 % of cases, over the seconds since the approach; see docs/live.md."
-)
+TIMELINE_CAPTION = """How far the nozzle was to be off at most, in 95 % of cases, over the seconds since the approach.
+Beyond the limit the surface alone may be known too badly to print on."""
 UNDER_WAY = RunStage.APPROACH, RunStage.PRINT, RunStage.PAUSED, RunStage.STOPPED  # whose time counts
 POSES_KEPT = 4  # the motion's last pose is among so many of the newest
 
@@ -344,7 +343,7 @@ class RunOutcome:
         timings = figures_table(("stage", "times", "median", "99 %", "largest"), rows)
         reasons = figures_table(("what", "times", "s"), [*holds, *self._other_times()], last_total=True)
         bins = timeline.error[:count], timeline.held[:count] > timeline.width / 2, timeline.width
-        drawn = error_timeline(*bins, ONE_DIRECTION * limit)
+        drawn = error_timeline(*bins, NORMAL_95 * limit)
         points = task.path.surface_from_nozzle[:, :3, 3]
         beads = bead_map(points, task.path.extrude, self.statistics.stretches, limit)
         body = [

@@ -20,7 +20,7 @@ import numpy as np
 from estimation.rig import Camera
 from hardware.operator.shared_state import OperatorLink, PagePictures, PageScene, RecordingView, WavingView
 from hardware.operator.view import (
-    ONE_DIRECTION,
+    NORMAL_95,
     Activity,
     LogLine,
     MoveRequest,
@@ -219,7 +219,7 @@ class Broadcast:
             return
         aged = motion.error_age > AGED  # nothing is extruded: the errors are of earlier
         errors = (nan, nan) if aged else (motion.error, motion.true_error)
-        limit, held = ONE_DIRECTION * motion.limit, motion.activity is Activity.HOLDING
+        limit, held = NORMAL_95 * motion.limit, motion.activity is Activity.HOLDING
         self._history.add(TimelineRow(view.stamp, *errors, limit, held))
 
 

@@ -195,7 +195,7 @@ class HoldCause:
     limit: float = nan
 
 
-ONE_DIRECTION = 1.96  # standard deviations that hold 95 % of errors of one direction: the limit as that
+NORMAL_95 = 1.96  # standard deviations that hold 95 % of errors of one direction: the limit as that
 CAUSE_TILES = {  # tile of the page, what is measured, its unit, and how many of that the guard's unit is
     RefusalCode.POSE_AGE: ("age", "age of pose", "ms", 1000.0),
     RefusalCode.POSE_ERROR: ("error", "predicted error", "mm", 1.0),
