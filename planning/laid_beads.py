@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from estimation.errors import InputError
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceHeights
-from planning.material import bead_areas, is_metered
+from planning.material import FlowShares, bead_areas, is_metered
 from planning.path import MIN_SPACING, Path, way_lengths
 
 STATION_LENGTH = 1.25  # mm of bead judged as one: a quarter of the shortest clog that must be found, to see its ends
@@ -248,6 +248,14 @@ def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPiece
 
 
 LOOK_BY_LAYER = "layer"
+MIN_FLOW, MAX_FLOW = 0.7, 1.5  # of the planned, in an adapted layer: beads neither break nor run over their neighbours
+MIN_LACK = 0.1  # share of the planned that pieces lack, below which nothing is done: they are told to 0.05-0.08
+MAX_UNSURE = 0.25  # sigma by the planned of a piece, beyond which it counts for nothing
+MIN_LOOK_SEEN = 0.8  # of the pieces that must be sure: else nothing is done
+FILL_SIGMA, FILL_REACH = (
+    0.7,
+    2.0,
+)  # mm beside a way, over which what lies under it is averaged, and beyond which none is
 
 
 def beads_between_looks(where: object, key: str, value: object) -> int | None:
@@ -311,6 +319,45 @@ class Look:
         ]
         parts += [f"{1 - seen:.0%} not seen"] if seen < 0.99 else []
         return ", ".join(parts)
+
+
+def adapted_flow(path: Path, look: Look) -> FlowShares | None:
+    """The flows of the next layer by what lies under it; None after an uncertain look, or where no new layer follows.
+
+    Each way of it gets what the nearest pieces lack, or less where they have too much; MIN_FLOW to MAX_FLOW of what was
+    planned. What a layer lacks is measured by what `path`, as it was planned, says of it, and not by what it was told
+    to fill: so a gap is filled once.
+    """
+    laid, stations = look.laid, look.laid.stations
+    with np.errstate(invalid="ignore"):
+        sure = np.isfinite(laid.volume) & (laid.sigma < MAX_UNSURE * laid.planned)
+    last = min(int(np.ceil(look.last)), len(path) - 1)
+    later = np.arange(last + 1, len(path))
+    later = later[path.extrude[later]]
+    if not len(later) or not len(sure) or sure.mean() < MIN_LOOK_SEEN or path.layer[later[0]] == stations.layer[-1]:
+        return None
+    planned = stations_of(pieces_between(path, look.first, look.last)).crest
+    lacks = (1 - laid.share * stations.crest * look.width / planned)[sure]
+    lacks = np.where(np.abs(lacks) < MIN_LACK, 0.0, lacks)
+    poses = path.surface_from_nozzle
+    knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
+    middle = (stations.begin + stations.end)[sure] / 2
+    under = np.column_stack([np.interp(middle, knots, poses[:, k, 3]) for k in (0, 1)])
+    ways = np.arange(later[0], later[path.layer[later] == path.layer[later[0]]][-1] + 1)
+    over = (poses[ways - 1, :2, 3] + poses[ways, :2, 3]) / 2
+    away = np.linalg.norm(over[:, None] - under, axis=2)
+    weight = np.exp(-((away / FILL_SIGMA) ** 2) / 2)
+    share = 1 + (weight * lacks).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
+    near = away.min(axis=1) < FILL_REACH
+    return FlowShares(int(ways[0]), np.where(near, np.clip(share, MIN_FLOW, MAX_FLOW), 1.0))
+
+
+def with_flow(path: Path, shares: FlowShares) -> Path:
+    """The path with the amounts that it is told to lay."""
+    volume, ways = bead_areas(path), slice(shares.first, shares.first + len(shares.share))
+    volume[1:] *= np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
+    volume[ways] *= shares.share
+    return replace(path, extra={**path.extra, "volume_mm3": volume})
 
 
 def clogged(looks: Sequence[Look]) -> list[tuple[float, float]]:

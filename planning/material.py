@@ -73,6 +73,19 @@ class Rest:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FlowShares:
+    """By how much the flow on some ways of a path differs from the planned."""
+
+    first: int  # checkpoint to which the first of the ways leads
+    share: Array  # (M,) of the planned flow on the ways to it and those after it
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return f"the next layer flows at {self.share.min():.0%} to {self.share.max():.0%} of the planned"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MaterialPlan:
     """Material along a path whose checkpoints (N,) lie at `knots` (N,), mm."""
 
@@ -229,9 +242,16 @@ class FlowCommands:
     def __init__(self, plan: MaterialPlan, outlets: Outlets, lag: float, tick: float) -> None:
         """lag: s from one tick after a command until the arm is at its axes. tick: s between calls."""
         self._plan, self._outlets, self.lag = plan, outlets, lag
+        self._planned = plan.area
         self._steps = np.arange(0.0, tick - SWITCH_STEP / 2, SWITCH_STEP)
         self._flow = 0.0  # mm^3/s last told
         self.begun = math.inf
+
+    def adapt(self, shares: FlowShares) -> None:
+        """Let other flows leave on some ways: shares of what was planned there, whatever was asked before."""
+        area, ways = self._plan.area.copy(), slice(shares.first, shares.first + len(shares.share))
+        area[ways] = self._planned[ways] * shares.share
+        self._plan = replace(self._plan, area=area)
 
     def outlet(self, material: str) -> Outlet:
         """The outlet of a material."""

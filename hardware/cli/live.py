@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SETTINGS_FLAGS = (
     "rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift", "stands_home",
     "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port",
-    "page_certificate", "page_key", "look",
+    "page_certificate", "page_key", "look", "adapt",
 )  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
@@ -64,6 +64,7 @@ def add_live(commands: Commands) -> None:
     add("--resume", type=Path, metavar="X.mcap", help="go on where the run recorded there stopped")
     add("--dry-run", action="store_true", default=None, help="extrude nothing, stay above the path")
     add("--look", metavar="WHEN", help='step aside and look at what was laid after each "layer", or so many beads')
+    add("--adapt", action="store_true", default=None, help="with --look: each layer's flow by what lies under it")
     add("--lift", type=float, metavar="MM", help="how far above, in a dry run; default 10")
     add("--yes", action="store_true", default=None, help="nobody confirms the path and the start")
     add("--stands-home", action="store_true", default=None, help="an arm that does not answer stands so")

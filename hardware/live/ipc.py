@@ -47,6 +47,7 @@ from hardware.process.faults import Fault
 from hardware.process.system import SPAWN, Bell, SharedLatest, ask_for_real_time, blocked_sigint, set_up_process
 from hardware.recording.session_reader import open_session
 from perception.frames import Frame, FrameSet, frame_set
+from planning.material import FlowShares
 
 TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
 REQUEST_POLL_PERIOD = 0.02  # s between looks whether the tracker asks for frames
@@ -192,6 +193,7 @@ ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy mach
 ARM_AFTERLIFE = 2.0  # s that a virtual arm goes on without the run: it has to come to rest by itself
 EXECUTED_STEP = 0.002  # s between rows of what a virtual arm executed
 TROUBLE_BYTES = 4096  # of the text that says what is wrong with the arm
+SHARES_BYTES = 2**22  # of the flows of a layer: half a million ways
 
 ProcessBody = Callable[..., None]
 
@@ -370,17 +372,18 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
         poses, tracking = SharedLatest[PoseHandover](), SharedLatest[TrackingReport]()
         motion, recorder = SharedLatest[LiveMotionReport](), SharedLatest[RecorderReport]()
-        trouble, bell = SharedLatest[str](TROUBLE_BYTES), Bell()
+        trouble, bell, shares = SharedLatest[str](TROUBLE_BYTES), Bell(), SharedLatest[FlowShares](SHARES_BYTES)
         to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
         lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
         ends = [end for end, _ in to_recorder]
         processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
-        mover = MotionChannels(url, place, poses, motion, orders[0], bell, link.requests, trouble, to_recorder[0][1])
+        own = orders[0], bell, link.requests, trouble, to_recorder[0][1]
+        mover = MotionChannels(url, place, poses, motion, shares, *own)
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:
             processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
         looks, outline, placed = RawValue(c_uint64, 0), SharedLatest[OutlineOrder](), SharedLatest[Array]()
-        ends_of_tracking = to_recorder[1][1], looks, outline, placed, lifeline[0]
+        ends_of_tracking = to_recorder[1][1], looks, outline, placed, shares, lifeline[0]
         track = TrackingChannels(ring, notices[0], poses, bell, tracking, motion, link, *ends_of_tracking)
         processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
         sender = RecorderSender(to_recorder[2][1])

@@ -42,6 +42,7 @@ from hardware.motion.step import PrintMotion
 from hardware.process.clock import PoseLockedSchedule, WallClock
 from hardware.process.system import Bell, SharedLatest, ask_for_real_time, set_up_process, take_messages
 from perception.frames import PrintHead
+from planning.material import FlowShares
 from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
@@ -67,6 +68,8 @@ class _OrderReceiver:
 
     def __init__(self, channels: MotionChannels, motion: PrintMotion, ticks: PoseLockedSchedule) -> None:
         self._connection, self._requests, self._motion, self._ticks = channels.orders, channels.requests, motion, ticks
+        self._shares = channels.shares
+        self._followed: FlowShares | None = None
         self._last_stop = channels.requests.last_stop
         self.alone, self.fingerprint = False, ""
         self._ended = False
@@ -85,6 +88,9 @@ class _OrderReceiver:
                 self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
                 self._motion.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
             elif order is PauseOrder.MATERIAL_IN:
+                if (shares := self._shares.get()) is not self._followed and shares is not None:
+                    self._followed = shares
+                    self._motion.adapt(shares)
                 self._motion.put_in()
             elif order is PauseOrder.RESUME:
                 self._motion.resume()
@@ -162,7 +168,10 @@ class _TickReporter:
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
             inputs = stamp, asked, begun, motion.waits, motion.material_in
             motion.material_in, lag = False, motion.lag if asked else math.nan
-            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag, motion.aside))
+            self._sender.put(
+                RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag, motion.aside, motion.adapted)
+            )
+            motion.adapted = None
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)

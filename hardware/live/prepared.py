@@ -268,6 +268,7 @@ def _prepared(
         unattended=settings.unattended,
         patience=settings.patience,
         looks=looks,
+        adapt=settings.adapt,
     )
     if scan is not None:
         task = replace(task, tissue=guarded_tissue(scan, path, task.profile))

@@ -40,6 +40,7 @@ from hardware.simulator.nozzle_error import MaterialFigures, material_figures
 from hardware.simulator.nozzle_error import nozzle_errors as row_errors
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold
+from planning.material import FlowShares
 from planning.path import PrintPhase, PrintProgress
 
 RUN_REQUIRED = "the recording of a run that began to print, or give --path"
@@ -102,10 +103,15 @@ def replay_run(record: File) -> Iterator[ReplayedTick]:
 def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Iterator[ReplayedTick]:
     """Where the file is damaged, ticks are left out whose pose is lost; those behind it may come out another way."""
     ticks, poses = run.messages["/tick"], run.poses
-    step, profile = None, inputs.profile
+    step, profile, shares = None, inputs.profile, list[FlowShares]()
     for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
         if tick["begun"]:
             step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets, inputs.tissue)
+            for each in shares:
+                step.adapt(each)
+        if step is not None and (adapted := tick.get("adapted")):
+            shares.append(FlowShares(int(adapted["first"]), np.array(adapted["share"], float)))
+            step.adapt(shares[-1])
         if step is not None and tick.get("lag"):
             step.lag = float(tick["lag"][0])
         if step is not None and tick.get("recalled"):

@@ -28,7 +28,7 @@ from hardware.process.system import Bell, SharedLatest
 from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
 from planning.clearance import TissueGuard
 from planning.laid_beads import Look
-from planning.material import Outlets
+from planning.material import FlowShares, Outlets
 from planning.path import Path, PrintProgress
 from planning.placement import PathPlacement
 
@@ -283,6 +283,7 @@ class TrackingChannels:
     looks: c_uint64  # how often the surface is to be looked for anew
     outline: SharedLatest[OutlineOrder]  # put before `looks` is set
     placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of what is printed, from when it is begun
+    shares: SharedLatest[FlowShares]  # of the next layer, to the motion
     lifeline: Connection  # its end says that the run is gone
 
 
@@ -294,6 +295,7 @@ class MotionChannels:
     place: c_double  # on the path, in checkpoints, NaN before it is begun; set before a command goes to the arm
     poses: SharedLatest[PoseHandover]
     reports: SharedLatest[LiveMotionReport]
+    shares: SharedLatest[FlowShares]  # of the next layer, put before its order MATERIAL_IN
     orders: Connection
     bell: Bell  # rung once a pose or an order is there
     requests: RequestLine  # of the operator's page

@@ -68,6 +68,7 @@ class LiveSettings:
     look: str = _key(
         "print.look", '"layer"', 'when the needle steps aside and what was laid is looked at: "layer", or "4" beads', ""
     )
+    adapt: bool = _key("print.adapt", "true", "each layer takes its flow from what a look found under it", False)
     dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
     lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under
         "print.lift_mm", "10.0", "how far above, in a dry run; 0 to 100", 10.0
@@ -180,6 +181,8 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         raise InputError(where, "record.file", s.record or "missing", "a file that ends in .mcap")
     if not 0 <= s.lift <= MAX_LIFT_MM:
         raise InputError(where, "print.lift_mm", s.lift, f"0 to {MAX_LIFT_MM:g} mm")
+    if s.adapt and not s.look:
+        raise InputError(where, "print.adapt", "true", "with print.look")
     if not 1 <= s.patience <= MAX_PATIENCE:
         raise InputError(where, "cameras.patience_s", s.patience, f"1 to {MAX_PATIENCE:g} s")
     if s.region.drawn and not s.page:

@@ -164,7 +164,9 @@ class _TrackingLoop:
             sender.put(replace(roi, stamp=self.report.stamp))
         self._rois, self._drawn = rois, region.drawn and not rois
         self._sheet: OutlineSheet | None = None  # of this look, where a network looked
-        self._looks = LiveLooks(rig, prepared.task.path, stack) if prepared.task.looks else None
+        task = prepared.task
+        adapt = channels.shares.put if task.adapt else None
+        self._looks = LiveLooks(rig, task.path, stack, adapt) if task.looks else None
         self._steps = stack.enter_context(ExitStack())
         self._look(0)
 

@@ -29,6 +29,7 @@ from hardware.process.clock import Clock, Histogram, TickSchedule
 from perception.frames import PrintHead
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
+from planning.material import FlowShares
 from planning.path import Path, PrintPhase
 
 
@@ -214,6 +215,7 @@ class RecordedTick:
     recalled: Array | None = None  # (2, 6) mm and rad: where the arm rested and stands, where moves were called back
     lag: float = nan  # s, the arm's lag from this tick on; NaN: as before
     aside: bool = False  # whether they were to wait beside all that is printed, for a look
+    adapted: FlowShares | None = None  # flows that were changed before the tick
 
 
 MAX_COMMANDS = 256  # commands, five seconds of them: frames are never that late

@@ -23,7 +23,7 @@ from hardware.process.clock import Clock
 from planning.clearance import TissueGuard
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
-from planning.material import Outlets, with_offsets
+from planning.material import FlowShares, Outlets, with_offsets
 from planning.motion.guard import Guard
 from planning.motion.planner import LOOKS, Planner
 from planning.path import Path, PrintProgress
@@ -67,6 +67,10 @@ class MotionStep:
     def material_in(self) -> None:
         """Note that the material that `progress.wanted` asks for is in."""
         self._planner.material_in()
+
+    def adapt(self, shares: FlowShares) -> None:
+        """Let other flows leave on some ways of the path."""
+        self._planner.flow.adapt(shares)
 
     @property
     def lag(self) -> float:
@@ -155,6 +159,7 @@ class PrintMotion:
     begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
     waits: whether they were told to wait above the surface,
     aside: and that beside all that is printed, for a look.
+    adapted: the flows that were changed since this was last reset.
     material_in: whether the material that was wanted was put in since this was last reset.
     lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
         tick, so that a replay is equal byte by byte.
@@ -178,6 +183,8 @@ class PrintMotion:
         self._material, self._measured = material, measured
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
         self.waits = self.material_in = self.aside = False
+        self._shares: list[FlowShares] = []
+        self.adapted: FlowShares | None = None
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
         self.paused = self.asked = False
@@ -187,6 +194,7 @@ class PrintMotion:
         self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
     ) -> None:
         """Print this path, surface frame, from now on. start: place on it, in checkpoints. tissue: see `MotionStep`."""
+        self._shares = []
         self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
         self._make(start)
 
@@ -203,6 +211,13 @@ class PrintMotion:
     def look(self) -> None:
         """Step aside in a pause, until what was laid has been looked at, which `put_in` says."""
         self.aside = self.paused
+
+    def adapt(self, shares: FlowShares | None) -> None:
+        """Let other flows leave on some ways, also where the path is begun anew at home; None: as they are."""
+        if self._step is not None and shares is not None:
+            self._shares.append(shares)
+            self._step.adapt(shares)
+            self.adapted = shares
 
     def put_in(self) -> None:
         """The operator has put in the material that was wanted, or the look is done."""
@@ -251,6 +266,8 @@ class PrintMotion:
     def _make(self, start: float) -> None:
         assert self._begin is not None
         self._step = self._begin(start)
+        for shares in self._shares:
+            self._step.adapt(shares)
         self._place.value = self.begun = start
         self.material_in = False
         self._prepare_material()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -44,12 +44,15 @@ from planning.laid_beads import (
     BeadPieces,
     LaidBeads,
     Look,
+    adapted_flow,
     bead_heights,
     judge_beads,
     nearest_station,
     pieces_between,
     stations_of,
+    with_flow,
 )
+from planning.material import FlowShares
 from planning.motion.planner import LOOKS
 from planning.path import LOOK, Path, PrintProgress, way_lengths
 
@@ -70,12 +73,13 @@ SHARE_COLOURS = ((0.6, "#c0392b"), (0.8, "#e67e22"), (1.25, "#27ae60"), (1.6, "#
 class SurfaceLooks:
     """The looks of one print. surface: as it was measured last, None before the first. last: what the last one told."""
 
-    def __init__(self, rig: Rig, path: Path, start: float = 0.0) -> None:
-        """path: in the surface frame of the poses. start: where it begins, in checkpoints.
+    def __init__(self, rig: Rig, path: Path, start: float = 0.0, adapt: bool = False) -> None:
+        """path: in the surface frame of the poses. start: where it begins, in checkpoints. adapt: whether to adapt it.
 
         InputError where the path says no amounts.
         """
         self._lenses, self._path = Lenses(rig), path
+        self._planned, self._adapts = path, adapt
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
         self._gathered = -math.inf  # s, of the last view
@@ -97,6 +101,13 @@ class SurfaceLooks:
             return False
         self.finish(progress.fraction, surface_map.points)
         return True
+
+    def adapted(self) -> FlowShares | None:
+        """The flows of the next layer by the last look, which later looks then expect; None where they stay."""
+        shares = adapted_flow(self._planned, self.last) if self._adapts and self.last is not None else None
+        if shares is not None:
+            self._path = with_flow(self._path, shares)
+        return shares
 
     def gather(self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose) -> bool:
         """Keep the views of a look; whether they are enough by this frame set, which is said once."""
@@ -159,8 +170,11 @@ class LiveLooks:
     The bare surface is measured in views from just before the print begins, when the arm stands at its home.
     """
 
-    def __init__(self, rig: Rig, path: Path, stack: ExitStack) -> None:
-        """path: in its own frame. stack: at whose end what is still judged is left."""
+    def __init__(
+        self, rig: Rig, path: Path, stack: ExitStack, adapt: Callable[[FlowShares], None] | None = None
+    ) -> None:
+        """path: in its own frame. stack: at whose end what is still judged is left. adapt: is told the next flows."""
+        self._adapt = adapt
         self._rig, self._path = rig, path
         self._looks: SurfaceLooks | None = None
         self._bare = deque[SurfaceView](maxlen=VIEWS)
@@ -195,7 +209,10 @@ class LiveLooks:
             return None
         if self._looks is None:
             self.placed = replace(self._path, surface_from_nozzle=lies @ self._path.surface_from_nozzle)
-            self._looks, self._counts = SurfaceLooks(self._rig, self.placed, progress.fraction), False
+            self._looks, self._counts = (
+                SurfaceLooks(self._rig, self.placed, progress.fraction, self._adapt is not None),
+                False,
+            )
             self.busy = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
             self._bare.clear()
         elif self._looks.gather(progress, command, frames, pose):
@@ -213,6 +230,9 @@ class LiveLooks:
         if look is None:
             return None
         self.text = f"looked at: {look.text}"
+        if self._adapt is not None and (shares := self._looks.adapted()) is not None:
+            self._adapt(shares)
+            self.text += f"; {shares.text}"
         return replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
 
 

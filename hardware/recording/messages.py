@@ -245,8 +245,10 @@ def hold_from_message(message: Message) -> Hold:
 
 def message_from_tick(tick: RecordedTick) -> Message:
     """A tick of the motion as a message; its command is written as a message of its own."""
-    aside = {"aside": True} if tick.aside else {}
-    return aside | {
+    more: Message = {"aside": True} if tick.aside else {}
+    if tick.adapted is not None:
+        more |= {"adapted": {"first": tick.adapted.first, "share": tick.adapted.share.tolist()}}
+    return more | {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
         "asked": tick.asked,

@@ -103,6 +103,7 @@ class Scenario:
     nozzle: bool  # whether pictures show it
     beads: bool  # whether pictures show what was printed
     gel: Gel | None  # how it lies; None: it has no height
+    adapt: bool  # whether each layer takes its flow from what a look found under it
     looks: int | None  # beads from one look at what was laid to the next, 0: a layer; None: nobody looks
 
 
@@ -119,7 +120,7 @@ SCENARIO_TABLES = (
     "planted",
     "limits",
 )
-OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "look", "faults", "motion", *SCENARIO_TABLES)
+OPTIONAL_KEYS = ("seed", "clearance_mm", "bead_mm", "look", "adapt", "faults", "motion", *SCENARIO_TABLES)
 MAX_CAMERAS = 8
 WITHOUT_PICTURES = ("truth", "tracks")  # ways of tracking that need no pictures
 PICTURE_SIDES = 64, 4096  # px of a picture
@@ -179,6 +180,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         profile=replace(profile, arm=replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ arm_shift)),
         limits=limits_from_table(path, parts["limits"]),
         gel=_gel(path, parts["gel"]),
+        adapt=_adapt(path, table),
         looks=beads_between_looks(path, "look", table.get("look")),
     )
 
@@ -193,6 +195,13 @@ def _gel(path: Path, table: Table) -> Gel | None:
         sag_time=_within(path, "gel.sag_s", table.get("sag_s", usual.sag_time), 0.01, 1000, "s"),
         gloss=_within(path, "gel.gloss", table.get("gloss", usual.gloss), 0, 1, ""),
     )
+
+
+def _adapt(path: Path, table: Table) -> bool:
+    value = table.get("adapt", False)
+    if not isinstance(value, bool) or (value and "look" not in table):
+        raise InputError(path, "adapt", value, "true or false, and with look")
+    return value
 
 
 def _table(path: Path, table: Table, name: str) -> Table:

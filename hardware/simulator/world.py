@@ -353,15 +353,16 @@ class SimulatedWorld:
         self.motion.begin(placed_path, scenario.profile, 0.0, self.dispensers.outlets)
         self._sink.registered(change)
         if scenario.looks is not None:
-            self._looks = SurfaceLooks(scenario.known_rig, placed_path)
+            self._looks = SurfaceLooks(scenario.known_rig, placed_path, adapt=scenario.adapt)
 
     def _look_at(self, pose: SurfacePose, frames: FrameSet) -> None:
         looks, progress, last = self._looks, self.motion.progress, self.motion.last
         if looks is not None and progress is not None and looks.at(progress, last, frames, pose, self._step):
-            self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks.last))
+            self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks))
 
-    def _looked(self, look: Look | None, now: float) -> None:
-        if look is not None:
+    def _looked(self, looks: SurfaceLooks, now: float) -> None:
+        if (look := looks.last) is not None:
+            self.motion.adapt(looks.adapted())
             look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
             self._sink.look(look)
             self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)

@@ -97,7 +97,7 @@ class Planner:
         self._place = float(np.interp(start, np.arange(len(path)), self._curve.knots))  # mm of it that are printed
         self._material = material_plan(path, self._curve.knots)
         self._rests = RestsAhead(self._material, self._place)
-        self._flow = FlowCommands(self._material, outlets or {}, lag, tick)
+        self.flow = FlowCommands(self._material, outlets or {}, lag, tick)
         self.horizons = 0  # timed so far
         self._finished, self._last_call = False, -np.inf
         self.paused = self.aside = False  # go up and stand there; for a look, beside all that is printed
@@ -116,7 +116,7 @@ class Planner:
             return self._stop(now, HoldReason("no pose yet", RefusalCode.NO_POSE))
         if reason := self._pose_fault(pose, now):
             return self._stop(now, reason)
-        self._flow.lag = self.lag  # which whoever has learned it sets
+        self.flow.lag = self.lag  # which whoever has learned it sets
         if self.lag:  # as the arm, late by the lag, will meet it, under its own stamp
             pose = replace(pose.predict(pose.stamp + self.lag), stamp=pose.stamp)
         if self.paused or self._rests.wanted:
@@ -131,7 +131,7 @@ class Planner:
         """Note that the last move was not sent: the arm is at `axes` (6,), and the segment begins anew."""
         self._follower.rest(axes)
         self._segment = None
-        self._flow.closed()
+        self.flow.closed()
         self._sent.clear()
 
     def material_in(self) -> None:
@@ -139,7 +139,7 @@ class Planner:
         rest = self._rests.next
         if rest is None or not self._rests.wanted:
             return
-        before, after = (self._flow.outlet(self._material.materials[rest.checkpoint - k]) for k in (1, 0))
+        before, after = (self.flow.outlet(self._material.materials[rest.checkpoint - k]) for k in (1, 0))
         if before.offset != after.offset:
             self._place = float(self._curve.knots[rest.checkpoint])
         self._rests.passed()
@@ -270,8 +270,8 @@ class Planner:
                 self._rests.passed()
             entered = -np.inf if self._segment is None else self._segment.timing.end
             begin = max(entered, now + LOOKAHEAD - self._tick)  # within the tick that ends LOOKAHEAD from now
-            self._flow.begun = max(begin, now + self._tick + self._flow.lead_on(self._place))
-            return self._start(pose, PrintPhase.PRINTING, self._curve, self._place, self._flow.begun)
+            self.flow.begun = max(begin, now + self._tick + self.flow.lead_on(self._place))
+            return self._start(pose, PrintPhase.PRINTING, self._curve, self._place, self.flow.begun)
         self._finished = True
         return ""
 
@@ -332,7 +332,7 @@ class Planner:
             before = self._place
             self._place = max(before, float(segment.timing.at(np.array([now + self._tick]))[0]))
             extrude = bool(self._path.extrude[self._checkpoint()]) and self._place > before
-            told = self._flow(segment.timing, before, self._rests.end, now)
+            told = self.flow(segment.timing, before, self._rests.end, now)
         if now >= segment.timing.end and (left := self._rests.left(self._place, now)) > 0:
             reason = f"{RESTS}: {left:.1f} s left"
         return self._move(now, start, axes, extrude, reason, told)
@@ -355,7 +355,7 @@ class Planner:
             if not isinstance(axes, str):
                 return self._move(now, start, axes, extrude=False, reason=reason)
             self._follower.rest()
-        self._flow.closed()
+        self.flow.closed()
         return Hold(now, self._limits.pause, reason)
 
     def _move(
@@ -364,7 +364,7 @@ class Planner:
         """told: to the dispenser; None: off at once."""
         feed = min(feed_for(start, axes, self._tick), self._limits.feed)
         self._sent.append((axes[:3], self._place))
-        return Move(now, axes, feed, self._checkpoint(), extrude, reason, *(told or self._flow.closed()))
+        return Move(now, axes, feed, self._checkpoint(), extrude, reason, *(told or self.flow.closed()))
 
     def _checkpoint(self) -> int:
         """The checkpoint that the place on the path leads to."""
