@@ -255,7 +255,7 @@ MIN_LOOK_SEEN = 0.8  # of the pieces that must be sure: else nothing is done
 FILL_SIGMA, FILL_REACH = (
     0.7,
     2.0,
-)  # mm beside a way, over which what lies under it is averaged, and beyond which none is
+)  # mm beside a way, over which what lies under it is averaged, and up to which
 
 
 def beads_between_looks(where: object, key: str, value: object) -> int | None:

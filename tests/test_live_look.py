@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,11 +12,18 @@ from hardware.files.path_file import write_path
 from hardware.live.prerender import prerender
 from hardware.live.recorded_run import replay_run
 from hardware.offline.looks import read_looks
+from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from tests.live_runs import Running, closed
 from tests.test_live_scan import SCENARIO
 from tests.test_looks import layers
 
 pytestmark = pytest.mark.slow
+
+
+def stored_ticks(record: Path) -> list[dict[str, Any]]:
+    """The ticks of a recording as they stand in it."""
+    chunks = (part for part in walk(record) if isinstance(part, ChunkMessages))
+    return [parse(record, each) for chunk in chunks for each in chunk.messages if each.topic == "/tick"]
 
 
 def test_it_looks_after_each_layer_and_when_somebody_asks_and_goes_on(tmp_path: Path) -> None:
@@ -24,7 +32,7 @@ def test_it_looks_after_each_layer_and_when_somebody_asks_and_goes_on(tmp_path: 
     scenario.write_text(SCENARIO.replace("focal_px = 1100", "focal_px = 1600").replace("15.0", "8.0"))
     prerender(scenario, tmp_path / "stillbed", threads=2)
     record = tmp_path / "run.mcap"
-    given = "--simulated", scenario, "--yes", "--look", "layer", "--record", record, "--no-page"
+    given = "--simulated", scenario, "--yes", "--look", "layer", "--adapt", "--record", record, "--no-page"
     run = Running(*map(str, given), cache=tmp_path)
     try:
         run.wait_for(r"\nprint\n")
@@ -33,7 +41,7 @@ def test_it_looks_after_each_layer_and_when_somebody_asks_and_goes_on(tmp_path: 
         run.press("o")
         run.wait_for(r"\npaused: looked at: ")
         run.press("r")
-        run.wait_for(r"\nprint: looked at: ")
+        run.wait_for(r"\nprint: looked at: .*; the next layer flows at \d+% to 150% of the planned")
         run.wait_for(r"\nthe path is printed")
         run.end()
     finally:
@@ -47,4 +55,6 @@ def test_it_looks_after_each_layer_and_when_somebody_asks_and_goes_on(tmp_path: 
     assert any(look.laid.clogs for look in looks) and max(look.seconds for look in looks) < 6.0
     assert "Looks at what was laid" in record.with_suffix(".report.html").read_text(encoding="utf-8")
     ticks = list(replay_run(record))
+    told = [t for t in stored_ticks(record) if t.get("adapted")]
+    assert len(told) == 1 and told[0]["material_in"] and max(told[0]["adapted"]["share"]) == 1.5
     assert len(ticks) > 500 and all(tick.frame == tick.recorded for tick in ticks)

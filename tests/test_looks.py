@@ -46,12 +46,18 @@ from perception.mapping.surface_heights import (
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.laid_beads import (
+    MAX_FLOW,
+    MIN_FLOW,
     BeadPieces,
     Look,
+    adapted_flow,
     bead_heights,
     judge_beads,
+    pieces_between,
+    with_flow,
     with_looks,
 )
+from planning.material import FlowShares
 from planning.motion.guard import Guard
 from planning.motion.planner import LOOKS, Planner
 from planning.path import LOOK, Path, PrintPhase, PrintProgress
@@ -231,6 +237,98 @@ def test_the_report_says_and_draws_what_was_found() -> None:
     page, picture = looks_section([look], path), look_picture(look, path)
     assert picture.count("<path") == len(look.laid.planned) and "10 to 18 mm" in page and picture in page
     assert "clog" not in some_look(gap=False).text and looks_section([], path) == ""
+
+
+def layered(shares: Array, sigma: float = 0.02, layer: int = 0, told: Array | None = None) -> tuple[Path, Look]:
+    """Three layers of three beads of eight ways each, and a look at one, of whose ways came `shares` (24,).
+
+    told: (24,) shares of the planned that the layer was told to lay.
+    """
+    points, beads = [], []
+    for n in range(3):
+        for k in range(3):
+            x = np.linspace(-8, 8, 9) * (1 if k % 2 == 0 else -1)
+            points += [[a, WIDTH * k, HEIGHT * n] for a in x]
+            beads += [False] + [True] * 8
+    path = path_through(np.array(points, float), 10.0)
+    amounts = {"width_mm": np.full(len(path), WIDTH), "height_mm": np.full(len(path), HEIGHT)}
+    path = replace(path, extrude=np.array(beads), layer=np.arange(len(path)) // 27, extra=amounts)
+    first, last = 27.0 * layer, 27.0 * layer + 26
+    expected = path if told is None else with_flow(path, FlowShares(27 * layer, spread(told)))
+    pieces = pieces_between(expected, first, last)
+    low = np.array([-12.0, -4.0])
+    before = SurfaceHeights(low, 0.2, np.zeros((60, 120)), np.full((60, 120), sigma))
+    planned = pieces_between(path, first, last)
+    came = bead_heights(replace(planned, area=planned.area * shares), before.nodes)
+    laid = judge_beads(before, replace(before, heights=came), pieces)
+    return path, Look(1.0, first, last, 1.0, 1.0, laid)
+
+
+def spread(shares: Array) -> Array:
+    """Shares of the ways that print (24,) on all ways of a layer (27,)."""
+    return np.insert(shares, [0, 8, 16], 1.0)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.floats(0.0, 3.0), min_size=24, max_size=24))
+def test_whatever_lies_there_the_next_layer_flows_within_its_limits(shares: list[float]) -> None:
+    path, look = layered(np.array(shares))
+    told = adapted_flow(path, look)
+    assert told is not None and told.first >= 27 and told.first + len(told.share) <= 54
+    assert told.share.min() >= MIN_FLOW and told.share.max() <= MAX_FLOW
+
+
+def test_a_gap_is_filled_by_the_next_layer_over_it_and_not_beside_it_and_once() -> None:
+    shares = np.ones(24)
+    shares[10:13] = 0.0  # of the middle bead
+    path, look = layered(shares)
+    told = adapted_flow(path, look)
+    assert told is not None
+    whole = np.ones(27)
+    whole[told.first - 27 :][: len(told.share)] = told.share
+    ways = np.delete(whole, [0, 9, 18])
+    assert ways[11] == MAX_FLOW and ways[[8, 15, 0, 3, 4, 7, 19, 20]] == pytest.approx(1.0, abs=0.1)
+    assert adapted_flow(*layered(ways, layer=1, told=ways)) is not None
+    again = adapted_flow(*layered(ways, layer=1, told=ways))
+    assert again is not None and again.share.max() <= 1.0  # what was filled is no gap,
+    failed = adapted_flow(*layered(np.where(ways > 1.2, 0.0, 1.0), layer=1, told=ways))
+    assert failed is not None and failed.share.max() <= MAX_FLOW  # and what was not filled is not asked for twice
+    fresh = adapted_flow(*layered(np.where(ways > 1.2, 0.0, 1.0), layer=1))
+    assert fresh is not None and failed.share == pytest.approx(fresh.share, abs=0.02)
+
+
+def test_nothing_is_done_after_an_uncertain_look_in_a_layer_or_after_the_last_one_or_for_noise() -> None:
+    shares = np.ones(24)
+    shares[10:13] = 0.0
+    path, look = layered(shares)
+    unsure = replace(look, laid=replace(look.laid, sigma=look.laid.planned * 0.3))
+    unseen = replace(look, laid=replace(look.laid, volume=np.where(look.laid.stations.bead == 0, np.nan, 0.5)))
+    assert adapted_flow(path, unsure) is None and adapted_flow(path, unseen) is None
+    assert adapted_flow(path, replace(look, last=20.0)) is None
+    assert adapted_flow(*layered(shares, layer=2)) is None
+    told = adapted_flow(*layered(np.full(24, 0.93)))
+    assert told is not None and (told.share == 1.0).all()
+
+
+def test_the_dispenser_is_told_the_flow_of_the_adapted_layer_and_a_replay_the_same() -> None:
+    path = with_looks(layers(2, 1))
+    flows: dict[float, list[float]] = {}
+    for share in (1.0, 1.4):
+        step = MotionStep(path, replace(ArmProfile(), limits=LIMITS, arm=CLOSE, tick=TICK))
+        flows[share] = []
+        for k in range(4000):
+            now = START + k * TICK
+            command = step(pose_at(still, now), now)
+            if isinstance(command, Move) and command.flow:
+                flows[share].append(command.flow if command.checkpoint > 1 else -command.flow)
+            elif isinstance(command, Hold) and command.reason == LOOKS:
+                step.adapt(FlowShares(2, np.array([1.0, share])))
+                step.material_in()
+            if step.progress.phase is PrintPhase.FINISHED:
+                break
+    plain, adapted = (np.array(flows[share]) for share in (1.0, 1.4))
+    assert len(plain) == len(adapted) > 20 and (plain[plain < 0] == adapted[adapted < 0]).all()
+    assert adapted[adapted > 0] == pytest.approx(1.4 * plain[plain > 0])
 
 
 def test_a_live_run_gathers_judges_beside_the_tracking_and_says_so_once() -> None:

@@ -167,11 +167,9 @@ class _TickReporter:
             motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
             reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
             inputs = stamp, asked, begun, motion.waits, motion.material_in
-            motion.material_in, lag = False, motion.lag if asked else math.nan
-            self._sender.put(
-                RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag, motion.aside, motion.adapted)
-            )
-            motion.adapted = None
+            told = motion.lag if asked else math.nan, motion.aside, motion.adapted
+            motion.material_in, motion.adapted = False, None
+            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, *told))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)

@@ -273,14 +273,13 @@ class _TrackingLoop:
         """Look at what was laid where the nozzle stands aside for it."""
         if self._looks is None:
             return
-        motion, surface_map, lies = self._channels.motion.get(), self._step.map, self._channels.placed.get()
+        motion, surface_map = self._channels.motion.get(), self._step.map
         progress, command = (None, None) if motion is None else (motion.progress, motion.tick.command)
         landmarks = None if surface_map is None else surface_map.points
-        look = self._looks(progress, command, frames, pose, landmarks, lies)
+        look = self._looks(progress, command, frames, pose, landmarks, self._channels.placed.get())
         if look is not None and self._looks.placed is not None:
             self._sender.put(look)
-            ends = station_places(look, self._looks.placed, 2)
-            self._channels.link.laid.put(LaidDrawing(ends, look.laid.share))
+            self._channels.link.laid.put(LaidDrawing(station_places(look, self._looks.placed, 2), look.laid.share))
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""
