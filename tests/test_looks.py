@@ -294,7 +294,7 @@ def test_a_gap_is_filled_by_the_next_layer_over_it_and_not_beside_it_and_once() 
     failed = adapted_flow(*layered(np.where(ways > 1.2, 0.0, 1.0), layer=1, told=ways))
     assert failed is not None and failed.share.max() <= MAX_FLOW  # and what was not filled is not asked for twice
     fresh = adapted_flow(*layered(np.where(ways > 1.2, 0.0, 1.0), layer=1))
-    assert fresh is not None and failed.share == pytest.approx(fresh.share, abs=0.02)
+    assert fresh is not None and failed.share == pytest.approx(fresh.share, abs=0.05)
 
 
 def test_nothing_is_done_after_an_uncertain_look_in_a_layer_or_after_the_last_one_or_for_noise() -> None:
