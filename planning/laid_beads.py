@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from estimation.errors import InputError
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceHeights
-from planning.material import FlowShares, bead_areas, is_metered
+from planning.material import AS_PLANNED, FlowShares, bead_areas, is_metered
 from planning.path import MIN_SPACING, Path, way_lengths
 
 STATION_LENGTH = 1.25  # mm of bead judged as one: a quarter of the shortest clog that must be found, to see its ends
@@ -52,28 +52,46 @@ class BeadPieces:
         return len(self.area)
 
 
-def pieces_between(path: Path, first: float, last: float, where: object = "path") -> BeadPieces:
+def pieces_between(
+    path: Path, first: float, last: float, where: object = "path", told: FlowShares = AS_PLANNED
+) -> BeadPieces:
     """The beads that a path lays from `first` to `last`, in checkpoints, between which both may lie.
 
+    told: shares of the planned that it is told to lay; with more a bead gets higher and wider, in the same form.
     InputError for a path that does not say how much material it needs.
     """
     if not is_metered(path):
         raise InputError(where, "look", "a path without amounts", "columns width_mm and height_mm, or volume_mm3")
     ways = np.arange(max(int(np.floor(first)), 0) + 1, min(int(np.ceil(last)), len(path) - 1) + 1)
     poses = path.surface_from_nozzle
-    knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
+    knots = _knots(path)
     begins = path.extrude & ~np.concatenate([[False], path.extrude[:-1]])
     bead = np.cumsum(begins) - 1
     begun, done = np.clip(first - ways + 1, 0.0, 1.0), np.clip(last - ways + 1, 0.0, 1.0)  # shares of each way
+    share = np.ones(len(ways))
+    if told is not AS_PLANNED:
+        ways, begun, done, share = _cut_ways(ways, begun, done, told)
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[ways - 1] * (done - begun) > MIN_SPACING
-    ways, begun, done = (column[path.extrude[ways] & moved] for column in (ways, begun, done))
+    ways, begun, done, share = (column[path.extrude[ways] & moved] for column in (ways, begun, done, share))
     area = bead_areas(path, where)[ways]
     width = np.sqrt(2.5 * area)  # of a bead 0.4 as high as it is wide
     if "width_mm" in path.extra:
         width = path.extra["width_mm"][ways].astype(float)
+    area, width = area * share, width * np.sqrt(share)
     way, whole = poses[ways, :3, 3] - poses[ways - 1, :3, 3], knots[ways] - knots[ways - 1]
     start, end = (poses[ways - 1, :3, 3] + share[:, None] * way for share in (begun, done))
     return BeadPieces(start, end, area, width, bead[ways], path.layer[ways], knots[ways - 1] + begun * whole)
+
+
+def _cut_ways(ways: Index, begun: Array, done: Array, told: FlowShares) -> tuple[Index, Array, Array, Array]:
+    """Ways (P,), from their `begun` to their `done`, cut where the flow changes, and the share that each is told."""
+    low, high = ways - 1 + begun, ways - 1 + done
+    edges = np.unique(np.concatenate([low, high, told.begin, told.end]))
+    middle = (edges[1:] + edges[:-1]) / 2
+    own = np.searchsorted(low, middle, "right") - 1
+    inside = (own >= 0) & (middle < high[np.maximum(own, 0)])
+    ways = ways[own[inside]]
+    return ways, edges[:-1][inside] - ways + 1, edges[1:][inside] - ways + 1, told.at(middle[inside])
 
 
 def bead_heights(pieces: BeadPieces, nodes: Array) -> Array:
@@ -252,10 +270,9 @@ MIN_FLOW, MAX_FLOW = 0.7, 1.5  # of the planned, in an adapted layer: beads neit
 MIN_LACK = 0.1  # share of the planned that pieces lack, below which nothing is done: they are told to 0.05-0.08
 MAX_UNSURE = 0.25  # sigma by the planned of a piece, beyond which it counts for nothing
 MIN_LOOK_SEEN = 0.8  # of the pieces that must be sure: else nothing is done
-FILL_SIGMA, FILL_REACH = (
-    0.7,
-    2.0,
-)  # mm beside a way, over which what lies under it is averaged, and up to which
+FILL_SIGMA = 0.7  # mm beside a place, over which what lies under it is averaged,
+FILL_REACH = 2.0  # mm, and beyond which nothing is known of it
+SHARE_SAMPLES = np.linspace(0.05, 0.95, 10)  # of a piece, at which what it was told is averaged
 
 
 def beads_between_looks(where: object, key: str, value: object) -> int | None:
@@ -321,43 +338,56 @@ class Look:
         return ", ".join(parts)
 
 
-def adapted_flow(path: Path, look: Look) -> FlowShares | None:
-    """The flows of the next layer by what lies under it; None after an uncertain look, or where no new layer follows.
+def adapted_flow(path: Path, looks: Sequence[Look], told: FlowShares = AS_PLANNED) -> FlowShares | None:
+    """The flows of the next layer by what lies under it; None after uncertain looks, or where no new layer follows.
 
-    Each way of it gets what the nearest pieces lack, or less where they have too much; MIN_FLOW to MAX_FLOW of what was
-    planned. What a layer lacks is measured by what `path`, as it was planned, says of it, and not by what it was told
-    to fill: so a gap is filled once.
+    looks: at one layer, the last one at its end. told: what it was told to lay, of which less than the planned is no
+    lack, and more no surplus: so a gap is filled once, by the next layer, as far as the limits of its flow allow.
+    Each piece of the next layer gets what the nearest pieces lack, or less where they have too much: MIN_FLOW to
+    MAX_FLOW of what was planned.
     """
-    laid, stations = look.laid, look.laid.stations
-    with np.errstate(invalid="ignore"):
-        sure = np.isfinite(laid.volume) & (laid.sigma < MAX_UNSURE * laid.planned)
-    last = min(int(np.ceil(look.last)), len(path) - 1)
-    later = np.arange(last + 1, len(path))
+    place, knots = looks[-1].last, _knots(path)
+    later = np.arange(min(int(np.ceil(place)), len(path) - 1) + 1, len(path))
     later = later[path.extrude[later]]
-    if not len(later) or not len(sure) or sure.mean() < MIN_LOOK_SEEN or path.layer[later[0]] == stations.layer[-1]:
+    if not len(later) or path.layer[later[0]] == looks[-1].laid.stations.layer[-1:]:
         return None
-    planned = stations_of(pieces_between(path, look.first, look.last)).crest
-    lacks = (1 - laid.share * stations.crest * look.width / planned)[sure]
-    lacks = np.where(np.abs(lacks) < MIN_LACK, 0.0, lacks)
-    poses = path.surface_from_nozzle
-    knots = np.concatenate([[0.0], np.cumsum(way_lengths(poses))])
-    middle = (stations.begin + stations.end)[sure] / 2
-    under = np.column_stack([np.interp(middle, knots, poses[:, k, 3]) for k in (0, 1)])
-    ways = np.arange(later[0], later[path.layer[later] == path.layer[later[0]]][-1] + 1)
-    over = (poses[ways - 1, :2, 3] + poses[ways, :2, 3]) / 2
-    away = np.linalg.norm(over[:, None] - under, axis=2)
+    under = [_lacks(path, knots, look, told) for look in looks]
+    points, lacks, sure = (np.concatenate(part) for part in zip(*under, strict=True))
+    if not len(sure) or sure.mean() < MIN_LOOK_SEEN:
+        return None
+    other = np.flatnonzero(path.layer[later] != path.layer[later[0]])
+    pieces = pieces_between(path, later[0] - 1, later[other[0] - 1] if len(other) else later[-1])
+    stations = stations_of(pieces)
+    away = np.linalg.norm(_at(path, knots, (stations.begin + stations.end) / 2)[:, None] - points[sure], axis=2)
     weight = np.exp(-((away / FILL_SIGMA) ** 2) / 2)
-    share = 1 + (weight * lacks).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
-    near = away.min(axis=1) < FILL_REACH
-    return FlowShares(int(ways[0]), np.where(near, np.clip(share, MIN_FLOW, MAX_FLOW), 1.0))
+    lack = (weight * lacks[sure]).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
+    share = np.where(away.min(axis=1) < FILL_REACH, 1 + lack / stations.crest, 1.0)
+    begin, end = (np.interp(edge, knots, np.arange(len(path))) for edge in (stations.begin, stations.end))
+    return FlowShares(begin, end, np.clip(share, MIN_FLOW, MAX_FLOW))
 
 
-def with_flow(path: Path, shares: FlowShares) -> Path:
-    """The path with the amounts that it is told to lay."""
-    volume, ways = bead_areas(path), slice(shares.first, shares.first + len(shares.share))
-    volume[1:] *= np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
-    volume[ways] *= shares.share
-    return replace(path, extra={**path.extra, "volume_mm3": volume})
+def _lacks(path: Path, knots: Array, look: Look, told: FlowShares) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Middles (S, 2) mm of the pieces of a look, how much lower than planned their crests are, mm, and who is sure."""
+    laid = look.laid
+    stations = stations_of(pieces_between(path, look.first, look.last))  # as they were planned
+    samples = stations.begin[:, None] + (stations.end - stations.begin)[:, None] * SHARE_SAMPLES
+    due = told.at(np.interp(samples, knots, np.arange(len(path)))).mean(axis=1)
+    share = laid.share * due  # of the planned
+    with np.errstate(invalid="ignore"):
+        sure = np.isfinite(share) & (laid.sigma < MAX_UNSURE * laid.planned)
+    lack = np.maximum(np.minimum(due, 1.0) - share, 0.0) - np.maximum(share - np.maximum(due, 1.0), 0.0)
+    lack = np.where(np.abs(lack) < MIN_LACK, 0.0, lack)
+    return _at(path, knots, (stations.begin + stations.end) / 2), lack * stations.crest, sure
+
+
+def _knots(path: Path) -> Array:
+    """Places (N,) mm of the checkpoints along the path."""
+    return np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
+
+
+def _at(path: Path, knots: Array, place: Array) -> Array:
+    """x and y (M, 2) mm at places (M,) mm along a path."""
+    return np.column_stack([np.interp(place, knots, path.surface_from_nozzle[:, k, 3]) for k in (0, 1)])
 
 
 def clogged(looks: Sequence[Look]) -> list[tuple[float, float]]:

@@ -74,15 +74,31 @@ class Rest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlowShares:
-    """By how much the flow on some ways of a path differs from the planned."""
+    """By how much the flow on M stretches of a path differs from the planned; elsewhere it does not."""
 
-    first: int  # checkpoint to which the first of the ways leads
-    share: Array  # (M,) of the planned flow on the ways to it and those after it
+    begin: Array  # (M,) checkpoints, rising: where a stretch begins,
+    end: Array  # (M,) and ends, before the next one begins
+    share: Array  # (M,) of the planned flow
+
+    def at(self, place: Array) -> Array:
+        """Shares (N,) at places (N,), in checkpoints."""
+        stretch = np.maximum(np.searchsorted(self.begin, place, "right") - 1, 0)
+        inside = (place >= self.begin[stretch]) & (place < self.end[stretch])
+        return np.asarray(np.where(inside, self.share[stretch], 1.0))
+
+    def then(self, later: FlowShares) -> FlowShares:
+        """These, and those of what is printed later; where both say something, the later ones count."""
+        keep = self.end <= later.begin[0]
+        own, other = (self.begin, self.end, self.share), (later.begin, later.end, later.share)
+        return FlowShares(*(np.concatenate([a[keep], b]) for a, b in zip(own, other, strict=True)))
 
     @property
     def text(self) -> str:
         """In words."""
         return f"the next layer flows at {self.share.min():.0%} to {self.share.max():.0%} of the planned"
+
+
+AS_PLANNED = FlowShares(np.zeros(1), np.zeros(1), np.ones(1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,16 +258,14 @@ class FlowCommands:
     def __init__(self, plan: MaterialPlan, outlets: Outlets, lag: float, tick: float) -> None:
         """lag: s from one tick after a command until the arm is at its axes. tick: s between calls."""
         self._plan, self._outlets, self.lag = plan, outlets, lag
-        self._planned = plan.area
+        self._shares = AS_PLANNED
         self._steps = np.arange(0.0, tick - SWITCH_STEP / 2, SWITCH_STEP)
         self._flow = 0.0  # mm^3/s last told
         self.begun = math.inf
 
     def adapt(self, shares: FlowShares) -> None:
-        """Let other flows leave on some ways: shares of what was planned there, whatever was asked before."""
-        area, ways = self._plan.area.copy(), slice(shares.first, shares.first + len(shares.share))
-        area[ways] = self._planned[ways] * shares.share
-        self._plan = replace(self._plan, area=area)
+        """Let other flows leave on some stretches: shares of what was planned there, whatever was asked before."""
+        self._shares = self._shares.then(shares)
 
     def outlet(self, material: str) -> Outlet:
         """The outlet of a material."""
@@ -282,8 +296,16 @@ class FlowCommands:
             self._flow = 0.0
         else:
             speed = max(timing.speed_at(float(times[at]) + on), MIN_FLOW_SPEED)
-            self._flow = self._plan.area_at(float(led_on[at])) * speed
+            self._flow = self._plan.area_at(float(led_on[at])) * speed * self._share_at(float(led_on[at]))
         return self._flow, float(self._steps[at])
+
+    def _share_at(self, place: float) -> float:
+        if self._shares is AS_PLANNED:
+            return 1.0
+        knots = self._plan.knots
+        way = min(max(int(np.searchsorted(knots, place, "right")), 1), len(knots) - 1)
+        share = (place - knots[way - 1]) / max(knots[way] - knots[way - 1], ROUNDING)
+        return float(self._shares.at(np.array([way - 1 + share]))[0])
 
 
 def with_offsets(path: Path, outlets: Outlets) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import wait
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path as File
 
 import cv2
@@ -49,15 +49,16 @@ from planning.laid_beads import (
     MAX_FLOW,
     MIN_FLOW,
     BeadPieces,
+    LaidBeads,
     Look,
+    Stations,
     adapted_flow,
     bead_heights,
     judge_beads,
     pieces_between,
-    with_flow,
     with_looks,
 )
-from planning.material import FlowShares
+from planning.material import AS_PLANNED, FlowShares
 from planning.motion.guard import Guard
 from planning.motion.planner import LOOKS, Planner
 from planning.path import LOOK, Path, PrintPhase, PrintProgress
@@ -239,75 +240,113 @@ def test_the_report_says_and_draws_what_was_found() -> None:
     assert "clog" not in some_look(gap=False).text and looks_section([], path) == ""
 
 
-def layered(shares: Array, sigma: float = 0.02, layer: int = 0, told: Array | None = None) -> tuple[Path, Look]:
-    """Three layers of three beads of eight ways each, and a look at one, of whose ways came `shares` (24,).
+def layered(came: Array, sigma: float = 0.02, layer: int = 0, told: FlowShares = AS_PLANNED) -> tuple[Path, Look]:
+    """Three layers of three beads of 16 mm, and a look at one, of whose pieces of 2 mm came shares (24,).
 
-    told: (24,) shares of the planned that the layer was told to lay.
+    told: what the layer was told to lay.
     """
-    points, beads = [], []
-    for n in range(3):
-        for k in range(3):
-            x = np.linspace(-8, 8, 9) * (1 if k % 2 == 0 else -1)
-            points += [[a, WIDTH * k, HEIGHT * n] for a in x]
-            beads += [False] + [True] * 8
-    path = path_through(np.array(points, float), 10.0)
+    ends = np.array([[x, WIDTH * k, HEIGHT * n] for n in range(3) for k in range(3) for x in ((-8, 8), (8, -8))[k % 2]])
+    path = path_through(ends.astype(float), 10.0)
     amounts = {"width_mm": np.full(len(path), WIDTH), "height_mm": np.full(len(path), HEIGHT)}
-    path = replace(path, extrude=np.array(beads), layer=np.arange(len(path)) // 27, extra=amounts)
-    first, last = 27.0 * layer, 27.0 * layer + 26
-    expected = path if told is None else with_flow(path, FlowShares(27 * layer, spread(told)))
-    pieces = pieces_between(expected, first, last)
-    low = np.array([-12.0, -4.0])
-    before = SurfaceHeights(low, 0.2, np.zeros((60, 120)), np.full((60, 120), sigma))
-    planned = pieces_between(path, first, last)
-    came = bead_heights(replace(planned, area=planned.area * shares), before.nodes)
-    laid = judge_beads(before, replace(before, heights=came), pieces)
-    return path, Look(1.0, first, last, 1.0, 1.0, laid)
+    path = replace(path, extrude=np.arange(len(path)) % 2 == 1, layer=np.arange(len(path)) // 6, extra=amounts)
+    first, last = 6.0 * layer, 6.0 * layer + 5
+    before = SurfaceHeights(np.array([-12.0, -4.0]), 0.2, np.zeros((60, 120)), np.full((60, 120), sigma))
+    laid = bead_heights(pieces_between(path, first, last, told=as_flow(came, layer)), before.nodes)
+    pieces = pieces_between(path, first, last, told=told)
+    return path, Look(1.0, first, last, 1.0, 1.0, judge_beads(before, replace(before, heights=laid), pieces))
 
 
-def spread(shares: Array) -> Array:
-    """Shares of the ways that print (24,) on all ways of a layer (27,)."""
-    return np.insert(shares, [0, 8, 16], 1.0)
+def as_flow(shares: Array, layer: int) -> FlowShares:
+    """Shares (24,) of a layer's pieces of 2 mm, as it is told them."""
+    edges = np.linspace(0.0, 1.0, 9)
+    begin, end = (np.concatenate([6 * layer + 2 * k + edge for k in range(3)]) for edge in (edges[:-1], edges[1:]))
+    return FlowShares(begin, end, np.maximum(shares, 1e-6))
+
+
+def flow_on(told: FlowShares | None, layer: int) -> Array:
+    """What a layer's pieces of 2 mm (24,) are told, of the planned."""
+    assert told is not None
+    pieces = as_flow(np.ones(24), layer)
+    at = pieces.begin[:, None] + (pieces.end - pieces.begin)[:, None] * np.linspace(0.05, 0.95, 10)
+    return np.asarray(told.at(at).mean(axis=1))
 
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(0.0, 3.0), min_size=24, max_size=24))
 def test_whatever_lies_there_the_next_layer_flows_within_its_limits(shares: list[float]) -> None:
     path, look = layered(np.array(shares))
-    told = adapted_flow(path, look)
-    assert told is not None and told.first >= 27 and told.first + len(told.share) <= 54
+    told = adapted_flow(path, [look])
+    assert told is not None and told.begin.min() >= 6 and told.end.max() <= 11
     assert told.share.min() >= MIN_FLOW and told.share.max() <= MAX_FLOW
 
 
+GAP = np.where(np.isin(np.arange(24), (10, 11, 12)), 0.0, 1.0)  # of the middle bead
+
+
 def test_a_gap_is_filled_by_the_next_layer_over_it_and_not_beside_it_and_once() -> None:
-    shares = np.ones(24)
-    shares[10:13] = 0.0  # of the middle bead
-    path, look = layered(shares)
-    told = adapted_flow(path, look)
+    told = adapted_flow(*wrapped(layered(GAP)))
     assert told is not None
-    whole = np.ones(27)
-    whole[told.first - 27 :][: len(told.share)] = told.share
-    ways = np.delete(whole, [0, 9, 18])
-    assert ways[11] == MAX_FLOW and ways[[8, 15, 0, 3, 4, 7, 19, 20]] == pytest.approx(1.0, abs=0.1)
-    assert adapted_flow(*layered(ways, layer=1, told=ways)) is not None
-    again = adapted_flow(*layered(ways, layer=1, told=ways))
-    assert again is not None and again.share.max() <= 1.0  # what was filled is no gap,
-    failed = adapted_flow(*layered(np.where(ways > 1.2, 0.0, 1.0), layer=1, told=ways))
-    assert failed is not None and failed.share.max() <= MAX_FLOW  # and what was not filled is not asked for twice
-    fresh = adapted_flow(*layered(np.where(ways > 1.2, 0.0, 1.0), layer=1))
-    assert fresh is not None and failed.share == pytest.approx(fresh.share, abs=0.05)
+    ways = flow_on(told, 1)
+    assert ways[[10, 11, 12]] == pytest.approx(MAX_FLOW, abs=0.1)
+    assert ways[[8, 15, 0, 3, 4, 7, 19, 20]] == pytest.approx(1.0, abs=0.1)
+    again = adapted_flow(*wrapped(layered(ways, layer=1, told=told)), told)
+    assert flow_on(again, 2) == pytest.approx(1.0)  # what was filled is no gap, and no blob,
+    missing = np.where(ways > 1.2, 0.0, 1.0)
+    failed = adapted_flow(*wrapped(layered(missing, layer=1, told=told)), told)
+    fresh = adapted_flow(*wrapped(layered(missing, layer=1)))
+    assert flow_on(failed, 2) == pytest.approx(flow_on(fresh, 2), abs=0.05)  # and what failed is not asked for twice
+
+
+def wrapped(looked: tuple[Path, Look]) -> tuple[Path, list[Look]]:
+    """A path, and the only look at a layer of it."""
+    return looked[0], [looked[1]]
+
+
+def test_no_clog_is_told_over_a_filled_gap_and_one_in_it_is() -> None:
+    told = adapted_flow(*wrapped(layered(GAP)))
+    assert told is not None
+    assert layered(GAP)[1].laid.clogs
+    filled = layered(flow_on(told, 1), layer=1, told=told)[1].laid
+    assert not filled.clogs and not filled.gap.any() and not filled.blob.any()
+    as_planned = layered(np.ones(24), layer=1, told=told)[1].laid  # a device that did not give what it was told
+    assert len(as_planned.clogs) == 1
+
+
+def test_looks_at_parts_of_a_layer_count_together_at_its_end() -> None:
+    path, look = layered(GAP)
+    parts = []
+    for first, last in ((0.0, 3.0), (3.0, 5.0)):
+        keep = (look.laid.stations.bead <= 1) == (last == 3.0)
+        columns = {f.name: getattr(look.laid, f.name)[keep] for f in fields(look.laid) if f.name != "stations"}
+        each = Stations(*(getattr(look.laid.stations, f.name)[keep] for f in fields(Stations)))
+        parts.append(replace(look, first=first, last=last, laid=LaidBeads(each, **columns)))
+    assert adapted_flow(path, parts[:1]) is None
+    whole, apart = adapted_flow(path, [look]), adapted_flow(path, parts)
+    assert flow_on(apart, 1) == pytest.approx(flow_on(whole, 1))
 
 
 def test_nothing_is_done_after_an_uncertain_look_in_a_layer_or_after_the_last_one_or_for_noise() -> None:
-    shares = np.ones(24)
-    shares[10:13] = 0.0
-    path, look = layered(shares)
+    path, look = layered(GAP)
     unsure = replace(look, laid=replace(look.laid, sigma=look.laid.planned * 0.3))
     unseen = replace(look, laid=replace(look.laid, volume=np.where(look.laid.stations.bead == 0, np.nan, 0.5)))
-    assert adapted_flow(path, unsure) is None and adapted_flow(path, unseen) is None
-    assert adapted_flow(path, replace(look, last=20.0)) is None
-    assert adapted_flow(*layered(shares, layer=2)) is None
-    told = adapted_flow(*layered(np.full(24, 0.93)))
+    assert adapted_flow(path, [unsure]) is None and adapted_flow(path, [unseen]) is None
+    assert adapted_flow(path, [replace(look, last=3.0)]) is None
+    assert adapted_flow(*wrapped(layered(GAP, layer=2))) is None
+    told = adapted_flow(*wrapped(layered(np.full(24, 0.93))))
     assert told is not None and (told.share == 1.0).all()
+
+
+@given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=6), st.floats(0.0, 5.0))
+def test_a_path_told_other_flows_lays_them(shares: list[float], first: float) -> None:
+    path, edges = layered(np.ones(24))[0], np.linspace(0.3, 4.7, len(shares) + 1)
+    told = FlowShares(edges[:-1], edges[1:], np.array(shares))
+    pieces = pieces_between(path, first, 5.0, told=told)
+    volume = (np.linalg.norm(pieces.end - pieces.start, axis=1) * pieces.area).sum()
+    fine = np.linspace(first, 5.0, 20001)
+    middle = (fine[1:] + fine[:-1]) / 2
+    beads = np.ceil(middle).astype(int) % 2 == 1
+    needed = (16.0 * WIDTH * HEIGHT * np.diff(fine) * told.at(middle) * beads).sum()
+    assert volume == pytest.approx(needed, rel=2e-3, abs=0.02)
 
 
 def test_the_dispenser_is_told_the_flow_of_the_adapted_layer_and_a_replay_the_same() -> None:
@@ -322,7 +361,7 @@ def test_the_dispenser_is_told_the_flow_of_the_adapted_layer_and_a_replay_the_sa
             if isinstance(command, Move) and command.flow:
                 flows[share].append(command.flow if command.checkpoint > 1 else -command.flow)
             elif isinstance(command, Hold) and command.reason == LOOKS:
-                step.adapt(FlowShares(2, np.array([1.0, share])))
+                step.adapt(FlowShares(np.array([1.5]), np.array([3.0]), np.array([share])))
                 step.material_in()
             if step.progress.phase is PrintPhase.FINISHED:
                 break

@@ -28,6 +28,7 @@ from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, da
 from hardware.recording.messages import (
     Message,
     bytes_from_message,
+    flow_from_message,
     move_from_message,
     pose_from_message,
     row_from_message,
@@ -110,7 +111,7 @@ def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Itera
             for each in shares:
                 step.adapt(each)
         if step is not None and (adapted := tick.get("adapted")):
-            shares.append(FlowShares(int(adapted["first"]), np.array(adapted["share"], float)))
+            shares.append(flow_from_message(adapted))
             step.adapt(shares[-1])
         if step is not None and tick.get("lag"):
             step.lag = float(tick["lag"][0])
@@ -209,6 +210,8 @@ def nozzle_errors(
     commands = _commands(run)
     for command, progress in commands:
         truth_log.write(command, progress)
+    for tick in run.messages["/tick"]:
+        truth_log.adapt(flow_from_message(tick["adapted"]) if tick.get("adapted") else None)
     with np.load(RunFiles(record).executed) as executed:
         stamps, axes = executed["stamps"], executed["axes"]
         deepest, held_up = float(executed["deepest"]), float(executed["held_up"])

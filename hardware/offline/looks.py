@@ -50,9 +50,8 @@ from planning.laid_beads import (
     nearest_station,
     pieces_between,
     stations_of,
-    with_flow,
 )
-from planning.material import FlowShares
+from planning.material import AS_PLANNED, FlowShares
 from planning.motion.planner import LOOKS
 from planning.path import LOOK, Path, PrintProgress, way_lengths
 
@@ -79,7 +78,8 @@ class SurfaceLooks:
         InputError where the path says no amounts.
         """
         self._lenses, self._path = Lenses(rig), path
-        self._planned, self._adapts = path, adapt
+        self._adapts, self._told = adapt, AS_PLANNED
+        self._layer: list[Look] = []  # those at the layer that is laid
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
         self._gathered = -math.inf  # s, of the last view
@@ -104,9 +104,13 @@ class SurfaceLooks:
 
     def adapted(self) -> FlowShares | None:
         """The flows of the next layer by the last look, which later looks then expect; None where they stay."""
-        shares = adapted_flow(self._planned, self.last) if self._adapts and self.last is not None else None
+        if not self._adapts or self.last is None:
+            return None
+        layer = self.last.laid.stations.layer[-1:]
+        self._layer = [each for each in self._layer if each.laid.stations.layer[-1:] == layer] + [self.last]
+        shares = adapted_flow(self._path, self._layer, self._told)
         if shares is not None:
-            self._path = with_flow(self._path, shares)
+            self._told, self._layer = self._told.then(shares), []
         return shares
 
     def gather(self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose) -> bool:
@@ -155,7 +159,7 @@ class SurfaceLooks:
         """What lies there of the path up to `fraction` checkpoints."""
         assert self.surface is not None
         views, self._views = self._views, []
-        pieces = pieces_between(self._path, self._from, fraction)
+        pieces = pieces_between(self._path, self._from, fraction, told=self._told)
         laid, self.surface, width = look_at(self._lenses, views, self.surface, pieces, self._widths)
         self._widths = (width,)  # a property of the gel, seen best on the bare surface
         first, self._from = self._from, fraction
@@ -209,10 +213,8 @@ class LiveLooks:
             return None
         if self._looks is None:
             self.placed = replace(self._path, surface_from_nozzle=lies @ self._path.surface_from_nozzle)
-            self._looks, self._counts = (
-                SurfaceLooks(self._rig, self.placed, progress.fraction, self._adapt is not None),
-                False,
-            )
+            self._looks = SurfaceLooks(self._rig, self.placed, progress.fraction, self._adapt is not None)
+            self._counts = False
             self.busy = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
             self._bare.clear()
         elif self._looks.gather(progress, command, frames, pose):

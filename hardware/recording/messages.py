@@ -21,6 +21,7 @@ from hardware.motion.loop import DispenserRecord, RecordedTick
 from perception.frames import OutlinedPicture, Roi
 from planning.command import Hold, Move
 from planning.laid_beads import LaidBeads, Look, Stations
+from planning.material import FlowShares
 
 Message = dict[str, Any]
 
@@ -243,11 +244,14 @@ def hold_from_message(message: Message) -> Hold:
     return Hold(message["stamp"], message["duration"], message["reason"])
 
 
+ADAPTED_KEYS = "begin", "end", "share"  # of FlowShares
+
+
 def message_from_tick(tick: RecordedTick) -> Message:
     """A tick of the motion as a message; its command is written as a message of its own."""
     more: Message = {"aside": True} if tick.aside else {}
     if tick.adapted is not None:
-        more |= {"adapted": {"first": tick.adapted.first, "share": tick.adapted.share.tolist()}}
+        more |= {"adapted": {key: getattr(tick.adapted, key).tolist() for key in ADAPTED_KEYS}}
     return more | {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
@@ -261,6 +265,11 @@ def message_from_tick(tick: RecordedTick) -> Message:
         "phase": tick.phase.value,
         "frame": base64.b64encode(tick.frame).decode("ascii"),
     }
+
+
+def flow_from_message(message: Message) -> FlowShares:
+    """The flows that were changed before a tick, from its message."""
+    return FlowShares(*(np.array(message[key], float) for key in ADAPTED_KEYS))
 
 
 def message_from_dispenser(record: DispenserRecord) -> Message:

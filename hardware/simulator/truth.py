@@ -23,6 +23,7 @@ from hardware.simulator.deposit import NozzleLog, planned_line
 from hardware.simulator.scene.shape import Deformation, Shape
 from planning.command import Command, Move
 from planning.kinematics import SimpleArm, nozzle_from_axes
+from planning.material import AS_PLANNED, FlowShares
 from planning.path import Path, PrintPhase, PrintProgress
 
 GRADIENT_STEP = 0.01  # mm over which the deformation's gradient is taken: it is smooth over centimetres
@@ -178,6 +179,11 @@ class TruthLog:
         self._fraction: list[float] = []  # checkpoints, at `due`; NaN before printing began
         self._extrude: list[bool] = []
         self._reason: list[str] = []
+        self._shares = AS_PLANNED
+
+    def adapt(self, shares: FlowShares | None) -> None:
+        """What a bead needs from here on is what the motion was asked for; None: as it was."""
+        self._shares = self._shares if shares is None else self._shares.then(shares)
 
     def write(self, command: Command, progress: PrintProgress) -> None:
         """The command of one tick, and how far the print is by it."""
@@ -239,7 +245,7 @@ class TruthLog:
     def _needed(self, fraction: Array, rate: Array) -> Array:
         """What the bead needs (N,), mm^3/s, at fractional checkpoints (N,) that are passed at a rate (N,), 1/s."""
         piece = np.clip(np.ceil(fraction).astype(np.int64) - 1, 0, len(self._places) - 2)
-        return np.asarray(self._line.area[piece] * np.diff(self._places)[piece] * rate)
+        return np.asarray(self._line.area[piece] * np.diff(self._places)[piece] * rate * self._shares.at(fraction))
 
     def _fractions(self, times: Array, index: NDArray[np.int64], known: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Fractional checkpoint (N,) due at times (N,), NaN where there is none; and its rate (N,), 1/s."""

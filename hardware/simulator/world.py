@@ -362,7 +362,8 @@ class SimulatedWorld:
 
     def _looked(self, looks: SurfaceLooks, now: float) -> None:
         if (look := looks.last) is not None:
-            self.motion.adapt(looks.adapted())
+            self.motion.adapt(shares := looks.adapted())
+            self._truth_log.adapt(shares)
             look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
             self._sink.look(look)
             self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
