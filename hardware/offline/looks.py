@@ -62,6 +62,7 @@ LOOK_TIMEOUT = 15.0  # s aside, after which a look goes without the views that d
 MARGIN = 10.0  # mm of surface beside the path that is measured as well: matching begins with what is coarse
 MIN_STEP = 0.2  # mm between nodes: ten across a bead, and a look in two seconds
 WIDTHS = (1.0, 1.12, 1.25, 1.4)  # by the planned: gel spreads
+GROUND_DOUBT = 0.3  # share by which a piece differs from the others before it is believed: two sigmas of a look
 NOTHING_JUDGED = "looked at: the surface was measured, and nothing was judged yet"
 LOOK_TOPIC = "/look"
 STATION_POINTS = 6  # of a piece's drawn line
@@ -254,8 +255,17 @@ def look_at(
     width, due = widths[swept.width], dues[swept.width]
     after = heights_with_beads(before, due, station, swept)
     laid = judge_beads(before, after, replace(pieces, width=pieces.width * width))
-    filled = np.where(np.isfinite(after.heights), after.heights, before.heights + due)  # unknown: taken for laid
-    return laid, replace(after, heights=filled), width
+    ground = heights_with_beads(before, due, station, replace(swept, share=ground_shares(swept.share)))
+    return laid, replace(after, heights=ground.heights), width
+
+
+def ground_shares(share: Array) -> Array:
+    """Shares (S,) of pieces as the next look takes them for its ground: what most have, but where one is surely off.
+
+    An error of the ground is one of the next layer, the other way round. What is unknown is taken for laid.
+    """
+    usual = float(np.median(share[np.isfinite(share)])) if np.isfinite(share).any() else 1.0
+    return np.where(np.abs(share - usual) < GROUND_DOUBT, usual, np.where(np.isfinite(share), share, 1.0))
 
 
 def read_looks(recording: File) -> list[Look]:
