@@ -24,6 +24,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceHeights
 from hardware.offline.track import FrameSetStep
+from hardware.process.system import step_back
 from hardware.recording import messages
 from hardware.recording.session_reader import read_channels
 from hardware.report import page
@@ -32,6 +33,7 @@ from perception.frames import FrameSet
 from perception.lens import Lenses
 from perception.mapping.scan_map import node_size
 from perception.mapping.surface_heights import (
+    BeadShares,
     SurfaceView,
     dense_heights,
     first_heights,
@@ -41,6 +43,7 @@ from perception.mapping.surface_heights import (
 )
 from planning.command import Command, Hold
 from planning.laid_beads import (
+    SURE,
     BeadPieces,
     LaidBeads,
     Look,
@@ -62,7 +65,7 @@ LOOK_TIMEOUT = 15.0  # s aside, after which a look goes without the views that d
 MARGIN = 10.0  # mm of surface beside the path that is measured as well: matching begins with what is coarse
 MIN_STEP = 0.2  # mm between nodes: ten across a bead, and a look in two seconds
 WIDTHS = (1.0, 1.12, 1.25, 1.4)  # by the planned: gel spreads
-GROUND_DOUBT = 0.3  # share by which a piece differs from the others before it is believed: two sigmas of a look
+GROUND_DOUBT = 0.3  # share by which a piece must differ from the others, and surely so, before it is believed
 NOTHING_JUDGED = "looked at: the surface was measured, and nothing was judged yet"
 LOOK_TOPIC = "/look"
 STATION_POINTS = 6  # of a piece's drawn line
@@ -184,7 +187,7 @@ class LiveLooks:
         self._looks: SurfaceLooks | None = None
         self._bare = deque[SurfaceView](maxlen=VIEWS)
         self._kept = -math.inf  # s, of the last of these
-        self._worker = ThreadPoolExecutor(1, "looks")
+        self._worker = ThreadPoolExecutor(1, "looks", step_back)  # not at the priority of the tracking
         stack.callback(self._worker.shutdown, wait=False, cancel_futures=True)
         self.busy: Future[None] | None = None
         self._counts = False  # whether the job is a look, rather than the bare surface
@@ -254,18 +257,20 @@ def look_at(
     swept = sweep_beads(lenses, views, before, dues, station, np.diff(stations.bead) == 0)
     width, due = widths[swept.width], dues[swept.width]
     after = heights_with_beads(before, due, station, swept)
-    laid = judge_beads(before, after, replace(pieces, width=pieces.width * width))
-    ground = heights_with_beads(before, due, station, replace(swept, share=ground_shares(swept.share)))
+    known = replace(before, sigma=0.0 * before.sigma)  # a share's sigma holds what the ground is off by
+    laid = judge_beads(known, after, replace(pieces, width=pieces.width * width))
+    ground = heights_with_beads(before, due, station, replace(swept, share=ground_shares(swept)))
     return laid, replace(after, heights=ground.heights), width
 
 
-def ground_shares(share: Array) -> Array:
+def ground_shares(swept: BeadShares) -> Array:
     """Shares (S,) of pieces as the next look takes them for its ground: what most have, but where one is surely off.
 
     An error of the ground is one of the next layer, the other way round. What is unknown is taken for laid.
     """
+    share, doubt = swept.share, np.maximum(GROUND_DOUBT, SURE * swept.sigma)
     usual = float(np.median(share[np.isfinite(share)])) if np.isfinite(share).any() else 1.0
-    return np.where(np.abs(share - usual) < GROUND_DOUBT, usual, np.where(np.isfinite(share), share, 1.0))
+    return np.where(np.abs(share - usual) < doubt, usual, np.where(np.isfinite(share), share, 1.0))
 
 
 def read_looks(recording: File) -> list[Look]:
