@@ -21,6 +21,7 @@ from hardware.simulator.arm.settings import SerialWire
 from hardware.simulator.camera_pipeline import ARRIVAL_EVENT, EXPOSURE_EVENT, POSE_EVENT, TICK_EVENT, EventQueue
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold, Move
+from planning.material import FlowShares
 from planning.path import Path, PrintPhase, PrintProgress
 from tests.moving import path_through
 
@@ -85,6 +86,15 @@ def test_the_target_runs_evenly_along_the_straight_pieces_and_turns_evenly() -> 
     assert target[:, :3, 3] == pytest.approx(np.array([[4, 1.5, 0], [4, 3, 0], [4, 4.5, 0], [4, 6, 0]]))
     turns = [se3.log_rotation(t[:3, :3])[0] for t in target]
     assert turns == pytest.approx([0.05, 0.1, 0.15, 0.2]) and log.checkpoint.tolist() == [2, 2, 2, 2]
+
+
+def test_a_bead_whose_flow_was_adapted_needs_that_and_lays_it_where_no_dispenser_is_simulated() -> None:
+    times = 1.0 + LAG + TICK * np.array([1.5, 2.0, 2.5, 3.0])
+    book = filled([1.0, 1.5, 2.0])
+    planned = book.rows(times, at_home).flow
+    book.adapt(FlowShares(np.array([1.4]), np.array([1.8]), np.array([1.5])))
+    assert planned.min() > 0 and book.rows(times, at_home).flow == pytest.approx(planned * [1, 1.5, 1.5, 1])
+    assert book.needed(times) == pytest.approx(planned * [1, 1.5, 1.5, 1])
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=12), st.floats(0, 0.1))
