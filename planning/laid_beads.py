@@ -317,6 +317,7 @@ class Look:
     seconds: float  # that the needle stood aside
     width: float  # of beads, by the planned
     laid: LaidBeads
+    flow: FlowShares | None = None  # of the next layer, where it takes it from what lies here
 
     @property
     def text(self) -> str:
@@ -335,7 +336,7 @@ class Look:
             f"{n} of {len(crest)} pieces {word}" for n, word in ((gaps, "lack gel"), (blobs, "have too much")) if n
         ]
         parts += [f"{1 - seen:.0%} not seen"] if seen < 0.99 else []
-        return ", ".join(parts)
+        return ", ".join(parts) + ("" if self.flow is None else f"; {self.flow.text}")
 
 
 def adapted_flow(path: Path, looks: Sequence[Look], told: FlowShares = AS_PLANNED) -> FlowShares | None:

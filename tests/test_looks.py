@@ -194,7 +194,11 @@ def test_a_clogged_needle_holds_its_share_back_and_a_wrong_pump_gives_another_fl
 
 @pytest.mark.parametrize(
     ("top", "key"),
-    [({"look": "often"}, "look"), ({"look": 0}, "look"), ({"look": True}, "look")],
+    [
+        *[({"look": often}, "look") for often in ("often", 0, True)],
+        ({"adapt": True}, "adapt"),
+        ({"look": 1, "adapt": "yes"}, "adapt"),
+    ],
 )
 def test_a_look_that_makes_no_sense_is_refused(top: dict[str, object], key: str, tmp_path: File) -> None:
     with pytest.raises(InputError, match=key):
@@ -220,7 +224,7 @@ def some_look(gap: bool = True) -> Look:
 
 
 def test_a_look_is_recorded_and_read_back_bit_for_bit(tmp_path: File) -> None:
-    look = some_look()
+    look = replace(some_look(), flow=FlowShares(np.array([4.1]), np.array([4.7]), np.array([1.3])))
     unseen = replace(look, laid=replace(look.laid, volume=np.full(len(look.laid.volume), np.nan)))
     with Recorder(tmp_path / "run.mcap", arc_rig()) as recorder:
         for each in (look, unseen):
@@ -238,6 +242,10 @@ def test_the_report_says_and_draws_what_was_found() -> None:
     page, picture = looks_section([look], path), look_picture(look, path)
     assert picture.count("<path") == len(look.laid.planned) and "10 to 18 mm" in page and picture in page
     assert "clog" not in some_look(gap=False).text and looks_section([], path) == ""
+    adapted = replace(look, flow=FlowShares(np.array([1.2, 1.6]), np.array([1.6, 2.4]), np.array([1.3, 0.8])))
+    page = looks_section([adapted], path)
+    assert adapted.text.endswith("; the next layer flows at 80% to 130% of the planned")
+    assert page.count("<svg") == 2 and page.count("% of the planned flow</title>") == 2
 
 
 def layered(came: Array, sigma: float = 0.02, layer: int = 0, told: FlowShares = AS_PLANNED) -> tuple[Path, Look]:

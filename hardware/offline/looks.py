@@ -47,6 +47,7 @@ from planning.laid_beads import (
     BeadPieces,
     LaidBeads,
     Look,
+    Stations,
     adapted_flow,
     bead_heights,
     judge_beads,
@@ -71,6 +72,7 @@ LOOK_TOPIC = "/look"
 STATION_POINTS = 6  # of a piece's drawn line
 PLOT_SCALE = 14.0  # px a mm of the drawing
 SHARE_COLOURS = ((0.6, "#c0392b"), (0.8, "#e67e22"), (1.25, "#27ae60"), (1.6, "#e67e22"), (math.inf, "#8e44ad"))
+FLOW_COLOURS = ((0.8, "#1f618d"), (0.99, "#7fb3d5"), (1.01, "#bbb"), (1.25, "#f5b041"), (math.inf, "#d35400"))
 
 
 class SurfaceLooks:
@@ -115,6 +117,7 @@ class SurfaceLooks:
         shares = adapted_flow(self._path, self._layer, self._told)
         if shares is not None:
             self._told, self._layer = self._told.then(shares), []
+            self.last = replace(self.last, flow=shares)
         return shares
 
     def gather(self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose) -> bool:
@@ -235,10 +238,10 @@ class LiveLooks:
         self.count, self.text, look = self.count + 1, NOTHING_JUDGED, self._looks.last
         if look is None:
             return None
-        self.text = f"looked at: {look.text}"
         if self._adapt is not None and (shares := self._looks.adapted()) is not None:
             self._adapt(shares)
-            self.text += f"; {shares.text}"
+            look = replace(look, flow=shares)
+        self.text = f"looked at: {look.text}"
         return replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
 
 
@@ -303,13 +306,14 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
     head = ("at, s", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "planned, mm", "uneven, mm")
     table = page.figures_table((*head, "gaps", "blobs", "clogs"), rows)
     drawn = "".join(
-        f"<figure>{look_picture(look, path)}<figcaption>after {look.last:.0f} checkpoints: {escape(look.text)}"
-        "</figcaption></figure>"
+        f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
         for look in looks
+        for picture, caption in _drawn(look, path)
     )
     text = (
         "What lies there of the planned beads, by the cameras while the needle stood aside. Green: as planned to a "
-        "quarter; orange: less than 0.8 or more than 1.25; red: a gap; violet: a blob; grey: not seen."
+        "quarter; orange: less than 0.8 or more than 1.25; red: a gap; violet: a blob; grey: not seen. What is planned "
+        "of a layer that took its flow from the one below is what it was told to lay."
     )
     return page.section("Looks at what was laid", text, table + f'<div class="pictures">{drawn}</div>')
 
@@ -325,21 +329,47 @@ def station_places(look: Look, path: Path, count: int = STATION_POINTS) -> Array
     return np.stack([np.interp(at, knots, path.surface_from_nozzle[:, k, 3]) for k in range(3)], axis=-1)
 
 
+def _drawn(look: Look, path: Path) -> list[tuple[str, str]]:
+    """The pictures of a look with their captions: what lies there, and the next layer's flow where it has its own."""
+    pictures = [(look_picture(look, path), f"after {look.last:.0f} checkpoints: {look.text}")]
+    if look.flow is not None:
+        caption = f"{look.flow.text}; grey: as planned, blue: less, orange: more"
+        pictures.append((flow_picture(look.flow, look.laid.stations, path), caption))
+    return pictures
+
+
 def look_picture(look: Look, path: Path) -> str:
     """The stations of a look from above, each in the colour of its share, as SVG."""
-    places = station_places(look, path)[..., :2]
+    places, widths = station_places(look, path)[..., :2], look.laid.stations.width / look.width
+    colours, titles = [], []
+    for share in look.laid.share.tolist():
+        seen = not math.isnan(share)
+        colours.append(next(c for most, c in SHARE_COLOURS if share < most) if seen else "#999")
+        titles.append(f"{share:.0%} of the planned" if seen else "not seen")
+    return _beads_picture(places, widths, colours, titles, path, "beads by how much lies there")
+
+
+def flow_picture(flow: FlowShares, below: Stations, path: Path) -> str:
+    """Stretches of the next layer from above, by the flow that each gets, as SVG; as wide as the beads below them."""
+    at = np.linspace(flow.begin, flow.end, STATION_POINTS, axis=1)
+    places = [np.interp(at, np.arange(len(path)), path.surface_from_nozzle[:, k, 3]) for k in range(2)]
+    colours = [next(c for most, c in FLOW_COLOURS if share < most) for share in flow.share.tolist()]
+    titles = [f"{share:.0%} of the planned flow" for share in flow.share.tolist()]
+    width = np.full(len(titles), np.median(below.width))
+    return _beads_picture(np.stack(places, axis=-1), width, colours, titles, path, "the next layer by its flow")
+
+
+def _beads_picture(
+    places: Array, widths: Array, colours: Sequence[str], titles: Sequence[str], path: Path, label: str
+) -> str:
+    """Lines through places (S, K, 2) mm, `widths` (S,) mm wide."""
     low, high = path.zone[:, :2] + np.array([[-2.0], [2.0]])
-    size = (high - low) * PLOT_SCALE
-    lines, stations = [], look.laid.stations
-    for i, share in enumerate(look.laid.share.tolist()):
-        x, y = ((places[i] - low) * PLOT_SCALE).T
-        y = size[1] - y
-        colour = "#999" if math.isnan(share) else next(c for most, c in SHARE_COLOURS if share < most)
-        way = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
-        width = 0.85 * stations.width[i] / look.width * PLOT_SCALE
-        title = "not seen" if math.isnan(share) else f"{share:.0%} of the planned"
+    size, lines = (high - low) * PLOT_SCALE, []
+    for place, width, colour, title in zip(places, widths * 0.85 * PLOT_SCALE, colours, titles, strict=True):
+        x, y = ((place - low) * PLOT_SCALE).T
+        way = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, size[1] - y, strict=True))
         lines.append(
             f'<path d="M{way}" stroke="{colour}" stroke-width="{width:.1f}" fill="none"><title>{title}</title></path>'
         )
     box = f'viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" width="{min(size[0], 520):.0f}"'
-    return f'<svg {box} role="img" aria-label="beads by how much lies there">{"".join(lines)}</svg>'
+    return f'<svg {box} role="img" aria-label="{label}">{"".join(lines)}</svg>'

@@ -244,14 +244,11 @@ def hold_from_message(message: Message) -> Hold:
     return Hold(message["stamp"], message["duration"], message["reason"])
 
 
-ADAPTED_KEYS = "begin", "end", "share"  # of FlowShares
-
-
 def message_from_tick(tick: RecordedTick) -> Message:
     """A tick of the motion as a message; its command is written as a message of its own."""
     more: Message = {"aside": True} if tick.aside else {}
     if tick.adapted is not None:
-        more |= {"adapted": {key: getattr(tick.adapted, key).tolist() for key in ADAPTED_KEYS}}
+        more |= {"adapted": message_from_flow(tick.adapted)}
     return more | {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
@@ -267,9 +264,17 @@ def message_from_tick(tick: RecordedTick) -> Message:
     }
 
 
+_FLOW = "begin", "end", "share"  # of FlowShares
+
+
+def message_from_flow(flow: FlowShares) -> Message:
+    """Changed flows as a part of a message."""
+    return {name: getattr(flow, name).tolist() for name in _FLOW}
+
+
 def flow_from_message(message: Message) -> FlowShares:
-    """The flows that were changed before a tick, from its message."""
-    return FlowShares(*(np.array(message[key], float) for key in ADAPTED_KEYS))
+    """Changed flows from their part of a message."""
+    return FlowShares(*(np.array(message[name], float) for name in _FLOW))
 
 
 def message_from_dispenser(record: DispenserRecord) -> Message:
@@ -287,7 +292,8 @@ def message_from_look(look: Look) -> Message:
     names = ("stamp", "first", "last", "seconds")
     laid = {name: [v if np.isfinite(v) else None for v in getattr(look.laid, name).tolist()] for name in _LAID}
     stations = {name: getattr(look.laid.stations, name).tolist() for name in _STATIONS}
-    return {
+    flow = {} if look.flow is None else {"flow": message_from_flow(look.flow)}
+    return flow | {
         **{name: float(getattr(look, name)) for name in names},
         "spread": look.width,
         "text": look.text,
@@ -301,7 +307,9 @@ def look_from_message(message: Message) -> Look:
     kinds = (np.int64, np.int64, float, float, float, float)
     stations = Stations(*(np.array(message[name], kind) for name, kind in zip(_STATIONS, kinds, strict=True)))
     laid = LaidBeads(stations, *(np.array(message[name], float) for name in _LAID))  # null: NaN
-    return Look(message["stamp"], message["first"], message["last"], message["seconds"], message["spread"], laid)
+    stamp, first, last, seconds, spread = (message[name] for name in ("stamp", "first", "last", "seconds", "spread"))
+    flow = flow_from_message(message["flow"]) if "flow" in message else None
+    return Look(stamp, first, last, seconds, spread, laid, flow)
 
 
 def message_from_bytes(stamp: float, data: bytes) -> Message:

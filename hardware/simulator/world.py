@@ -361,9 +361,9 @@ class SimulatedWorld:
             self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks))
 
     def _looked(self, looks: SurfaceLooks, now: float) -> None:
+        self.motion.adapt(shares := looks.adapted())
+        self._truth_log.adapt(shares)
         if (look := looks.last) is not None:
-            self.motion.adapt(shares := looks.adapted())
-            self._truth_log.adapt(shares)
             look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
             self._sink.look(look)
             self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
