@@ -303,7 +303,7 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
         clogs = "; ".join(f"{a:.0f} to {b:.0f} mm" for a, b in laid.clogs) or "none"
         values = f"{look.stamp:.1f}", f"{look.seconds:.1f}", figure(volume), figure(planned), *map(figure, heights)
         rows.append([*values, str(int(laid.gap.sum())), str(int(laid.blob.sum())), clogs])
-    head = ("at, s", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "planned, mm", "uneven, mm")
+    head = ("at, s", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "as planned, mm", "uneven, mm")
     table = page.figures_table((*head, "gaps", "blobs", "clogs"), rows)
     drawn = "".join(
         f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
