@@ -29,7 +29,8 @@ def stored_ticks(record: Path) -> list[dict[str, Any]]:
 def test_it_looks_after_each_layer_and_when_somebody_asks_and_goes_on(tmp_path: Path) -> None:
     write_path(tmp_path / "path.csv", layers(2, 4))
     scenario = tmp_path / "gel.toml"
-    scenario.write_text(SCENARIO.replace("focal_px = 1100", "focal_px = 2200").replace("15.0", "8.0"))
+    dry = SCENARIO.replace('"chest"', '"chest"\nwetness = 0.0')
+    scenario.write_text(dry.replace("focal_px = 1100", "focal_px = 2200").replace("15.0", "8.0"))
     prerender(scenario, tmp_path / "stillbed", threads=2)
     record = tmp_path / "run.mcap"
     given = "--simulated", scenario, "--yes", "--look", "layer", "--adapt", "--record", record, "--no-page"

@@ -22,7 +22,7 @@ from estimation.surface_map import SurfaceHeights
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile
 from hardware.motion.step import MotionStep
-from hardware.offline.looks import LiveLooks, look_at, look_picture, looks_section, read_looks
+from hardware.offline.looks import LiveLooks, SurfaceLooks, look_at, look_picture, looks_section, read_looks
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
 from hardware.recording.messages import message_from_look
@@ -333,10 +333,21 @@ def test_looks_at_parts_of_a_layer_count_together_at_its_end() -> None:
     assert flow_on(apart, 1) == pytest.approx(flow_on(whole, 1))
 
 
+def test_the_looks_of_a_print_remember_what_each_layer_was_told() -> None:
+    path, look = layered(GAP)
+    looks, others = SurfaceLooks(arc_rig(), path, adapt=True), SurfaceLooks(arc_rig(), path)
+    assert looks.adapted() is None
+    looks.last = others.last = look
+    told = looks.adapted()
+    assert told is not None and looks.last.flow is told and others.adapted() is None
+    _, looks.last = layered(flow_on(told, 1), layer=1, told=told)
+    assert flow_on(looks.adapted(), 2) == pytest.approx(1.0)
+
+
 def test_nothing_is_done_after_an_uncertain_look_in_a_layer_or_after_the_last_one_or_for_noise() -> None:
     path, look = layered(GAP)
     unsure = replace(look, laid=replace(look.laid, sigma=look.laid.planned * 0.3))
-    unseen = replace(look, laid=replace(look.laid, volume=np.where(look.laid.stations.bead == 0, np.nan, 0.5)))
+    unseen = replace(look, laid=replace(look.laid, volume=np.where(look.laid.stations.bead <= 1, np.nan, 0.5)))
     assert adapted_flow(path, [unsure]) is None and adapted_flow(path, [unseen]) is None
     assert adapted_flow(path, [replace(look, last=3.0)]) is None
     assert adapted_flow(*wrapped(layered(GAP, layer=2))) is None
