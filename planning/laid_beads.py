@@ -267,7 +267,7 @@ def judge_beads(before: SurfaceHeights, after: SurfaceHeights, pieces: BeadPiece
 
 LOOK_BY_LAYER = "layer"
 MIN_FLOW, MAX_FLOW = 0.7, 1.5  # of the planned, in an adapted layer: beads neither break nor run over their neighbours
-MIN_LACK = 0.1  # share of the planned that pieces lack, below which nothing is done: they are told to 0.05-0.08
+MIN_LACK = 0.1  # share of the planned that pieces lack, and surely so, below which nothing is done
 MAX_UNSURE = 0.25  # sigma by the planned of a piece, beyond which it counts for nothing
 MIN_LOOK_SEEN = 0.6  # of the pieces that must be sure: else nothing is done; those that are not count for nothing
 FILL_SIGMA = 0.7  # mm beside a place, over which what lies under it is averaged,
@@ -377,7 +377,8 @@ def _lacks(path: Path, knots: Array, look: Look, told: FlowShares) -> tuple[Arra
     with np.errstate(invalid="ignore"):
         sure = np.isfinite(share) & (laid.sigma < MAX_UNSURE * laid.planned)
     lack = np.maximum(np.minimum(due, 1.0) - share, 0.0) - np.maximum(share - np.maximum(due, 1.0), 0.0)
-    lack = np.where(np.abs(lack) < MIN_LACK, 0.0, lack)
+    with np.errstate(invalid="ignore"):
+        lack = np.where(np.abs(lack) < np.maximum(MIN_LACK, SURE * laid.sigma / laid.planned * due), 0.0, lack)
     return _at(path, knots, (stations.begin + stations.end) / 2), lack * stations.crest, sure
 
 

@@ -353,6 +353,8 @@ def test_nothing_is_done_after_an_uncertain_look_in_a_layer_or_after_the_last_on
     assert adapted_flow(*wrapped(layered(GAP, layer=2))) is None
     told = adapted_flow(*wrapped(layered(np.full(24, 0.93))))
     assert told is not None and (told.share == 1.0).all()
+    told = adapted_flow(*wrapped(layered(np.where(GAP, 1.0, 0.8), sigma=0.04)))
+    assert told is not None and (told.share == 1.0).all()  # a fifth less, not known to a tenth
 
 
 @given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=6), st.floats(0.0, 5.0))
