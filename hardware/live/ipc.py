@@ -192,8 +192,7 @@ ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device
 ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy machine
 ARM_AFTERLIFE = 2.0  # s that a virtual arm goes on without the run: it has to come to rest by itself
 EXECUTED_STEP = 0.002  # s between rows of what a virtual arm executed
-TROUBLE_BYTES = 4096  # of the text that says what is wrong with the arm
-SHARES_BYTES = 2**22  # of the flows of a layer: half a million ways
+TROUBLE_BYTES, SHARES_BYTES = 4096, 2**22  # of what is wrong with the arm; of a layer's flows: 170,000 pieces
 
 ProcessBody = Callable[..., None]
 
@@ -363,8 +362,7 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
     processes = ProcessGroup()
     with ExitStack() as stack:
         stack.callback(processes.kill_all)
-        url = prepared.settings.arm
-        arm_lifeline = SPAWN.Pipe(duplex=False)
+        url, arm_lifeline = prepared.settings.arm, SPAWN.Pipe(duplex=False)
         if url == VIRTUAL_ARM:
             url = str(folder / "arm")
             _start_arm(processes, prepared, File(url), arm_lifeline[0])
@@ -375,9 +373,8 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         trouble, bell, shares = SharedLatest[str](TROUBLE_BYTES), Bell(), SharedLatest[FlowShares](SHARES_BYTES)
         to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
         lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
-        ends = [end for end, _ in to_recorder]
+        ends, own = [end for end, _ in to_recorder], (orders[0], bell, link.requests, trouble, to_recorder[0][1])
         processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
-        own = orders[0], bell, link.requests, trouble, to_recorder[0][1]
         mover = MotionChannels(url, place, poses, motion, shares, *own)
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:

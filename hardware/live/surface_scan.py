@@ -355,10 +355,8 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     rows.append(("scanned", f"{scanned.coverage:.0%}"))
     most = max(2 * WEAK_SIGMA_MM, float(np.percentile(sigma, SHADED_PERCENT)))
     colours = np.where(surface.sure[::-1, :, None], _shaded(surface.sigma[::-1] / most), 255)
-    scale = _figure(
-        f"blue: 0, red: {most:.2g} mm or more", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8)
-    )
-    known = "Standard deviation across the surface. White lies outside, or no two cameras saw it alike."
+    scale = _figure(f"0 to {most:.2g} mm", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8))
+    known = "Standard deviation across the surface, blue to red. White lies outside, or no two cameras saw it alike."
     from_above = _figure("from above", np.asarray(colours, np.uint8))
     sigmas = [(f"{v:.3f}", "mm", f"standard deviation, {w}") for v, w in zip(limits, ("median", "95 %"), strict=True)]
     tiles = (f"{scanned.area / 100:.1f}", "cm²", "scanned"), (f"{scanned.coverage:.0%}", "", "of the region"), *sigmas

@@ -199,11 +199,10 @@ class SimulatedWorld:
         material.begin(0.0, 0.0)
         self.motion = PrintMotion(profile, self._time, c_double(), material, lambda: self.link.lag)
         self._operator = _SimulatedOperator(self.motion, material)
-        self._rows_until = 0.0
         beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
         self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
         self._looks: SurfaceLooks | None = None
-        self._end = scenario.seconds
+        self._rows_until, self._end = 0.0, scenario.seconds
         self._killed = self._broken = False
         self._progress: ProgressReport = no_progress
         self._reported = 0  # frame sets
