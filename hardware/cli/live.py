@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from hardware.cameras.genicam import IndustrialCamera
     from hardware.cameras.sources import CameraDevice
 
-SETTINGS_FLAGS = ["rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift", "stands_home", "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port", "page_certificate", "page_key", "look", "adapt"]
+SETTINGS_FLAGS = ("rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift",
+    "stands_home", "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port",
+    "page_certificate", "page_key", "look", "adapt")  # fmt: skip
 NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
   plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
