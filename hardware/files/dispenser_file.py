@@ -252,7 +252,7 @@ def write_delays(path: str | Path, name: str, delays: DispenserProfile) -> None:
     end = next((i for i in range(start, len(lines)) if HEADER.match(lines[i])), len(lines))
     body, new = lines[start:end], []
     for key, field_name in DELAY_KEYS.items():
-        value = checks.toml_number(round(getattr(delays, field_name), 6))
+        value = checks.toml_value(round(getattr(delays, field_name), 6))
         at = next((i for i, line in enumerate(body) if re.match(rf"\s*{key}\s*=", line)), None)
         if at is None:
             new.append(f"{key} = {value}")

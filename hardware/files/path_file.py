@@ -307,7 +307,7 @@ def read_progress(file: File, path: Path) -> float:
 
 def _replace(file: File, mark: ProgressMark, printed: int, durable: bool = False) -> None:
     """Write beside the file and rename, so that a whole file is there always. durable: wait for the disk."""
-    text = f'path = "{mark.path}"\nfraction = {checks.toml_number(mark.fraction)}\nprinted = {printed}\n'
+    text = f'path = "{mark.path}"\nfraction = {checks.toml_value(mark.fraction)}\nprinted = {printed}\n'
     beside = file.with_name(file.name + ".new")
     with beside.open("w", encoding="utf-8") as stream:
         stream.write(text)

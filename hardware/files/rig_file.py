@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,17 +115,15 @@ def write_rig(
     sigmas = [None] * len(rig) if lens_sigma is None else lens_sigma
     blocks = ["# mm, px; base_from_camera carries camera coordinates (x right, y down, z into the scene) to the base\n"]
     for camera, source, sigma in zip(rig.cameras, sources, sigmas, strict=True):
-        lines = ["[[camera]]", f"name = {json.dumps(camera.name, ensure_ascii=False)}"]
-        if source is not None:
-            lines.append(f"{source.kind} = {json.dumps(source.pattern, ensure_ascii=False)}")
-        lines.append(f"size = {list(camera.size)}")
-        for key in ("matrix", "distortion", "base_from_camera"):
-            lines.append(f"{key} = {checks.toml_numbers(getattr(camera, key))}")
-        if camera.clock_offset:
-            lines.append(f"clock_offset_s = {checks.toml_number(camera.clock_offset)}")
-        if sigma is not None:
-            lines.append(f"{SIGMA_KEY} = {checks.toml_numbers(sigma)}")
-        blocks.append("\n".join(lines) + "\n")
+        values = {
+            "name": camera.name,
+            **({} if source is None else {source.kind: source.pattern}),
+            "size": camera.size,
+            **{key: getattr(camera, key) for key in ("matrix", "distortion", "base_from_camera")},
+            "clock_offset_s": camera.clock_offset or None,
+            SIGMA_KEY: sigma,
+        }
+        blocks.append("\n".join(["[[camera]]", *checks.toml_lines(values)]) + "\n")
     Path(path).write_text("\n".join(blocks), encoding="utf-8")
 
 
@@ -241,15 +238,10 @@ def read_board(path: str | Path) -> Board:
 
 def write_board(path: Path, board: Board) -> None:
     """Write a board.toml that `read_board` reads back to the same board."""
-    lines = [
-        f'kind = "{board.kind}"',
-        f"squares = {list(board.squares)}",
-        f"square_mm = {checks.toml_number(board.square)}",
-    ]
+    values = {"kind": board.kind, "squares": board.squares, "square_mm": float(board.square)}
     if board.kind == "charuco":
-        lines += [f"marker = {checks.toml_number(board.marker)}  # of a square", f'dictionary = "{board.dictionary}"']
-        lines += [f"legacy = {str(board.legacy).lower()}"]
-    lines.append(f"inverted = {str(board.inverted).lower()}")
+        values |= {"marker": float(board.marker), "dictionary": board.dictionary, "legacy": board.legacy}
+    lines = checks.toml_lines({**values, "inverted": board.inverted})
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

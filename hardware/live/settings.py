@@ -245,20 +245,7 @@ def _toml_value(value: object) -> str | None:
     """A value as TOML writes it; None for one that is left out."""
     if value is None or value in ("", ()):
         return None
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return str(list(value))
-    if isinstance(value, Path):
-        value = str(value.resolve())
-    if isinstance(value, str):
-        return toml_string(value)
-    return repr(value)
-
-
-def toml_string(text: str) -> str:
-    """A text without control characters as TOML writes it."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return checks.toml_value(str(value.resolve()) if isinstance(value, Path) else value)
 
 
 FLAG_NAMES = {  # of settings whose flag has another name

@@ -28,8 +28,8 @@ Table = dict[str, Any]
 CsvRow = tuple[int, list[str]]  # line number and words
 Check = Callable[[object, str, object], Any]  # of a file, a key and its value: what a field holds; InputError
 Keys = Mapping[str, tuple[str, Check]]  # a table's keys: each with the field that it gives, and its check
-T = TypeVar("T")
-E = TypeVar("E", bound=Enum)
+Made = TypeVar("Made")
+Kind = TypeVar("Kind", bound=Enum)
 
 
 def read_toml(path: Path) -> Table:
@@ -101,11 +101,11 @@ def record_from_table(
     where: object,
     prefix: str,
     table: Table,
-    make: Callable[..., T],
+    make: Callable[..., Made],
     keys: Keys,
     required: Iterable[str] = (),
     also: Iterable[str] = (),
-) -> T:
+) -> Made:
     """The record that `make` makes of a table; its error about a field is one about the key and the file's value.
 
     also: keys that are read elsewhere.
@@ -117,7 +117,8 @@ def record_from_table(
         return make(**values)
     except InputError as error:
         key = with_keys.get(error.what, error.what)
-        raise InputError(where, prefix + key, table.get(key, error.got), error.allowed) from None
+        got = error.got if isinstance(error.got, str) else table.get(key, error.got)  # a text: the one wrong word
+        raise InputError(where, prefix + key, got, error.allowed) from None
 
 
 def one_of_text(word: str, known: Collection[str]) -> str:
@@ -203,7 +204,7 @@ def word(allowed: Collection[str]) -> Check:
     return check
 
 
-def member(kind: type[E]) -> Check:
+def member(kind: type[Kind]) -> Check:
     """The check for the value of one of an enumeration's members, which it gives."""
     one_of = word([each.value for each in kind])
     return lambda where, key, value: kind(one_of(where, key, value))
@@ -237,7 +238,7 @@ def within(low: float = -math.inf, high: float = math.inf, unit: str = "", open:
     """The check for a finite number from low (above it where `open`) to high."""
 
     def check(where: object, key: str, value: object) -> float:
-        number_read = number(where, key, value)
+        number_read = float(numbers(where, key, value, (), range_text(low, high, unit, open)))
         if not (low < number_read <= high or (number_read == low and not open)):
             raise InputError(where, key, value, range_text(low, high, unit, open))
         return number_read
@@ -263,7 +264,9 @@ def range_text(low: float, high: float, unit: str = "", open: bool = False) -> s
     """A range of numbers in words."""
     unit = f" {unit}" if unit else ""
     if math.isinf(high):
-        return f"above {low:g}{unit}" if open else f"{low:g}{unit} or more"
+        return "" if math.isinf(low) else f"above {low:g}{unit}" if open else f"{low:g}{unit} or more"
+    if math.isinf(low):
+        return f"at most {high:g}{unit}"
     return f"above {low:g}, at most {high:g}{unit}" if open else f"{low:g} to {high:g}{unit}"
 
 
@@ -304,11 +307,13 @@ def _all_numbers(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def toml_number(value: float) -> str:
-    """A number as TOML, numpy's too, with the digits that give the same float64 back."""
-    return repr(float(value))
+def toml_lines(values: Mapping[str, object]) -> list[str]:
+    """Keys and values as lines of TOML; what is None is left out."""
+    return [f"{key} = {toml_value(value)}" for key, value in values.items() if value is not None]
 
 
-def toml_numbers(array: Array) -> str:
-    """An array as TOML, every number with the digits that give the same float64 back."""
-    return json.dumps(array.tolist())
+def toml_value(value: object) -> str:
+    """A text, a number, an array or a list of these as TOML; every number with the digits that give it back."""
+    if isinstance(value, (np.ndarray, np.number)):
+        value = value.tolist()
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

@@ -19,7 +19,6 @@ start on; with one, every frame that begins meanwhile.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -118,14 +117,10 @@ def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
 
 def write_virtual_arm(file: Path, settings: ArmSettings, faults: tuple[Fault, ...]) -> None:
     """Write what `read_virtual_arm` reads back as the same."""
-    lines = [f"faults = {json.dumps([str(fault) for fault in faults])}", "[arm]"]
-    for key, (name, _) in ARM_KEYS.items():
-        value = getattr(settings, name)
-        if key.endswith("_mm_deg"):
-            lines.append(f"{key} = {checks.toml_numbers(value / AXIS_UNITS)}")
-        elif value is not None:
-            value = float(np.rad2deg(value)) if key.endswith("_deg_s") else value
-            lines.append(f"{key} = {json.dumps(value.value if isinstance(value, ReplyMode) else value)}")
+    values = {key: getattr(settings, name) for key, (name, _) in ARM_KEYS.items()}
+    values |= {key: values[key] / AXIS_UNITS for key in ("low_mm_deg", "high_mm_deg")}
+    values |= {"top_turn_deg_s": float(np.rad2deg(settings.top_turn)), "replies": settings.replies.value}
+    lines = [*checks.toml_lines({"faults": [str(fault) for fault in faults]}), "[arm]", *checks.toml_lines(values)]
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
