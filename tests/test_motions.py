@@ -198,7 +198,7 @@ def test_a_waveform_alone_has_unit_height() -> None:
         ({**SPECS["breathing"], "direction": [0, 0, 0]}, "motion[0].direction", "not all 0"),
         ({**SPECS["breathing"], "direction": [0, 1]}, "motion[0].direction", "3 finite numbers"),
         ({"kind": "sine", "amplitude_mm": 1}, "motion[0].rate_hz", "this key"),
-        ({"kind": "sine", "amplitude_mm": 1, "rate_hz": 0}, "motion[0].rate_hz", "0 < it"),
+        ({"kind": "sine", "amplitude_mm": 1, "rate_hz": 0}, "motion[0].rate_hz", "above 0"),
         ({"kind": "sine", "amplitude_mm": 1, "mm_per_frame": 1, "rate_hz": 1}, "motion[0].amplitude_mm", "none"),
         ({"kind": "steps", "height_mm": 0.3, "every_s": 1, "rise_s": 2}, "motion[0].rise_s", "to 1"),
         ({"kind": "steps", "amplitude_mm": 0.3}, "motion[0].height_mm", "this key"),
@@ -209,7 +209,7 @@ def test_a_waveform_alone_has_unit_height() -> None:
         ({"kind": "ramp", "speed_mm_s": [1, 0, 0], "back": True}, "motion[0].end_s", "back = true"),
         ({"kind": "ramp", "speed_mm_s": [1, 0, 0], "back": 1}, "motion[0].back", "true or false"),
         ({"kind": "turn", "angles_deg": []}, "motion[0].angles_deg", "one number or more"),
-        ({"kind": "constant", "travel_s": 0}, "motion[0].travel_s", ">= 0.001"),
+        ({"kind": "constant", "travel_s": 0}, "motion[0].travel_s", "0.001 or more"),
         ({"kind": "trace"}, "motion[0].file", "this key"),
     ],
 )

@@ -152,11 +152,10 @@ def _no_go_lines(zones: tuple[NoGo, ...]) -> list[str]:
     lines: list[str] = []
     for zone in zones:
         shape: dict[str, object] = {"cylinder": zone.axis, "radius": float(zone.radius)}
-        if not zone.radius < float("inf"):
-            plane = zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
-            shape = {"half_space": plane}
-            if len(zone.offsets) > 1:
-                shape = {"box": (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]}
+        if not zone.radius < float("inf") and len(zone.offsets) == 1:
+            shape = {"half_space": zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]}
+        elif not zone.radius < float("inf"):
+            shape = {"box": (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]}
         lines += ["", "[[no_go]]", *checks.toml_lines({"name": zone.name, **shape})]
     return lines
 

@@ -12,6 +12,7 @@ run.report.html, run.summary.json
 from __future__ import annotations
 
 import math
+import os
 import re
 import shutil
 import sys
@@ -128,11 +129,7 @@ def read_placement(file: File) -> SurfacePlacement:
 
 def _recording(where: object, key: str, value: object) -> File:
     recording = File(checks.text(where, key, value))
-    try:
-        there = recording.exists()
-    except OSError:  # a name that no file can have
-        there = False
-    if not there:
+    if not os.path.exists(recording):  # False for a name that no file can have, too
         raise InputError(where, key, recording, "the recording that shows the surface")
     return recording
 
