@@ -20,13 +20,14 @@ from estimation.errors import InputError
 from hardware.cameras.sources import read_live_rig
 from hardware.files.arm_file import read_arm
 from hardware.files.dispenser_file import read_dispensers
-from hardware.files.path_file import read_path
+from hardware.files.path_file import PATH_HEADER, read_contour, read_path
 from hardware.files.rig_file import read_board, read_rig
 from hardware.live.settings import check_settings, read_settings
 from hardware.process.checks import read_toml
 from hardware.simulator.arm.settings import read_virtual_arm
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scenario_tables import bare_scene
+from hardware.simulator.trace_file import read_trace
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests/reference/file_messages.txt"
@@ -254,8 +255,21 @@ TEXTS = {  # files that are no such TOML at all, and paths
     "twice.toml": 'kind = "charuco"\nkind = "chessboard"\n',
     "semicolons.csv": "x_mm;y_mm;z_mm\n1;2;3\n",
     "word.csv": "x_mm,y_mm,z_mm,a_deg,b_deg,c_deg,speed_mm_s,material,temperature_c,layer,extrude\n1,2,three\n",
+    "short.csv": f"{','.join(PATH_HEADER)}\n1,2,3\n",
+    "nothing.csv": "\n\n",
+    "numbers.csv": f"{','.join(PATH_HEADER)}\n0,0,0,0,0,0,nan,1,20,0,1\n1,0,0,0,0,0,1,1,20,0,1\n",
+    "contour_empty.csv": "",
+    "contour_word.csv": "x_mm,y_mm\n1,two\n3,4\n5,6\n",
+    "contour_short.csv": "x_mm,y_mm\n1,2,3\n",
+    "contour_head.csv": "x,y\n1,2\n",
+    "trace_empty.csv": "",
+    "trace_word.csv": "t_s,tx_mm,ty_mm,tz_mm\n0,0,0,zero\n",
+    "trace_short.csv": "t_s,tx_mm,ty_mm,tz_mm\n0,0,0\n",
     "unit.csv": "x_m,y_mm,z_mm,a_deg,b_deg,c_deg,speed_mm_s,material,temperature_c,layer,extrude\n1,2,3\n",
 }
+
+
+TEXT_KINDS: dict[str, Callable[[Path], object]] = {"contour": read_contour, "trace": read_trace}
 
 
 def toml(value: object) -> str:
@@ -295,7 +309,7 @@ def refusals(folder: Path) -> dict[str, str]:
     for name, text in TEXTS.items():
         file = Path(name)
         file.write_text(text, encoding="utf-8")
-        found[name] = refusal(read_path if file.suffix == ".csv" else read_board, file)
+        found[name] = refusal(TEXT_KINDS.get(name.split("_")[0], read_path if file.suffix == ".csv" else read_board), file)
     return found
 
 
