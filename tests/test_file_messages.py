@@ -309,7 +309,9 @@ def refusals(folder: Path) -> dict[str, str]:
     for name, text in TEXTS.items():
         file = Path(name)
         file.write_text(text, encoding="utf-8")
-        found[name] = refusal(TEXT_KINDS.get(name.split("_")[0], read_path if file.suffix == ".csv" else read_board), file)
+        found[name] = refusal(
+            TEXT_KINDS.get(name.split("_")[0], read_path if file.suffix == ".csv" else read_board), file
+        )
     return found
 
 

@@ -81,6 +81,38 @@ def read_csv(path: Path, allowed: str = "a readable CSV file", text: str | None 
         raise InputError(path, "file", error_text(error), allowed) from error
 
 
+def csv_columns(
+    where: object, rows: Iterable[CsvRow], contents: str, check: Callable[[list[str]], None] | None = None
+) -> tuple[list[int], dict[str, list[str]]]:
+    """Line numbers of the rows below a header, and the words of each column, without blanks; empty rows do not count.
+
+    contents: what is allowed instead of nothing. check: refuses a header. InputError for a row that is not as long.
+    """
+    full = [(line, [word.strip() for word in row]) for line, row in rows if any(map(str.strip, row))]
+    if not full:
+        raise InputError(where, "file", "empty", contents)
+    (_, header), *body = full
+    if check is not None:
+        check(header)
+    for line, row in body:
+        if len(row) != len(header):
+            raise InputError(where, f"line {line}", f"{len(row)} values", f"{len(header)}, as in the header")
+    return [line for line, _ in body], {name: [row[i] for _, row in body] for i, name in enumerate(header)}
+
+
+def csv_numbers(where: object, lines: Iterable[int], name: str, words: Iterable[str]) -> Array:
+    """The finite numbers (N,) in the words of a column."""
+    out: list[float] = []
+    for line, word in zip(lines, words, strict=True):
+        try:
+            out.append(float(word))
+        except ValueError:
+            out.append(math.nan)
+        if not math.isfinite(out[-1]):
+            raise InputError(where, f"line {line}: {name}", word, "a finite number")
+    return np.array(out, float)
+
+
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:
     """InputError for a required key that is not there, or for one that nobody reads."""
     known = list(dict.fromkeys([*required, *optional]))
