@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import os
 import tempfile
 import tomllib
@@ -15,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from hardware.cameras.sources import read_live_rig
@@ -23,7 +26,7 @@ from hardware.files.dispenser_file import read_dispensers
 from hardware.files.path_file import PATH_HEADER, read_contour, read_path
 from hardware.files.rig_file import read_board, read_rig
 from hardware.live.settings import check_settings, read_settings
-from hardware.process.checks import read_toml
+from hardware.process.checks import read_toml, record_from_table, toml_from_text, toml_lines, within
 from hardware.simulator.arm.settings import read_virtual_arm
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scenario_tables import bare_scene
@@ -338,6 +341,33 @@ def test_a_wrong_settings_file_is_refused_with_the_sentence_that_was_looked_at(
     assert "accepted" not in found.values()
     assert {case: text for case, text in found.items() if golden().get(case) != text} == {}
     assert found.keys() == golden().keys()
+
+
+PLAIN = (
+    st.text(st.characters(exclude_categories=["Cs"])) | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats()
+)
+
+
+@given(st.dictionaries(st.from_regex(r"[a-z_]{1,8}", fullmatch=True), PLAIN | st.lists(PLAIN, max_size=3)))
+def test_what_is_written_is_read_back(table: dict[str, object]) -> None:
+    read = toml_from_text("here", "\n".join(["a0 = 0", *toml_lines(table)]))
+    assert repr({"a0": 0, **table}) == repr(read)
+
+
+@example(1.0, 2.0, 1.0, False)
+@example(1.0, 2.0, 1.0, True)
+@example(1.0, 2.0, 2.0, True)
+@given(st.floats(), st.floats(), st.floats(), st.booleans())
+def test_a_number_passes_within_its_range_alone_and_is_told_the_range(
+    low: float, high: float, number: float, open_end: bool
+) -> None:
+    table, inside = {"a_mm": number}, low <= number <= high and (number > low or not open_end)
+    try:
+        found = record_from_table("x.toml", "t.", table, dict, {"a_mm": ("a", within(low, high, "mm", open_end))})
+    except InputError as error:
+        assert error.what == "t.a_mm" and not (inside and math.isfinite(number))
+    else:
+        assert found == {"a": number} and inside
 
 
 if __name__ == "__main__":

@@ -271,7 +271,7 @@ def within(low: float = -math.inf, high: float = math.inf, unit: str = "", open:
 
     def check(where: object, key: str, value: object) -> float:
         number_read = float(numbers(where, key, value, (), range_text(low, high, unit, open)))
-        if not (low < number_read <= high or (number_read == low and not open)):
+        if not low <= number_read <= high or (open and number_read == low):
             raise InputError(where, key, value, range_text(low, high, unit, open))
         return number_read
 
@@ -348,4 +348,6 @@ def toml_value(value: object) -> str:
     """A text, a number, an array or a list of these as TOML; every number with the digits that give it back."""
     if isinstance(value, (np.ndarray, np.number)):
         value = value.tolist()
-    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
