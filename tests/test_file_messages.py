@@ -348,6 +348,7 @@ PLAIN = (
 )
 
 
+@example({"a": "\x7f", "b": [float("inf"), "\\"]})
 @given(st.dictionaries(st.from_regex(r"[a-z_]{1,8}", fullmatch=True), PLAIN | st.lists(PLAIN, max_size=3)))
 def test_what_is_written_is_read_back(table: dict[str, object]) -> None:
     read = toml_from_text("here", "\n".join(["a0 = 0", *toml_lines(table)]))
