@@ -44,12 +44,10 @@ from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, Recorde
 from hardware.live.records import (
     FIRST_BIN_WIDTH,
     TIMELINE_BINS,
-    BeginPrint,
     Entry,
     ErrorTimeline,
     EventEntry,
     SetEntry,
-    recorded_begin,
 )
 from hardware.live.settings import (
     LiveSettings,
@@ -60,11 +58,12 @@ from hardware.live.settings import (
     settings_text,
 )
 from hardware.motion.loop import RecordedTick
-from hardware.motion.step import LAG_STEP, PrintMotion
+from hardware.motion.step import LAG_STEP, BeginPrint, PrintMotion
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import faults_from_texts
 from hardware.process.progress import cached
 from hardware.process.system import MOST_RINGS, Bell
+from hardware.recording.loop_record import recorded_begin
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import input_texts
 from perception.frames import Frame, FrameSet

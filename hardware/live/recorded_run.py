@@ -7,7 +7,7 @@ of the pictures, which is part of the recording, interpolated between their inst
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path as File
 
@@ -16,23 +16,26 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.protocol import frame_from_command
-from hardware.files.arm_file import read_arm
+from hardware.files.arm_file import arm_from_text, read_arm
 from hardware.files.folder_tables import trajectory_from_rows
 from hardware.files.path_file import read_path
 from hardware.live.prepared import RunFiles
-from hardware.motion.step import MotionStep
+from hardware.motion.loop import Tick
+from hardware.motion.print_loop import PrintLoop
+from hardware.motion.step import BeginPrint
 from hardware.offline.replay import CommandWriter
+from hardware.process.clock import SimClock
 from hardware.process.progress import prepare_out
+from hardware.recording.loop_playback import PartedError, PlayedFrame, PlayedOutError, PlayedSource
+from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT
 from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, damage_words, parse, walk
 from hardware.recording.messages import (
     Message,
-    bytes_from_message,
     move_from_message,
     pose_from_message,
     row_from_message,
 )
-from hardware.recording.session_reader import PATH_ATTACHMENT, PrintInputs, inputs_from_texts
+from hardware.recording.session_reader import PATH_ATTACHMENT, inputs_from_texts
 from hardware.simulator.deposit import NozzleLog, PlannedLine, join_logs, planned_line
 from hardware.simulator.dispenser import VirtualDispenserSettings
 from hardware.simulator.material import flow_from_told
@@ -40,6 +43,7 @@ from hardware.simulator.nozzle_error import MaterialFigures, material_figures
 from hardware.simulator.nozzle_error import nozzle_errors as row_errors
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold
+from planning.material import Outlets
 from planning.path import PrintPhase, PrintProgress
 
 RUN_REQUIRED = "the recording of a run that began to print, or give --path"
@@ -81,49 +85,35 @@ class ReplayCount:
     frames: int
     other: int
     damage: str
+    parted: str  # where the loop did something else than it did then, "" if nowhere
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReplayedTick:
-    """One tick: s, what was decided anew, the frame of that, and the frame that the run gave."""
-
-    stamp: float
-    command: Command
-    frame: bytes
-    recorded: bytes
+def replay_run(record: File) -> list[PlayedFrame]:
+    """Every frame that a recorded run gave its arm, decided anew; PartedError where the loop did something else."""
+    run, frames = _read_run(record, "/loop", "/pose"), list[PlayedFrame]()
+    _play(run, record, frames.append, lambda tick: None)
+    return frames
 
 
-def replay_run(record: File) -> Iterator[ReplayedTick]:
-    """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
-    run = _read_run(record, "/tick", "/pose")
-    return _replay_ticks(run, inputs_from_texts(run.texts, record), record)
+def _play(
+    run: _RecordedRun, record: File, taken: Callable[[PlayedFrame], None], report: Callable[[Tick], None]
+) -> None:
+    """The loop of a recorded run, once more, as far as it was recorded."""
+    if LOOP_ARM_ATTACHMENT not in run.texts:
+        raise InputError(
+            record, "recording", "no /loop", "of a run or simulation that recorded what its loop was given"
+        )
+    profile = arm_from_text(run.texts[LOOP_ARM_ATTACHMENT], record / LOOP_ARM_ATTACHMENT)
 
+    def begin(start: float, outlets: Outlets) -> BeginPrint:
+        inputs = inputs_from_texts(run.texts, record)
+        return BeginPrint(inputs.path, inputs.profile, start, outlets, "", inputs.tissue)
 
-def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Iterator[ReplayedTick]:
-    """Where the file is damaged, ticks are left out whose pose is lost; those behind it may come out another way."""
-    ticks, poses = run.messages["/tick"], run.poses
-    step, profile = None, inputs.profile
-    for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
-        if tick["begun"]:
-            step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets, inputs.tissue)
-        if step is not None and tick.get("lag"):
-            step.lag = float(tick["lag"][0])
-        if step is not None and tick.get("recalled"):
-            step.recalled(*np.array(tick["recalled"], float).reshape(2, 6))
-        if step is None or not tick["asked"]:
-            continue
-        stamp = tick["pose_stamp"]
-        if stamp and stamp[0] not in poses:
-            if run.damage:
-                continue
-            raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
-        now = float(tick["stamp"])
-        if tick.get("material_in"):
-            step.material_in()
-        step.paused, step.aside = bool(tick.get("paused")), bool(tick.get("aside"))
-        command = step(poses[stamp[0]] if stamp else None, now)
-        frame = frame_from_command(command, profile.dialect)
-        yield ReplayedTick(now, command, frame, bytes_from_message({"data": tick["frame"]}))
+    try:
+        source = PlayedSource(run.messages["/loop"], run.poses, begin, profile, taken)
+        PrintLoop(source, profile, source.settings, SimClock(), report).run()
+    except PlayedOutError:
+        pass
 
 
 def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
@@ -133,19 +123,22 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     """
     if record.is_dir():
         raise InputError(record, "recording", "a session folder", RUN_REQUIRED)
-    run = _read_run(record, "/tick", "/pose")
+    run = _read_run(record, "/loop", "/pose")
     if PATH_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no path", RUN_REQUIRED)
-    inputs = inputs_from_texts(run.texts, record)
     prepare_out(out, force)
-    frames = other = 0
+    same, parted = list[bool](), ""
     with CommandWriter(out) as writer:
-        for tick in _replay_ticks(run, inputs, record):
-            writer.write(tick.command)
-            writer.send(tick.frame)
-            frames += 1
-            other += tick.frame != tick.recorded
-    return ReplayCount(frames, other, run.damage)
+
+        def take(played: PlayedFrame) -> None:
+            writer.send(played.frame)
+            same.append(played.frame == played.recorded)
+
+        try:
+            _play(run, record, take, lambda tick: writer.write(tick.command))
+        except PartedError as error:
+            parted = str(error)
+    return ReplayCount(len(same), same.count(False), run.damage, parted)
 
 
 BEAD_WIDTH = 1.0  # mm

@@ -43,6 +43,7 @@ from hardware.live.trace import MIN_WRITE_S, RECORDER_LANE, TraceBatch, TraceLan
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
 from hardware.process.system import SharedLatest, set_up_process, state_inputs
+from hardware.recording.loop_record import LoopRecord
 from perception.frames import OutlinedPicture, Roi
 from planning.laid_beads import Look
 
@@ -369,7 +370,7 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.show_scan(entry.stamp, entry.points)
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
-    elif isinstance(entry, Roi | OutlinedPicture | DispenserRecord | Look):
+    elif isinstance(entry, Roi | OutlinedPicture | LoopRecord | DispenserRecord | Look):
         recorder.write(entry)
 
 

@@ -127,8 +127,9 @@ class MotionLoop:
                 switch = math.inf if self.material is None else self.material.due
                 self._clock.wait_until(min(schedule.due, switch, self._clock.now() + self._poll_period))
         finally:
+            ended = self._clock.now()
             if self.material is not None:
-                self.material.off(self._clock.now())
+                self.material.off(ended)
             shut_down(self.arm, "the motion has ended", self._clock, self._poll_period)
 
     def _poll_material(self, now: float) -> None:

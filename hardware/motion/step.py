@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from ctypes import c_double
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -140,6 +141,36 @@ def predicted_error(
     return PredictedError(due, tip, sigma, radii[:-1], float(radii[-1]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseHandover:
+    """A pose on its way from the tracking to the motion process."""
+
+    pose: SurfacePose
+    handed: float  # s, when the newest of its frames was handed over
+    sent: float  # s, when the pose left the tracking process
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeginPrint:
+    """The order to print."""
+
+    path: Path  # in the tracker's surface frame
+    profile: ArmProfile  # with the arm's place and lag as they are now known
+    start: float  # place on the path, counted in checkpoints
+    outlets: Outlets  # of its materials
+    fingerprint: str  # of the path as its file has it
+    tissue: TissueGuard | None = None  # that the tool is kept out of, in the same frame
+
+
+class PauseOrder(Enum):
+    """Orders of a live run beside those that the arm follows."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    MATERIAL_IN = "material in"  # what the motion asked for was put in, or the look that it stands aside for is done
+    LOOK = "look"  # step aside in a pause, for a look at what was laid
+
+
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"
 LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
@@ -169,13 +200,15 @@ class PrintMotion:
         place: c_double,
         material: MaterialControl | None = None,
         measured: Callable[[], float] = lambda: math.nan,
+        dry: Callable[[], str] = str,
     ) -> None:
-        """clock: of the loop. place: kept up to date, in checkpoints.
+        """clock: of the dispensers. place: kept up to date, in checkpoints.
 
         measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
+        dry: says why material cannot flow now, "" where it can.
         """
         self._profile, self._clock, self._place = profile, clock, place
-        self._material, self._measured = material, measured
+        self._material, self._measured, self._dry = material, measured, dry
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
         self.waits = self.material_in = self.aside = False
         self._step: MotionStep | None = None
@@ -189,6 +222,19 @@ class PrintMotion:
         """Print this path, surface frame, from now on. start: place on it, in checkpoints. tissue: see `MotionStep`."""
         self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
         self._make(start)
+
+    def follow(self, order: PauseOrder | BeginPrint) -> None:
+        """Follow an order that the arm has no part in."""
+        if isinstance(order, BeginPrint):
+            self.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
+        elif order is PauseOrder.PAUSE:
+            self.paused = True
+        elif order is PauseOrder.RESUME:
+            self.resume()
+        elif order is PauseOrder.LOOK:
+            self.look()
+        else:
+            self.put_in()
 
     def homed(self) -> None:
         """Begin anew at the same place of the path, as the arm stands at home."""
@@ -234,7 +280,7 @@ class PrintMotion:
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
             return self.last
-        dry = "" if self._material is None else self._material.reason
+        dry = self._dry()
         self._step.paused = self.waits = self.paused or bool(dry)
         self._step.aside = self.aside
         measured = self._measured()
