@@ -100,9 +100,7 @@ def _play(
 ) -> None:
     """The loop of a recorded run, once more, as far as it was recorded."""
     if LOOP_ARM_ATTACHMENT not in run.texts:
-        raise InputError(
-            record, "recording", "no /loop", "of a run or simulation that recorded what its loop was given"
-        )
+        raise InputError(record, "recording", "no /loop", "of a run that recorded what its loop was given")
     profile = arm_from_text(run.texts[LOOP_ARM_ATTACHMENT], record / LOOP_ARM_ATTACHMENT)
 
     def begin(start: float, outlets: Outlets) -> BeginPrint:

@@ -8,6 +8,7 @@ are those of a live run; the arm is one that takes all and never answers, so the
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -26,7 +27,7 @@ from hardware.arm.s6h4d import S6H4D
 from hardware.files.arm_file import write_arm
 from hardware.files.path_file import ProgressFile, read_path, read_progress
 from hardware.files.session import Session
-from hardware.motion.loop import Order, Tick
+from hardware.motion.loop import MaterialControl, Order, Tick
 from hardware.motion.print_loop import LoopOrder, LoopSettings, PrintLoop
 from hardware.motion.step import BeginPrint, PoseHandover
 from hardware.process.clock import SimClock
@@ -101,7 +102,7 @@ class ReplaySource(SimClock):
     given. driver: of the arm.
     """
 
-    material = None
+    material: MaterialControl | None = None
 
     def __init__(
         self,
@@ -120,7 +121,8 @@ class ReplaySource(SimClock):
         self._handover: PoseHandover | None = None
         self._next = next(self._coming, None)
         super().__init__(0.0 if self._next is None else self._next.stamp)
-        self._begun, self._first = self.now(), [order, Order.AT_HOME, Order.ARM]
+        self._begun = self.now()
+        self._first: list[LoopOrder] = [order, Order.AT_HOME, Order.ARM]
         self.driver: ArmDriver = S6H4D(lambda: port, order.profile)
 
     def wait_until(self, instant: float) -> None:
@@ -139,7 +141,8 @@ class ReplaySource(SimClock):
 
     def orders(self) -> Sequence[LoopOrder]:
         """At first to print; at the end to end."""
-        orders, self._first = self._first, []
+        orders: list[LoopOrder] = self._first
+        self._first = []
         return [Order.QUIT] if self._next is None else orders
 
     def dry(self) -> str:
@@ -186,7 +189,12 @@ def replay(
 
     report: of each tick, and how far the print is by it. taken: is given the bytes that go to the arm. As ReplaySource.
     """
-    source = ReplaySource(poses, order, SilentPort(taken), delay, hangs)
+
+    def send(data: bytes) -> None:
+        if math.isfinite(source.now()):  # a motion that was killed sends no stop
+            taken(data)
+
+    source = ReplaySource(poses, order, SilentPort(send), delay, hangs)
 
     def told(tick: Tick) -> None:
         if (progress := loop.motion.progress) is not None:

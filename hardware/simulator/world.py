@@ -165,20 +165,18 @@ class SimulatedWorld:
         keeper: LoopKeeper | None = None,
     ) -> None:
         """scene: the scenario's, None without pictures; beads are drawn into it. path: in the true surface frame.
-
-        exposures: filled with the shot of each picture, for a step that may know. clock: for tracking times. line:
-        carries bytes from the motion to the arm, e.g. over a pty. store: pictures of earlier runs.
-        keeper: keeps what the loop was given.
+        exposures: filled with each picture's shot, for a step that may know. clock: of tracking. keeper: of the loop.
+        line: carries bytes from the motion to the arm, e.g. over a pty. store: pictures of earlier runs.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
         if scene is not None:
             scene.gel = scenario.gel
-        self._step, self._truth, self._exposures, self._time = step, truth, exposures, SimClock()
+        self._step, self._truth, self._exposures, self._keeper = step, truth, exposures, keeper
+        self._time = SimClock()
         self._events = EventQueue(self._time)
         profile, faults = scenario.profile, scenario.faults
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, faults, scenario.baud)
-        wire = _Wire(sink, self._time)
-        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=wire, line=line)
+        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time), line=line)
         self._truth_log = TruthLog(path, scenario.true_arm, truth, profile.tick, profile.lag)
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
@@ -194,7 +192,6 @@ class SimulatedWorld:
         self._lines = faults_striking(faults, FaultPart.DISPENSER, FaultKind.UNPLUG, FaultKind.BLOCK, FaultKind.DROP)
         self._handover: PoseHandover | None = None
         self._given: list[LoopOrder] = []  # since the loop last asked
-        self._keeper, self._begun = keeper, False
         self.dispensers = SimulatedDispensers(path, scenario.dispenser, self._time, faults, scenario.path)
         material = self.dispensers.control
         material.begin(0.0, 0.0)
@@ -204,14 +201,12 @@ class SimulatedWorld:
         source = RecordingSource(*given, put, profile, material, settings)
         self._loop = PrintLoop(source, profile, settings, self._time, self._report)
         self.motion, self.link = self._loop.motion, self._loop.arm
-        self._rows_until = 0.0
         beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
         self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
         self._looks: SurfaceLooks | None = None
-        self._end = scenario.seconds
-        self._killed = self._broken = False
+        self._rows_until, self._end, self._reported = 0.0, scenario.seconds, 0
+        self._begun = self._killed = self._broken = False
         self._progress: ProgressReport = no_progress
-        self._reported = 0  # frame sets
 
     def run(self, progress: ProgressReport = no_progress) -> None:
         """Let the scenario's time pass; `progress` is called for each frame set tracked."""
@@ -223,6 +218,10 @@ class SimulatedWorld:
             self._advance(self._end)  # of a motion that was killed
         finally:
             self._emit_rows(self.ended)
+
+    def order(self, order: LoopOrder) -> None:
+        """Give the motion an order."""
+        self._given.append(order)
 
     def every(self, period: float, action: Callable[[float], None]) -> None:
         """Do `action` every `period` s from the beginning on; it is given the instant, s."""
@@ -351,7 +350,7 @@ class SimulatedWorld:
             return
         placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
         order, self._begun = BeginPrint(placed_path, scenario.profile, 0.0, self.dispensers.outlets, ""), True
-        self._given.append(order if self._keeper is None else self._keeper.begun(order))
+        self.order(order if self._keeper is None else self._keeper.begun(order))
         self._sink.registered(change)
         if scenario.looks is not None:
             self._looks = SurfaceLooks(scenario.known_rig, placed_path)
@@ -366,7 +365,7 @@ class SimulatedWorld:
             look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
             self._sink.look(look)
             self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
-        self._given.append(PauseOrder.MATERIAL_IN)
+        self.order(PauseOrder.MATERIAL_IN)
 
     def _orders(self) -> list[LoopOrder]:
         now = self._time.now()
