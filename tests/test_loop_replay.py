@@ -64,7 +64,10 @@ class Recorded(Heard):
 def simulated(
     folder: Path, faults: list[str], stops: bool = False, away: tuple[tuple[float, float], ...] = ()
 ) -> tuple[Path, Recorded]:
-    """The recording of a run with faults, and all that was heard of it. stops: by the operator. away: when the arm's device is, s."""
+    """The recording of a run with faults, and all that was heard of it.
+
+    stops: the operator stops, arms again, pauses and resumes. away: when the arm's device is, s.
+    """
     folder.mkdir()
     by = "tracks" if any("camera" in fault for fault in faults) else "truth"
     scenario = read_scenario(

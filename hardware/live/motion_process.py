@@ -134,12 +134,13 @@ class _TickReporter:
         progress, late = motion.progress, loop.lateness
         if progress is not None:
             stamp = math.nan if self._handover is None else self._handover.pose.stamp
-            asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
-            motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
-            reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            inputs = stamp, asked, begun, motion.waits, motion.material_in
-            motion.material_in, lag = False, motion.lag if asked else math.nan
-            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag, motion.aside))
+            asked = motion.asked and motion.last.stamp == tick.stamp
+            frame, recalled = (
+                loop.arm.command_frame if asked else b"",
+                None if tick.recalled is None else tick.recalled.rows,
+            )
+            reached = tick.command, frame, progress.fraction, progress.phase, recalled
+            self._sender.put(RecordedTick(tick.stamp, stamp, asked, *reached))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)

@@ -71,10 +71,7 @@ class MotionStep:
 
     @property
     def lag(self) -> float:
-        """Seconds from one tick after a command was sent until the arm is at its axes: the profile's until it is set.
-
-        Whoever sets it records it with the tick, as the commands from then on depend on it.
-        """
+        """Seconds from one tick after a command was sent until the arm is at its axes: by default the profile's."""
         return self._planner.lag
 
     @lag.setter
@@ -183,12 +180,7 @@ class PrintMotion:
 
     last: the last command.
     asked: whether planner and guard made it.
-    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
-    waits: whether they were told to wait above the surface,
-    aside: and that beside all that is printed, for a look.
-    material_in: whether the material that was wanted was put in since this was last reset.
-    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
-        tick, so that a replay is equal byte by byte.
+    aside: whether they are told to wait beside all that is printed, for a look.
     """
 
     last: Command
@@ -210,11 +202,10 @@ class PrintMotion:
         self._profile, self._clock, self._place = profile, clock, place
         self._material, self._measured, self._dry = material, measured, dry
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
-        self.waits = self.material_in = self.aside = False
+        self.aside = False
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
         self.paused = self.asked = False
-        self.begun = self.lag = math.nan
 
     def begin(
         self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
@@ -256,7 +247,6 @@ class PrintMotion:
             self.aside = False
         elif self._step is not None and self._step.progress.wanted:
             self._step.material_in()
-            self.material_in = True
             self._prepare_material()
 
     def recalled(self, place: Array, stands: Array) -> None:
@@ -281,15 +271,14 @@ class PrintMotion:
             self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
             return self.last
         dry = self._dry()
-        self._step.paused = self.waits = self.paused or bool(dry)
+        self._step.paused = waits = self.paused or bool(dry)
         self._step.aside = self.aside
         measured = self._measured()
         lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
-        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
-        if not math.isnan(self.lag):
+        if abs(lag - self._step.lag) > LAG_STEP:
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if self.waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
+        if waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last
@@ -297,8 +286,7 @@ class PrintMotion:
     def _make(self, start: float) -> None:
         assert self._begin is not None
         self._step = self._begin(start)
-        self._place.value = self.begun = start
-        self.material_in = False
+        self._place.value = start
         self._prepare_material()
 
     def _prepare_material(self) -> None:
