@@ -22,9 +22,10 @@ from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH
 from hardware.files.path_file import read_path
 from hardware.files.rig_file import read_rig
+from hardware.motion.loop import Tick
 from hardware.motion.step import BeginPrint
 from hardware.offline.replay import placed_by, replay
-from planning.command import Command, Move
+from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import Path as Route
 
@@ -33,9 +34,7 @@ TRACKS = ("breathing", "outage")
 CASES = (*TRACKS, "pictures")
 ABOVE = 1.0  # mm
 
-Arrays = dict[
-    str, NDArray[np.generic]
-]  # by name; the first word of a name is what has a row each: pose, tick, track, frame
+Arrays = dict[str, NDArray[np.generic]]  # by name; the first word of a name is what has a row each: pose, tick, track
 
 
 def replayed(case: str) -> Arrays:
@@ -46,12 +45,9 @@ def replayed(case: str) -> Arrays:
         poses, tracks = _tracked(FOLDER / case / "session.mcap")
     path = read_path(FOLDER / "path.csv")
     given, profile = placed_by(poses)
-    near, commands, sent = _near(profile, next(pose for pose in poses if pose.state.measured), path), [], bytearray()
-    replay(
-        given, BeginPrint(path, near, 0.0, {}, ""), lambda tick, progress: commands.append(tick.command), sent.extend
-    )
-    frames = np.frombuffer(bytes(sent), np.uint8).reshape(-1, FRAME_LENGTH)
-    return tracks | _pose_arrays(poses) | _tick_arrays(commands) | {"frame bytes": frames}
+    near, ticks = _near(profile, next(pose for pose in poses if pose.state.measured), path), list[Tick]()
+    replay(given, BeginPrint(path, near, 0.0, {}, ""), lambda tick, progress: ticks.append(tick))
+    return tracks | _pose_arrays(poses) | _tick_arrays(ticks)
 
 
 def recorded_tracks(case: str) -> list[Observations]:
@@ -118,8 +114,8 @@ def _pose_arrays(poses: list[SurfacePose]) -> Arrays:
     }
 
 
-def _tick_arrays(commands: list[Command]) -> Arrays:
-    nothing = np.full(6, np.nan)
+def _tick_arrays(ticks: list[Tick]) -> Arrays:
+    nothing, commands = np.full(6, np.nan), [tick.command for tick in ticks]
     moves = [command if isinstance(command, Move) else None for command in commands]
     return {
         "tick stamp": np.array([command.stamp for command in commands]),
@@ -128,6 +124,7 @@ def _tick_arrays(commands: list[Command]) -> Arrays:
         "tick checkpoint": np.array([-1 if move is None else move.checkpoint for move in moves]),
         "tick extrude": np.array([move is not None and move.extrude for move in moves]),
         "tick reason": np.array([command.reason for command in commands]),
+        "tick frame": np.array([list(tick.frame.ljust(FRAME_LENGTH, b"\0")) for tick in ticks], np.uint8),
     }
 
 

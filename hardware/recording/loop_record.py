@@ -30,7 +30,7 @@ from hardware.process.clock import Clock
 LOOP_ARM_ATTACHMENT = "loop_arm.toml"  # the arm as it was known when the loop began
 START = "start"  # kind of the first call: the settings
 UNPLUGGED, REFUSED = "unplugged", "refused"  # keys of a call that raised: UnpluggedError, InputError
-T = TypeVar("T")
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,7 +187,7 @@ class _NotedDriver(ArmDriver):
     def waiting(self) -> float:
         return self._through("waiting", self._driver.waiting, float)
 
-    def _through(self, kind: str, call: Callable[[], T], told: Callable[[T], Any]) -> T:
+    def _through(self, kind: str, call: Callable[[], Answer], told: Callable[[Answer], Any]) -> Answer:
         try:
             answer = call()
         except UnpluggedError as error:
