@@ -16,10 +16,9 @@ from estimation.errors import InputError
 from estimation.synthetic.world import arc_rig
 from hardware.arm.protocol import FRAME_LENGTH
 from hardware.cli.main import main
-from hardware.live.recorded_run import replay_run
+from hardware.live.recorded_run import PartedError, replay_run
 from hardware.motion.loop import Order
 from hardware.motion.step import PauseOrder
-from hardware.recording.loop_playback import PartedError
 from hardware.recording.loop_record import LoopKeeper, LoopRecord
 from hardware.recording.recorder import Recorder
 from hardware.simulator.arm.ports import PortFaults

@@ -126,7 +126,7 @@ WRONG = [
     ("motion[0].file", {"motion": [{"kind": "trace"}]}), ("titel", {"titel": "x"}),
     *((table, {table: 5}) for table in ("scene", "strain", "rig", "cameras", "sensor", "tracking", "arm", "limits")),
     ("planted", {"planted": []}), ("scene.nozzle", {"scene": {"nozzle": 1}}),
-    ("scene.beads", {"scene": {"beads": "yes"}}), ("strain.kind", {"strain": {"rate_hz": 0.25}}),
+    ("scene.fields", {"scene": {"beads": "yes"}}), ("strain.kind", {"strain": {"rate_hz": 0.25}}),
     ("strain.kind", {"strain": {"kind": "hand"}}),
     ("strain.amplitude_mm", {"strain": {"kind": "sine", "rate_hz": 1, "amplitude_mm": 1}}),
     ("rig.angle", {"rig": {"angle": 3}}), ("rig.angles_deg", {"rig": {"angles_deg": 3}}),

@@ -32,8 +32,8 @@ from hardware.bench.whole import LiveSession
 from hardware.files.dispenser_file import read_dispensers
 from hardware.files.path_file import read_path, write_path
 from hardware.live.prepared import RunFiles
-from hardware.live.prerender import prerender
-from hardware.live.recorded_run import NozzleErrors, nozzle_errors, printed_range
+from hardware.live.prerender import NozzleErrors, nozzle_errors, prerender
+from hardware.live.recorded_run import printed_range
 from hardware.live.records import EXPOSURE_TO_WIRE_STAGE, FRAMES_TO_WIRE_STAGE, LATE_TICK_STAGE
 from hardware.live.settings import LiveSettings, available_cores, settings_text
 from hardware.offline.track import tracker

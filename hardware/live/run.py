@@ -35,13 +35,7 @@ from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
-from hardware.live.records import (
-    EventEntry,
-    OutlineOrder,
-    PlacedScanEntry,
-    RunReports,
-    UsedEntry,
-)
+from hardware.live.records import EventEntry, OutlineOrder, PlacedScanEntry, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text, used_files
 from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
@@ -97,8 +91,8 @@ class LiveRun:
             channels = self._channels = start_processes(prepared, File(folder), self._tracker)
             stack.callback(channels.processes.kill_all)
             files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
-            channels.sender.put(UsedEntry("session.toml", settings_text(prepared.settings)))
-            channels.sender.put(UsedEntry(LOOP_ARM_ATTACHMENT, text))
+            for used in (("session.toml", settings_text(prepared.settings)), (LOOP_ARM_ATTACHMENT, text)):
+                channels.sender.put(UsedEntry(*used))
             progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)
             stack.callback(self._close_progress, progress_writer)
             self._open_page(stack)

@@ -2,8 +2,8 @@
 
 A print has one loop (`hardware/motion/print_loop.py`). It reads no clock and no device: all that it cannot compute
 comes through its `LoopSource`. A live run and a simulation give it theirs in a `RecordingSource`, which notes what it
-hands on; a replay gives it a `PlayedSource` (`loop_playback.py`), which hands on what was noted. Whatever stands behind
-the source is then neither needed nor asked: cameras, the arm, the operator, dispensers, the machine's clock.
+hands on; a replay gives it a `PlayedSource` (`hardware/live/recorded_run.py`), which hands on what was noted. Whatever
+stands behind the source is then neither needed nor asked: cameras, arm, operator, dispensers, the machine's clock.
 
 A record holds the readings of the clock in order, and of all other calls those whose answer was not the usual one, each
 by the number of readings before it and of calls since the last. What is given to the arm's driver is always noted.

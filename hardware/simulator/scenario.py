@@ -56,7 +56,7 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
-from hardware.simulator.scene.beads import FRESH_ASPECT, Gel
+from hardware.simulator.scene.fields import FRESH_ASPECT, Gel
 from planning.kinematics import SimpleArm
 from planning.laid_beads import beads_between_looks
 
@@ -160,7 +160,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         else None,
         bead=_within(path, "bead_mm", table.get("bead_mm", 1.0), 0.05, 20.0, "mm"),
         nozzle=_switch(path, "scene.nozzle", parts["scene"].pop("nozzle", True)),
-        beads=_switch(path, "scene.beads", parts["scene"].pop("beads", True)),
+        beads=_switch(path, "scene.fields", parts["scene"].pop("beads", True)),
         scene=parts["scene"],
         motion=motion_from_tables(path, table.get("motion", []), path.parent, seed),
         strain=waveform_from_table(path, "strain", parts["strain"], strain_rng) if parts["strain"] else None,
