@@ -226,7 +226,7 @@ def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: P
     finally:
         run.close()
     summary: dict[str, Any] = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))
-    error = nozzle_errors(record, path, arm, _truth(options.dispenser))
+    error = nozzle_errors(record, RunFiles(record).executed, path, arm, _truth(options.dispenser))
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
     name += f", {options.busy} busy beside it" if options.busy else ""

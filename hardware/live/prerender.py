@@ -5,8 +5,8 @@ surface, arm.toml as the motion knows the arm, virtual_arm.toml as it is, and sc
 prints are not in the pictures, as nobody knows beforehand where they will be.
 
 A run before them has a true error at the nozzle, which nobody in the loop knows (`nozzle_errors`): the simulator's
-truth log compares what was commanded with what the arm did, millisecond by millisecond. The truth is that of the pictures,
-which is part of the recording, interpolated between their instants.
+truth log compares what was commanded with what the arm did, millisecond by millisecond. The truth is that of the
+pictures, which is part of the recording, interpolated between their instants.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from estimation.se3 import Array
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.files.folder_tables import rows_from_trajectory, trajectory_from_rows
 from hardware.files.path_file import read_path, write_path
-from hardware.live.prepared import RunFiles
 from hardware.live.recorded_run import commands_in, read_run
 from hardware.process.clock import WallClock
 from hardware.process.faults import FaultPart
@@ -192,10 +191,11 @@ class _TrueMotion:
 
 
 def nozzle_errors(
-    record: Path, path: Path, arm: Path, dispenser: VirtualDispenserSettings | None = None
+    record: Path, executed: Path, path: Path, arm: Path, dispenser: VirtualDispenserSettings | None = None
 ) -> NozzleErrors:
-    """path: checkpoints in the true surface frame; arm: the arm as it truly stands. InputError without ticks.
+    """executed: what the arm did, as a live run leaves it. path: checkpoints in the true surface frame.
 
+    arm: as it truly stands. InputError without ticks.
     dispenser: what the one that was told truly does; None: it gives each bead what it needs, at once.
     """
     run = read_run(record, "/tick", "/move", "/truth", "/dispenser")
@@ -212,9 +212,9 @@ def nozzle_errors(
     commands = commands_in(run)
     for command, progress in commands:
         truth_log.write(command, progress)
-    with np.load(RunFiles(record).executed) as executed:
-        stamps, axes = executed["stamps"], executed["axes"]
-        deepest, held_up = float(executed["deepest"]), float(executed["held_up"])
+    with np.load(executed) as done:
+        stamps, axes = done["stamps"], done["axes"]
+        deepest, held_up = float(done["deepest"]), float(done["held_up"])
     first, last = commands[0][0].stamp, min(truth_log.known_until, float(stamps[-1]))
 
     def axes_at(times: Array) -> Array:

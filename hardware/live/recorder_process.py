@@ -270,8 +270,8 @@ class _EntryWriter:
         began = round((utc_now() - self._clock.now()) * 1e9)
         self._server = FoxgloveServer(settings.foxglove_port) if settings.foxglove_port else None
         listener = None if self._server is None else self._server.publish
-        how = {"jpeg_quality": quality, "overwrite": True, "compress": False, "began": began, "listener": listener}
-        self._opened = partial(Recorder, self._file, **how)
+        opened = partial(Recorder, self._file, jpeg_quality=quality, overwrite=True, compress=False)
+        self._opened = partial(opened, began=began, listener=listener)
         self._lane = TraceLane(RECORDER_LANE, self._clock, self._write) if settings.trace else None
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
