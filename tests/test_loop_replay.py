@@ -40,6 +40,7 @@ FAULTS = {  # name: faults of the run, and what its events or holds say of them
     "a lost camera": (["camera0 off at 1.2s for 1s"], ""),
     "a hung motion": (["motion hang at 1.5s for 0.3s"], ""),
     "a killed motion": (["motion kill at 2s"], ""),
+    "a dispenser that is gone": (["dispenser unplug at 1.2s for 0.8s"], "dispenser dispenser is"),
 }
 
 
@@ -69,8 +70,11 @@ def simulated(
     """
     folder.mkdir()
     by = "tracks" if any("camera" in fault for fault in faults) else "truth"
+    dispenser = {"dispenser": {"flow_mm3_s": 5.0}} if any("dispenser" in fault for fault in faults) else {}
     scenario = read_scenario(
-        write_scenario(folder, ANSWERING, {"tracking": {"by": by}}, seconds=SECONDS, motion=BREATHING, faults=faults)
+        write_scenario(
+            folder, ANSWERING, {"tracking": {"by": by}, **dispenser}, seconds=SECONDS, motion=BREATHING, faults=faults
+        )
     )
     file = folder / "run.mcap"
     with Recorder(file, scenario.known_rig) as recorder:
@@ -150,6 +154,29 @@ def test_a_planner_that_decides_otherwise_is_found(
     played = replay_run(recordings["a hung motion"][0])
     assert any(each.frame != each.recorded for each in played)
     assert main(["replay", str(recordings["a hung motion"][0]), "-o", str(tmp_path / "out")]) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "where", "value"),
+    [
+        ("a silent arm", "hardware.arm.feedback.MAX_MISSED_ANSWERS", 5),
+        ("a recall", "hardware.arm.jog.MIN_TRIAL_STEP", 1.0),
+        ("stopped and resumed", "hardware.arm.link.MIN_SHUTDOWN_TIME", 0.5),
+        ("an unplugged arm", "hardware.arm.feedback.REST_TIME", 0.6),
+        ("stopped and resumed", "hardware.motion.step.PrintMotion.resume", lambda motion: None),
+        ("a dispenser that is gone", "hardware.live.recorded_run.PlayedSource.dry", lambda source: ""),
+    ],
+)
+def test_a_link_or_motion_that_does_otherwise_is_found(
+    recordings: dict[str, tuple[Path, Recorded]], monkeypatch: pytest.MonkeyPatch, name: str, where: str, value: object
+) -> None:
+    monkeypatch.setattr(where, value)
+    try:
+        same = all(each.frame == each.recorded for each in replay_run(recordings[name][0]))
+    except PartedError:
+        same = False
+    print(name, where, same)
+    assert not same
 
 
 @pytest.mark.parametrize("what", ["stop", "pose", "reading", "gap", "start"])
