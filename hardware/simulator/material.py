@@ -35,7 +35,7 @@ from hardware.process import checks
 from hardware.process.clock import Clock
 from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
 from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
-from hardware.simulator.scene.beads import GelPieces
+from hardware.simulator.scene.fields import GelPieces
 from hardware.simulator.scene.scene import Scene
 from hardware.simulator.truth import FlowAt, Truth, TruthLog
 from planning.command import Command, Move

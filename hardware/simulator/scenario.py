@@ -56,7 +56,7 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
-from hardware.simulator.scene.beads import FRESH_ASPECT, Gel
+from hardware.simulator.scene.fields import FRESH_ASPECT, Gel
 from planning.kinematics import SimpleArm
 from planning.laid_beads import beads_between_looks
 
