@@ -98,6 +98,19 @@ class FlowShares:
         return f"the next layer flows at {self.share.min():.0%} to {self.share.max():.0%} of the planned"
 
 
+_FLOW = "begin", "end", "share"  # of FlowShares
+
+
+def message_from_flow(flow: FlowShares) -> dict[str, list[float]]:
+    """Changed flows as a part of a message."""
+    return {name: getattr(flow, name).tolist() for name in _FLOW}
+
+
+def flow_from_message(message: Mapping[str, list[float]]) -> FlowShares:
+    """Changed flows from their part of a message."""
+    return FlowShares(*(np.array(message[name], float) for name in _FLOW))
+
+
 AS_PLANNED = FlowShares(np.zeros(1), np.zeros(1), np.ones(1))
 
 

@@ -45,7 +45,6 @@ class PrintTask:
     unattended: bool = False  # nobody confirms and nobody resumes: what stops such a run ends it
     patience: float = 10.0  # s without pictures, after which the arm is stopped
     dispensers: str = ""  # text of the dispenser file; "": nothing is extruded
-    adapt: bool = False  # whether each layer takes its flow from what a look found under it
     looks: bool = False  # whether what is laid can be looked at: the path says how much it is
     outlets: Outlets = field(default_factory=dict)  # of the path's materials
     tissue: TissueGuard | None = None  # that the tool is kept out of, in the path's own frame; None without a scan

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from ctypes import c_double
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -74,10 +75,7 @@ class MotionStep:
 
     @property
     def lag(self) -> float:
-        """Seconds from one tick after a command was sent until the arm is at its axes: the profile's until it is set.
-
-        Whoever sets it records it with the tick, as the commands from then on depend on it.
-        """
+        """Seconds from one tick after a command was sent until the arm is at its axes: by default the profile's."""
         return self._planner.lag
 
     @lag.setter
@@ -144,6 +142,36 @@ def predicted_error(
     return PredictedError(due, tip, sigma, radii[:-1], float(radii[-1]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseHandover:
+    """A pose on its way from the tracking to the motion process."""
+
+    pose: SurfacePose
+    handed: float  # s, when the newest of its frames was handed over
+    sent: float  # s, when the pose left the tracking process
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeginPrint:
+    """The order to print."""
+
+    path: Path  # in the tracker's surface frame
+    profile: ArmProfile  # with the arm's place and lag as they are now known
+    start: float  # place on the path, counted in checkpoints
+    outlets: Outlets  # of its materials
+    fingerprint: str  # of the path as its file has it
+    tissue: TissueGuard | None = None  # that the tool is kept out of, in the same frame
+
+
+class PauseOrder(Enum):
+    """Orders of a live run beside those that the arm follows."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    MATERIAL_IN = "material in"  # what the motion asked for was put in, or the look that it stands aside for is done
+    LOOK = "look"  # step aside in a pause, for a look at what was laid
+
+
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"
 LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
@@ -156,13 +184,7 @@ class PrintMotion:
 
     last: the last command.
     asked: whether planner and guard made it.
-    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
-    waits: whether they were told to wait above the surface,
-    aside: and that beside all that is printed, for a look.
-    adapted: the flows that were changed since this was last reset.
-    material_in: whether the material that was wanted was put in since this was last reset.
-    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
-        tick, so that a replay is equal byte by byte.
+    aside: whether they are told to wait beside all that is printed, for a look.
     """
 
     last: Command
@@ -174,21 +196,21 @@ class PrintMotion:
         place: c_double,
         material: MaterialControl | None = None,
         measured: Callable[[], float] = lambda: math.nan,
+        dry: Callable[[], str] = str,
     ) -> None:
-        """clock: of the loop. place: kept up to date, in checkpoints.
+        """clock: of the dispensers. place: kept up to date, in checkpoints.
 
         measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
+        dry: says why material cannot flow now, "" where it can.
         """
         self._profile, self._clock, self._place = profile, clock, place
-        self._material, self._measured = material, measured
+        self._material, self._measured, self._dry = material, measured, dry
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
-        self.waits = self.material_in = self.aside = False
+        self.aside = False
         self._shares: list[FlowShares] = []
-        self.adapted: FlowShares | None = None
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
         self.paused = self.asked = False
-        self.begun = self.lag = math.nan
 
     def begin(
         self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
@@ -197,6 +219,21 @@ class PrintMotion:
         self._shares = []
         self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
         self._make(start)
+
+    def follow(self, order: PauseOrder | BeginPrint | FlowShares) -> None:
+        """Follow an order that the arm has no part in."""
+        if isinstance(order, BeginPrint):
+            self.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
+        elif isinstance(order, FlowShares):
+            self.adapt(order)
+        elif order is PauseOrder.PAUSE:
+            self.paused = True
+        elif order is PauseOrder.RESUME:
+            self.resume()
+        elif order is PauseOrder.LOOK:
+            self.look()
+        else:
+            self.put_in()
 
     def homed(self) -> None:
         """Begin anew at the same place of the path, as the arm stands at home."""
@@ -212,12 +249,11 @@ class PrintMotion:
         """Step aside in a pause, until what was laid has been looked at, which `put_in` says."""
         self.aside = self.paused
 
-    def adapt(self, shares: FlowShares | None) -> None:
-        """Let other flows leave on some ways, also where the path is begun anew at home; None: as they are."""
-        if self._step is not None and shares is not None:
+    def adapt(self, shares: FlowShares) -> None:
+        """Let other flows leave on some stretches, also where the path is begun anew at home."""
+        if self._step is not None:
             self._shares.append(shares)
             self._step.adapt(shares)
-            self.adapted = shares
 
     def put_in(self) -> None:
         """The operator has put in the material that was wanted, or the look is done."""
@@ -225,7 +261,6 @@ class PrintMotion:
             self.aside = False
         elif self._step is not None and self._step.progress.wanted:
             self._step.material_in()
-            self.material_in = True
             self._prepare_material()
 
     def recalled(self, place: Array, stands: Array) -> None:
@@ -249,16 +284,15 @@ class PrintMotion:
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
             return self.last
-        dry = "" if self._material is None else self._material.reason
-        self._step.paused = self.waits = self.paused or bool(dry)
+        dry = self._dry()
+        self._step.paused = waits = self.paused or bool(dry)
         self._step.aside = self.aside
         measured = self._measured()
         lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
-        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
-        if not math.isnan(self.lag):
+        if abs(lag - self._step.lag) > LAG_STEP:
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if self.waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
+        if waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last
@@ -268,8 +302,7 @@ class PrintMotion:
         self._step = self._begin(start)
         for shares in self._shares:
             self._step.adapt(shares)
-        self._place.value = self.begun = start
-        self.material_in = False
+        self._place.value = start
         self._prepare_material()
 
     def _prepare_material(self) -> None:

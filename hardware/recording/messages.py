@@ -21,7 +21,7 @@ from hardware.motion.loop import DispenserRecord, RecordedTick
 from perception.frames import OutlinedPicture, Roi
 from planning.command import Hold, Move
 from planning.laid_beads import LaidBeads, Look, Stations
-from planning.material import FlowShares
+from planning.material import flow_from_message, message_from_flow
 
 Message = dict[str, Any]
 
@@ -246,35 +246,15 @@ def hold_from_message(message: Message) -> Hold:
 
 def message_from_tick(tick: RecordedTick) -> Message:
     """A tick of the motion as a message; its command is written as a message of its own."""
-    more: Message = {"aside": True} if tick.aside else {}
-    if tick.adapted is not None:
-        more |= {"adapted": message_from_flow(tick.adapted)}
-    return more | {
+    return {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
         "asked": tick.asked,
-        "begun": _flat(np.array([tick.begun])),
         "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
-        "lag": _flat(np.array([tick.lag])),
-        "paused": tick.paused,
-        "material_in": tick.material_in,
         "fraction": tick.fraction,
         "phase": tick.phase.value,
         "frame": base64.b64encode(tick.frame).decode("ascii"),
     }
-
-
-_FLOW = "begin", "end", "share"  # of FlowShares
-
-
-def message_from_flow(flow: FlowShares) -> Message:
-    """Changed flows as a part of a message."""
-    return {name: getattr(flow, name).tolist() for name in _FLOW}
-
-
-def flow_from_message(message: Message) -> FlowShares:
-    """Changed flows from their part of a message."""
-    return FlowShares(*(np.array(message[name], float) for name in _FLOW))
 
 
 def message_from_dispenser(record: DispenserRecord) -> Message:
