@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError, StillbedError
-from estimation.pose import SurfacePose, TrackState, Trajectory
+from estimation.observations import no_observations
+from estimation.pose import SurfacePose, TrackState, Trajectory, identity_pose
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.arm.protocol import frame_from_command
 from hardware.cli.main import main
@@ -39,14 +40,17 @@ from hardware.live.prepared import (
     read_placement,
     write_placement,
 )
-from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
+from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender, record
 from hardware.live.records import (
     FIRST_BIN_WIDTH,
     TIMELINE_BINS,
     Entry,
     ErrorTimeline,
     EventEntry,
+    PoseEntry,
+    RecorderReport,
     SetEntry,
+    UsedPoses,
 )
 from hardware.live.settings import (
     LiveSettings,
@@ -60,13 +64,15 @@ from hardware.motion.step import LAG_STEP, BeginPrint, PrintMotion
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import faults_from_texts
 from hardware.process.progress import cached
-from hardware.process.system import MOST_RINGS, Bell
+from hardware.process.system import MOST_RINGS, SPAWN, Bell, SharedLatest
 from hardware.recording.loop_record import recorded_begin
+from hardware.recording.session_reader import read_poses
 from perception.frames import Frame, FrameSet
 from planning.material import Outlet, SwitchDelay
 from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
 from tests.scans import body, height_field
+from tests.session_files import rig
 from tests.slowly import slowly
 
 THERE = available_cores()
@@ -200,6 +206,28 @@ def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is
     reader.join(10)
     assert [type(entry) for entry in found] == [SetEntry] * (20 - before) + [EventEntry]
     box.put(picture)
+
+
+def test_poses_that_died_with_the_tracking_process_are_recorded_once_the_motion_process_tells_them(
+    tmp_path: Path,
+) -> None:
+    (first, tracking), (second, motion) = Pipe(duplex=False), Pipe(duplex=False)
+    kept = LiveSettings(record=tmp_path / "run.mcap", arm="virtual", trace=False)
+    recorder = SPAWN.Process(target=record, args=(kept, [first, second], SharedLatest[RecorderReport]()))
+    recorder.start()
+    first.close()
+    second.close()
+    by_tracking, by_motion = RecorderSender(tracking), RecorderSender(motion)
+    poses = [replace(identity_pose(stamp, ""), state=TrackState.TRACKING) for stamp in (1.0, 1.1, 1.2)]
+    by_tracking.put(rig())
+    for pose in poses[:2]:
+        by_tracking.put(PoseEntry(pose, no_observations(pose.stamp)))
+    by_motion.put(UsedPoses(tuple(poses)))  # before the tracking process has ended
+    by_motion.close()
+    by_tracking.close()
+    recorder.join(30)
+    assert recorder.exitcode == 0
+    assert [pose.stamp for pose in read_poses(tmp_path / "run.mcap")] == [1.0, 1.1, 1.2]
 
 
 def _taken(inbox: RecorderReceiver) -> list[Entry]:

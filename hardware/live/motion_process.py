@@ -14,6 +14,7 @@ from types import FrameType
 import numpy as np
 
 from estimation.errors import StillbedError
+from estimation.pose import SurfacePose
 from hardware.arm.device import ArmEvent
 from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
@@ -29,6 +30,7 @@ from hardware.live.records import (
     MotionChannels,
     StageHistograms,
     StageTiming,
+    UsedPoses,
     WireEntry,
 )
 from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
@@ -43,6 +45,7 @@ from planning.material import FlowShares
 from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
+LAST_POSES = 8  # kept for the recording: more do not wait in the tracking process when it is killed
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
 
 
@@ -100,6 +103,7 @@ class _TickReporter:
         self.times = StageHistograms()
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
         self._handover: PoseHandover | None = None  # the newest
+        self._used = deque[SurfacePose](maxlen=LAST_POSES)
         self._unsent = False  # whether no move made of that pose went out yet
         self._lane = TraceLane(MOTION_LANE, self._clock, sender.put) if trace else None
         self._seen = math.nan  # s, when the handover was seen here
@@ -111,6 +115,8 @@ class _TickReporter:
         handover = self._poses.get()
         if handover is not self._handover:
             self._handover, self._unsent, self._seen = handover, True, self._clock.now()
+            if handover is not None:
+                self._used.append(handover.pose)
         return handover
 
     def bytes_passed(self, data: bytes, sent: bool) -> None:
@@ -128,7 +134,8 @@ class _TickReporter:
         self._sender.put(WireEntry(now, data, sent))
 
     def close(self) -> None:
-        """Hand over the rest of the trace."""
+        """Hand over the poses that were used last, and the rest of the trace."""
+        self._sender.put(UsedPoses(tuple(self._used)))
         if self._lane is not None:
             self._lane.close()
 

@@ -36,6 +36,7 @@ from hardware.live.records import (
     SetEntry,
     SurfaceEntry,
     UsedEntry,
+    UsedPoses,
     WireEntry,
 )
 from hardware.live.settings import LOOPBACK, LiveSettings, used_files
@@ -276,8 +277,8 @@ class _EntryWriter:
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
         self._early: list[Entry] = []
-        self._failed = ""
-        self._reported = 0.0
+        self._used, self._tracked = UsedPoses(()), -np.inf  # and the stamp, s, of the last pose by the tracking process
+        self._failed, self._reported = "", 0.0
 
     def run(self, senders: Sequence[RecorderReceiver]) -> None:
         """Write entries until all senders have ended."""
@@ -314,7 +315,10 @@ class _EntryWriter:
                 _write_entry(self._recorder, each)
         elif self._recorder is None:
             self._early.append(entry)
+        elif isinstance(entry, UsedPoses):
+            self._used = entry
         else:
+            self._tracked = entry.pose.stamp if isinstance(entry, PoseEntry) else self._tracked
             _write_entry(self._recorder, entry)
 
     def report(self, failed: str = "") -> None:
@@ -332,6 +336,8 @@ class _EntryWriter:
         if self._lane is not None:
             self._lane.close()
         if self._recorder is not None:
+            for pose in (each for each in self._used.poses if each.stamp > self._tracked):
+                self._recorder.write(pose)
             self._recorder.close()
         self.report()
 

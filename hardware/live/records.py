@@ -140,6 +140,13 @@ class PoseEntry:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class UsedPoses:
+    """The last poses that the motion process used: what the tracking process could not record before it died."""
+
+    poses: tuple[SurfacePose, ...]  # by stamp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SurfaceEntry:
     """What viewers are shown of the surface: landmarks (V, 3) and outlines of the region (K, 3), mm, in its frame."""
 
@@ -197,7 +204,7 @@ class UsedEntry:
 # the rig comes first: nothing is written before the cameras are known
 Record = Roi | OutlinedPicture | RecordedTick | LoopRecord | DispenserRecord
 Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceBatch | Look
-Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
+Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | UsedPoses | Record | WireEntry | Shown
 
 
 @dataclass(slots=True)
