@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from estimation.errors import InputError
@@ -24,6 +25,7 @@ from hardware.recording.recorder import Recorder
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.scenario import read_scenario
 from planning.command import Move
+from planning.material import FlowShares
 from planning.motion.planner import Planner
 from tests.live_runs import CLOCK, Running, light_runs, messages
 from tests.worlds import Heard, world_of, write_scenario
@@ -66,7 +68,7 @@ def simulated(
 ) -> tuple[Path, Recorded]:
     """The recording of a run with faults, and all that was heard of it.
 
-    stops: the operator stops, arms again, pauses and resumes. away: when the arm's device is, s.
+    stops: the flow changes, the operator stops, arms again, pauses and resumes. away: when the arm's device is, s.
     """
     folder.mkdir()
     by = "tracks" if any("camera" in fault for fault in faults) else "truth"
@@ -82,7 +84,8 @@ def simulated(
         scenario = replace(scenario, profile=sink.keeper.arm(scenario.profile))
         world = world_of(scenario, sink, keeper=sink.keeper)
         if stops:
-            told = iter([(1.5, Order.STOP), (2.2, PauseOrder.PAUSE), (2.6, PauseOrder.RESUME)])
+            flow = FlowShares(np.array([0.2]), np.array([2.5]), np.array([1.3]))
+            told = iter([(1.4, flow), (1.5, Order.STOP), (2.2, PauseOrder.PAUSE), (2.6, PauseOrder.RESUME)])
             later = next(told)
 
             def order(now: float) -> None:
@@ -118,6 +121,8 @@ def test_a_simulated_run_replays_bit_by_bit(recordings: dict[str, tuple[Path, Re
     assert wire.startswith(sink.sent[: 40 * FRAME_LENGTH])
     said = " ".join([*(text for _, text in sink.events), *sink.reasons])
     assert FAULTS[name][1] in said, said
+    flows = [text for record in sink.records for *_, kind, given in record.calls if kind == "orders" for text in given]
+    assert ("flow" in [text[0] for text in flows]) == ("stopped" in name)
 
 
 def test_the_same_in_another_process_with_two_threads(recordings: dict[str, tuple[Path, Recorded]]) -> None:
