@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import json
 import re
@@ -102,6 +103,9 @@ def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) 
     data = re.search(r'<script type="application/json" id="plan-data">(.*?)</script>', page)
     held = json.loads(data[1])
     assert len(held["extrude"]) == -(-len(read_path(out)) // 3) * 4  # a byte each, as base64
+    moments = np.frombuffer(base64.b64decode(held["seconds"]), "<f4")  # the slider's last time is that of the tile
+    seconds = json.loads(out.with_suffix(".json").read_text())["total"]["seconds"]
+    assert len(moments) == len(read_path(out)) and moments[-1] == pytest.approx(seconds, rel=1e-5)
 
 
 def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

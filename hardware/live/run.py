@@ -18,6 +18,7 @@ from dataclasses import replace
 from logging import INFO, WARNING
 from multiprocessing.connection import wait
 from pathlib import Path as File
+from threading import Thread
 from types import FrameType
 
 import numpy as np
@@ -196,9 +197,8 @@ class LiveRun:
         decided = self._clock.now()
         sent, reason = emergency_stop(self._channels.url, self._prepared.task.profile)
         if reason:
-            self._log(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
-        else:
-            self._statistics.times.add("motion process gone to stop on the wire", sent - decided)
+            return self._log(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
+        self._statistics.times.add("motion process gone to stop on the wire", sent - decided)
 
     def _switch_off_material(self) -> None:
         """Switch the dispensers off in place of the motion process; those with a watchdog did it themselves."""
@@ -369,6 +369,7 @@ class LiveRun:
 
     def _shut_down(self) -> None:
         channels, reports = self._channels, self._reports
+        Thread(target=importlib.import_module, args=("hardware.report.report",), daemon=True).start()  # write needs it
         self._injector.close()
         with suppress(OSError):
             channels.orders.send(Order.QUIT)

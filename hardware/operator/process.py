@@ -30,6 +30,7 @@ from perception.frames import Image
 PAGE_NICENESS = 5  # below the loops, above what may wait for minutes
 RESTART_AFTER = 1.0  # s between two starts of a page that died
 REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
+EXIT_TIMEOUT = 0.8  # s for the page's process: 0.2 in which its windows show that the run is gone, and to close them
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
 CROP_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
@@ -87,8 +88,9 @@ class OperatorPage:
     def close(self) -> None:
         """End the process and give the port back."""
         if self.process is not None:
-            self.process.terminate()
-            self.process.join(2.0)
+            if self._link.requests.windows:  # else nobody sees that the run is gone
+                self.process.terminate()
+                self.process.join(EXIT_TIMEOUT)
             self.process.kill()
             self.process.join()
             self.process = None
