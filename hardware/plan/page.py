@@ -204,7 +204,7 @@ def page_text(
     view = f'<script type="application/json" id="plan-data">{_data(plan, moments)}</script><script>{script}</script>'
     help_text = (
         "Drag to turn, shift and drag to move, wheel to come nearer. By touch one finger turns it or scrolls the page, "
-        "two come nearer and tilt. The slider prints as far as it is moved, and says the time of a run over a still surface."
+        "two come nearer and tilt. The slider prints as far as it is moved; its times are of a surface at rest."
     )
     body.append(section("The beads", help_text, VIEW_CONTROLS + view))
     body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
