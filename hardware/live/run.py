@@ -53,12 +53,11 @@ from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
-from hardware.process.system import state_inputs
+from hardware.process.system import answer_first, state_inputs
 from planning.material import with_offsets
 from planning.placement import PlacedBy
 
-POLL_PERIOD = 0.02  # s between looks while nothing happens
-VIEW_PERIOD = 0.15  # s between views for the page
+POLL_PERIOD, VIEW_PERIOD = 0.02, 0.15  # s between looks while nothing happens, and between views for the page
 STATUS_PERIOD = 5.0  # s between status lines
 REST_TIMEOUT = 1.0  # s in which the arm has to report that it is at rest
 MOTION_HANG_TIMEOUT = 2.0  # s without a report, after which the motion process is ended and the arm stopped for it
@@ -105,6 +104,8 @@ class LiveRun:
             importlib.import_module("scipy.interpolate")  # the prediction needs it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
+            if prepared.settings.real_time:
+                answer_first()
             while not self._machine.ended:
                 self._cycle(wake, progress_writer)
             self._wait_for_rest(wake)
@@ -149,11 +150,9 @@ class LiveRun:
     def _requests_by_key(self, ready: Sequence[object]) -> list[OperatorRequest]:
         if self._console.file is None or self._console.file not in ready:
             return []
-        requests = []
-        for wish in self._console.wishes():
-            self._key_requests -= 1  # the numbers of the page go upwards
-            requests.append(OperatorRequest(self._key_requests, wish, self._machine.turn))
-        return requests
+        wishes, last = self._console.wishes(), self._key_requests - 1
+        self._key_requests -= len(wishes)  # the numbers of the page go upwards
+        return [OperatorRequest(last - k, wish, self._machine.turn) for k, wish in enumerate(wishes)]
 
     def _check_failures(self, progress_writer: ProgressWriter, now: float) -> Orders:
         """End the run for a signal, for a process that has ended or hangs, or for progress that cannot be kept."""
