@@ -353,7 +353,7 @@ class RunChannels:
         self.processes.kill("feed")  # it keeps nothing
         self.sender.close()
         self.processes.end("recorder", 30.0 if tracks or self.recorder.get() is not None else 0.0)
-        self.processes.end("arm", 0.1)
+        self.processes.end("arm", 0.1 if begun else 0.0)
 
 
 def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:

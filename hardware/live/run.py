@@ -114,7 +114,8 @@ class LiveRun:
             outcome = self._outcome().write()
             if self._page is not None:
                 self._put_view(self._clock.now(), outcome.result())
-                self._page.hand_out_report()
+                if self._profile is not None:  # else it says nothing that anybody would wait for
+                    self._page.hand_out_report()
         return outcome
 
     def _outcome(self) -> RunOutcome:

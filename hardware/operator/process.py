@@ -31,7 +31,7 @@ from perception.frames import Image
 
 RESTART_AFTER = 1.0  # s between two starts of a page that died
 REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
-EXIT_TIMEOUT = 0.8  # s for the page's process: 0.2 in which its windows show that the run is gone, and to close them
+EXIT_TIMEOUT = 0.5  # s for the page's process: 0.2 in which its windows show that the run is gone, and to close them
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
 CROP_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
