@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -25,7 +27,8 @@ from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Move
 
 STEP = 0.002  # s between looks
-EXAMPLE = Path(__file__).parents[1] / "docs/examples/own_arm.py"
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "docs/examples/own_arm.py"
 LISTEN_TIME = 0.3  # s in which an arm that answers has told where it stands
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)
 
@@ -259,3 +262,50 @@ def closing_bench(bench: ArmBench) -> Iterator[ArmBench]:
         bench.arm.close()
         bench.arm.driver.release()
         bench.end()
+
+
+READY = "ready"  # on a line of a counterpart's output, once it answers
+
+
+class CounterpartServer:
+    """An arm that others wrote, in a process of its own."""
+
+    def __init__(self, name: str, command: Sequence[str]) -> None:
+        self.process: subprocess.Popen[str] | None = None
+        self._name, self._command = name, command
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(self._command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        while READY not in (line := self.process.stdout.readline()):
+            assert line, f"{self._name} did not start"
+
+    def silence(self) -> None:
+        assert self.process is not None
+        self.process.send_signal(signal.SIGSTOP)
+
+    def end(self, number: int = signal.SIGTERM) -> None:
+        if self.process is not None:
+            self.process.send_signal(number)
+            self.process.send_signal(signal.SIGCONT)
+            self.process.wait(20.0)
+        self.process = None
+
+
+class ServedBench(ArmBench):
+    """A driver before such an arm."""
+
+    server: CounterpartServer
+
+    def silence(self) -> None:
+        self.server.silence()
+
+    def unplug(self) -> None:
+        self.server.end(signal.SIGKILL)
+
+    def plug(self) -> None:
+        self.server.start()
+
+    def end(self) -> None:
+        self.server.end(signal.SIGKILL)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 from importlib.util import find_spec
@@ -24,14 +23,13 @@ from hardware.arm.profile import ArmProfile, open_arm
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import WallClock
 from hardware.process.system import ask_for_real_time
-from tests.arm_benches import ArmBench
+from tests.arm_benches import READY, CounterpartServer, ServedBench
 
 ROOT = Path(__file__).parents[1]
 MISSING = "franky and franky_sim are not installed: make counterparts"
 HOST = "127.0.0.1"
 FLANGE_BODY, HAND_ABOVE_LINK = "robot0_fr3_link7", 0.107  # m of the flange beyond the last link, as in the URDF
 START_TIME = 90.0  # s; a busy machine takes a minute
-READY = "ready"
 
 
 def installed() -> bool:
@@ -65,27 +63,12 @@ def serve(log: Path) -> None:
             server.run_forever()
 
 
-class FrankaServer:
+class FrankaServer(CounterpartServer):
     """franky-sim in a process of its own."""
 
     def __init__(self, folder: Path) -> None:
-        self.log, self.process = folder / "flange.npy", None
-        self.start()
-
-    def start(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.franka_bench", str(self.log)], cwd=ROOT, stdout=subprocess.PIPE, text=True
-        )
-        assert self.process.stdout is not None
-        while READY not in (line := self.process.stdout.readline()):
-            assert line, "franky-sim did not start"
-
-    def end(self, number: int = signal.SIGTERM) -> None:
-        if self.process is not None:
-            self.process.send_signal(number)
-            self.process.send_signal(signal.SIGCONT)
-            self.process.wait(20.0)
-        self.process = None
+        self.log = folder / "flange.npy"
+        super().__init__("franky-sim", [sys.executable, "-m", "tests.franka_bench", str(self.log)])
 
     def truth(self, profile: ArmProfile) -> tuple[Array, Array]:
         """End it; stamps (N,), s, and axes (N, 6) of the nozzle, by where the flange truly was."""
@@ -117,7 +100,7 @@ def fr3() -> ArmProfile:
     return read_arm(ROOT / "data/arms/fr3.toml")
 
 
-class FrankaBench(ArmBench):
+class FrankaBench(ServedBench):
     """The driver of the Franka before franky-sim."""
 
     tolerance, rest_time, rest_way, silent_time = 0.5, 0.4, 3.0, 0.5
@@ -128,20 +111,6 @@ class FrankaBench(ArmBench):
 
     def truth(self) -> tuple[Array, Array]:
         return self.server.truth(self.profile)
-
-    def silence(self) -> None:
-        assert self.server.process is not None
-        self.server.process.send_signal(signal.SIGSTOP)
-
-    def unplug(self) -> None:
-        self.server.end(signal.SIGKILL)
-
-    def plug(self) -> None:
-        self.server.start()
-
-    def end(self) -> None:
-        if self.server.process is not None:
-            self.server.end(signal.SIGKILL)
 
 
 if __name__ == "__main__":

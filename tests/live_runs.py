@@ -143,7 +143,10 @@ class Running:
 
     def end(self) -> int:
         """Wait for its end; the exit code."""
-        code = self.process.wait(PATIENCE)
+        try:
+            code = self.process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"it goes on; what it said: {self.said}") from None
         self._reader.join(5.0)
         if self.keys >= 0:
             os.close(self.keys)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile, open_arm
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import WallClock
-from tests.arm_benches import ArmBench
+from tests.arm_benches import CounterpartServer, ServedBench
 
 ROOT = Path(__file__).parents[1]
 PYTHON = ROOT / ".octoprint/bin/python"
@@ -30,28 +29,18 @@ def gantry() -> ArmProfile:
     return read_arm(ROOT / "data/arms/gantry.toml")
 
 
-class OctoPrintServer:
+class OctoPrintServer(CounterpartServer):
     """The virtual printer on the pseudo-terminal `link`."""
 
     def __init__(self, folder: Path, place: Array = PARKED, errors: Sequence[str] = ()) -> None:
         """place: (3,) mm, where it was left. errors: that it makes; see `octoprint_server.py`."""
         self.link, self.log = folder / "printer", folder / "places.txt"
-        self._arguments = [str(self.link), str(self.log), *map(str, place[:3].tolist()), *errors]
-        self.process: subprocess.Popen[str] | None = None
-        self.start()
-
-    def start(self) -> None:
         script = str(ROOT / "tests/octoprint_server.py")
-        self.process = subprocess.Popen([PYTHON, script, *self._arguments], stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == "ready\n", "OctoPrint's virtual printer did not start"
+        arguments = [str(self.link), str(self.log), *map(str, place[:3].tolist()), *errors]
+        super().__init__("OctoPrint's virtual printer", [str(PYTHON), script, *arguments])
 
     def end(self, number: int = signal.SIGTERM) -> None:
-        if self.process is not None:
-            self.process.send_signal(number)
-            self.process.send_signal(signal.SIGCONT)
-            self.process.wait(20.0)
-        self.process = None
+        super().end(number)
         self.link.unlink(missing_ok=True)
 
     def truth(self) -> Array:
@@ -60,7 +49,7 @@ class OctoPrintServer:
         return np.loadtxt(self.log)
 
 
-class GcodeBench(ArmBench):
+class GcodeBench(ServedBench):
     """The driver of G-code machines before OctoPrint's virtual printer."""
 
     tolerance, rest_time, rest_way, silent_time = 0.5, 0.15, 1.0, 0.5
@@ -78,16 +67,3 @@ class GcodeBench(ArmBench):
     def truth(self) -> tuple[Array, Array]:
         rows = self.server.truth()
         return rows[:, 0], np.hstack([rows[:, 1:], np.zeros((len(rows), 3))])
-
-    def silence(self) -> None:
-        assert self.server.process is not None
-        self.server.process.send_signal(signal.SIGSTOP)
-
-    def unplug(self) -> None:
-        self.server.end(signal.SIGKILL)
-
-    def plug(self) -> None:
-        self.server.start()
-
-    def end(self) -> None:
-        self.server.end(signal.SIGKILL)

@@ -137,8 +137,8 @@ def test_what_is_too_small_for_a_bead_is_left_open(kind: PatternKind, region: Re
 
 
 def test_a_slit_narrower_than_two_beads_gets_one_of_its_own_width() -> None:
-    (bead,) = fill(box(0, 0, 10, 0.52), Pattern(), PACE)
-    assert np.allclose(bead.width, 0.52, atol=0.02) and bead.length > 9
+    (bead,) = fill(box(0, 0, 10, 0.48), Pattern(), PACE)
+    assert np.allclose(bead.width, 0.48, atol=0.02) and bead.length > 9
 
 
 def test_of_a_slit_narrower_than_any_bead_the_gap_is_told() -> None:
@@ -209,29 +209,48 @@ def test_a_plain_bead_covers_its_length_times_width_and_both_ends() -> None:
 
 def test_time_counts_printing_travel_and_turns() -> None:
     corner = even_bead(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 0.4)
-    cost = print_cost([corner, corner], PrintPace(20, 60, 0.05))
-    assert cost.turns == 2 and cost.seconds == pytest.approx(40 / 20 + np.hypot(10, 10) / 60 + 0.1)
+    cost = print_cost([corner, corner], PrintPace(20, 60, 0.05))  # each has a corner, and the travel one at each end
+    assert cost.turns == 4 and cost.seconds == pytest.approx(40 / 20 + np.hypot(10, 10) / 60 + 0.2)
+    straight_on = even_bead(np.array([[10.0, 12.0], [10.0, 20.0]]), 0.4)
+    assert print_cost([corner, straight_on], PrintPace(20, 60, 0.05)).turns == 1
+    assert print_cost([], PACE).seconds == 0
     assert print_cost([smooth_corners(corner, 0.1)], PACE).turns == 0
 
 
 @few
-@given(st.integers(0, 10**6), st.integers(2, 25))
-def test_ordering_keeps_every_run_and_never_travels_farther_than_nearest_neighbour(seed: int, count: int) -> None:
-    ends = np.random.default_rng(seed).uniform(-20, 20, (count, 2, 2))
-    beads = [even_bead(pair, 0.4) for pair in ends]
-    found = order_runs([[bead] for bead in beads], np.array([-20.0, 20.0]))
+@given(st.integers(0, 10**6), st.integers(2, 25), st.sampled_from([0.0, 0.05]))
+def test_ordering_keeps_every_run_and_is_never_slower_than_nearest_neighbour(
+    seed: int, count: int, turn: float
+) -> None:
+    ends, corner = np.random.default_rng(seed).uniform(-20, 20, (count, 2, 2)), np.array([-20.0, 20.0])
+    beads, pace = [even_bead(pair, 0.4) for pair in ends], PrintPace(20, 60, turn)
+    found = order_runs([[bead] for bead in beads], corner, pace)
     assert sorted(b.length for b in found) == sorted(b.length for b in beads)
-    assert travel_length(found) <= _greedy(ends, np.array([-20.0, 20.0])) + 1e-9
+    assert _travel_s(found, corner, pace) <= _travel_s(_greedy(beads, corner, pace), corner, pace) + 1e-9
 
 
-def _greedy(ends: np.ndarray, here: np.ndarray) -> float:
-    start, free, way = here, list(range(len(ends))), 0.0
+def _travel_s(beads: list[Bead], start: np.ndarray, pace: PrintPace) -> float:
+    """Time, s, of all travels, the first from `start`, whose turn is not at the start."""
+    lead = even_bead(np.stack([2 * start - beads[0].points[0], start]), 0.4)  # goes straight on to the first bead
+    return print_cost([lead, *beads], pace).seconds - sum(bead.length for bead in [lead, *beads]) / pace.printing
+
+
+def _greedy(beads: list[Bead], start: np.ndarray, pace: PrintPace) -> list[Bead]:
+    order, free = list[Bead](), list(range(len(beads)))
     while free:
-        far = [(float(np.linalg.norm(ends[i, k] - here)), i, k) for i in free for k in (0, 1)]
-        step, i, k = min(far)
-        way, here = way + step, ends[i, 1 - k]
+        ways = [(_travel_s([*order, one], start, pace), i, one) for i in free for one in (beads[i], beads[i].reversed)]
+        _, i, nearest = min(ways, key=lambda way: way[0])
+        order.append(nearest)
         free.remove(i)
-    return way + float(np.linalg.norm(start))
+    return order
+
+
+def test_runs_are_ordered_by_turns_as_well_as_by_way() -> None:
+    first = even_bead(np.array([[0.0, 0.0], [10.0, 0.0]]), 0.4)
+    ahead, aside = np.array([[12.2, 0.0], [12.4, 0.0]]), np.array([[10.0, 2.0], [10.0, 0.8]])
+    runs = [[first], [even_bead(aside, 0.4)], [even_bead(ahead, 0.4)]]
+    by_way, by_time = (order_runs(runs, np.zeros(2), PrintPace(20, 60, turn)) for turn in (0.0, 0.05))
+    assert by_way[1].points[0] == pytest.approx(aside[1]) and by_time[1].points[0] == pytest.approx(ahead[0])
 
 
 def test_a_closed_bead_begins_anywhere_without_changing() -> None:

@@ -28,7 +28,7 @@ from tests.live_runs import PATH, SCENARIO, Running, messages, printed_once, res
 
 pytestmark = pytest.mark.slow
 CLOCK = WallClock()
-MIN_SETS_TO_A_MAP = 12  # 0.3 s of sets after the third key frame, of which there is one each 0.4 s
+MAP_DUE_S = 1.0  # a refined map is due 0.3 s after the third key frame, of which there is one each 0.4 s
 Start = Callable[..., Running]
 
 
@@ -67,12 +67,13 @@ def begun(start: Start, cache: Path, record: Path, **more: Callable[[], None]) -
 def retracked_alike(record: Path, count: int) -> None:
     """That the first sets of a recording, tracked anew, give the very poses that it holds, before any late map."""
     stored = (m for part in walk(record) if isinstance(part, ChunkMessages) for m in part.messages)
-    if any(MAP_LATE.encode() in m.data for m in stored if m.topic == "/events"):  # a machine that is that busy
-        count = min(count, MIN_SETS_TO_A_MAP)
+    late = any(MAP_LATE.encode() in m.data for m in stored if m.topic == "/events")  # a machine that is that busy
     session, poses = open_session(record), {pose.stamp: pose for pose in read_poses(record)}
     rois = [replace(roi, stamp=-np.inf) for roi in session.roi]
     with tracker(session.rig, rois) as step:
         for frames in islice(session.frame_sets(), count):
+            if late and frames.stamp - min(poses) > MAP_DUE_S:
+                break
             pose, recorded = step(frames), poses[frames.stamp]
             step.idle()
             assert (pose.base_from_surface == recorded.base_from_surface).all() and pose.state is recorded.state

@@ -9,6 +9,7 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from hardware.recording.mcap_file import CHECKSUM_KEY, sealed
 from hardware.recording.recorder import LOG_EPOCH
 from hardware.recording.session_reader import open_session
 
@@ -25,9 +26,9 @@ def moved(recording: Path, out: Path, first: float) -> Path:
         writer.start("ros2", "stillbed")
         channels: dict[int, int] = {}
         for metadata in reader.iter_metadata():
-            writer.add_metadata(
-                metadata.name, {**metadata.metadata, "epoch_ns": str(LOG_EPOCH * 10**9), "log_times": "not known"}
-            )
+            table = {key: text for key, text in metadata.metadata.items() if key != CHECKSUM_KEY}
+            table |= {"epoch_ns": str(LOG_EPOCH * 10**9), "log_times": "not known"}
+            writer.add_metadata(metadata.name, sealed(table))
         for kept in reader.iter_attachments():
             writer.add_attachment(kept.create_time, kept.log_time, kept.name, kept.media_type, kept.data)
         for schema, channel, message in reader.iter_messages(log_time_order=False):

@@ -29,18 +29,17 @@ from hardware.bench.figures import Figure, at_least, at_most, columns, with_prog
 from hardware.process.clock import CpuClock, ProcessorClock
 from planning.fill import PATTERN_KINDS, PatternKind
 from planning.fill.bead import (
-    SHARP_TURN,
     Bead,
     FillCoverage,
     Pattern,
     PrintPace,
     Region,
     areas,
+    even_bead,
     fill_coverage,
     only_areas,
     print_cost,
     region_of,
-    turn_angles,
 )
 from planning.fill.fill import fill
 
@@ -245,21 +244,13 @@ def _contour_figures(name: str, region: Region, pattern: Pattern) -> list[Figure
         Figure(f"{name}: over", 100 * coverage.over, "%", at_most(0.05)),
         Figure(f"{name}: double", 100 * coverage.double, "%", at_most(3.0)),
         Figure(f"{name}: time", cost.seconds, "s", seconds, peers, note),
-        *_slicers_rule(name, beads, region, pattern.width),
+        Figure(f"{name}: covered by lines of nominal width", 100 * _of_one_width(beads, region, pattern.width), "%"),
     ]
 
 
-def _slicers_rule(name: str, beads: Sequence[Bead], region: Region, width: float) -> list[Figure]:
-    """Coverage and time as other planners' are taken: lines of one width, and turns at the ends of travels as well."""
-    way = np.concatenate([bead.points for bead in beads])
-    way = way[np.r_[True, np.linalg.norm(np.diff(way, axis=0), axis=1) > 1e-9]]
-    more = int((turn_angles(way) > SHARP_TURN).sum()) - (cost := print_cost(beads, PrintPace())).turns
-    lines = [Bead(bead.points, np.full(len(bead.points), width)) for bead in beads]
-    covered, seconds = 100 * fill_coverage(lines, region).covered, cost.seconds + more * PrintPace().turn
-    return [
-        Figure(f"{name}: covered by lines of nominal width", covered, "%"),
-        Figure(f"{name}: time with turns at travels", seconds, "s"),
-    ]
+def _of_one_width(beads: Sequence[Bead], region: Region, width: float) -> float:
+    """The share of a region that beads cover as other planners' are taken: all of one width, mm."""
+    return fill_coverage([even_bead(bead.points, width) for bead in beads], region).covered
 
 
 def _wound_figures(pattern: Pattern, count: int, seed: int) -> list[Figure]:

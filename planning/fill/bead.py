@@ -22,7 +22,7 @@ from estimation.se3 import Array
 from planning.fill import PATTERN_KINDS, PatternKind
 
 POINT_TOLERANCE = 1e-9  # mm: two points nearer are one
-TWO_BEADS_FROM = 0.75  # spacings: radius from which two beads are laid: one would be half as wide again as nominal
+TWO_BEADS_FROM = 0.625  # spacings: radius from which two beads are laid: one would be a quarter wider than nominal
 SHARP_TURN = np.deg2rad(30.0)  # a turn beyond costs time; as the other planners' figures were counted
 
 
@@ -189,7 +189,7 @@ class PrintCost:
 
     printed: float  # mm
     travelled: float  # mm
-    turns: int  # of more than SHARP_TURN, within beads
+    turns: int  # of more than SHARP_TURN, within beads and where travels begin and end
     seconds: float
 
 
@@ -197,7 +197,10 @@ def print_cost(beads: Sequence[Bead], pace: PrintPace) -> PrintCost:
     """Length, travel, turns and time of beads printed in this order."""
     printed = sum(bead.length for bead in beads)
     travelled = travel_length(beads)
-    turns = sum(int((turn_angles(bead.points) > SHARP_TURN).sum()) for bead in beads)
+    way = np.concatenate([np.empty((0, 2)), *(bead.points for bead in beads)])
+    distinct = np.ones(len(way), bool)
+    distinct[1:] = np.abs(np.diff(way, axis=0)).max(axis=1) > POINT_TOLERANCE
+    turns = int((turn_angles(way[distinct]) > SHARP_TURN).sum())
     seconds = printed / pace.printing + travelled / pace.travel + turns * pace.turn
     return PrintCost(printed, travelled, turns, seconds)
 

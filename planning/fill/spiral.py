@@ -1,7 +1,7 @@
 """Closed lines printed one by one or joined to a spiral, and the order of runs with the least travel between them.
 
 The order is nearest neighbour first, then 2-opt and Or-opt (thesis 2.1.3). Printing itself takes as long in any order
-and direction, so the shortest travel is the shortest time.
+and direction, so travels and the turns at their ends are what can be saved.
 
 Beads are widened here over gaps as well: in rough or narrow regions, and into corners that the next closed line cannot
 reach.
@@ -20,7 +20,17 @@ from scipy.ndimage import convolve1d
 from shapely.geometry.base import BaseGeometry
 
 from estimation.se3 import Array
-from planning.fill.bead import POINT_TOLERANCE, Bead, BeadFit, Region, covered_area, difference, even_bead
+from planning.fill.bead import (
+    POINT_TOLERANCE,
+    SHARP_TURN,
+    Bead,
+    BeadFit,
+    PrintPace,
+    Region,
+    covered_area,
+    difference,
+    even_bead,
+)
 
 BeadRun = list[Bead]  # beads that follow one another
 MAX_IMPROVEMENTS = 300  # improvements: a bound on time, reached by no layer that a wound was seen to need
@@ -35,6 +45,7 @@ MAX_WIDENING = 0.5  # spacings by which a line widens at most: a corner of 50 de
 DEPTH_SAMPLES = 8  # places across that depth at which the corner is tested for being open
 SMOOTHING_ROUNDS = 2  # roundings of width and way, each over two points: else the way turns sharply
 MIN_WIDENING = 0.01  # spacings: less is no widening
+MIN_DOT_WIDTH = 0.65  # spacings: the way to a narrower gap takes the time in which a line covers ten times as much
 DOT_HALF_LENGTH = 0.05  # spacings to either side of a dot's middle: the nozzle hardly moves
 MAX_GAP_DEPTH = 0.2  # spacings beyond a bead's edge up to which gaps are looked for
 GAP_SAMPLES = 12  # places in that
@@ -45,16 +56,16 @@ OVERLAP_PRICES = (0.0, 0.25, 0.5, 1.0, 2.0)
 SMOOTHING_KERNEL = np.array([1.0, 2.0, 1.0]) / 4  # weights over neighbours: else the way turns sharply
 
 
-def order_runs(runs: Sequence[BeadRun], start: Array) -> list[Bead]:
-    """The beads of all runs, runs in the order and direction that travel least from `start` (2,)."""
-    if len(runs) < 2:
-        near = min((math.dist(end, start), way) for way, end in enumerate(_ends(runs[0]))) if runs else (0.0, 0)
-        return [bead for run in runs for bead in (_reversed(run) if near[1] else run)]
-    ends = np.array([_ends(run) for run in runs])  # (M, entry or exit, 2)
-    tour = _nearest(ends, start)
-    for _ in range(MAX_IMPROVEMENTS):
-        better = _turned(tour, ends, start)
-        better = _moved(tour, ends, start) if better is None else better
+def order_runs(runs: Sequence[BeadRun], start: Array, pace: PrintPace) -> list[Bead]:
+    """The beads of all runs, in the order and direction whose travels from `start` (2,) take the least time.
+
+    A travel takes the time of its length and of the turns at its two ends.
+    """
+    hops = _hops(runs, start, pace)
+    tour = _nearest(hops)
+    for _ in range(MAX_IMPROVEMENTS if len(runs) > 1 else 0):
+        better = _turned(tour, hops)
+        better = _moved(tour, hops) if better is None else better
         if better is None:
             break
         tour = better
@@ -64,40 +75,55 @@ def order_runs(runs: Sequence[BeadRun], start: Array) -> list[Bead]:
 Tour = NDArray[np.intp]  # (M, 2): number of the run, and 1 where it is printed from its end
 
 
-def _ends(run: BeadRun) -> tuple[Array, Array]:
-    return run[0].points[0], run[-1].points[-1]
-
-
 def _reversed(run: BeadRun) -> BeadRun:
     return [bead.reversed for bead in reversed(run)]
 
 
-def _nearest(ends: Array, start: Array) -> Tour:
-    free = np.ones(len(ends), bool)
-    tour, here = [], start
-    for _ in range(len(ends)):
-        far = np.linalg.norm(ends - here, axis=2)
-        far[~free] = np.inf
-        run, end = divmod(int(far.argmin()), 2)
-        free[run] = False
-        tour.append((run, end))
-        here = ends[run, 1 - end]
-    return np.array(tour)
+def _hops(runs: Sequence[BeadRun], start: Array, pace: PrintPace) -> Array:
+    """What travels cost, in mm of travel (2M+1, 2M+1): between the ends of runs, 2 i where run i begins and 2 i + 1
+    where it ends, and last the start (2,), which has no direction.
+    """
+    ends, onwards = [], []  # onwards: the way out of a run through this end
+    for run in runs:
+        for line in (run[0].points[::-1], run[-1].points):
+            ends.append(line[-1])
+            onwards.append(line[-1] - line[-2])
+    place, way = np.array([*ends, start]), np.array([*onwards, (0.0, 0.0)])
+    hop = place[None] - place[:, None]  # (from, to, 2)
+    far, size = np.hypot(hop[..., 0], hop[..., 1]), np.hypot(way[:, 0], way[:, 1])
+    here = far < POINT_TOLERANCE
+    turn, straight = pace.turn * pace.travel, np.cos(SHARP_TURN)
+    sharp = np.einsum("ijk,ik->ij", hop, way) < straight * far * size[:, None]
+    meet = way @ -way.T < straight * size[:, None] * size
+    return np.asarray(np.where(here, turn * meet, far + turn * sharp + turn * sharp.T))
 
 
-def _places(tour: Tour, ends: Array, start: Array) -> tuple[Array, Array]:
-    """Where each run of a tour begins (M, 2), and where the nozzle leaves before the first and after each (M+1, 2)."""
-    run, flipped = tour.T
-    return ends[run, flipped], np.concatenate([start[None], ends[run, 1 - flipped]])
+def _nearest(hops: Array) -> Tour:
+    count, here = len(hops) // 2, len(hops) - 1
+    free = np.ones(2 * count, bool)
+    tour = []
+    for _ in range(count):
+        entry = int(np.where(free, hops[here, :-1], np.inf).argmin())
+        run, flipped = divmod(entry, 2)
+        free[2 * run : 2 * run + 2] = False
+        tour.append((run, flipped))
+        here = entry ^ 1
+    return np.array(tour, np.intp).reshape(-1, 2)
 
 
-def _turned(tour: Tour, ends: Array, start: Array) -> Tour | None:
+def _ends(tour: Tour, hops: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """At which ends runs of a tour begin (M,), and which the nozzle leaves before the first and after each (M+1,)."""
+    entry = 2 * tour[:, 0] + tour[:, 1]
+    return entry, np.append(len(hops) - 1, entry ^ 1)
+
+
+def _turned(tour: Tour, hops: Array) -> Tour | None:
     """The tour with its best stretch printed backwards (2-opt); None where none is better."""
-    entry, leave = _places(tour, ends, start)
-    hop = np.linalg.norm(entry - leave[:-1], axis=1)
-    into = np.linalg.norm(leave[:-1, None] - leave[None, 1:], axis=2)  # (i, j): from before i to the end of j
+    entry, leave = _ends(tour, hops)
+    hop = hops[leave[:-1], entry]
+    into = hops[leave[:-1, None], leave[None, 1:]]  # (i, j): from before i to the end of j
     out = np.zeros_like(into)
-    out[:, :-1] = np.linalg.norm(entry[:, None] - entry[None, 1:], axis=2)  # from the start of i to what follows j
+    out[:, :-1] = hops[entry[:, None], entry[None, 1:]]  # from the start of i to what follows j
     gain = into + out - hop[:, None] - np.append(hop[1:], 0.0)
     gain[np.tri(len(tour), k=-1, dtype=bool)] = 0.0
     i, j = divmod(int(gain.argmin()), len(tour))
@@ -109,20 +135,20 @@ def _turned(tour: Tour, ends: Array, start: Array) -> Tour | None:
     return better
 
 
-def _moved(tour: Tour, ends: Array, start: Array) -> Tour | None:
+def _moved(tour: Tour, hops: Array) -> Tour | None:
     """The tour with one run moved to its best place, in its better direction (Or-opt); None where none is better."""
     if len(tour) < 3:
         return None
-    entry, leave = _places(tour, ends, start)
-    hop = np.linalg.norm(entry - leave[:-1], axis=1)
-    skip = np.append(np.linalg.norm(entry[1:] - leave[:-2], axis=1), 0.0)  # from before i to what follows it
+    entry, leave = _ends(tour, hops)
+    hop = hops[leave[:-1], entry]
+    skip = np.append(hops[leave[:-2], entry[1:]], 0.0)  # from before i to what follows it
     saved = hop + np.append(hop[1:], 0.0) - skip
     best, move = -MIN_TRAVEL_GAIN, None
     for flip in (0, 1):
-        first, last = (leave[1:], entry) if flip else (entry, leave[1:])
-        into = np.linalg.norm(leave[None] - first[:, None], axis=2)  # (i, place): after `place` runs
+        first = entry ^ flip
+        into = hops[leave[None], first[:, None]]  # (i, place): after `place` runs
         out = np.zeros_like(into)
-        out[:, :-1] = np.linalg.norm(entry[None] - last[:, None], axis=2)
+        out[:, :-1] = hops[entry[None], first[:, None] ^ 1]
         cost = into + out - np.append(hop, 0.0) - saved[:, None]
         i = np.arange(len(tour))
         cost[i, i] = cost[i, i + 1] = 0.0
@@ -302,13 +328,14 @@ def densify(ring: Bead, near: NDArray[np.object_], spacing: float) -> Bead:
 
 
 def dot_beads(gaps: NDArray[np.object_], fit: BeadFit) -> list[Bead]:
-    """A short bead in the middle of each gap that is wide enough for one."""
-    large = gaps[shapely.area(gaps) > np.pi * fit.one**2]
+    """A short bead in the middle of each gap that is wide enough to be worth one."""
+    least = max(fit.one, MIN_DOT_WIDTH * fit.spacing / 2)
+    large = gaps[shapely.area(gaps) > np.pi * least**2]
     beads = []
     for circle in [shapely.maximum_inscribed_circle(gap, 0.1 * fit.one) for gap in large]:
         middle, rim = shapely.get_coordinates(circle)
         radius = math.dist(middle, rim)
-        if radius >= fit.one:
+        if radius >= least:
             half = np.array([DOT_HALF_LENGTH * fit.spacing, 0.0])
             beads.append(even_bead(np.stack([middle - half, middle + half]), min(2 * radius, fit.most)))
     return beads
