@@ -53,7 +53,8 @@ def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 
 
     from estimation.observations import no_observations
     from hardware.live.recorder_process import RecorderSender
-    from hardware.live.records import PoseEntry, PoseHandover, SetEntry, SurfaceEntry, TrackingReport
+    from hardware.live.records import PoseEntry, SetEntry, SurfaceEntry, TrackingReport
+    from hardware.motion.step import PoseHandover
     from hardware.process.clock import WallClock
     from hardware.process.system import pipe_closed, set_up_process
     from planning.placement import PathPlacement, PlacedBy

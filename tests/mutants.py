@@ -209,7 +209,7 @@ MUTANTS = (
     Mutant(
         "material flows on when the loop ends",
         "hardware/motion/loop.py",
-        "self.material.off(self._clock.now())",
+        "self.material.off(ended)",
         "pass",
         ("test_material_loop.py::test_whatever_ends_the_loop_closes_the_material",),
     ),

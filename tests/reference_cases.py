@@ -19,12 +19,13 @@ from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.synthetic.follow import Follower
 from hardware.arm.profile import ArmProfile
-from hardware.arm.protocol import frame_from_command
+from hardware.arm.protocol import FRAME_LENGTH
 from hardware.files.path_file import read_path
 from hardware.files.rig_file import read_rig
-from hardware.motion.step import MotionStep
+from hardware.motion.loop import Tick
+from hardware.motion.step import BeginPrint
 from hardware.offline.replay import placed_by, replay
-from planning.command import Command, Move
+from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import Path as Route
 
@@ -44,13 +45,9 @@ def replayed(case: str) -> Arrays:
         poses, tracks = _tracked(FOLDER / case / "session.mcap")
     path = read_path(FOLDER / "path.csv")
     given, profile = placed_by(poses)
-    motion = MotionStep(path, _near(profile, next(pose for pose in poses if pose.state.measured), path))
-    ticks = list(replay(given, motion))
-    return (
-        tracks
-        | _pose_arrays(poses)
-        | _tick_arrays([(command, frame_from_command(command, profile.dialect)) for _, command in ticks])
-    )
+    near, ticks = _near(profile, next(pose for pose in poses if pose.state.measured), path), list[Tick]()
+    replay(given, BeginPrint(path, near, 0.0, {}, ""), lambda tick, progress: ticks.append(tick))
+    return tracks | _pose_arrays(poses) | _tick_arrays(ticks)
 
 
 def recorded_tracks(case: str) -> list[Observations]:
@@ -117,9 +114,8 @@ def _pose_arrays(poses: list[SurfacePose]) -> Arrays:
     }
 
 
-def _tick_arrays(ticks: list[tuple[Command, bytes]]) -> Arrays:
-    nothing = np.full(6, np.nan)
-    commands = [command for command, _ in ticks]
+def _tick_arrays(ticks: list[Tick]) -> Arrays:
+    nothing, commands = np.full(6, np.nan), [tick.command for tick in ticks]
     moves = [command if isinstance(command, Move) else None for command in commands]
     return {
         "tick stamp": np.array([command.stamp for command in commands]),
@@ -128,7 +124,7 @@ def _tick_arrays(ticks: list[tuple[Command, bytes]]) -> Arrays:
         "tick checkpoint": np.array([-1 if move is None else move.checkpoint for move in moves]),
         "tick extrude": np.array([move is not None and move.extrude for move in moves]),
         "tick reason": np.array([command.reason for command in commands]),
-        "tick frame": np.array([list(frame) for _, frame in ticks], np.uint8),
+        "tick frame": np.array([list(tick.frame.ljust(FRAME_LENGTH, b"\0")) for tick in ticks], np.uint8),
     }
 
 

@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.files.arm_file import arm_over, write_arm
 from hardware.files.path_file import read_path
-from hardware.live.recorded_run import ReplayedTick, commands_of, replay_run
+from hardware.live.recorded_run import commands_of, replay_run
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.path import PrintPhase
 from tests.arm_benches import closing_bench
@@ -118,7 +118,7 @@ def test_a_breathing_surface_is_printed_and_the_true_flange_says_how_well(live: 
     )
     print(words)
     assert code == 0, run.said
-    ticks: list[ReplayedTick] = list(replay_run(record))
+    ticks = replay_run(record)
     assert len(ticks) > 200 and all(tick.frame == tick.recorded for tick in ticks)
     assert p95 <= 0.5 and most <= 1.0 and duty >= 0.8, words
 

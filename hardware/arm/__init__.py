@@ -2,5 +2,5 @@
 
 __all__ = [
     "console", "device", "driver", "feedback", "franka", "gcode", "jog", "link", "port", "profile", "protocol", "queue",
-    "s6h4d", "serial_driver",
+    "s6h4d",
 ]  # fmt: skip

@@ -25,7 +25,7 @@ from estimation.se3 import Array
 from hardware.arm.driver import G1, G4, ByteListener, Pause, Reply, ReplyKind, Reported, Sent
 from hardware.arm.port import Opener, PortOpener, serial_ports, write_last
 from hardware.arm.profile import ArmProfile
-from hardware.arm.serial_driver import SerialDriver
+from hardware.arm.s6h4d import SerialDriver
 
 SCHEME = "gcode://"
 LINES = 2  # that may be unanswered: a move, and the question where it is

@@ -1,5 +1,7 @@
 """The driver of the SEED S6H4D, and of any arm that speaks its protocol: frames of 48 bytes through a serial port.
 
+`SerialDriver` is what drivers of arms on a serial line share.
+
 A frame that is partly out is always completed first: torn, it would take bytes of the next one with it. A frame of
 which no byte is out may be called back. Which bytes a frame has, `hardware/arm/protocol.py` says.
 """
@@ -16,6 +18,7 @@ from hardware.arm.driver import (
     G1,
     G4,
     G54,
+    ArmDriver,
     ByteListener,
     Pause,
     Reply,
@@ -23,12 +26,66 @@ from hardware.arm.driver import (
     Reported,
     Sent,
 )
-from hardware.arm.port import Opener, PortOpener, serial_ports, write_last
+from hardware.arm.port import Opener, Port, PortOpener, serial_ports, write_last
 from hardware.arm.profile import BITS_PER_BYTE, ArmProfile
 from hardware.arm.protocol import FRAME_LENGTH, REPLY_LENGTH, encode, reply_stream
-from hardware.arm.serial_driver import SerialDriver
 
 STOP_FRAMES = 2  # the first one may complete a frame that was torn when the process died
+
+
+class SerialDriver(ArmDriver):
+    """An arm on a serial line. port: that is open; None before `connect` and after `close`."""
+
+    def __init__(self, opener: Opener, listener: ByteListener | None = None) -> None:
+        """opener: opens the device, and opens it again after it was away. listener: is told all bytes that pass."""
+        self.opener, self._listener = opener, listener
+        self.port: Port | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        """Forget what was given and what has come."""
+        raise NotImplementedError
+
+    def connect(self, now: float) -> None:
+        """Open the port."""
+        port = self.opener()
+        self.port = port if self._listener is None else _LoggedPort(port, self._listener)
+
+    def close(self) -> None:
+        """Close the port; what waits is dropped."""
+        if self.port is not None:
+            self.port.close()
+        self.port = None
+        self._reset()
+
+    def release(self) -> None:
+        """Let the device's lock go, where its opener holds one."""
+        if isinstance(self.opener, PortOpener):
+            self.opener.release()
+
+    def waiting(self) -> float:
+        """Bytes in the system's output buffer."""
+        return 0.0 if self.port is None else self.port.waiting()
+
+
+class _LoggedPort:
+    """A port whose listener is called with all bytes that pass."""
+
+    def __init__(self, port: Port, listener: ByteListener) -> None:
+        self._port, self._listener = port, listener
+        self.waiting, self.close = port.waiting, port.close
+
+    def write(self, data: bytes) -> int:
+        count = self._port.write(data)
+        if count:
+            self._listener(data[:count], True)
+        return count
+
+    def read(self) -> bytes:
+        data = self._port.read()
+        if data:
+            self._listener(data, False)
+        return data
 
 
 class S6H4D(SerialDriver):

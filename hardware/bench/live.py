@@ -32,8 +32,8 @@ from hardware.bench.whole import LiveSession
 from hardware.files.dispenser_file import read_dispensers
 from hardware.files.path_file import read_path, write_path
 from hardware.live.prepared import RunFiles
-from hardware.live.prerender import prerender
-from hardware.live.recorded_run import NozzleErrors, nozzle_errors, printed_range
+from hardware.live.prerender import NozzleErrors, nozzle_errors, prerender
+from hardware.live.recorded_run import printed_range
 from hardware.live.records import EXPOSURE_TO_WIRE_STAGE, FRAMES_TO_WIRE_STAGE, LATE_TICK_STAGE
 from hardware.live.settings import LiveSettings, available_cores, settings_text
 from hardware.offline.track import tracker
@@ -226,7 +226,7 @@ def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: P
     finally:
         run.close()
     summary: dict[str, Any] = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))
-    error = nozzle_errors(record, path, arm, _truth(options.dispenser))
+    error = nozzle_errors(record, RunFiles(record).executed, path, arm, _truth(options.dispenser))
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
     name += f", {options.busy} busy beside it" if options.busy else ""

@@ -21,7 +21,7 @@ from hardware.live.surface_scan import ScanSource, scan_surface
 from hardware.offline.looks import look_at
 from hardware.process.clock import WallClock
 from hardware.simulator.scene.appearance import Appearance, Sensor
-from hardware.simulator.scene.beads import Gel, GelPieces
+from hardware.simulator.scene.fields import Gel, GelPieces
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import Wound, body

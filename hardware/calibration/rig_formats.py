@@ -268,9 +268,9 @@ def write_anipose(path: Path, rig: Rig) -> None:
         camera_from_base = se3.inverse(camera.base_from_camera)
         blocks.append(
             f"[cam_{number}]\nname = {json.dumps(camera.name)}\nsize = {list(camera.size)}\n"
-            f"matrix = {checks.toml_numbers(camera.matrix)}\ndistortions = {checks.toml_numbers(camera.distortion)}\n"
-            f"rotation = {checks.toml_numbers(se3.log_rotation(camera_from_base[:3, :3]))}\n"
-            f"translation = {checks.toml_numbers(np.asarray(camera_from_base[:3, 3]))}\n"
+            f"matrix = {checks.toml_value(camera.matrix)}\ndistortions = {checks.toml_value(camera.distortion)}\n"
+            f"rotation = {checks.toml_value(se3.log_rotation(camera_from_base[:3, :3]))}\n"
+            f"translation = {checks.toml_value(np.asarray(camera_from_base[:3, 3]))}\n"
             f"clock_offset_s = {float(camera.clock_offset)!r}\n"
         )
     blocks.append("[metadata]\nadjusted = true\n")

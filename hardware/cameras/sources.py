@@ -55,6 +55,7 @@ CONTROL_RANGES = {  # both ends included
     "white_balance_k": (1000.0, 20000.0),
     "fps": (1.0, 1000.0),
 }
+CONTROL_FIELDS = ("exposure", "gain", "focus", "white_balance", "fps")  # of CameraSource, in that order
 _INDEX = re.compile(r"-?\d+|(/dev/)?video\d+")
 _PASSWORD = re.compile(r"(://[^/@:]*:)[^/]*@")
 _LINKS = ("dev/v4l/by-id", "dev/v4l/by-path")
@@ -219,19 +220,11 @@ def source_from_table(where: object, name: str, camera: Table, folder: Path) -> 
     written = camera["source"]
     text = str(written) if isinstance(written, int) else checks.text(where, key + "source", written)
     identity = identity_from_text(where, key + "source", text, folder)
-    exposure, gain, focus, white, fps = (_number(where, key, camera, one) for one in CONTROL_RANGES)
+    ranges = zip(CONTROL_FIELDS, CONTROL_RANGES.items(), strict=True)
+    controls = checks.table_fields(where, key, camera, {k: (f, checks.within(*both)) for f, (k, both) in ranges})
     kind, form = identity.kind, _format(where, key + "format", camera, identity.kind)
-    trigger, ptp = _trigger(where, key, camera, kind, fps), _ptp(where, key, camera, kind)
-    return CameraSource(identity, exposure, gain, focus, white, fps, form, trigger, ptp)
-
-
-def _number(where: object, key: str, camera: Table, name: str) -> float | None:
-    if name not in camera:
-        return None
-    value, (low, high) = checks.number(where, key + name, camera[name]), CONTROL_RANGES[name]
-    if not low <= value <= high:
-        raise InputError(where, key + name, value, f"{low:g} to {high:g}")
-    return value
+    trigger, ptp = _trigger(where, key, camera, kind), _ptp(where, key, camera, kind)
+    return CameraSource(identity, **controls, format=form, trigger=trigger, ptp=ptp)
 
 
 def _format(where: object, key: str, camera: Table, kind: SourceKind) -> str | None:
@@ -245,7 +238,7 @@ def _format(where: object, key: str, camera: Table, kind: SourceKind) -> str | N
     return text
 
 
-def _trigger(where: object, key: str, camera: Table, kind: SourceKind, fps: float | None) -> str | None:
+def _trigger(where: object, key: str, camera: Table, kind: SourceKind) -> str | None:
     if "trigger" not in camera:
         return None
     _check_genicam(where, key + "trigger", camera["trigger"], kind)
@@ -254,16 +247,14 @@ def _trigger(where: object, key: str, camera: Table, kind: SourceKind, fps: floa
         raise InputError(where, key + "trigger", text, '"software", or a line of the camera, such as "Line1"')
     if text.lower() != SOFTWARE_TRIGGER.lower():
         return text
-    if fps is None:
-        low, high = CONTROL_RANGES["fps"]
-        raise InputError(where, key + "fps", "missing", f"{low:g} to {high:g}: the rate at which software triggers")
+    if "fps" not in camera:
+        allowed = checks.range_text(*CONTROL_RANGES["fps"])
+        raise InputError(where, key + "fps", "missing", f"{allowed}: the rate at which software triggers")
     return SOFTWARE_TRIGGER
 
 
 def _ptp(where: object, key: str, camera: Table, kind: SourceKind) -> bool:
-    value = camera.get("ptp", False)
-    if not isinstance(value, bool):
-        raise InputError(where, key + "ptp", value, "true or false")
+    value = checks.flag(where, key + "ptp", camera.get("ptp", False))
     if "ptp" in camera:
         _check_genicam(where, key + "ptp", value, kind)
     return value

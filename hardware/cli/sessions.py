@@ -134,7 +134,9 @@ def _replay_run(a: argparse.Namespace) -> int:
     same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
     code = damage_code(count.damage)
     print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {a.out}")
-    return FAILED if count.other else code
+    if count.parted:
+        print(f"then the replay ended: {count.parted}")
+    return FAILED if count.other or count.parted else code
 
 
 def _import(a: argparse.Namespace) -> None:

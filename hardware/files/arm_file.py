@@ -46,8 +46,9 @@ posture = ["front", "up", "negative"]
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -77,74 +78,70 @@ from planning.command import MotionLimits, NoGo, box, cylinder, half_space
 from planning.kinematics import AngleMode, JointModel, SimpleArm
 from planning.urdf import UrdfArm
 
-URDF_KEYS = ("name", "urdf", "flange", "ready_deg")
 JOINT_KEYS = {"low_deg": "low", "high_deg": "high", "speed_deg_s": "speed", "acceleration_deg_s2": "acceleration"}
 PLACE_KEYS = ("arm_from_foot", "flange_from_nozzle")
 _RAD = float(np.deg2rad(1.0))  # rad a degree
 _DH_UNITS = np.array([1.0, _RAD, 1.0, _RAD])  # mm and rad, of a row in mm and degrees
 
 
-def _kinematics(where: object, table: object) -> tuple[JointModel | None, AngleMode]:
-    """The model in the table, and what A B C are; no model without a table. InputError names the key."""
-    if table is None:
-        return None, AngleMode.SURFACE
+def _posture(where: object, key: str, value: object) -> tuple[str, ...]:
+    if not (isinstance(value, list) and len(value) == 3):
+        raise InputError(where, key, value, "three words, of shoulder, elbow and wrist")
+    return tuple(map(str, value))
+
+
+MODEL_KEYS: checks.Keys = {
+    "name": ("name", checks.text),
+    "dh_mm_deg": ("dh", checks.times(checks.array((6, 4)), _DH_UNITS)),
+    **{key: (name, checks.times(checks.array((6,)), _RAD)) for key, name in JOINT_KEYS.items()},
+    "nominal": ("nominal", checks.flag),
+    "angles": ("angles", checks.member(AngleMode)),
+    **{key: (key, checks.array((4, 4))) for key in PLACE_KEYS},
+    "posture": ("posture", _posture),
+}
+URDF_KEYS: checks.Keys = {
+    "name": ("name", checks.text),
+    "urdf": ("file", lambda where, key, value: Path(str(where)).parent / checks.text(where, key, value)),
+    "flange": ("flange", checks.text),
+    "ready_deg": ("ready", checks.times(checks.array((None,), "degrees"), _RAD)),
+}
+
+
+def _kinematics(where: object, key: str, table: object) -> UrdfArm | tuple[JointModel, AngleMode]:
+    """The arm's joints by a URDF file, which is not read here, or by their model, and what A B C are."""
     if not isinstance(table, dict):
-        raise InputError(where, "kinematics", table, "a table [kinematics]")
-    required, optional = ("name", "dh_mm_deg", *JOINT_KEYS), ("nominal", "angles", *PLACE_KEYS, "posture")
-    checks.check_keys(where, "kinematics.", table, required, optional)
+        raise InputError(where, key, table, "a table [kinematics]")
+    if "urdf" in table:
+        return checks.record_from_table(where, "kinematics.", table, UrdfArm, URDF_KEYS, URDF_KEYS)
+    required = ("name", "dh_mm_deg", *JOINT_KEYS)
+    return checks.record_from_table(where, "kinematics.", table, _model, MODEL_KEYS, required)
 
-    def numbers(key: str, shape: tuple[int, ...], unit: Array | float = 1.0) -> Array:
-        return np.asarray(checks.numbers(where, f"kinematics.{key}", table[key], shape) * unit)
 
-    joints = {name: numbers(key, (6,), _RAD) for key, name in JOINT_KEYS.items()}
-    nominal, posture = table.get("nominal", True), table.get("posture", ["front", "up", "negative"])
-    if not isinstance(nominal, bool):
-        raise InputError(where, "kinematics.nominal", nominal, "true or false")
-    name, dh = checks.text(where, "kinematics.name", table["name"]), numbers("dh_mm_deg", (6, 4), _DH_UNITS)
-    places = {key: numbers(key, (4, 4)) for key in PLACE_KEYS if key in table}
-    if not (isinstance(posture, list) and len(posture) == 3):
-        raise InputError(where, "kinematics.posture", posture, "three words, of shoulder, elbow and wrist")
-    shoulder, elbow, wrist = map(str, posture)
-    model = JointModel(name, dh, **joints, **places, posture=(shoulder, elbow, wrist), nominal=nominal)
-    angles, modes = table.get("angles", AngleMode.SURFACE.value), [mode.value for mode in AngleMode]
-    if angles not in modes:
-        raise InputError(where, "kinematics.angles", angles, checks.one_of_text(str(angles), modes))
-    return model, AngleMode(angles)
+def _model(angles: AngleMode = AngleMode.SURFACE, **model: Any) -> tuple[JointModel, AngleMode]:
+    return JointModel(**model), angles
 
 
 def _kinematics_lines(arm: SimpleArm) -> list[str]:
     """The table of an arm as lines of TOML; none where it has no model."""
     if (model := arm.joints) is None:
         return []
-    quoted = model.name.replace("\\", "\\\\").replace('"', '\\"')
-    return [
-        "",
-        "[kinematics]",
-        f'name = "{quoted}"',
-        f"nominal = {str(model.nominal).lower()}",
-        f'angles = "{arm.angles.value}"',
-        f"dh_mm_deg = {checks.toml_numbers(model.dh / _DH_UNITS)}",
-        *(f"{key} = {checks.toml_numbers(np.rad2deg(getattr(model, name)))}" for key, name in JOINT_KEYS.items()),
-        *(f"{key} = {checks.toml_numbers(getattr(model, key))}" for key in PLACE_KEYS),
-        f"posture = {json.dumps(model.posture)}",
-    ]
-
-
-def _urdf(path: Path, table: checks.Table) -> UrdfArm:
-    """The arm that a URDF file describes, which is not read here."""
-    checks.check_keys(path, "kinematics.", table, URDF_KEYS, ())
-    name, file, flange = (checks.text(path, f"kinematics.{key}", table[key]) for key in URDF_KEYS[:3])
-    ready = checks.numbers(path, "kinematics.ready_deg", table["ready_deg"], (None,), "degrees") * _RAD
-    return UrdfArm(name, path.parent / file, flange, np.asarray(ready))
+    joints = {key: np.rad2deg(getattr(model, name)) for key, name in JOINT_KEYS.items()}
+    head = {"name": model.name, "nominal": model.nominal, "angles": arm.angles.value, "dh_mm_deg": model.dh / _DH_UNITS}
+    places = {key: getattr(model, key) for key in PLACE_KEYS}
+    return ["", "[kinematics]", *checks.toml_lines({**head, **joints, **places, "posture": model.posture})]
 
 
 def _urdf_lines(arm: UrdfArm | None) -> list[str]:
     """The table of such an arm as lines of TOML."""
     if arm is None:
         return []
-    texts = {"name": arm.name, "urdf": str(arm.file.resolve()), "flange": arm.flange}
-    ready = f"ready_deg = {checks.toml_numbers(np.rad2deg(arm.ready))}"
-    return ["", "[kinematics]", *(f"{key} = {json.dumps(text)}" for key, text in texts.items()), ready]
+    values = {
+        "name": arm.name,
+        "urdf": str(arm.file.resolve()),
+        "flange": arm.flange,
+        "ready_deg": np.rad2deg(arm.ready),
+    }
+    return ["", "[kinematics]", *checks.toml_lines(values)]
 
 
 ZONE_KINDS = ("half_space", "box", "cylinder")
@@ -154,15 +151,12 @@ def _no_go_lines(zones: tuple[NoGo, ...]) -> list[str]:
     """The zones as `[[no_go]]` tables."""
     lines: list[str] = []
     for zone in zones:
-        lines += ["", "[[no_go]]", f'name = "{zone.name}"']
-        if zone.radius < float("inf"):
-            lines += [f"cylinder = {checks.toml_numbers(zone.axis)}", f"radius = {checks.toml_number(zone.radius)}"]
-        elif len(zone.offsets) == 1:
-            plane = zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]
-            lines.append(f"half_space = {checks.toml_numbers(plane)}")
-        else:
-            corners = (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]
-            lines.append(f"box = {checks.toml_numbers(corners)}")
+        shape: dict[str, object] = {"cylinder": zone.axis, "radius": float(zone.radius)}
+        if not zone.radius < float("inf") and len(zone.offsets) == 1:
+            shape = {"half_space": zone.normals.repeat(2, axis=0) * [[1.0], [zone.offsets[0]]]}
+        elif not zone.radius < float("inf"):
+            shape = {"box": (zone.offsets.reshape(2, 3) * [[1.0], [-1.0]])[::-1]}
+        lines += ["", "[[no_go]]", *checks.toml_lines({"name": zone.name, **shape})]
     return lines
 
 
@@ -184,22 +178,6 @@ def _zone(where: object, table: checks.Table) -> NoGo:
 
 
 MIN_ZONE_SIZE = 1.0  # mm, the largest side of what an arm must not enter: less was typed in metres
-_ARRAYS = {  # shapes
-    **{"home_mm_deg": (6,), "arm_from_base": (4, 4), "arm_from_upright": (3, 3), "tool_offset_mm": (3,)},
-    **{"flange_from_nozzle": (4, 4)},
-}
-ARM_KEYS = (
-    *(*_ARRAYS, "motion_byte", "slots", "origin_scale", "pwm", "pwm_on", "baud", "tick_s", "lag_s", "tool_mm"),
-    *("dead_time_s", "flight_s", "max_lean_deg", "tool_part", "limits", "no_go", "kinematics"),
-)
-# of errors about a part of the profile: the prefix of the part's keys in the file; keys that are not the fields' names
-PART_PREFIXES = {"arm profile": "", "arm": "", "dialect": "", "limits": "limits.", "kinematics": "kinematics."}
-FILE_KEYS = {
-    **{"home": "home_mm_deg", "tool_offset": "tool_offset_mm", "tick": "tick_s", "lag": "lag_s", "tool": "tool_mm"},
-    **{"dead_time": "dead_time_s", "flight": "flight_s", "max_lean": "max_lean_deg"},
-    "kinematics.dh": "kinematics.dh_mm_deg",
-    **{f"kinematics.{name}": f"kinematics.{key}" for key, name in JOINT_KEYS.items()},
-}
 
 
 def read_arm(path: str | Path) -> ArmProfile:
@@ -229,39 +207,31 @@ def arm_from_text(text: str, where: str | Path) -> ArmProfile:
 
 
 def _profile(path: Path, table: checks.Table) -> ArmProfile:
-    checks.check_keys(path, "", table, (), ARM_KEYS)
-    try:
-        kinematics = table.get("kinematics")
-        by_urdf = isinstance(kinematics, dict) and "urdf" in kinematics
-        default = at_baud(ArmProfile(), checks.integer(path, "baud", table.get("baud", ArmProfile().baud), 1))
-        arrays = {key: checks.numbers(path, key, table[key], shape) for key, shape in _ARRAYS.items() if key in table}
-        keys = "max_lean_deg", "dead_time_s", "flight_s"
-        lean, dead_time, flight = (checks.number(path, k, table[k]) if k in table else None for k in keys)
-        return ArmProfile(
-            arm=SimpleArm(
-                arrays.get("arm_from_base", default.arm.arm_from_base),
-                arrays.get("arm_from_upright", default.arm.arm_from_upright),
-                arrays["home_mm_deg"] * AXIS_UNITS if "home_mm_deg" in arrays else default.arm.home,
-                *_kinematics(path, None if by_urdf else kinematics),
-                tool_offset=arrays.get("tool_offset_mm", default.arm.tool_offset),
-                max_lean=None if lean is None else lean * _RAD,
-            ),
-            limits=_limits(path, table.get("limits", {}), table.get("no_go")),
-            dialect=_dialect(path, table),
-            baud=default.baud,
-            tick=checks.number(path, "tick_s", table.get("tick_s", default.tick)),
-            lag=checks.number(path, "lag_s", table.get("lag_s", default.lag)),
-            flange_from_nozzle=arrays.get("flange_from_nozzle"),
-            urdf=_urdf(path, table["kinematics"]) if by_urdf else None,
-            dead_time=dead_time,
-            flight=flight,
-            tool=tool_from_value(path, "tool_mm", table["tool_mm"]) if "tool_mm" in table else default.tool,
-            parts=_parts(path, table.get("tool_part")),
-        )
-    except InputError as error:
-        if error.where == str(path):
-            raise
-        raise _in_file(path, table, error) from None
+    return checks.record_from_table(path, "", table, _made, ARM_KEYS)
+
+
+def _made(
+    baud: int = ArmProfile().baud,
+    limits: MotionLimits | None = None,
+    zones: tuple[NoGo, ...] = (),
+    kinematics: UrdfArm | tuple[JointModel, AngleMode] | None = None,
+    **values: Any,
+) -> ArmProfile:
+    """The profile of what the keys of an arm file give."""
+    frame, dialect = (
+        {name: values.pop(name) for name, _ in keys.values() if name in values} for keys in (FRAME_KEYS, DIALECT_KEYS)
+    )
+    urdf = kinematics if isinstance(kinematics, UrdfArm) else None
+    if isinstance(kinematics, tuple):
+        frame["joints"], frame["angles"] = kinematics
+    return replace(
+        at_baud(ArmProfile(), baud),
+        arm=SimpleArm(**frame),
+        limits=replace(limits or MotionLimits(), zones=zones),
+        dialect=Dialect(**dialect),
+        urdf=urdf,
+        **values,
+    )
 
 
 def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
@@ -272,47 +242,38 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
 def arm_text(profile: ArmProfile, remark: str = "") -> str:
     """The text of an arm file, as `write_arm` writes it."""
     arm, dialect, limits = profile.arm, profile.dialect, profile.limits
-    lean = arm.max_lean and np.rad2deg(arm.max_lean)
-    flange = [] if (at := profile.flange_from_nozzle) is None else [f"flange_from_nozzle = {checks.toml_numbers(at)}"]
-    optional = {"dead_time_s": profile.dead_time, "flight_s": profile.flight, "max_lean_deg": lean}
-    lines = [f"# {line}" for line in remark.splitlines()] + [
-        f"home_mm_deg = {checks.toml_numbers(arm.home / AXIS_UNITS)}",
-        f"arm_from_base = {checks.toml_numbers(arm.arm_from_base)}",
-        f"arm_from_upright = {checks.toml_numbers(arm.arm_from_upright)}",
-        f"tool_offset_mm = {checks.toml_numbers(arm.tool_offset)}",
-        f"motion_byte = {dialect.motion_byte}",
-        f"slots = {json.dumps(dialect.slots)}",
-        f"origin_scale = {dialect.origin_scale}",
-        f"pwm = {checks.toml_number(dialect.pwm)}",
-        *([] if dialect.pwm_on is None else [f"pwm_on = {checks.toml_number(dialect.pwm_on)}"]),
-        f"baud = {profile.baud}",
-        f"tick_s = {checks.toml_number(profile.tick)}",
-        f"lag_s = {checks.toml_number(profile.lag)}",
-        *flange,
-        *(f"{key} = {checks.toml_number(value)}" for key, value in optional.items() if value is not None),
-        f"tool_mm = {checks.toml_numbers(profile.tool)}",
+    lean = arm.max_lean and float(np.rad2deg(arm.max_lean))
+    values = {
+        "home_mm_deg": arm.home / AXIS_UNITS,
+        "arm_from_base": arm.arm_from_base,
+        "arm_from_upright": arm.arm_from_upright,
+        "tool_offset_mm": arm.tool_offset,
+        "motion_byte": dialect.motion_byte,
+        "slots": dialect.slots,
+        "origin_scale": dialect.origin_scale,
+        "pwm": float(dialect.pwm),
+        "pwm_on": dialect.pwm_on,
+        "baud": profile.baud,
+        "tick_s": float(profile.tick),
+        "lag_s": float(profile.lag),
+        "flange_from_nozzle": profile.flange_from_nozzle,
+        "dead_time_s": profile.dead_time,
+        "flight_s": profile.flight,
+        "max_lean_deg": lean,
+        "tool_mm": profile.tool,
+    }
+    lines = [
+        *(f"# {line}" for line in remark.splitlines()),
+        *checks.toml_lines(values),
         "",
         "[limits] # X Y Z in mm, A B C in degrees",
-        *(f"{name} = {checks.toml_numbers(getattr(limits, name) / limit_unit(name))}" for name in LIMIT_KEYS),
+        *checks.toml_lines({name: getattr(limits, name) / limit_unit(name) for name in LIMIT_KEYS}),
         *_part_lines(profile.parts),
         *_no_go_lines(limits.zones),
         *_kinematics_lines(arm),
         *_urdf_lines(profile.urdf),
     ]
     return "\n".join(lines) + "\n"
-
-
-def _in_file(path: Path, table: checks.Table, error: InputError) -> InputError:
-    """The error about a part of the profile with the key and the value in the file; of a default with its own value."""
-    if error.where not in PART_PREFIXES:
-        return InputError(path, f"{error.where}: {error.what}", error.got, error.allowed)
-    key = PART_PREFIXES[error.where] + error.what
-    key = FILE_KEYS.get(key, key)
-    value: object = table
-    for word in key.split("."):
-        value = value.get(word) if isinstance(value, dict) else None
-    whole = value is None or isinstance(error.got, str)  # one word of a list is what is wrong
-    return InputError(path, key, error.got if whole else value, error.allowed)
 
 
 def tool_from_value(where: object, key: str, value: object) -> Array:
@@ -322,9 +283,13 @@ def tool_from_value(where: object, key: str, value: object) -> Array:
     return profile
 
 
-def _parts(path: Path, tables: object) -> tuple[ToolPart, ...]:
+def _parts(where: object, key: str, value: object) -> tuple[ToolPart, ...]:
     """The parts of the tool that no profile describes, in `[[tool_part]]` tables."""
-    return tuple(_part(path, table) for table in ([] if tables is None else checks.tables(path, "tool_part", tables)))
+    return tuple(_part(Path(str(where)), table) for table in checks.tables(where, key, value))
+
+
+def _zones(where: object, key: str, value: object) -> tuple[NoGo, ...]:
+    return tuple(_zone(where, table) for table in checks.tables(where, key, value))
 
 
 def _part(path: Path, table: checks.Table) -> ToolPart:
@@ -351,11 +316,11 @@ def _part_lines(parts: tuple[ToolPart, ...]) -> list[str]:
     """The parts as `[[tool_part]]` tables; a mesh by the whole path of its file."""
     lines: list[str] = []
     for part in parts:
-        value = json.dumps(part.file) if part.kind == "mesh" else checks.toml_numbers(part.ends)
-        lines += ["", "[[tool_part]]", f"name = {json.dumps(part.name)}", f"{part.kind} = {value}"]
+        shape: dict[str, object] = {part.kind: part.file if part.kind == "mesh" else part.ends}
         if part.kind in ("cylinder", "capsule"):
-            lines.append(f"radius = {checks.toml_number(part.radii[0])}")
-        lines += [f"radii = {checks.toml_numbers(part.radii)}"] if part.kind == "cone" else []
+            shape["radius"] = float(part.radii[0])
+        shape |= {"radii": part.radii} if part.kind == "cone" else {}
+        lines += ["", "[[tool_part]]", *checks.toml_lines({"name": part.name, **shape})]
     return lines
 
 
@@ -369,32 +334,55 @@ def _mesh_triangles(file: str) -> Array:
     return read_mesh(file).scan.corners
 
 
-def _limits(path: Path, table: object, zones: object) -> MotionLimits:
-    if not isinstance(table, dict):
-        raise InputError(path, "limits", table, "a table [limits]")
-    checks.check_keys(path, "limits.", table, (), LIMIT_KEYS)
-    limits: dict[str, Array | float] = {}
-    for name, value in table.items():
-        number = checks.numbers(path, f"limits.{name}", value, (6,) if name in AXIS_LIMITS else ()) * limit_unit(name)
-        limits[name] = number if name in AXIS_LIMITS else float(number)
-    no_go = [] if zones is None else [_zone(path, each) for each in checks.tables(path, "no_go", zones)]
-    checked = MotionLimits(**limits, zones=tuple(no_go))  # type: ignore[arg-type]
-    for name, value in table.items():
-        low, high = LIMIT_RANGES[name]
-        if np.min(value) < low or np.max(value) > high:
-            raise InputError(path, f"limits.{name}", value, f"{low:g} to {high:g}, {limit_unit_text(name)}")
-    return checked
+def _limit(name: str) -> checks.Check:
+    low, high = LIMIT_RANGES[name]
+
+    def check(where: object, key: str, value: object) -> Array | float:
+        limit = checks.numbers(where, key, value, (6,) if name in AXIS_LIMITS else ())
+        if limit.min() < low or limit.max() > high:
+            raise InputError(where, key, value, f"{low:g} to {high:g}, {limit_unit_text(name)}")
+        return limit * limit_unit(name) if name in AXIS_LIMITS else float(limit * limit_unit(name))
+
+    return check
 
 
-def _dialect(path: Path, table: checks.Table) -> Dialect:
-    default = Dialect()
-    slots = table.get("slots", list(default.slots))
-    if not (isinstance(slots, list) and len(slots) == 3 and all(isinstance(joint, str) for joint in slots)):
-        raise InputError(path, "slots", slots, 'three of "J4", "J5", "J6"')
-    return Dialect(
-        checks.integer(path, "motion_byte", table.get("motion_byte", default.motion_byte), 0),
-        tuple(slots),
-        checks.integer(path, "origin_scale", table.get("origin_scale", default.origin_scale), 1),
-        checks.number(path, "pwm", table.get("pwm", default.pwm)),
-        checks.number(path, "pwm_on", table["pwm_on"]) if "pwm_on" in table else None,
-    )
+def _limits(where: object, key: str, value: object) -> MotionLimits:
+    table, keys = checks.table_at(where, "", {key: value}, key), {name: (name, _limit(name)) for name in LIMIT_KEYS}
+    return checks.record_from_table(where, "limits.", table, MotionLimits, keys)
+
+
+def _slots(where: object, key: str, value: object) -> tuple[str, ...]:
+    if not (isinstance(value, list) and len(value) == 3 and all(isinstance(joint, str) for joint in value)):
+        raise InputError(where, key, value, 'three of "J4", "J5", "J6"')
+    return tuple(value)
+
+
+FRAME_KEYS: checks.Keys = {  # of SimpleArm
+    "home_mm_deg": ("home", checks.times(checks.array((6,)), AXIS_UNITS)),
+    "arm_from_base": ("arm_from_base", checks.array((4, 4))),
+    "arm_from_upright": ("arm_from_upright", checks.array((3, 3))),
+    "tool_offset_mm": ("tool_offset", checks.array((3,))),
+    "max_lean_deg": ("max_lean", checks.times(checks.number, _RAD)),
+}
+DIALECT_KEYS: checks.Keys = {
+    "motion_byte": ("motion_byte", checks.whole(0)),
+    "slots": ("slots", _slots),
+    "origin_scale": ("origin_scale", checks.whole(1)),
+    "pwm": ("pwm", checks.number),
+    "pwm_on": ("pwm_on", checks.number),
+}
+ARM_KEYS: checks.Keys = {
+    **FRAME_KEYS,
+    "flange_from_nozzle": ("flange_from_nozzle", checks.array((4, 4))),
+    **DIALECT_KEYS,
+    "baud": ("baud", checks.whole(1)),
+    "tick_s": ("tick", checks.number),
+    "lag_s": ("lag", checks.number),
+    "tool_mm": ("tool", tool_from_value),
+    "dead_time_s": ("dead_time", checks.number),
+    "flight_s": ("flight", checks.number),
+    "tool_part": ("parts", _parts),
+    "limits": ("limits", _limits),
+    "no_go": ("zones", _zones),
+    "kinematics": ("kinematics", _kinematics),
+}

@@ -35,7 +35,9 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from estimation.errors import InputError
 from hardware.dispenser.dispenser import ArmPwmDispenser, Dispenser, DispenserProfile, Dispensers
@@ -47,23 +49,40 @@ from planning.material import Outlet, Outlets, SwitchDelay
 ARM_PWM = "arm_pwm"
 PRESET_NAMES = (*PRESETS, ARM_PWM)
 DELAY_KEYS = {f"{name}_s": name for name in ("on_dead_time", "on_lag", "off_dead_time", "off_lag")}
-PAIR_KEYS = {"flow_range_mm3_s": "flow_range", "temperature_range_c": "temperature_range"}
-PROFILE_KEYS = {  # key: field of the profile
-    **{**DELAY_KEYS, **PAIR_KEYS, "nozzle_offset_mm": "nozzle_offset", "watchdog_s": "watchdog"},
-    **{"metered": "metered", "flow_mm3_s": "flow", "kept_at_c": "kept_at"},
-    **{"prime_mm3": "prime_volume", "retract_mm3": "retract_volume", "materials": "materials"},
+
+
+def _materials(where: object, key: str, value: object) -> tuple[str, ...]:
+    words = value if isinstance(value, list) else []
+    if not words or not all((isinstance(w, str) and w) or type(w) is int for w in words):
+        raise InputError(where, key, value, "a list of names or whole numbers, one or more")
+    return tuple(map(str, words))
+
+
+PROFILE_KEYS: checks.Keys = {
+    "name": ("name", checks.text),
+    "materials": ("materials", _materials),
+    **{key: (name, checks.number) for key, name in DELAY_KEYS.items()},
+    "flow_range_mm3_s": ("flow_range", checks.pair()),
+    "temperature_range_c": ("temperature_range", checks.pair()),
+    "nozzle_offset_mm": ("nozzle_offset", checks.array((3,), "mm")),
+    "watchdog_s": ("watchdog", checks.number),
+    "metered": ("metered", checks.flag),
+    "flow_mm3_s": ("flow", checks.number),
+    "kept_at_c": ("kept_at", checks.number),
+    "prime_mm3": ("prime_volume", checks.number),
+    "retract_mm3": ("retract_volume", checks.number),
 }
-LINE_RANGES = {  # key: field of the line, least and greatest value
-    "keepalive_s": ("keepalive", 0.01, 10.0),
-    "start_s": ("start", 0.0, 30.0),
-    "gap_s": ("gap", 0.0, 1.0),
-    "timeout_s": ("timeout", 0.05, 5.0),
-    "plunger_mm2": ("plunger", 0.01, 10_000.0),
+LINE_KEYS: checks.Keys = {
+    "port": ("port", checks.text),
+    "baud": ("baud", checks.whole(300)),
+    "keepalive_s": ("keepalive", checks.within(0.01, 10.0, "s")),
+    "start_s": ("start", checks.within(0.0, 30.0, "s")),
+    "gap_s": ("gap", checks.within(0.0, 1.0, "s")),
+    "timeout_s": ("timeout", checks.within(0.05, 5.0, "s")),
+    "plunger_mm2": ("plunger", checks.within(0.01, 10_000.0, "mm^2")),
 }
-PWM_KEYS = ("pwm_on", "pwm_off")
-NEEDED = ("name", "materials", "preset")
-LINE_KEYS = ("port", "baud", *LINE_RANGES, "messages")
-PWM_RANGE = (-1e6, 1e6)  # as a binary32 it is exact to a tenth there
+PWM_NUMBER = checks.within(-1e6, 1e6)  # as a binary32 it is exact to a tenth there
+PWM_KEYS: checks.Keys = {key: (key, PWM_NUMBER) for key in ("pwm_on", "pwm_off")}
 KEEPALIVE_SHARE = 0.4  # of the watchdog, at most: one keepalive may be lost and the next late
 
 
@@ -133,20 +152,18 @@ def _settings(path: Path, table: checks.Table) -> tuple[DispenserSettings, ...]:
 
 
 def _one(path: Path, table: checks.Table) -> DispenserSettings:
-    preset = table.get("preset", "")
-    if "preset" in table and preset not in PRESET_NAMES:
-        raise InputError(path, "dispenser.preset", preset, checks.one_of_text(str(preset), PRESET_NAMES))
-    special = PWM_KEYS if preset == ARM_PWM else (*LINE_KEYS,)
-    required = (*NEEDED, *(PWM_KEYS if preset == ARM_PWM else ("port",)))
+    preset = checks.word(PRESET_NAMES)(path, "dispenser.preset", table["preset"]) if "preset" in table else ""
+    special = PWM_KEYS if preset == ARM_PWM else {**LINE_KEYS, "messages": ()}
+    required = ("name", "materials", "preset", *(PWM_KEYS if preset == ARM_PWM else ("port",)))
     checks.check_keys(path, "dispenser.", table, required, [*PROFILE_KEYS, *special])
     if preset == ARM_PWM:
         for key in ("metered", "temperature_range_c", "watchdog_s", "prime_mm3", "retract_mm3"):
             if table.get(key):
                 raise InputError(path, f"dispenser.{key}", table[key], "left out of arm_pwm, which can only switch")
-        pwm_on, pwm_off = (_within(path, key, table[key], *PWM_RANGE) for key in PWM_KEYS)
-        if pwm_on == pwm_off:
+        pwm = checks.table_fields(path, "dispenser.", table, PWM_KEYS)
+        if pwm["pwm_on"] == pwm["pwm_off"]:
             raise InputError(path, "dispenser.pwm_on", table["pwm_on"], "another number than pwm_off")
-        return DispenserSettings(_profile(path, table, None), preset, None, (pwm_on, pwm_off))
+        return DispenserSettings(_profile(path, table, None), preset, None, (pwm["pwm_on"], pwm["pwm_off"]))
     kind = PRESETS[preset]
     profile, line = _profile(path, table, kind), _line(path, table, kind)
     _check_both(path, table, kind, profile, line)
@@ -154,53 +171,23 @@ def _one(path: Path, table: checks.Table) -> DispenserSettings:
 
 
 def _profile(path: Path, table: checks.Table, preset: Preset | None) -> DispenserProfile:
-    values: dict[str, object] = {}
-    for key, name in PROFILE_KEYS.items():
-        where = f"dispenser.{key}"
-        if key not in table:
-            continue
-        if key == "materials":
-            values[name] = _materials(path, table[key])
-        elif key == "metered":
-            if not isinstance(table[key], bool):
-                raise InputError(path, where, table[key], "true or false")
-            values[name] = table[key]
-        elif key == "nozzle_offset_mm":
-            values[name] = checks.numbers(path, where, table[key], (3,), "mm")
-        elif key in PAIR_KEYS:
-            values[name] = tuple(checks.numbers(path, where, table[key], (2,)).tolist())
-        else:
-            values[name] = checks.number(path, where, table[key])
+    usual: dict[str, Any] = {}
     if preset is not None:
-        values = {"metered": preset.metered, "watchdog": preset.watchdog, "flow_range": preset.flow_range} | values
-    values["watchdog"] = values.get("watchdog") or None
-    try:
-        return DispenserProfile(checks.text(path, "dispenser.name", table["name"]), **values)  # type: ignore[arg-type]
-    except InputError as error:
-        if error.where == str(path):
-            raise
-        keys = {name: key for key, name in PROFILE_KEYS.items()}
-        raise InputError(path, f"dispenser.{keys.get(error.what, error.what)}", error.got, error.allowed) from None
+        usual = {"metered": preset.metered, "watchdog": preset.watchdog, "flow_range": preset.flow_range}
 
+    def profile(**values: Any) -> DispenserProfile:
+        values = usual | values
+        return DispenserProfile(**values | {"watchdog": values.get("watchdog") or None})
 
-def _materials(path: Path, value: object) -> tuple[str, ...]:
-    words = value if isinstance(value, list) else []
-    if not words or not all((isinstance(w, str) and w) or type(w) is int for w in words):
-        raise InputError(path, "dispenser.materials", value, "a list of names or whole numbers, one or more")
-    return tuple(map(str, words))
+    return checks.record_from_table(path, "dispenser.", table, profile, PROFILE_KEYS, also=table)
 
 
 def _line(path: Path, table: checks.Table, preset: Preset) -> DispenserLine:
-    changes: dict[str, object] = {"port": checks.text(path, "dispenser.port", table["port"])}
-    if "baud" in table:
-        changes["baud"] = checks.integer(path, "dispenser.baud", table["baud"], 300)
-    for key, (name, low, high) in LINE_RANGES.items():
-        if key in table:
-            changes[name] = _within(path, key, table[key], low, high)
+    changes = checks.table_fields(path, "dispenser.", table, LINE_KEYS)
     for key in preset.settings:
         if key not in table:
             raise InputError(path, f"dispenser.{key}", "missing", f"this key, which the preset {table['preset']} needs")
-    line = replace(preset.line, messages=_messages(path, table, preset.line.messages), **changes)  # type: ignore[arg-type]
+    line = replace(preset.line, messages=_messages(path, table, preset.line.messages), **changes)
     try:
         line.messages.check(MessageValues(plunger=line.plunger))
     except InputError as error:
@@ -213,17 +200,9 @@ def _line(path: Path, table: checks.Table, preset: Preset) -> DispenserLine:
 
 
 def _messages(path: Path, table: checks.Table, preset: DispenserMessages) -> DispenserMessages:
-    own = table.get("messages", {})
-    if not isinstance(own, dict):
-        raise InputError(path, "dispenser.messages", own, "a table [dispenser.messages]")
-    checks.check_keys(path, "dispenser.messages.", own, (), [f.name for f in fields(DispenserMessages)])
-    for key, value in own.items():
-        if not isinstance(value, str):
-            raise InputError(path, f"dispenser.messages.{key}", value, "a text")
-    try:
-        return replace(preset, **own)
-    except InputError as error:
-        raise InputError(path, f"dispenser.messages.{error.what}", error.got, error.allowed) from None
+    own, words = checks.table_at(path, "dispenser.", table, "messages"), fields(DispenserMessages)
+    keys: checks.Keys = {each.name: (each.name, checks.any_text) for each in words}
+    return checks.record_from_table(path, "dispenser.messages.", own, partial(replace, preset), keys)
 
 
 def _check_both(
@@ -253,13 +232,6 @@ def _check_both(
         raise InputError(path, "dispenser.keepalive_s", line.keepalive, allowed)
 
 
-def _within(path: Path, key: str, value: object, low: float, high: float) -> float:
-    number = checks.number(path, f"dispenser.{key}", value)
-    if not low <= number <= high:
-        raise InputError(path, f"dispenser.{key}", value, f"{low:g} to {high:g}")
-    return number
-
-
 HEADER = re.compile(r"^\s*\[")
 
 
@@ -280,7 +252,7 @@ def write_delays(path: str | Path, name: str, delays: DispenserProfile) -> None:
     end = next((i for i in range(start, len(lines)) if HEADER.match(lines[i])), len(lines))
     body, new = lines[start:end], []
     for key, field_name in DELAY_KEYS.items():
-        value = checks.toml_number(round(getattr(delays, field_name), 6))
+        value = checks.toml_value(round(getattr(delays, field_name), 6))
         at = next((i for i, line in enumerate(body) if re.match(rf"\s*{key}\s*=", line)), None)
         if at is None:
             new.append(f"{key} = {value}")

@@ -256,7 +256,7 @@ def write_roi(path: Path, rig: Rig, rois: Sequence[Roi], frames: Sequence[int]) 
     blocks = ["# where the surface is: per camera a polygon in pixels of that frame\n"]
     for roi, frame in zip(rois, frames, strict=True):
         name = json.dumps(rig.cameras[roi.camera].name, ensure_ascii=False)
-        polygon = checks.toml_numbers(roi.polygon)
+        polygon = checks.toml_value(roi.polygon)
         blocks.append(f"[[roi]]\ncamera = {name}\nframe = {frame}\npolygon = {polygon}\n")
     path.write_text("\n".join(blocks), encoding="utf-8")
 

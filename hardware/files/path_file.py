@@ -26,6 +26,7 @@ import threading
 import zlib
 from collections.abc import Sequence
 from ctypes import c_double
+from functools import partial
 from pathlib import Path as File
 from typing import Any
 
@@ -64,7 +65,7 @@ def _path_from_rows(file: File, rows: list[checks.CsvRow]) -> Path:
     lines, words = _columns(file, rows)
     speed_column = next(name for name in SPEED_COLUMNS if name in words)
     number_columns = (*POSE_COLUMNS, speed_column, "temperature_c")
-    numbers = {name: _numbers(file, lines, name, words[name]) for name in number_columns}
+    numbers = {name: checks.csv_numbers(file, lines, name, words[name]) for name in number_columns}
     pose = np.stack([numbers[name] for name in POSE_COLUMNS], axis=1)
     path = Path(
         surface_from_nozzle=se3.make(se3.rotation_from_euler(np.deg2rad(pose[:, 3:])), pose[:, :3]),
@@ -127,22 +128,11 @@ def _cells(column: Column) -> list[str]:
 
 def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], dict[str, list[str]]]:
     """Line numbers of the checkpoints, and the cells of each column."""
-    rows = _stripped(rows)
-    if not rows:
-        raise InputError(file, "file", "empty", f"a header {','.join(PATH_HEADER)} and 2 checkpoints or more")
-    (_, header), body = rows[0], rows[1:]
-    _check_header(file, header)
-    for line, row in body:
-        if len(row) != len(header):
-            raise InputError(file, f"line {line}", f"{len(row)} values", f"{len(header)}, as in the header")
-    if len(body) < 2:
-        raise InputError(file, "checkpoints", len(body), "2 or more")
-    return [line for line, _ in body], {name: [row[i] for _, row in body] for i, name in enumerate(header)}
-
-
-def _stripped(rows: list[checks.CsvRow]) -> list[checks.CsvRow]:
-    """The rows that are not empty, without blanks around their words."""
-    return [(line, [word.strip() for word in row]) for line, row in rows if any(map(str.strip, row))]
+    contents = f"a header {','.join(PATH_HEADER)} and 2 checkpoints or more"
+    lines, words = checks.csv_columns(file, rows, contents, partial(_check_header, file))
+    if len(lines) < 2:
+        raise InputError(file, "checkpoints", len(lines), "2 or more")
+    return lines, words
 
 
 def _check_header(file: File, header: Sequence[str]) -> None:
@@ -162,21 +152,6 @@ def _check_header(file: File, header: Sequence[str]) -> None:
             raise InputError(file, "header", f"no {name}", ",".join(PATH_HEADER))
     if sum(name in header for name in SPEED_COLUMNS) != 1:
         raise InputError(file, "header", ",".join(header), f"one of {', '.join(SPEED_COLUMNS)}")
-
-
-def _numbers(file: File, lines: Sequence[int], name: str, words: Sequence[str]) -> NDArray[np.float64]:
-    numbers = np.array([_number(word) for word in words])
-    wrong = np.flatnonzero(~np.isfinite(numbers))
-    if len(wrong):
-        raise InputError(file, f"line {lines[wrong[0]]}: {name}", words[wrong[0]], "a finite number")
-    return numbers
-
-
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return math.nan
 
 
 def _whole(file: File, lines: Sequence[int], name: str, words: Sequence[str], flags: bool = False) -> NDArray[np.int64]:
@@ -246,14 +221,15 @@ CONTOUR_COLUMNS = ("x_mm", "y_mm", "z_mm")
 def read_contour(file: str | File) -> Array:
     """Points (N, 2) or (N, 3), mm, in order around a contour, the first not repeated at the end; N >= 3."""
     file = File(file)
-    rows = _stripped(checks.read_csv(file))
     allowed = "x_mm,y_mm or x_mm,y_mm,z_mm"
-    if not rows:
-        raise InputError(file, "file", "empty", f"a header {allowed} and 3 points or more")
-    (_, header), body = rows[0], rows[1:]
-    if tuple(header) not in (CONTOUR_COLUMNS[:2], CONTOUR_COLUMNS):
-        raise InputError(file, "header", ",".join(header), allowed)
-    points = np.array([_point(file, line, row, len(header)) for line, row in body]).reshape(-1, len(header))
+
+    def check(header: list[str]) -> None:
+        if tuple(header) not in (CONTOUR_COLUMNS[:2], CONTOUR_COLUMNS):
+            raise InputError(file, "header", ",".join(header), allowed)
+
+    contents = f"a header {allowed} and 3 points or more"
+    lines, words = checks.csv_columns(file, checks.read_csv(file), contents, check)
+    points = np.stack([checks.csv_numbers(file, lines, *column) for column in words.items()], axis=1)
     if len(points):
         points = points[np.r_[True, (np.diff(points, axis=0) != 0).any(axis=1)]]  # no point twice in a row
     if len(points) > 1 and np.array_equal(points[0], points[-1]):
@@ -261,18 +237,6 @@ def read_contour(file: str | File) -> Array:
     if len(points) < 3:
         raise InputError(file, "points", len(points), "3 or more, each at another place")
     return points
-
-
-def _point(file: File, line: int, row: list[str], count: int) -> list[float]:
-    if len(row) != count:
-        raise InputError(file, f"line {line}", f"{len(row)} values", f"{count}, as in the header")
-    try:
-        point = [float(word) for word in row]
-    except ValueError:
-        raise InputError(file, f"line {line}", ",".join(row), "numbers, mm") from None
-    if not all(map(math.isfinite, point)):
-        raise InputError(file, f"line {line}", ",".join(row), "finite numbers, mm")
-    return point
 
 
 KEYS = ("path", "fraction", "printed")
@@ -307,7 +271,7 @@ def read_progress(file: File, path: Path) -> float:
 
 def _replace(file: File, mark: ProgressMark, printed: int, durable: bool = False) -> None:
     """Write beside the file and rename, so that a whole file is there always. durable: wait for the disk."""
-    text = f'path = "{mark.path}"\nfraction = {checks.toml_number(mark.fraction)}\nprinted = {printed}\n'
+    text = f'path = "{mark.path}"\nfraction = {checks.toml_value(mark.fraction)}\nprinted = {printed}\n'
     beside = file.with_name(file.name + ".new")
     with beside.open("w", encoding="utf-8") as stream:
         stream.write(text)

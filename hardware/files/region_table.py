@@ -84,7 +84,7 @@ def region_from_table(where: object, table: object) -> RegionSettings:
         if name not in (BY_KEY, COLOUR_KEY)
     )
     colour = _colour(where, table[COLOUR_KEY]) if COLOUR_KEY in table else PATCH_COLOUR
-    by = _by(where, table[BY_KEY]) if BY_KEY in table else None
+    by = checks.member(RegionBy)(where, "region.by", table[BY_KEY]) if BY_KEY in table else None
     if by is None and (polygons or COLOUR_KEY in table):
         by = RegionBy.POLYGON if polygons else RegionBy.COLOUR
     if polygons and by is not RegionBy.POLYGON:
@@ -92,13 +92,6 @@ def region_from_table(where: object, table: object) -> RegionSettings:
     if COLOUR_KEY in table and by is not RegionBy.COLOUR:
         raise InputError(where, "region.colour", colour, f'none with by = "{by}"')
     return RegionSettings(by, polygons, colour)
-
-
-def _by(where: object, value: object) -> RegionBy:
-    known = [each.value for each in RegionBy]
-    if not isinstance(value, str) or value not in known:
-        raise InputError(where, "region.by", value, checks.one_of_text(str(value), known))
-    return RegionBy(value)
 
 
 def _colour(where: object, value: object) -> str:

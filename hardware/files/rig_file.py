@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,17 +115,15 @@ def write_rig(
     sigmas = [None] * len(rig) if lens_sigma is None else lens_sigma
     blocks = ["# mm, px; base_from_camera carries camera coordinates (x right, y down, z into the scene) to the base\n"]
     for camera, source, sigma in zip(rig.cameras, sources, sigmas, strict=True):
-        lines = ["[[camera]]", f"name = {json.dumps(camera.name, ensure_ascii=False)}"]
-        if source is not None:
-            lines.append(f"{source.kind} = {json.dumps(source.pattern, ensure_ascii=False)}")
-        lines.append(f"size = {list(camera.size)}")
-        for key in ("matrix", "distortion", "base_from_camera"):
-            lines.append(f"{key} = {checks.toml_numbers(getattr(camera, key))}")
-        if camera.clock_offset:
-            lines.append(f"clock_offset_s = {checks.toml_number(camera.clock_offset)}")
-        if sigma is not None:
-            lines.append(f"{SIGMA_KEY} = {checks.toml_numbers(sigma)}")
-        blocks.append("\n".join(lines) + "\n")
+        values = {
+            "name": camera.name,
+            **({} if source is None else {source.kind: source.pattern}),
+            "size": camera.size,
+            **{key: getattr(camera, key) for key in ("matrix", "distortion", "base_from_camera")},
+            "clock_offset_s": camera.clock_offset or None,
+            SIGMA_KEY: sigma,
+        }
+        blocks.append("\n".join(["[[camera]]", *checks.toml_lines(values)]) + "\n")
     Path(path).write_text("\n".join(blocks), encoding="utf-8")
 
 
@@ -153,16 +150,14 @@ def _camera(where: object, key: str, entry: Table, also: Sequence[str]) -> Camer
     checks.check_keys(where, f"{key}.", entry, CAMERA_KEYS, [*also, "clock_offset_s", SIGMA_KEY])
     name = _name(where, f"{key}.name", entry["name"])
     key = f"camera {name!r}: "
-    size = checks.numbers(where, key + "size", entry["size"], (2,), "[width, height] in px")
-    if (size < 1).any() or (size != np.round(size)).any():
-        raise InputError(where, key + "size", entry["size"], "[width, height], whole px >= 1")
+    size = checks.whole_pair(1, np.inf, "[width, height], whole px >= 1")(where, key + "size", entry["size"])
     matrix = checks.numbers(where, key + "matrix", entry["matrix"], (3, 3), PINHOLE)
-    _check_matrix(where, key + "matrix", matrix, float(size.max()))
+    _check_matrix(where, key + "matrix", matrix, float(max(size)))
     distortion = checks.numbers(where, key + "distortion", entry["distortion"], (5,), "k1 k2 p1 p2 k3")
     base_from_camera = checks.numbers(where, key + "base_from_camera", entry["base_from_camera"], (4, 4), "mm")
     offset = checks.number(where, key + "clock_offset_s", entry.get("clock_offset_s", 0.0))
     extrinsics = _rigid(where, key + "base_from_camera", base_from_camera)
-    return Camera(name, (int(size[0]), int(size[1])), matrix, distortion, extrinsics, offset)
+    return Camera(name, size, matrix, distortion, extrinsics, offset)
 
 
 def _name(where: object, key: str, value: object) -> str:
@@ -212,8 +207,6 @@ def _check_scale(where: object, cameras: Sequence[Camera]) -> None:
         raise InputError(where, "base_from_camera of all cameras", f"{spread:.4g} mm apart", allowed)
 
 
-BOARD_KEYS = ("kind", "squares", "square_mm")
-OPTIONAL_BOARD_KEYS = ("marker", "dictionary", "inverted", "legacy")
 MIN_SQUARES, MAX_SQUARES = 3, 60  # squares along an edge
 SQUARE_SIZE_RANGE = (0.5, 500.0)  # mm, a square: from under a microscope to a wall
 MARKER_SHARE_RANGE = (0.3, 0.95)  # of a square: bits large enough to be read, and white around them
@@ -223,42 +216,32 @@ def read_board(path: str | Path) -> Board:
     """Read and check a board.toml; InputError names the key that is wrong."""
     from perception.boards.board import BOARD_KINDS, DICTIONARIES, Board  # loads cv2, which rigs alone do not need
 
-    path, default = Path(path), Board()
-    table = checks.read_toml(path)
-    checks.check_keys(path, "", table, BOARD_KEYS, OPTIONAL_BOARD_KEYS)
-    kind = checks.text(path, "kind", table["kind"])
-    if kind not in BOARD_KINDS:
-        raise InputError(path, "kind", kind, " or ".join(BOARD_KINDS))
-    squares = checks.numbers(path, "squares", table["squares"], (2,), "[columns, rows]")
-    if (squares != squares.round()).any() or (squares < MIN_SQUARES).any() or (squares > MAX_SQUARES).any():
-        allowed = f"[columns, rows], whole, {MIN_SQUARES} to {MAX_SQUARES} each"
-        raise InputError(path, "squares", table["squares"], allowed)
-    square = _within(path, "square_mm", table["square_mm"], *SQUARE_SIZE_RANGE)
-    marker = _within(path, "marker", table.get("marker", default.marker), *MARKER_SHARE_RANGE)
-    dictionary = str(table.get("dictionary", default.dictionary)).removeprefix("DICT_")
-    if dictionary not in DICTIONARIES:
-        raise InputError(path, "dictionary", dictionary, checks.one_of_text(dictionary, DICTIONARIES))
-    flags = [table.get(key, False) for key in ("inverted", "legacy")]
-    for key, flag in zip(("inverted", "legacy"), flags, strict=True):
-        if not isinstance(flag, bool):
-            raise InputError(path, key, flag, "true or false")
-    columns, rows = int(squares[0]), int(squares[1])
-    board = Board(kind, (columns, rows), square, marker, dictionary, *flags)
+    path = Path(path)
+
+    def dictionary(where: object, key: str, value: object) -> object:
+        return checks.word(DICTIONARIES)(where, key, str(value).removeprefix("DICT_"))
+
+    counts = f"[columns, rows], whole, {MIN_SQUARES} to {MAX_SQUARES} each"
+    keys: checks.Keys = {
+        "kind": ("kind", checks.word(BOARD_KINDS)),
+        "squares": ("squares", checks.whole_pair(MIN_SQUARES, MAX_SQUARES, counts)),
+        "square_mm": ("square", checks.within(*SQUARE_SIZE_RANGE, "mm")),
+        "marker": ("marker", checks.within(*MARKER_SHARE_RANGE, "of a square")),
+        "dictionary": ("dictionary", dictionary),
+        "inverted": ("inverted", checks.flag),
+        "legacy": ("legacy", checks.flag),
+    }
+    board = checks.record_from_table(path, "", checks.read_toml(path), Board, keys, ("kind", "squares", "square_mm"))
     _check_whole(path, board)
     return board
 
 
 def write_board(path: Path, board: Board) -> None:
     """Write a board.toml that `read_board` reads back to the same board."""
-    lines = [
-        f'kind = "{board.kind}"',
-        f"squares = {list(board.squares)}",
-        f"square_mm = {checks.toml_number(board.square)}",
-    ]
+    values = {"kind": board.kind, "squares": board.squares, "square_mm": float(board.square)}
     if board.kind == "charuco":
-        lines += [f"marker = {checks.toml_number(board.marker)}  # of a square", f'dictionary = "{board.dictionary}"']
-        lines += [f"legacy = {str(board.legacy).lower()}"]
-    lines.append(f"inverted = {str(board.inverted).lower()}")
+        values |= {"marker": float(board.marker), "dictionary": board.dictionary, "legacy": board.legacy}
+    lines = checks.toml_lines({**values, "inverted": board.inverted})
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -269,13 +252,6 @@ def _check_whole(path: Path, board: Board) -> None:
     if board.kind == "chessboard" and sum(board.squares) % 2 == 0:
         allowed = "an even and an odd number: only then can the board not be taken upside down"
         raise InputError(path, "squares", list(board.squares), allowed)
-
-
-def _within(path: Path, key: str, value: object, low: float, high: float) -> float:
-    number = checks.number(path, key, value)
-    if not low <= number <= high:
-        raise InputError(path, key, number, f"{low:g} to {high:g}")
-    return number
 
 
 def surface_of_rig(file: Path, surface: str | None) -> Path | None:

@@ -34,12 +34,12 @@ from hardware.live.records import (
     LiveMotionReport,
     MotionChannels,
     OutlineOrder,
-    PoseHandover,
     RecorderReport,
     TrackingChannels,
     TrackingReport,
 )
 from hardware.live.settings import VIRTUAL_ARM
+from hardware.motion.step import PoseHandover
 from hardware.offline.replay import FrameFaults
 from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock, WatchedClock

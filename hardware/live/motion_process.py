@@ -14,9 +14,7 @@ from types import FrameType
 import numpy as np
 
 from estimation.errors import StillbedError
-from estimation.pose import SurfacePose
 from hardware.arm.device import ArmEvent
-from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import write_progress_durably
@@ -26,21 +24,20 @@ from hardware.live.records import (
     EXPOSURE_TO_WIRE_STAGE,
     FRAMES_TO_WIRE_STAGE,
     LATE_TICK_STAGE,
-    BeginPrint,
     EventEntry,
     LiveMotionReport,
     MotionChannels,
-    PauseOrder,
-    PoseHandover,
     StageHistograms,
     StageTiming,
     WireEntry,
 )
 from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
 from hardware.motion.loop import CommandedPose, MaterialControl, MotionLoop, Order, RecordedTick, Tick
-from hardware.motion.step import PrintMotion
-from hardware.process.clock import PoseLockedSchedule, WallClock
+from hardware.motion.print_loop import LoopOrder, LoopSettings, PrintLoop
+from hardware.motion.step import BeginPrint, PoseHandover, PrintMotion
+from hardware.process.clock import WallClock
 from hardware.process.system import Bell, SharedLatest, ask_for_real_time, set_up_process, take_messages
+from hardware.recording.loop_record import RecordingSource
 from perception.frames import PrintHead
 from planning.path import Path
 
@@ -60,38 +57,26 @@ class _WakingClock(WallClock):
 
 
 class _OrderReceiver:
-    """Takes the orders: those of a live run are followed here, those of the arm are returned.
+    """Takes the orders.
 
     alone: whether the process that gives the orders is gone. fingerprint: of the path that was begun, "" before.
     """
 
-    def __init__(self, channels: MotionChannels, motion: PrintMotion, ticks: PoseLockedSchedule) -> None:
-        self._connection, self._requests, self._motion, self._ticks = channels.orders, channels.requests, motion, ticks
+    def __init__(self, channels: MotionChannels) -> None:
+        self._connection, self._requests = channels.orders, channels.requests
         self._last_stop = channels.requests.last_stop
         self.alone, self.fingerprint = False, ""
         self._ended = False
         signal.signal(signal.SIGTERM, self._end)
 
-    def __call__(self) -> list[Order]:
-        orders: list[Order] = []
+    def __call__(self) -> list[LoopOrder]:
+        orders: list[LoopOrder] = []
         if (stop := self._requests.last_stop) != self._last_stop:  # a stop of the page does not wait for the run's loop
             self._last_stop = stop
             orders.append(Order.STOP)
         messages, closed = take_messages(self._connection)
-        for order in messages:
-            if isinstance(order, Order):
-                orders.append(order)
-            elif isinstance(order, BeginPrint):
-                self.fingerprint, self._ticks.tick = order.fingerprint, order.profile.tick
-                self._motion.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
-            elif order is PauseOrder.MATERIAL_IN:
-                self._motion.put_in()
-            elif order is PauseOrder.RESUME:
-                self._motion.resume()
-            elif order is PauseOrder.LOOK:
-                self._motion.look()
-            else:
-                self._motion.paused = True
+        orders.extend(messages)
+        self.fingerprint = next((o.fingerprint for o in orders if isinstance(o, BeginPrint)), self.fingerprint)
         self.alone |= closed
         return [*orders, Order.QUIT] if self.alone or self._ended else orders
 
@@ -102,10 +87,8 @@ class _OrderReceiver:
 class _TickReporter:
     """Times the way from frames to the wire, records what passes the port, and reports each tick."""
 
-    def __init__(
-        self, channels: MotionChannels, sender: RecorderSender, ticks: PoseLockedSchedule, priority: str, trace: bool
-    ) -> None:
-        self._poses, self._reports, self._sender, self._ticks = channels.poses, channels.reports, sender, ticks
+    def __init__(self, channels: MotionChannels, sender: RecorderSender, priority: str, trace: bool) -> None:
+        self._poses, self._reports, self._sender = channels.poses, channels.reports, sender
         self._clock, self._priority = WallClock(), priority
         self.times = StageHistograms()
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
@@ -116,18 +99,12 @@ class _TickReporter:
         self.loop: MotionLoop | None = None
         self.motion: PrintMotion | None = None
 
-    def newest_pose(self) -> SurfacePose | None:
+    def newest_pose(self) -> PoseHandover | None:
         """The newest pose there is."""
         handover = self._poses.get()
         if handover is not self._handover:
             self._handover, self._unsent, self._seen = handover, True, self._clock.now()
-            if handover is not None:
-                self._ticks.arrived(handover.sent)
-        return None if handover is None else handover.pose
-
-    def arm_lag(self) -> float:
-        """The arm's lag from set-point to answer, s; NaN while unknown."""
-        return math.nan if self.loop is None else self.loop.arm.lag
+        return handover
 
     def bytes_passed(self, data: bytes, sent: bool) -> None:
         """Record bytes of the port, and time the first move made of a pose."""
@@ -157,12 +134,13 @@ class _TickReporter:
         progress, late = motion.progress, loop.lateness
         if progress is not None:
             stamp = math.nan if self._handover is None else self._handover.pose.stamp
-            asked, begun = motion.asked and motion.last.stamp == tick.stamp, motion.begun
-            motion.begun, frame = math.nan, loop.arm.command_frame if asked else b""
-            reached = progress.fraction, progress.phase, None if tick.recalled is None else tick.recalled.rows
-            inputs = stamp, asked, begun, motion.waits, motion.material_in
-            motion.material_in, lag = False, motion.lag if asked else math.nan
-            self._sender.put(RecordedTick(tick.stamp, *inputs, tick.command, frame, *reached, lag, motion.aside))
+            asked = motion.asked and motion.last.stamp == tick.stamp
+            frame, recalled = (
+                loop.arm.command_frame if asked else b"",
+                None if tick.recalled is None else tick.recalled.rows,
+            )
+            reached = tick.command, frame, progress.fraction, progress.phase, recalled
+            self._sender.put(RecordedTick(tick.stamp, stamp, asked, *reached))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
         lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
@@ -192,24 +170,20 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     set_up_process("motion", settings.cores_motion, outlives=True)
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     clock, sender = WallClock(), RecorderSender(channels.recorder)  # its thread shares the interpreter: as urgent
-    link_settings = LinkSettings(pause_frame=settings.pause_frame)
-    ticks = PoseLockedSchedule(profile.tick, link_settings.ease, clock.now())
+    how = LoopSettings(LinkSettings(pause_frame=settings.pause_frame))
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
-    reporter = _TickReporter(channels, sender, ticks, priority, settings.trace)
-    motion = PrintMotion(profile, clock, channels.place, material, reporter.arm_lag)
-    orders = _OrderReceiver(channels, motion, ticks)
+    reporter, orders = _TickReporter(channels, sender, priority, settings.trace), _OrderReceiver(channels)
     driver = open_arm(channels.url, profile, reporter.bytes_passed)
+    given = _WakingClock(channels.bell), driver, reporter.newest_pose, orders
+    source = RecordingSource(*given, sender.put, profile, material, how)
     try:
-        arm = Arm(driver, profile, clock.now(), link_settings)
-        reporter.motion = motion
-        poses, report = reporter.newest_pose, reporter.report
-        waking = _WakingClock(channels.bell)
-        loop = reporter.loop = MotionLoop(motion, arm, waking, poses, orders, report, motion.homed, ticks, material)
+        printing = PrintLoop(source, profile, how, clock, reporter.report, channels.place)
+        reporter.motion, reporter.loop = printing.motion, printing.loop
         try:
-            loop.run()
+            printing.run()
         finally:
             reporter.loop = None
-            arm.close()
+            printing.arm.close()
             for words in [] if material is None else material.close(clock):
                 sender.put(EventEntry(clock.now(), f"could not be switched off: {words}", WARNING, "dispenser"))
     except StillbedError as error:  # the arm cannot be used, or nothing is recorded any more

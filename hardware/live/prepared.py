@@ -12,6 +12,7 @@ run.report.html, run.summary.json
 from __future__ import annotations
 
 import math
+import os
 import re
 import shutil
 import sys
@@ -48,7 +49,6 @@ from hardware.live.settings import (
     override_settings,
     page_settings,
     read_settings,
-    toml_string,
 )
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
@@ -109,46 +109,47 @@ def write_placement(file: File, placement: SurfacePlacement) -> None:
 
 def placement_text(placement: SurfacePlacement) -> str:
     """The placement as TOML."""
-    lines = [
-        f'map = "{placement.map.resolve()}"',
-        f"until_s = {checks.toml_number(placement.until)}",
-        f"surface_from_path = {checks.toml_numbers(placement.surface_from_path)}",
-        f"arm_from_base = {checks.toml_numbers(placement.arm_from_base)}",
-        f"certain = {str(placement.certain).lower()}",
-        f"verdict = {toml_string(placement.verdict)}",
-    ]
-    if math.isfinite(placement.since):
-        lines.append(f"since_s = {checks.toml_number(placement.since)}")
-    return "\n".join(lines) + "\n"
+    values = {
+        "map": str(placement.map.resolve()),
+        "until_s": float(placement.until),
+        "surface_from_path": placement.surface_from_path,
+        "arm_from_base": placement.arm_from_base,
+        "certain": bool(placement.certain),
+        "verdict": placement.verdict,
+        "since_s": float(placement.since) if math.isfinite(placement.since) else None,
+    }
+    return "\n".join(checks.toml_lines(values)) + "\n"
 
 
 def read_placement(file: File) -> SurfacePlacement:
     """The placement in a file; InputError where it makes no sense."""
-    table = checks.read_toml(file)
-    optional = "since_s", "certain", "verdict"
-    checks.check_keys(file, "", table, ("map", "until_s", "surface_from_path", "arm_from_base"), optional)
-    poses = {key: checks.numbers(file, key, table[key], (4, 4)) for key in ("surface_from_path", "arm_from_base")}
-    for key, pose in poses.items():
-        if not se3.is_transform(pose):
-            raise InputError(file, key, pose.tolist(), "a finite 4x4 rigid motion, mm")
-    recording = File(checks.text(file, "map", table["map"]))
-    try:
-        there = recording.exists()
-    except OSError:  # a name that no file can have
-        there = False
-    if not there:
-        raise InputError(file, "map", recording, "the recording that shows the surface")
-    certain = table.get("certain", False)
-    if not isinstance(certain, bool):
-        raise InputError(file, "certain", certain, "true or false")
-    return SurfacePlacement(
-        recording,
-        checks.number(file, "until_s", table["until_s"]),
-        **poses,
-        since=checks.number(file, "since_s", table["since_s"]) if "since_s" in table else -math.inf,
-        certain=certain,
-        verdict=checks.text(file, "verdict", table["verdict"]) if table.get("verdict") else "",
-    )
+    required = "map", "until_s", "surface_from_path", "arm_from_base"
+    return checks.record_from_table(file, "", checks.read_toml(file), SurfacePlacement, PLACEMENT_KEYS, required)
+
+
+def _recording(where: object, key: str, value: object) -> File:
+    recording = File(checks.text(where, key, value))
+    if not os.path.exists(recording):  # False for a name that no file can have, too
+        raise InputError(where, key, recording, "the recording that shows the surface")
+    return recording
+
+
+def _pose(where: object, key: str, value: object) -> Array:
+    pose = checks.numbers(where, key, value, (4, 4))
+    if not se3.is_transform(pose):
+        raise InputError(where, key, pose.tolist(), "a finite 4x4 rigid motion, mm")
+    return pose
+
+
+PLACEMENT_KEYS: checks.Keys = {
+    "map": ("map", _recording),
+    "until_s": ("until", checks.number),
+    "surface_from_path": ("surface_from_path", _pose),
+    "arm_from_base": ("arm_from_base", _pose),
+    "since_s": ("since", checks.number),
+    "certain": ("certain", checks.flag),
+    "verdict": ("verdict", checks.any_text),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

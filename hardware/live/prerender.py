@@ -3,6 +3,10 @@
 A cache folder holds one session for each scenario: session.mcap with exact truth, path.csv as laid onto the true
 surface, arm.toml as the motion knows the arm, virtual_arm.toml as it is, and scenario.toml. The nozzle and what it
 prints are not in the pictures, as nobody knows beforehand where they will be.
+
+A run before them has a true error at the nozzle, which nobody in the loop knows (`nozzle_errors`): the simulator's
+truth log compares what was commanded with what the arm did, millisecond by millisecond. The truth is that of the
+pictures, which is part of the recording, interpolated between their instants.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +22,11 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, Trajectory, identity_pose
-from hardware.files.arm_file import write_arm
-from hardware.files.folder_tables import rows_from_trajectory
+from estimation.se3 import Array
+from hardware.files.arm_file import read_arm, write_arm
+from hardware.files.folder_tables import rows_from_trajectory, trajectory_from_rows
 from hardware.files.path_file import read_path, write_path
+from hardware.live.recorded_run import commands_in, read_run
 from hardware.process.clock import WallClock
 from hardware.process.faults import FaultPart
 from hardware.process.progress import (
@@ -33,16 +39,24 @@ from hardware.process.progress import (
     folder_size,
     size_text,
 )
+from hardware.recording.messages import row_from_message
 from hardware.recording.recorder import Recorder
+from hardware.recording.session_reader import inputs_from_texts
 from hardware.simulator.arm.settings import write_virtual_arm
 from hardware.simulator.cameras import Shot
+from hardware.simulator.deposit import NozzleLog, PlannedLine, join_logs, planned_line
+from hardware.simulator.dispenser import VirtualDispenserSettings
+from hardware.simulator.material import flow_from_told
+from hardware.simulator.nozzle_error import MaterialFigures, material_figures
+from hardware.simulator.nozzle_error import nozzle_errors as row_errors
 from hardware.simulator.scenario import Scenario, read_scenario
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.simulate import regions
-from hardware.simulator.truth import Truth, drape_path
+from hardware.simulator.truth import Truth, TruthLog, drape_path, row_instants
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport, report_without_offsets
+from planning.path import PrintPhase
 
 STAMP_DIGITS = 9  # of a truth's stamp: exposures of one instant are one
 
@@ -140,3 +154,89 @@ class _PictureSink:
         pass
 
     pose = given = tick = wire = head = rows = registered = look = event = _ignore
+
+
+BEAD_WIDTH = 1.0  # mm
+BLOCK_SECONDS = 10.0  # s of rows compared at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NozzleErrors:
+    """The true error at the nozzle of a run before pre-rendered pictures."""
+
+    distance: Array  # (N,) mm, nozzle to its place, of each extruding millisecond
+    duty: float  # share of the time due in which material left; NaN where none was due
+    deepest: float  # s of motion that the arm ever had queued
+    held_up: float  # s that a busy machine kept the virtual arm from its line at most
+    material: MaterialFigures | None = None  # of what a dispenser was told; None of a run without one
+
+    def figure(self, share: float) -> float:
+        """Error, mm, that `share` percent do not exceed; NaN of none."""
+        return float(np.percentile(self.distance, share)) if len(self.distance) else float("nan")
+
+
+class _TrueMotion:
+    """A motion known at some instants."""
+
+    def __init__(self, rows: Array) -> None:
+        self._known = trajectory_from_rows(rows, True)
+
+    def __call__(self, times: Array) -> Array:
+        """(N, 4, 4) at times (N,), s."""
+        return self._known.at(times)
+
+    def twist(self, times: Array) -> Array:
+        """Nobody asks for it here."""
+        raise NotImplementedError
+
+
+def nozzle_errors(
+    record: Path, executed: Path, path: Path, arm: Path, dispenser: VirtualDispenserSettings | None = None
+) -> NozzleErrors:
+    """executed: what the arm did, as a live run leaves it. path: checkpoints in the true surface frame.
+
+    arm: as it truly stands. InputError without ticks.
+    dispenser: what the one that was told truly does; None: it gives each bead what it needs, at once.
+    """
+    run = read_run(record, "/tick", "/move", "/truth", "/dispenser")
+    if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
+        raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
+    true, profile = read_arm(arm), inputs_from_texts(run.texts, record).profile  # tick and lag as the run took them
+    rows = np.unique(np.array([row_from_message(message) for message in run.messages["/truth"]]), axis=0)
+    rising = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
+    truth = Truth(np.eye(4), _TrueMotion(rows[rising]))
+    checkpoints = read_path(path)
+    truth_log = TruthLog(checkpoints, true.arm, truth, profile.tick, profile.lag)
+    told = sorted((float(m["stamp"]), float(m["flow"][0])) for m in run.messages["/dispenser"] if m["flow"])
+    flow, logs = flow_from_told(told, dispenser), list[NozzleLog]()
+    commands = commands_in(run)
+    for command, progress in commands:
+        truth_log.write(command, progress)
+    with np.load(executed) as done:
+        stamps, axes = done["stamps"], done["axes"]
+        deepest, held_up = float(done["deepest"]), float(done["held_up"])
+    first, last = commands[0][0].stamp, min(truth_log.known_until, float(stamps[-1]))
+
+    def axes_at(times: Array) -> Array:
+        return np.stack([np.interp(times, stamps, axes[:, i]) for i in range(6)], axis=1)
+
+    errors, extruding, due = list[Array](), 0, 0
+    printed = PrintPhase.LEAVING, PrintPhase.FINISHED  # nothing is due any more
+    finished = min((command.stamp for command, progress in commands if progress.phase in printed), default=np.inf)
+    for start in np.arange(first, last, BLOCK_SECONDS):
+        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at, flow)
+        if told:
+            logs.append(log)
+        known = log.extrude & np.isfinite(log.place)
+        off = log.base_from_nozzle[known, :3, 3] - log.base_from_target[known, :3, 3]
+        errors.append(np.linalg.norm(off, axis=1))
+        extruding += int(log.extrude.sum())
+        due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
+    duty = extruding / due if due else float("nan")
+    material = _material(join_logs(logs), planned_line(checkpoints)) if logs else None
+    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up, material)
+
+
+def _material(log: NozzleLog, line: PlannedLine) -> MaterialFigures:
+    """The width of beads is not recorded: it is taken as that of UNIT_AREA, 1 mm."""
+    return material_figures(log, line, row_errors(log, line), BEAD_WIDTH, float("nan"))

@@ -1,52 +1,46 @@
-"""A recorded run, examined afterwards: its motion replayed byte by byte, and its true error at the nozzle.
-
-The true error is known where a scenario's pictures were shown to a virtual arm; nobody in the loop knows it. The
-simulator's truth log compares what was commanded with what the arm did, millisecond by millisecond. The truth is that
-of the pictures, which is part of the recording, interpolated between their instants.
-"""
+"""A recorded run, examined afterwards: its loop played back and compared bit by bit, and its commands."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import base64
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
+from typing import Any
 
 import numpy as np
 
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.arm.protocol import frame_from_command
-from hardware.files.arm_file import read_arm
-from hardware.files.folder_tables import trajectory_from_rows
-from hardware.files.path_file import read_path
-from hardware.live.prepared import RunFiles
-from hardware.motion.step import MotionStep
+from hardware.arm.driver import G1, G4, G54, ArmDriver, Pause, Reply, ReplyKind, Reported, Sent, UnpluggedError
+from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.protocol import encode
+from hardware.files.arm_file import arm_from_text
+from hardware.motion.loop import MaterialControl, Order, Tick
+from hardware.motion.print_loop import LoopOrder, LoopSettings, PrintLoop
+from hardware.motion.step import BeginPrint, PauseOrder, PoseHandover
 from hardware.offline.replay import CommandWriter
+from hardware.process.clock import SimClock
 from hardware.process.progress import prepare_out
+from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT, REFUSED, START, UNPLUGGED
 from hardware.recording.mcap_file import AttachedFile, ChunkMessages, Damage, damage_words, parse, walk
 from hardware.recording.messages import (
     Message,
-    bytes_from_message,
     move_from_message,
     pose_from_message,
-    row_from_message,
 )
-from hardware.recording.session_reader import PATH_ATTACHMENT, PrintInputs, inputs_from_texts
-from hardware.simulator.deposit import NozzleLog, PlannedLine, join_logs, planned_line
-from hardware.simulator.dispenser import VirtualDispenserSettings
-from hardware.simulator.material import flow_from_told
-from hardware.simulator.nozzle_error import MaterialFigures, material_figures
-from hardware.simulator.nozzle_error import nozzle_errors as row_errors
-from hardware.simulator.truth import Truth, TruthLog, row_instants
+from hardware.recording.session_reader import PATH_ATTACHMENT, inputs_from_texts
 from planning.command import Command, Hold
+from planning.material import Outlet, Outlets, SwitchDelay
 from planning.path import PrintPhase, PrintProgress
 
 RUN_REQUIRED = "the recording of a run that began to print, or give --path"
 
 
 @dataclass(slots=True)
-class _RecordedRun:
+class RecordedRun:
     """What a recording holds of a run."""
 
     texts: dict[str, str]  # of attached files, by name
@@ -59,8 +53,9 @@ class _RecordedRun:
         return {pose.stamp: pose for pose in map(pose_from_message, self.messages["/pose"])}
 
 
-def _read_run(record: File, *topics: str) -> _RecordedRun:
-    run, damages = _RecordedRun({}, {topic: [] for topic in topics}), list[Damage]()
+def read_run(record: File, *topics: str) -> RecordedRun:
+    """The attached files of a recording, and its messages of these topics."""
+    run, damages = RecordedRun({}, {topic: [] for topic in topics}), list[Damage]()
     for part in walk(record):
         if isinstance(part, Damage):
             damages.append(part)
@@ -74,6 +69,217 @@ def _read_run(record: File, *topics: str) -> _RecordedRun:
     return run
 
 
+class PartedError(StillbedError):
+    """The loop does something else than it did."""
+
+
+class PlayedOutError(StillbedError):
+    """All that was recorded is played."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedFrame:
+    """What the arm's driver is given, as a frame of the S6H4D, beside what it was given then."""
+
+    stamp: float  # s
+    frame: bytes
+    recorded: bytes
+
+
+class PlayedSource:
+    """Hands on what was noted. frames: what the driver was given so far. settings: with which the loop was begun."""
+
+    material: MaterialControl | None = None
+
+    def __init__(
+        self,
+        records: Iterable[Mapping[str, Any]],
+        poses: Mapping[float, SurfacePose],
+        begin: Callable[[float, Outlets], BeginPrint],
+        profile: ArmProfile,
+        taken: Callable[[PlayedFrame], None],
+    ) -> None:
+        """records: messages of LoopRecords, in order. poses: by stamp. begin: the order that began to print.
+
+        profile: LOOP_ARM_ATTACHMENT's. taken: is given each frame. PartedError where the beginning is missing.
+        """
+        self._records, self._poses, self._begin, self._taken = iter(records), poses, begin, taken
+        self._readings: deque[float] = deque()
+        self._calls: deque[tuple[int, int, str, Any]] = deque()
+        self._passed = self._count = self._number = 0  # readings of this record, calls since the last
+        self._instant = 0.0
+        self._handover: PoseHandover | None = None
+        self._fill()
+        start = self.answer(START)
+        if not start:
+            raise PartedError("the recording does not hold how the loop began")
+        self.settings = LoopSettings(LinkSettings(**start["link"]), start.get("until"))
+        self.driver: ArmDriver = _PlayedDriver(self, profile)
+
+    def now(self) -> float:
+        """The clock as it was read then, s."""
+        if self._calls and not self._readings:
+            self._missed()
+        if not self._readings:
+            self._fill()
+        if self._calls and self._calls[0][0] <= self._passed:
+            self._missed()
+        self._passed, self._count = self._passed + 1, 0
+        self._instant = self._readings.popleft()
+        return self._instant
+
+    def wait_until(self, instant: float) -> None:
+        """The next reading says how long that took. PlayedOutError where the motion was ended meanwhile."""
+        if told := self.answer("wait"):
+            raise PlayedOutError(f"the motion was ended: {told}")
+
+    def pose(self) -> PoseHandover | None:
+        """The newest pose."""
+        if answer := self.answer("pose"):
+            stamp, sent = answer
+            if stamp not in self._poses:
+                raise PartedError(f"the pose of {stamp:.3f} s is not in the recording")
+            self._handover = PoseHandover(self._poses[stamp], sent, sent)
+        return self._handover
+
+    def orders(self) -> Sequence[LoopOrder]:
+        """The orders since the last call."""
+        return [self._order(text) for text in self.answer("orders") or ()]
+
+    def dry(self) -> str:
+        """Why material could not flow then."""
+        return str(self.answer("dry") or "")
+
+    def answer(self, kind: str) -> Any:
+        """What a call was answered then; None: the usual."""
+        self._count += 1
+        if not self._calls and not self._readings:
+            self._fill(optional=True)
+        if not self._calls or self._calls[0][:2] != (self._passed, self._count):
+            return None
+        if self._calls[0][2] != kind:
+            self._missed(kind)
+        answer = self._calls.popleft()[3]
+        if isinstance(answer, dict) and UNPLUGGED in answer:
+            raise UnpluggedError(answer[UNPLUGGED])
+        if isinstance(answer, dict) and REFUSED in answer:
+            raise _RefusedError(answer[REFUSED])
+        return answer
+
+    def flush(self) -> None:
+        """Nothing is kept."""
+
+    def take(self, frame: bytes, recorded: bytes) -> None:
+        """The driver is given something."""
+        self._taken(PlayedFrame(self._instant, frame, recorded))
+
+    def _order(self, told: Sequence[Any]) -> LoopOrder:
+        kind, *rest = told
+        if kind == "begin":
+            outlets = {name: Outlet(SwitchDelay(**delay), tuple(at)) for name, delay, at in rest[1]}
+            return self._begin(rest[0], outlets)
+        return Order(rest[0]) if kind == "arm" else PauseOrder(rest[0])
+
+    def _fill(self, optional: bool = False) -> None:
+        """Go on to the next record. optional: of what may be the last one."""
+        record = next(self._records, None)
+        if record is None:
+            if optional:
+                return
+            raise PlayedOutError("all is played")
+        if record["number"] != self._number:
+            raise PartedError(f"after {self._instant:.3f} s a part of the recording is missing")
+        self._number += 1
+        self._readings.extend(record["readings"])
+        self._calls.extend((row[0], row[1], row[2], row[3]) for row in record["calls"])
+        self._passed = 0
+
+    def _missed(self, kind: str = "the clock") -> None:
+        asked = self._calls[0][2]
+        raise PartedError(f"after {self._instant:.3f} s the loop asked for {asked!r} then, and now for {kind!r}")
+
+
+class _RefusedError(InputError):
+    """What a driver refused, by its words."""
+
+    def __init__(self, words: str) -> None:
+        StillbedError.__init__(self, words)
+
+
+class _PlayedDriver(ArmDriver):
+    """A driver that answers as another did."""
+
+    def __init__(self, source: PlayedSource, profile: ArmProfile) -> None:
+        self._source, self._answer, self._dialect = source, source.answer, profile.dialect
+        self.origin = np.zeros(3)
+
+    def connect(self, now: float) -> None:
+        self._answer("connect")
+
+    def state(self, now: float) -> Reported:
+        answer = self._answer("state")
+        return _reported_from_list(answer) if answer else Reported(now)
+
+    def send(self, instruction: G1 | G4, now: float) -> Sequence[Sent]:
+        recorded, rows = self._given("send")
+        self._source.take(encode(instruction, self._dialect), base64.b64decode(recorded))
+        return _sent_from_rows(rows) if rows else (Sent(instruction),)
+
+    def stop(self, now: float) -> Sequence[Sent]:
+        _, rows = self._given("stop")
+        frame = encode(Pause(), self._dialect)
+        self._source.take(frame, frame)
+        return _sent_from_rows(rows) if rows else (Sent(Pause()),)
+
+    def set_origin(self, origin: Array, now: float) -> Sequence[Sent]:
+        recorded, rows = self._given("set_origin")
+        self._source.take(encode(G54(origin), self._dialect), encode(G54(np.array(recorded)), self._dialect))
+        self.origin = np.array(origin, float)
+        return _sent_from_rows(rows)
+
+    def flush(self, now: float) -> Sequence[Sent]:
+        return _sent_from_rows(self._answer("flush") or ())
+
+    def enable(self, now: float) -> str:
+        return str(self._answer("enable") or "")
+
+    def home(self, now: float) -> bool:
+        return bool(self._answer("home"))
+
+    def blocked_for(self, now: float) -> float | None:
+        answer = self._answer("blocked_for")
+        return float(answer[0]) if answer else None
+
+    def waiting(self) -> float:
+        return float(self._answer("waiting") or 0.0)
+
+    def close(self) -> None:
+        self.origin = np.zeros(3)
+
+    def _given(self, kind: str) -> Sequence[Any]:
+        answer: Sequence[Any] | None = self._answer(kind)
+        if answer is None:
+            raise PartedError(f"the loop gives the arm {kind!r}, which it did not then")
+        return answer
+
+
+def _reported_from_list(told: Sequence[Any]) -> Reported:
+    stamp, replies, strays, fault, busy = told
+    known = tuple(Reply(ReplyKind(kind), np.array(values, float)) for kind, values in replies)
+    return Reported(stamp, known, base64.b64decode(strays), fault, busy)
+
+
+def _sent_from_rows(rows: Sequence[Any]) -> list[Sent]:
+    known: dict[str, Callable[..., G1 | G4 | G54 | Pause | None]] = {
+        "G1": lambda axes, feed, material: G1(np.array(axes, float), feed, material),
+        "G4": G4,
+        "G54": lambda origin: G54(np.array(origin, float)),
+        "pause": Pause,
+        "part": lambda: None,
+    }
+    return [Sent(known[row[1]](*row[2:]), row[0]) for row in rows if row != ["nothing"]]
+
+
 @dataclass(frozen=True, slots=True)
 class ReplayCount:
     """How many frames were replayed, how many of them not as recorded, and what was lost of the file, "" if nothing."""
@@ -81,49 +287,31 @@ class ReplayCount:
     frames: int
     other: int
     damage: str
+    parted: str  # where the loop did something else than it did then, "" if nowhere
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReplayedTick:
-    """One tick: s, what was decided anew, the frame of that, and the frame that the run gave."""
-
-    stamp: float
-    command: Command
-    frame: bytes
-    recorded: bytes
+def replay_run(record: File) -> list[PlayedFrame]:
+    """Every frame that a recorded run gave its arm, decided anew; PartedError where the loop did something else."""
+    run, frames = read_run(record, "/loop", "/pose"), list[PlayedFrame]()
+    _play(run, record, frames.append, lambda tick: None)
+    return frames
 
 
-def replay_run(record: File) -> Iterator[ReplayedTick]:
-    """Every tick of a recorded run in which planner and guard were asked, decided anew from the recorded poses."""
-    run = _read_run(record, "/tick", "/pose")
-    return _replay_ticks(run, inputs_from_texts(run.texts, record), record)
+def _play(run: RecordedRun, record: File, taken: Callable[[PlayedFrame], None], report: Callable[[Tick], None]) -> None:
+    """The loop of a recorded run, once more, as far as it was recorded."""
+    if LOOP_ARM_ATTACHMENT not in run.texts:
+        raise InputError(record, "recording", "no /loop", "of a run that recorded what its loop was given")
+    profile = arm_from_text(run.texts[LOOP_ARM_ATTACHMENT], record / LOOP_ARM_ATTACHMENT)
 
+    def begin(start: float, outlets: Outlets) -> BeginPrint:
+        inputs = inputs_from_texts(run.texts, record)
+        return BeginPrint(inputs.path, inputs.profile, start, outlets, "", inputs.tissue)
 
-def _replay_ticks(run: _RecordedRun, inputs: PrintInputs, record: File) -> Iterator[ReplayedTick]:
-    """Where the file is damaged, ticks are left out whose pose is lost; those behind it may come out another way."""
-    ticks, poses = run.messages["/tick"], run.poses
-    step, profile = None, inputs.profile
-    for tick in sorted(ticks, key=lambda tick: float(tick["stamp"])):
-        if tick["begun"]:
-            step = MotionStep(inputs.path, profile, float(tick["begun"][0]), inputs.outlets, inputs.tissue)
-        if step is not None and tick.get("lag"):
-            step.lag = float(tick["lag"][0])
-        if step is not None and tick.get("recalled"):
-            step.recalled(*np.array(tick["recalled"], float).reshape(2, 6))
-        if step is None or not tick["asked"]:
-            continue
-        stamp = tick["pose_stamp"]
-        if stamp and stamp[0] not in poses:
-            if run.damage:
-                continue
-            raise InputError(record, "/tick: pose_stamp", stamp[0], "a pose that is recorded")
-        now = float(tick["stamp"])
-        if tick.get("material_in"):
-            step.material_in()
-        step.paused, step.aside = bool(tick.get("paused")), bool(tick.get("aside"))
-        command = step(poses[stamp[0]] if stamp else None, now)
-        frame = frame_from_command(command, profile.dialect)
-        yield ReplayedTick(now, command, frame, bytes_from_message({"data": tick["frame"]}))
+    try:
+        source = PlayedSource(run.messages["/loop"], run.poses, begin, profile, taken)
+        PrintLoop(source, profile, source.settings, SimClock(), report).run()
+    except PlayedOutError:
+        pass
 
 
 def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
@@ -133,109 +321,27 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     """
     if record.is_dir():
         raise InputError(record, "recording", "a session folder", RUN_REQUIRED)
-    run = _read_run(record, "/tick", "/pose")
+    run = read_run(record, "/loop", "/pose")
     if PATH_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no path", RUN_REQUIRED)
-    inputs = inputs_from_texts(run.texts, record)
     prepare_out(out, force)
-    frames = other = 0
+    same, parted = list[bool](), ""
     with CommandWriter(out) as writer:
-        for tick in _replay_ticks(run, inputs, record):
-            writer.write(tick.command)
-            writer.send(tick.frame)
-            frames += 1
-            other += tick.frame != tick.recorded
-    return ReplayCount(frames, other, run.damage)
 
+        def take(played: PlayedFrame) -> None:
+            writer.send(played.frame)
+            same.append(played.frame == played.recorded)
 
-BEAD_WIDTH = 1.0  # mm
-BLOCK_SECONDS = 10.0  # s of rows compared at once
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NozzleErrors:
-    """The true error at the nozzle of a run before pre-rendered pictures."""
-
-    distance: Array  # (N,) mm, nozzle to its place, of each extruding millisecond
-    duty: float  # share of the time due in which material left; NaN where none was due
-    deepest: float  # s of motion that the arm ever had queued
-    held_up: float  # s that a busy machine kept the virtual arm from its line at most
-    material: MaterialFigures | None = None  # of what a dispenser was told; None of a run without one
-
-    def figure(self, share: float) -> float:
-        """Error, mm, that `share` percent do not exceed; NaN of none."""
-        return float(np.percentile(self.distance, share)) if len(self.distance) else float("nan")
-
-
-class _TrueMotion:
-    """A motion known at some instants."""
-
-    def __init__(self, rows: Array) -> None:
-        self._known = trajectory_from_rows(rows, True)
-
-    def __call__(self, times: Array) -> Array:
-        """(N, 4, 4) at times (N,), s."""
-        return self._known.at(times)
-
-    def twist(self, times: Array) -> Array:
-        """Nobody asks for it here."""
-        raise NotImplementedError
-
-
-def nozzle_errors(
-    record: File, path: File, arm: File, dispenser: VirtualDispenserSettings | None = None
-) -> NozzleErrors:
-    """path: checkpoints in the true surface frame; arm: the arm as it truly stands. InputError without ticks.
-
-    dispenser: what the one that was told truly does; None: it gives each bead what it needs, at once.
-    """
-    run = _read_run(record, "/tick", "/move", "/truth", "/dispenser")
-    if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
-        raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
-    true, profile = read_arm(arm), inputs_from_texts(run.texts, record).profile  # tick and lag as the run took them
-    rows = np.unique(np.array([row_from_message(message) for message in run.messages["/truth"]]), axis=0)
-    rising = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
-    truth = Truth(np.eye(4), _TrueMotion(rows[rising]))
-    checkpoints = read_path(path)
-    truth_log = TruthLog(checkpoints, true.arm, truth, profile.tick, profile.lag)
-    told = sorted((float(m["stamp"]), float(m["flow"][0])) for m in run.messages["/dispenser"] if m["flow"])
-    flow, logs = flow_from_told(told, dispenser), list[NozzleLog]()
-    commands = _commands(run)
-    for command, progress in commands:
-        truth_log.write(command, progress)
-    with np.load(RunFiles(record).executed) as executed:
-        stamps, axes = executed["stamps"], executed["axes"]
-        deepest, held_up = float(executed["deepest"]), float(executed["held_up"])
-    first, last = commands[0][0].stamp, min(truth_log.known_until, float(stamps[-1]))
-
-    def axes_at(times: Array) -> Array:
-        return np.stack([np.interp(times, stamps, axes[:, i]) for i in range(6)], axis=1)
-
-    errors, extruding, due = list[Array](), 0, 0
-    printed = PrintPhase.LEAVING, PrintPhase.FINISHED  # nothing is due any more
-    finished = min((command.stamp for command, progress in commands if progress.phase in printed), default=np.inf)
-    for start in np.arange(first, last, BLOCK_SECONDS):
-        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at, flow)
-        if told:
-            logs.append(log)
-        known = log.extrude & np.isfinite(log.place)
-        off = log.base_from_nozzle[known, :3, 3] - log.base_from_target[known, :3, 3]
-        errors.append(np.linalg.norm(off, axis=1))
-        extruding += int(log.extrude.sum())
-        due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
-    duty = extruding / due if due else float("nan")
-    material = _material(join_logs(logs), planned_line(checkpoints)) if logs else None
-    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up, material)
-
-
-def _material(log: NozzleLog, line: PlannedLine) -> MaterialFigures:
-    """The width of beads is not recorded: it is taken as that of UNIT_AREA, 1 mm."""
-    return material_figures(log, line, row_errors(log, line), BEAD_WIDTH, float("nan"))
+        try:
+            _play(run, record, take, lambda tick: writer.write(tick.command))
+        except PartedError as error:
+            parted = str(error)
+    return ReplayCount(len(same), same.count(False), run.damage, parted)
 
 
 def printed_range(record: File) -> tuple[float, float]:
     """First and last place, counted in checkpoints, at which a run extruded; NaN where it did not."""
-    run = _read_run(record, "/tick", "/move")
+    run = read_run(record, "/tick", "/move")
     extruding = {m["stamp"] for m in run.messages["/move"] if m["extrude"]}
     places = [float(m["fraction"]) for m in run.messages["/tick"] if m["stamp"] in extruding]
     return (min(places), max(places)) if places else (float("nan"), float("nan"))
@@ -243,10 +349,10 @@ def printed_range(record: File) -> tuple[float, float]:
 
 def commands_of(record: File) -> list[tuple[Command, PrintProgress]]:
     """A recorded run's commands in order, with the place on the path."""
-    return _commands(_read_run(record, "/tick", "/move"))
+    return commands_in(read_run(record, "/tick", "/move"))
 
 
-def _commands(run: _RecordedRun) -> list[tuple[Command, PrintProgress]]:
+def commands_in(run: RecordedRun) -> list[tuple[Command, PrintProgress]]:
     """Commands in order, with the place on the path."""
     ticks = {m["stamp"]: m for m in run.messages["/tick"]}
     moves = {m["stamp"]: move_from_message(m) for m in run.messages["/move"]}

@@ -43,6 +43,7 @@ from hardware.live.trace import MIN_WRITE_S, RECORDER_LANE, TraceBatch, TraceLan
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
 from hardware.process.system import SharedLatest, set_up_process, state_inputs
+from hardware.recording.loop_record import LoopRecord
 from perception.frames import OutlinedPicture, Roi
 from planning.laid_beads import Look
 
@@ -269,15 +270,8 @@ class _EntryWriter:
         began = round((utc_now() - self._clock.now()) * 1e9)
         self._server = FoxgloveServer(settings.foxglove_port) if settings.foxglove_port else None
         listener = None if self._server is None else self._server.publish
-        self._opened = partial(
-            Recorder,
-            self._file,
-            jpeg_quality=quality,
-            overwrite=True,
-            compress=False,
-            began=began,
-            listener=listener,
-        )
+        opened = partial(Recorder, self._file, jpeg_quality=quality, overwrite=True, compress=False)
+        self._opened = partial(opened, began=began, listener=listener)
         self._lane = TraceLane(RECORDER_LANE, self._clock, self._write) if settings.trace else None
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
@@ -369,7 +363,7 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
         recorder.show_scan(entry.stamp, entry.points)
     elif isinstance(entry, ScanEntry):
         recorder.surface(entry.file)
-    elif isinstance(entry, Roi | OutlinedPicture | DispenserRecord | Look):
+    elif isinstance(entry, Roi | OutlinedPicture | LoopRecord | DispenserRecord | Look):
         recorder.write(entry)
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from ctypes import c_double, c_uint64
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import dataclass
 from math import nan
 from multiprocessing.connection import Connection
 from pathlib import Path as File
@@ -18,32 +17,22 @@ from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
-from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
 from hardware.live.trace import TraceBatch
 from hardware.motion.loop import DispenserRecord, MaterialStatus, RecordedTick, Tick
+from hardware.motion.step import PoseHandover
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
 from hardware.process.clock import Histogram
 from hardware.process.system import Bell, SharedLatest
+from hardware.recording.loop_record import LoopRecord
 from perception.frames import Frame, OutlinedPicture, PrintHead, Roi
-from planning.clearance import TissueGuard
 from planning.laid_beads import Look
-from planning.material import Outlets
-from planning.path import Path, PrintProgress
+from planning.path import PrintProgress
 from planning.placement import PathPlacement
 
 FRAMES_TO_WIRE_STAGE = "frames handed over to move on the wire"  # as it stands in reports and recordings
 EXPOSURE_TO_WIRE_STAGE = "exposure to move on the wire"
 LATE_TICK_STAGE = "tick late"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseHandover:
-    """A pose on its way from the tracking to the motion process."""
-
-    pose: SurfacePose
-    handed: float  # s, when the newest of its frames was handed over
-    sent: float  # s, when the pose left the tracking process
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,27 +71,6 @@ class TrackingReport:
     outlined: bool = False  # whether the page was given pictures to correct the wound's outline on
     looked: int = 0  # how often what was laid was looked at
     look: str = ""  # what the last of these looks told
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BeginPrint:
-    """The order to print."""
-
-    path: Path  # in the tracker's surface frame
-    profile: ArmProfile  # with the arm's place and lag as they are now known
-    start: float  # place on the path, counted in checkpoints
-    outlets: Outlets  # of its materials
-    fingerprint: str  # of the path as its file has it
-    tissue: TissueGuard | None = None  # that the tool is kept out of, in the same frame
-
-
-class PauseOrder(Enum):
-    """Orders of a live run beside those that the arm follows."""
-
-    PAUSE = "pause"
-    RESUME = "resume"
-    MATERIAL_IN = "material in"  # what the motion asked for was put in, or the look that it stands aside for is done
-    LOOK = "look"  # step aside in a pause, for a look at what was laid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +194,7 @@ class UsedEntry:
 
 
 # the rig comes first: nothing is written before the cameras are known
-Record = Roi | OutlinedPicture | RecordedTick | DispenserRecord
+Record = Roi | OutlinedPicture | RecordedTick | LoopRecord | DispenserRecord
 Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceBatch | Look
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | Record | WireEntry | Shown
 
@@ -299,21 +267,6 @@ class MotionChannels:
     requests: RequestLine  # of the operator's page
     trouble: SharedLatest[str]  # why the arm cannot be used at all
     recorder: Connection
-
-
-def recorded_begin(order: BeginPrint, dispensers: str = "") -> tuple[dict[str, str], BeginPrint]:
-    """Path, arm and dispensers of an order as texts for the recording, and the order with what is read of those texts.
-
-    dispensers: text of their file, "" without one.
-    """
-    from hardware.files.path_file import tissue_text
-    from hardware.recording.session_reader import input_texts, inputs_from_texts  # loads what the motion must not
-
-    tissue = "" if order.tissue is None else tissue_text(order.tissue)
-    texts = input_texts(order.path, order.profile, dispensers, tissue)
-    inputs = inputs_from_texts(texts, File("kept"))
-    used = replace(order, path=inputs.path, profile=inputs.profile, outlets=inputs.outlets, tissue=inputs.tissue)
-    return texts, used
 
 
 TIMELINE_BINS = 600  # an even number: two bins become one

@@ -36,24 +36,18 @@ from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
-from hardware.live.records import (
-    BeginPrint,
-    EventEntry,
-    OutlineOrder,
-    PlacedScanEntry,
-    RunReports,
-    UsedEntry,
-    recorded_begin,
-)
+from hardware.live.records import EventEntry, OutlineOrder, PlacedScanEntry, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text, used_files
 from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
 from hardware.motion.loop import Order
+from hardware.motion.step import BeginPrint
 from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
 from hardware.process.system import answer_first, state_inputs
+from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT, recorded_arm, recorded_begin
 from planning.material import with_offsets
 from planning.placement import PlacedBy
 
@@ -92,10 +86,13 @@ class LiveRun:
         prepared, files = self._prepared, self._prepared.files
         state_inputs(used_files(prepared.settings), prepared.settings.operator)
         with tempfile.TemporaryDirectory() as folder, _signal_wakeup(self) as wake, ExitStack() as stack:
+            text, profile = recorded_arm(prepared.task.profile)
+            prepared = self._prepared = replace(prepared, task=replace(prepared.task, profile=profile))
             channels = self._channels = start_processes(prepared, File(folder), self._tracker)
             stack.callback(channels.processes.kill_all)
             files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
-            channels.sender.put(UsedEntry("session.toml", settings_text(prepared.settings)))
+            for used in (("session.toml", settings_text(prepared.settings)), (LOOP_ARM_ATTACHMENT, text)):
+                channels.sender.put(UsedEntry(*used))
             progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)
             stack.callback(self._close_progress, progress_writer)
             self._open_page(stack)

@@ -127,33 +127,16 @@ def read_settings(file: Path) -> LiveSettings:
     checks.check_keys(file, "", tables, (), [*SETTING_KEYS, "region"])
     values: dict[str, Any] = {"region": region_from_table(file, tables.get("region", {}))}
     for name, settings in SETTING_KEYS.items():
-        table = tables.get(name, {})
-        if not isinstance(table, dict):
-            raise InputError(file, name, table, f"a table [{name}]")
-        checks.check_keys(file, f"{name}.", table, (), settings)
-        for key, setting in settings.items():
-            if key in table:
-                values[setting.name] = _value(file, f"{name}.{key}", setting.type, table[key])
+        keys = {key: (setting.name, CHECKS[setting.type]) for key, setting in settings.items()}
+        table = checks.table_at(file, "", tables, name)
+        values |= checks.record_from_table(file, f"{name}.", table, dict, keys)
     return LiveSettings(**values)
 
 
-def _value(file: Path, key: str, kind: object, value: object) -> Any:
-    """The value of a key, checked by the annotation of its setting."""
-    if kind == "Path | None":
-        return file.parent / checks.text(file, key, value)
-    if kind == "bool":
-        if not isinstance(value, bool):
-            raise InputError(file, key, value, "true or false")
-        return value
-    if kind == "tuple[int, ...]":
-        if not (isinstance(value, list) and all(isinstance(core, int) and 0 <= core < MAX_CORES for core in value)):
-            raise InputError(file, key, value, "a list of core numbers, such as [0]")
-        return tuple(value)
-    if kind == "tuple[str, ...]":
-        return parse_host_names(file, key, value)
-    if kind == "str":
-        return checks.text(file, key, value)
-    return checks.integer(file, key, value, 0) if kind == "int" else checks.number(file, key, value)
+def _cores(file: Path, key: str, value: object) -> tuple[int, ...]:
+    if not (isinstance(value, list) and all(isinstance(core, int) and 0 <= core < MAX_CORES for core in value)):
+        raise InputError(file, key, value, "a list of core numbers, such as [0]")
+    return tuple(value)
 
 
 def parse_host_names(where: object, key: str, names: object) -> tuple[str, ...]:
@@ -161,6 +144,17 @@ def parse_host_names(where: object, key: str, names: object) -> tuple[str, ...]:
     if not (isinstance(names, list) and all(isinstance(name, str) and HOST_NAME.fullmatch(name) for name in names)):
         raise InputError(where, key, names, 'a list of names of this machine, such as ["printer.local"]')
     return tuple(names)
+
+
+CHECKS: dict[Any, Any] = {  # of a setting's annotation: the check of its value
+    "Path | None": lambda file, key, value: file.parent / checks.text(file, key, value),
+    "bool": checks.flag,
+    "tuple[int, ...]": _cores,
+    "tuple[str, ...]": parse_host_names,
+    "str": checks.text,
+    "int": checks.whole(0),
+    "float": checks.number,
+}
 
 
 def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
@@ -251,20 +245,7 @@ def _toml_value(value: object) -> str | None:
     """A value as TOML writes it; None for one that is left out."""
     if value is None or value in ("", ()):
         return None
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return str(list(value))
-    if isinstance(value, Path):
-        value = str(value.resolve())
-    if isinstance(value, str):
-        return toml_string(value)
-    return repr(value)
-
-
-def toml_string(text: str) -> str:
-    """A text without control characters as TOML writes it."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return checks.toml_value(str(value.resolve()) if isinstance(value, Path) else value)
 
 
 FLAG_NAMES = {  # of settings whose flag has another name

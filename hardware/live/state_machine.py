@@ -21,8 +21,9 @@ from hardware.live.checklist import (
     run_checks,
     silent_process,
 )
-from hardware.live.records import BeginPrint, LiveMotionReport, PauseOrder, RunReports, TrackingReport
+from hardware.live.records import LiveMotionReport, RunReports, TrackingReport
 from hardware.motion.loop import Order
+from hardware.motion.step import BeginPrint, PauseOrder
 from hardware.operator.shared_state import OperatorRequest, Polygons
 from hardware.operator.view import (
     ACTIVE_STAGES,

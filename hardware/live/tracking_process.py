@@ -36,7 +36,6 @@ from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
     EventEntry,
     PoseEntry,
-    PoseHandover,
     ScanEntry,
     SetEntry,
     StageHistograms,
@@ -45,6 +44,7 @@ from hardware.live.records import (
     TrackingReport,
 )
 from hardware.live.trace import QUEUE_STAGE, TRACKING_LANE, TraceLane, in_turn
+from hardware.motion.step import PoseHandover
 from hardware.offline.looks import LiveLooks, station_places
 from hardware.offline.track import region_search, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight

@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from math import nan
 from typing import Protocol
 
 import numpy as np
@@ -127,8 +126,9 @@ class MotionLoop:
                 switch = math.inf if self.material is None else self.material.due
                 self._clock.wait_until(min(schedule.due, switch, self._clock.now() + self._poll_period))
         finally:
+            ended = self._clock.now()
             if self.material is not None:
-                self.material.off(self._clock.now())
+                self.material.off(ended)
             shut_down(self.arm, "the motion has ended", self._clock, self._poll_period)
 
     def _poll_material(self, now: float) -> None:
@@ -199,21 +199,16 @@ class MotionLoop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedTick:
-    """A tick of a live run's motion as it is recorded: what planner and guard were given, and what they made of it."""
+    """A tick of a live run's motion as it is recorded for whoever looks at it; `LoopRecord` is for a replay."""
 
     stamp: float  # s
     pose_stamp: float  # s, of the pose they were given; NaN: none
     asked: bool  # whether planner and guard were called
-    begun: float  # place, in checkpoints, at which they were begun anew before the tick; NaN: they were not
-    paused: bool  # whether they were to wait above the surface
-    material_in: bool  # whether the material that they had asked for was put in before the tick
     command: Command  # of the loop
     frame: bytes  # of planner's and guard's command
     fraction: float  # place on the path after it, in checkpoints
     phase: PrintPhase
     recalled: Array | None = None  # (2, 6) mm and rad: where the arm rested and stands, where moves were called back
-    lag: float = nan  # s, the arm's lag from this tick on; NaN: as before
-    aside: bool = False  # whether they were to wait beside all that is printed, for a look
 
 
 MAX_COMMANDS = 256  # commands, five seconds of them: frames are never that late

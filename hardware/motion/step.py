@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from ctypes import c_double
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -70,10 +71,7 @@ class MotionStep:
 
     @property
     def lag(self) -> float:
-        """Seconds from one tick after a command was sent until the arm is at its axes: the profile's until it is set.
-
-        Whoever sets it records it with the tick, as the commands from then on depend on it.
-        """
+        """Seconds from one tick after a command was sent until the arm is at its axes: by default the profile's."""
         return self._planner.lag
 
     @lag.setter
@@ -140,6 +138,36 @@ def predicted_error(
     return PredictedError(due, tip, sigma, radii[:-1], float(radii[-1]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseHandover:
+    """A pose on its way from the tracking to the motion process."""
+
+    pose: SurfacePose
+    handed: float  # s, when the newest of its frames was handed over
+    sent: float  # s, when the pose left the tracking process
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeginPrint:
+    """The order to print."""
+
+    path: Path  # in the tracker's surface frame
+    profile: ArmProfile  # with the arm's place and lag as they are now known
+    start: float  # place on the path, counted in checkpoints
+    outlets: Outlets  # of its materials
+    fingerprint: str  # of the path as its file has it
+    tissue: TissueGuard | None = None  # that the tool is kept out of, in the same frame
+
+
+class PauseOrder(Enum):
+    """Orders of a live run beside those that the arm follows."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    MATERIAL_IN = "material in"  # what the motion asked for was put in, or the look that it stands aside for is done
+    LOOK = "look"  # step aside in a pause, for a look at what was laid
+
+
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"
 LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
@@ -152,12 +180,7 @@ class PrintMotion:
 
     last: the last command.
     asked: whether planner and guard made it.
-    begun: place, in checkpoints, at which the step was made anew since this was last reset to NaN.
-    waits: whether they were told to wait above the surface,
-    aside: and that beside all that is printed, for a look.
-    material_in: whether the material that was wanted was put in since this was last reset.
-    lag: s, of the arm, by which the step went from the last command on; NaN where it stayed. It is recorded with the
-        tick, so that a replay is equal byte by byte.
+    aside: whether they are told to wait beside all that is printed, for a look.
     """
 
     last: Command
@@ -169,19 +192,20 @@ class PrintMotion:
         place: c_double,
         material: MaterialControl | None = None,
         measured: Callable[[], float] = lambda: math.nan,
+        dry: Callable[[], str] = str,
     ) -> None:
-        """clock: of the loop. place: kept up to date, in checkpoints.
+        """clock: of the dispensers. place: kept up to date, in checkpoints.
 
         measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
+        dry: says why material cannot flow now, "" where it can.
         """
         self._profile, self._clock, self._place = profile, clock, place
-        self._material, self._measured = material, measured
+        self._material, self._measured, self._dry = material, measured, dry
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
-        self.waits = self.material_in = self.aside = False
+        self.aside = False
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
         self.paused = self.asked = False
-        self.begun = self.lag = math.nan
 
     def begin(
         self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
@@ -189,6 +213,19 @@ class PrintMotion:
         """Print this path, surface frame, from now on. start: place on it, in checkpoints. tissue: see `MotionStep`."""
         self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
         self._make(start)
+
+    def follow(self, order: PauseOrder | BeginPrint) -> None:
+        """Follow an order that the arm has no part in."""
+        if isinstance(order, BeginPrint):
+            self.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
+        elif order is PauseOrder.PAUSE:
+            self.paused = True
+        elif order is PauseOrder.RESUME:
+            self.resume()
+        elif order is PauseOrder.LOOK:
+            self.look()
+        else:
+            self.put_in()
 
     def homed(self) -> None:
         """Begin anew at the same place of the path, as the arm stands at home."""
@@ -210,7 +247,6 @@ class PrintMotion:
             self.aside = False
         elif self._step is not None and self._step.progress.wanted:
             self._step.material_in()
-            self.material_in = True
             self._prepare_material()
 
     def recalled(self, place: Array, stands: Array) -> None:
@@ -234,16 +270,15 @@ class PrintMotion:
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
             return self.last
-        dry = "" if self._material is None else self._material.reason
-        self._step.paused = self.waits = self.paused or bool(dry)
+        dry = self._dry()
+        self._step.paused = waits = self.paused or bool(dry)
         self._step.aside = self.aside
         measured = self._measured()
         lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
-        self.lag = lag if abs(lag - self._step.lag) > LAG_STEP else math.nan
-        if not math.isnan(self.lag):
+        if abs(lag - self._step.lag) > LAG_STEP:
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if self.waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
+        if waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last
@@ -251,8 +286,7 @@ class PrintMotion:
     def _make(self, start: float) -> None:
         assert self._begin is not None
         self._step = self._begin(start)
-        self._place.value = self.begun = start
-        self.material_in = False
+        self._place.value = start
         self._prepare_material()
 
     def _prepare_material(self) -> None:

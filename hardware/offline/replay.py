@@ -1,16 +1,18 @@
-"""`stillbed replay`: tracking and motion in one process under a simulated clock, merged by stamp.
+"""`stillbed replay`: tracking and the loop of a print in one process on a virtual clock, merged by stamp.
 
 The motion gets a pose POSE_DELAY_S after its stamp. That fixed delay stands for transport and processing in place of
-the measured time, so that the same input gives the same bytes on every machine.
+the measured time, so that the same input gives the same bytes on every machine. The loop, its pacing and the arm's link
+are those of a live run; the arm is one that takes all and never answers, so the link knows its place by dead reckoning.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path as File
 
 import numpy as np
@@ -18,16 +20,22 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.rig import Rig
+from hardware.arm.driver import ArmDriver
+from hardware.arm.port import Port
 from hardware.arm.profile import ArmProfile, placed
-from hardware.arm.protocol import frame_from_command
+from hardware.arm.s6h4d import S6H4D
 from hardware.files.arm_file import write_arm
 from hardware.files.path_file import ProgressFile, read_path, read_progress
 from hardware.files.session import Session
-from hardware.motion.step import MotionStep
+from hardware.motion.loop import MaterialControl, Order, Tick
+from hardware.motion.print_loop import LoopOrder, LoopSettings, PrintLoop
+from hardware.motion.step import BeginPrint, PoseHandover
+from hardware.process.clock import SimClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
 from perception.frames import Frame, FrameSet, Image
 from planning.command import Command, Move
+from planning.path import PrintProgress
 
 
 class FrameFaults:
@@ -87,29 +95,113 @@ COMMAND_COLUMNS = (
 )
 
 
-def replay(
-    poses: Iterable[SurfacePose], motion: MotionStep, delay: float = POSE_DELAY_S, hangs: Sequence[Fault] = ()
-) -> Iterator[tuple[float, Command]]:
-    """Every tick's instant (s) and command, from the first pose's stamp until the motion has the last pose.
+class ReplaySource(SimClock):
+    """Poses that are known a fixed delay after their stamps, for a print's loop in virtual time; it is the clock.
 
-    poses: in order of stamp, taken only when they are due. delay: s, from a pose's stamp until the motion has it.
-    hangs: faults during which there is no tick, s from the first tick.
+    The arm never answers. An operator says that it stands at home, and arms it; it is disarmed once all poses were
+    given. driver: of the arm.
     """
-    coming = iter(poses)
-    pose, following = None, next(coming, None)
-    if following is None:
-        return
-    start = following.stamp
-    for tick in count():
-        now = start + tick * motion.profile.tick
-        while following is not None and following.stamp + delay <= now:
-            pose, following = following, next(coming, None)
-            if following is not None and not following.stamp > pose.stamp:
-                raise InputError("poses", "stamp", following.stamp, f"after the one before, {pose.stamp} s")
-        if not any(fault.covers(now - start) for fault in hangs):
-            yield now, motion(pose, now)
-        if following is None:
-            return
+
+    material: MaterialControl | None = None
+
+    def __init__(
+        self,
+        poses: Iterable[SurfacePose],
+        order: BeginPrint,
+        port: Port,
+        delay: float = POSE_DELAY_S,
+        hangs: Sequence[Fault] = (),
+    ) -> None:
+        """poses: in order of stamp, taken only when they are due. port: takes what is sent to the arm.
+
+        delay: s, from a pose's stamp until the motion has it. hangs: faults during which the motion stands still, s
+        from the first pose's stamp on, at which the clock begins. InputError where no pose comes.
+        """
+        self._coming, self._delay, self._hangs = iter(poses), delay, hangs
+        self._handover: PoseHandover | None = None
+        self._next = next(self._coming, None)
+        super().__init__(0.0 if self._next is None else self._next.stamp)
+        self._begun = self.now()
+        self._first: list[LoopOrder] = [order, Order.AT_HOME, Order.ARM]
+        self.driver: ArmDriver = S6H4D(lambda: port, order.profile)
+
+    def wait_until(self, instant: float) -> None:
+        """Go on to `instant`, s, or to the end of a hang."""
+        ends = [self._begun + fault.end for fault in self._hangs if fault.covers(instant - self._begun)]
+        super().wait_until(max([instant, *ends]))
+
+    def pose(self) -> PoseHandover | None:
+        """The newest pose that is due; InputError for one whose stamp is not after the one before."""
+        while self._next is not None and self._next.stamp + self._delay <= self.now():
+            due = self._next
+            self._handover, self._next = PoseHandover(due, due.stamp, due.stamp + self._delay), next(self._coming, None)
+            if self._next is not None and not self._next.stamp > due.stamp:
+                raise InputError("poses", "stamp", self._next.stamp, f"after the one before, {due.stamp} s")
+        return self._handover
+
+    def orders(self) -> Sequence[LoopOrder]:
+        """At first to print; at the end to end."""
+        orders: list[LoopOrder] = self._first
+        self._first = []
+        return [Order.QUIT] if self._next is None else orders
+
+    def dry(self) -> str:
+        """Nothing needs material."""
+        return ""
+
+    def flush(self) -> None:
+        """Nothing is kept."""
+
+
+class SilentPort:
+    """A port whose arm never answers."""
+
+    def __init__(self, taken: Callable[[bytes], None]) -> None:
+        """taken: is given what is sent."""
+        self._taken = taken
+
+    def write(self, data: bytes) -> int:
+        """All is taken."""
+        self._taken(data)
+        return len(data)
+
+    def read(self) -> bytes:
+        """Nothing comes."""
+        return b""
+
+    def waiting(self) -> int:
+        """Nothing waits."""
+        return 0
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+def replay(
+    poses: Iterable[SurfacePose],
+    order: BeginPrint,
+    report: Callable[[Tick, PrintProgress], None],
+    taken: Callable[[bytes], None] = lambda data: None,
+    delay: float = POSE_DELAY_S,
+    hangs: Sequence[Fault] = (),
+) -> None:
+    """Print in virtual time on a surface of which only its poses are known, until the motion has the last of them.
+
+    report: of each tick, and how far the print is by it. taken: is given the bytes that go to the arm. As ReplaySource.
+    """
+
+    def send(data: bytes) -> None:
+        if math.isfinite(source.now()):  # a motion that was killed sends no stop
+            taken(data)
+
+    source = ReplaySource(poses, order, SilentPort(send), delay, hangs)
+
+    def told(tick: Tick) -> None:
+        if (progress := loop.motion.progress) is not None:
+            report(tick, progress)
+
+    loop = PrintLoop(source, order.profile, LoopSettings(), source, told)
+    loop.run()
 
 
 class CommandWriter(ExitStack):
@@ -180,14 +272,16 @@ def replay_session(
             poses, profile = placed_by(poses)
         remark = f"what this replay assumed; poses were known {POSE_DELAY_S} s after their stamps"
         write_arm(out / "arm.toml", profile, remark)
-        motion, saved = MotionStep(checkpoints, profile, start), ProgressFile(out / "progress.toml", checkpoints)
-        moves = ticks = 0
-        for _, command in replay(poses, motion, hangs=faults_striking(faults, FaultPart.MOTION)):
-            writer.write(command)
-            writer.send(frame_from_command(command, profile.dialect))
-            moves, ticks = moves + isinstance(command, Move), ticks + 1
-            saved.write(motion.progress)
-    return moves, ticks - moves
+        saved, moves = ProgressFile(out / "progress.toml", checkpoints), list[bool]()
+
+        def report(tick: Tick, reached: PrintProgress) -> None:
+            writer.write(tick.command)
+            moves.append(isinstance(tick.command, Move))
+            saved.write(reached)
+
+        order, hangs = BeginPrint(checkpoints, profile, start, {}, ""), faults_striking(faults, FaultPart.MOTION)
+        replay(poses, order, report, writer.send, hangs=hangs)
+    return moves.count(True), moves.count(False)
 
 
 def placed_by(poses: Iterable[SurfacePose]) -> tuple[Iterator[SurfacePose], ArmProfile]:

@@ -1,4 +1,8 @@
-"""Reading tables of unknown origin: each value checked as it is taken, each fault one InputError."""
+"""Reading tables of unknown origin: each value checked as it is taken, each fault one InputError.
+
+A record is read by one table of its keys: the field that each gives, and the check that its value passes, such as
+`{"sag_s": ("sag_time", within(0.01, 1000, "s"))}`. The unit in a key's name is the unit of the file's value.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,12 @@ import difflib
 import io
 import itertools
 import json
+import math
 import tomllib
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +26,10 @@ from perception import CLONE_DATA, INSTALLED_DATA
 
 Table = dict[str, Any]
 CsvRow = tuple[int, list[str]]  # line number and words
+Check = Callable[[object, str, object], Any]  # of a file, a key and its value: what a field holds; InputError
+Keys = Mapping[str, tuple[str, Check]]  # a table's keys: each with the field that it gives, and its check
+Made = TypeVar("Made")
+Kind = TypeVar("Kind", bound=Enum)
 
 
 def read_toml(path: Path) -> Table:
@@ -71,15 +81,76 @@ def read_csv(path: Path, allowed: str = "a readable CSV file", text: str | None 
         raise InputError(path, "file", error_text(error), allowed) from error
 
 
+def csv_columns(
+    where: object, rows: Iterable[CsvRow], contents: str, check: Callable[[list[str]], None] | None = None
+) -> tuple[list[int], dict[str, list[str]]]:
+    """Line numbers of the rows below a header, and the words of each column, without blanks; empty rows do not count.
+
+    contents: what is allowed instead of nothing. check: refuses a header. InputError for a row that is not as long.
+    """
+    full = [(line, [word.strip() for word in row]) for line, row in rows if any(map(str.strip, row))]
+    if not full:
+        raise InputError(where, "file", "empty", contents)
+    (_, header), *body = full
+    if check is not None:
+        check(header)
+    for line, row in body:
+        if len(row) != len(header):
+            raise InputError(where, f"line {line}", f"{len(row)} values", f"{len(header)}, as in the header")
+    return [line for line, _ in body], {name: [row[i] for _, row in body] for i, name in enumerate(header)}
+
+
+def csv_numbers(where: object, lines: Iterable[int], name: str, words: Iterable[str]) -> Array:
+    """The finite numbers (N,) in the words of a column."""
+    out: list[float] = []
+    for line, word in zip(lines, words, strict=True):
+        try:
+            out.append(float(word))
+        except ValueError:
+            out.append(math.nan)
+        if not math.isfinite(out[-1]):
+            raise InputError(where, f"line {line}: {name}", word, "a finite number")
+    return np.array(out, float)
+
+
 def check_keys(where: object, prefix: str, table: Table, required: Iterable[str], optional: Iterable[str] = ()) -> None:
     """InputError for a required key that is not there, or for one that nobody reads."""
-    known = [*required, *optional]
+    known = list(dict.fromkeys([*required, *optional]))
     for key in table:
         if key not in known:
             raise InputError(where, prefix + key, "unknown key", one_of_text(key, known))
     for key in required:
         if key not in table:
             raise InputError(where, prefix + key, "missing", f"this key ({', '.join(required)} are required)")
+
+
+def table_fields(where: object, prefix: str, table: Table, keys: Keys) -> dict[str, Any]:
+    """What the keys in a table give, by the names of the fields; a key that is left out gives none."""
+    return {keys[key][0]: keys[key][1](where, prefix + key, table[key]) for key in table if key in keys}
+
+
+def record_from_table(
+    where: object,
+    prefix: str,
+    table: Table,
+    make: Callable[..., Made],
+    keys: Keys,
+    required: Iterable[str] = (),
+    also: Iterable[str] = (),
+) -> Made:
+    """The record that `make` makes of a table; its error about a field is one about the key and the file's value.
+
+    also: keys that are read elsewhere.
+    """
+    check_keys(where, prefix, table, required, [*keys, *also])
+    values = table_fields(where, prefix, table, keys)
+    with_keys = {field: key for key, (field, _) in keys.items()}
+    try:
+        return make(**values)
+    except InputError as error:
+        key = with_keys.get(error.what, error.what)
+        got = error.got if isinstance(error.got, str) else table.get(key, error.got)  # a text: the one wrong word
+        raise InputError(where, prefix + key, got, error.allowed) from None
 
 
 def one_of_text(word: str, known: Collection[str]) -> str:
@@ -125,6 +196,14 @@ def tables(where: object, key: str, value: object) -> list[Table]:
     return value
 
 
+def table_at(where: object, prefix: str, table: Table, key: str) -> Table:
+    """A table in a table, a copy; empty where it is left out."""
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise InputError(where, prefix + key, value, f"a table [{prefix}{key}]")
+    return dict(value)
+
+
 def text(where: object, key: str, value: object) -> str:
     """A string that is not empty."""
     if not isinstance(value, str) or not value:
@@ -132,11 +211,105 @@ def text(where: object, key: str, value: object) -> str:
     return value
 
 
+def any_text(where: object, key: str, value: object) -> str:
+    """A string."""
+    if not isinstance(value, str):
+        raise InputError(where, key, value, "a text")
+    return value
+
+
+def flag(where: object, key: str, value: object) -> bool:
+    """true or false."""
+    if not isinstance(value, bool):
+        raise InputError(where, key, value, "true or false")
+    return value
+
+
+def word(allowed: Collection[str]) -> Check:
+    """The check for one of several words."""
+
+    def check(where: object, key: str, value: object) -> str:
+        if not isinstance(value, str) or value not in allowed:
+            raise InputError(where, key, value, one_of_text(str(value), allowed))
+        return value
+
+    return check
+
+
+def member(kind: type[Kind]) -> Check:
+    """The check for the value of one of an enumeration's members, which it gives."""
+    one_of = word([each.value for each in kind])
+    return lambda where, key, value: kind(one_of(where, key, value))
+
+
 def integer(where: object, key: str, value: object, low: int) -> int:
     """A whole number, at least `low`."""
     if not isinstance(value, int) or isinstance(value, bool) or value < low:
         raise InputError(where, key, value, f"a whole number >= {low}")
     return value
+
+
+def whole(low: int) -> Check:
+    """The check for a whole number, at least `low`."""
+    return lambda where, key, value: integer(where, key, value, low)
+
+
+def whole_pair(low: int, high: float, allowed: str) -> Check:
+    """The check for two whole numbers from low to high, which may be written 9.0; allowed: what they are."""
+
+    def check(where: object, key: str, value: object) -> tuple[int, int]:
+        pair = numbers(where, key, value, (2,), allowed)
+        if (pair != pair.round()).any() or (pair < low).any() or (pair > high).any():
+            raise InputError(where, key, value, allowed)
+        return int(pair[0]), int(pair[1])
+
+    return check
+
+
+def within(low: float = -math.inf, high: float = math.inf, unit: str = "", open: bool = False) -> Check:
+    """The check for a finite number from low (above it where `open`) to high."""
+
+    def check(where: object, key: str, value: object) -> float:
+        number_read = float(numbers(where, key, value, (), range_text(low, high, unit, open)))
+        if not low <= number_read <= high or (open and number_read == low):
+            raise InputError(where, key, value, range_text(low, high, unit, open))
+        return number_read
+
+    return check
+
+
+def pair(low: float = -math.inf, high: float = math.inf, rising: bool = False) -> Check:
+    """The check for two finite numbers from low to high; rising: the first above `low` and below the second."""
+
+    def check(where: object, key: str, value: object) -> tuple[float, float]:
+        first, second = numbers(where, key, value, (2,)).tolist()
+        if rising and not low < first < second:
+            raise InputError(where, key, value, f"[low, high], {low:g} < low < high")
+        if not (low <= min(first, second) and max(first, second) <= high):
+            raise InputError(where, key, value, f"2 numbers, each {range_text(low, high)}")
+        return first, second
+
+    return check
+
+
+def range_text(low: float, high: float, unit: str = "", open: bool = False) -> str:
+    """A range of numbers in words."""
+    unit = f" {unit}" if unit else ""
+    if math.isinf(high):
+        return "" if math.isinf(low) else f"above {low:g}{unit}" if open else f"{low:g}{unit} or more"
+    if math.isinf(low):
+        return f"at most {high:g}{unit}"
+    return f"above {low:g}, at most {high:g}{unit}" if open else f"{low:g} to {high:g}{unit}"
+
+
+def times(check: Check, factor: Array | float) -> Check:
+    """The check, and what it gives times a factor: from the file's unit to ours."""
+    return lambda where, key, value: check(where, key, value) * factor
+
+
+def array(shape: tuple[int | None, ...], unit: str = "") -> Check:
+    """The check for an array of finite numbers, as `numbers`."""
+    return lambda where, key, value: numbers(where, key, value, shape, unit)
 
 
 def number(where: object, key: str, value: object) -> float:
@@ -166,11 +339,15 @@ def _all_numbers(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def toml_number(value: float) -> str:
-    """A number as TOML, numpy's too, with the digits that give the same float64 back."""
-    return repr(float(value))
+def toml_lines(values: Mapping[str, object]) -> list[str]:
+    """Keys and values as lines of TOML; what is None is left out."""
+    return [f"{key} = {toml_value(value)}" for key, value in values.items() if value is not None]
 
 
-def toml_numbers(array: Array) -> str:
-    """An array as TOML, every number with the digits that give the same float64 back."""
-    return json.dumps(array.tolist())
+def toml_value(value: object) -> str:
+    """A text, a number, an array or a list of these as TOML; every number with the digits that give it back."""
+    if isinstance(value, (np.ndarray, np.number)):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -245,16 +245,11 @@ def hold_from_message(message: Message) -> Hold:
 
 def message_from_tick(tick: RecordedTick) -> Message:
     """A tick of the motion as a message; its command is written as a message of its own."""
-    aside = {"aside": True} if tick.aside else {}
-    return aside | {
+    return {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
         "asked": tick.asked,
-        "begun": _flat(np.array([tick.begun])),
         "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
-        "lag": _flat(np.array([tick.lag])),
-        "paused": tick.paused,
-        "material_in": tick.material_in,
         "fraction": tick.fraction,
         "phase": tick.phase.value,
         "frame": base64.b64encode(tick.frame).decode("ascii"),

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from logging import INFO
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,6 +29,7 @@ from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.checks import read_bytes
 from hardware.process.system import provenance
 from hardware.recording import messages, ros_messages
+from hardware.recording.loop_record import LoopRecord
 from hardware.recording.mcap_file import NO_SCHEMA, UTC_LOG_TIMES, ChunkMessages, sealed, walk
 from hardware.recording.mcap_writer import McapWriter
 from hardware.recording.messages import Message, camera_frame, image_topic
@@ -49,6 +51,7 @@ RECORD_CHANNELS: dict[type, tuple[str, Callable[[Any], Message]]] = {  # topic a
     Roi: ("/roi", messages.message_from_roi),
     OutlinedPicture: ("/wound_outline", messages.message_from_outlined),
     RecordedTick: ("/tick", messages.message_from_tick),
+    LoopRecord: ("/loop", attrgetter("message")),
     DispenserRecord: ("/dispenser", messages.message_from_dispenser),
     Look: ("/look", messages.message_from_look),
     Move: ("/move", messages.message_from_move),
@@ -140,6 +143,7 @@ class Recorder:
         | Roi
         | OutlinedPicture
         | RecordedTick
+        | LoopRecord
         | DispenserRecord
         | Look,
     ) -> None:

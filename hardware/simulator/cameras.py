@@ -52,7 +52,7 @@ def camera_settings_from_table(where: object, table: Table, names: Sequence[str]
     usual = CameraSettings((), ())
     keys = TableReader(where, "cameras.", table)
     fps = keys.number("fps", usual.fps, 0.1, 1000)
-    every = keys.whole("every", usual.every, 1)
+    every = keys.take("every", checks.whole(1), usual.every)
     settings = CameraSettings(
         phases=_per_camera(keys, "phase_s", names, 0.0),
         offsets=_per_camera(keys, "offset_s", names, -1.0),

@@ -20,7 +20,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as File
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +35,17 @@ from hardware.process import checks
 from hardware.process.clock import Clock
 from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
 from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
-from hardware.simulator.scene.beads import GelPieces
+from hardware.simulator.scene.fields import GelPieces
 from hardware.simulator.scene.scene import Scene
 from hardware.simulator.truth import FlowAt, Truth, TruthLog
 from planning.command import Command, Move
 from planning.material import Outlets
 from planning.path import Path
 
-TRUTH_KEYS = {  # key in a table [dispenser]: field of VirtualDispenserSettings
-    **{"on_dead_time_s": "on_dead_time", "on_lag_s": "on_lag", "off_dead_time_s": "off_dead_time"},
-    **{"off_lag_s": "off_lag", "ooze_mm3": "ooze", "ooze_lag_s": "ooze_lag", "watchdog_s": "watchdog"},
-    "flow_mm3_s": "flow",
+TRUTH_KEYS: checks.Keys = {  # in a table [dispenser]
+    **{f"{name}_s": (name, checks.number) for name in ("on_dead_time", "on_lag", "off_dead_time", "off_lag")},
+    **{f"{name}_s": (name, checks.number) for name in ("ooze_lag", "watchdog")},
+    **{"ooze_mm3": ("ooze", checks.number), "flow_mm3_s": ("flow", checks.number)},
 }
 IDEAL = VirtualDispenserSettings(on_dead_time=0.0, on_lag=0.0, off_dead_time=0.0, off_lag=0.0)
 METERED_ON = "ON {flow_mm3_s}"  # in the language of `arduino`
@@ -71,29 +70,27 @@ def dispenser_from_table(where: object, table: checks.Table, folder: File) -> Si
     """The table of the scenario `where`, None for an empty one; InputError names the key that makes no sense."""
     if not table:
         return None
-    checks.check_keys(where, "dispenser.", table, (), (*TRUTH_KEYS, "led", "given", "file"))
-    values: dict[str, Any] = {
-        name: checks.number(where, f"dispenser.{k}", table[k]) for k, name in TRUTH_KEYS.items() if k in table
+    if "led" in table and "file" in table:
+        raise InputError(where, "dispenser.led", table["led"], "true or false, and left out where a file says it")
+    keys: checks.Keys = {
+        **TRUTH_KEYS,
+        "led": ("led", checks.flag),
+        "given": ("given", checks.within(0, MAX_GIVEN, "of the flow that it is told", open=True)),
+        "file": ("believed", lambda where, key, value: _virtual(folder / checks.text(where, key, value))),
     }
-    led = table.get("led", True)
-    if not isinstance(led, bool) or ("file" in table and "led" in table):
-        raise InputError(where, "dispenser.led", led, "true or false, and left out where a file says it")
-    believed: tuple[DispenserSettings, ...] = ()
-    if "file" in table:
-        believed = _virtual(folder / checks.text(where, "dispenser.file", table["file"]))
-    try:
-        truth = replace(IDEAL, **values)
-        _profile(truth, ("",), metered=True, led=True)
-    except InputError as error:
-        keys = {name: key for key, name in TRUTH_KEYS.items()}
-        raise InputError(where, f"dispenser.{keys[str(error.what)]}", error.got, error.allowed) from None
-    given = checks.number(where, "dispenser.given", table.get("given", 1.0))
-    if not 0 < given <= MAX_GIVEN:
-        raise InputError(where, "dispenser.given", given, f"0 < given <= {MAX_GIVEN:g}, of the flow that it is told")
-    result = SimulatedDispenser(truth, "flow_mm3_s" not in table, led, believed, given)
-    if not believed:
+    result = checks.record_from_table(where, "dispenser.", table, _simulated, keys)
+    if not result.believed:
         _drivers(result, ("",), where)
     return result
+
+
+def _simulated(
+    led: bool = True, given: float = 1.0, believed: tuple[DispenserSettings, ...] = (), **truth: float
+) -> SimulatedDispenser:
+    """truth: fields that are not an ideal one's. InputError names one that makes no sense."""
+    true = replace(IDEAL, **truth)  # type: ignore[arg-type]
+    _profile(true, ("",), metered=True, led=True)
+    return SimulatedDispenser(true, "flow" not in truth, led, believed, given)
 
 
 def _virtual(file: File) -> tuple[DispenserSettings, ...]:

@@ -40,6 +40,7 @@ from estimation.synthetic.movements import (
     ease,
     ease_rate,
 )
+from hardware.process import checks
 from hardware.process.checks import Table
 from hardware.simulator.scenario_tables import TableReader
 from hardware.simulator.trace_file import corner, corner_rate, folded, folded_rate, played_trace, read_trace
@@ -136,7 +137,7 @@ def _noise(
     keys: TableReader, rng: Generator, pivot: Array, folder: Path, band: tuple[float, float], tilt: float
 ) -> WaveformMotion:
     """Six noises of their own; tilt: 1 for one speed at every frequency, as of a hand, counted from its start."""
-    low, high = keys.band("band_hz", band)
+    low, high = keys.take("band_hz", checks.pair(0, rising=True), band)
     rms = _six(keys, "rms_mm", "rms_deg", 0.0)
     waves = tuple(movements.draw_noise(low, high, tilt, rng) for _ in range(6))
     return WaveformMotion(waves, np.diag(rms), pivot, from_start=tilt > 0)
@@ -190,7 +191,9 @@ def _constant_speed(keys: TableReader, rng: Generator, pivot: Array, folder: Pat
 
 def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     """To each angle and back, with a rest before each change; the thesis's wrist (4.6) turned by 25 and -16 degrees."""
-    angles = keys.list_of_numbers("angles_deg", (25.0, -16.0))
+    angles = np.array(keys.take("angles_deg", checks.array((None,), "one or more"), (25.0, -16.0)))
+    if not len(angles):
+        raise keys.wrong("angles_deg", "one number or more")
     axis = keys.axis("axis", SURFACE_NORMAL)
     duration, hold = keys.number("duration_s", 1.0, 1e-2), keys.number("hold_s", 1.0, 0)
     start = keys.number("start_s", hold, 0)
@@ -245,10 +248,10 @@ class Zigzag(Waveform):
 
 
 def _trace(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> MotionPart:
-    unit = keys.word("unit", ["mm", "m"]) if keys.has("unit") else None
-    rate = keys.number("rate_hz", None, 0, open=True) if keys.has("rate_hz") else None
-    trace = read_trace(folder / keys.text("file"), unit, rate, keys.number("start_s", 0.0, 0))
-    smooth = keys.number("smooth_s", None, 0) if keys.has("smooth_s") else None
+    unit = keys.take("unit", checks.word(("mm", "m")), None)
+    rate = keys.take("rate_hz", checks.within(0, open=True), None)
+    trace = read_trace(folder / keys.take("file", checks.text), unit, rate, keys.number("start_s", 0.0, 0))
+    smooth = keys.take("smooth_s", checks.within(0), None)
     back = keys.word("loop", ["back", "hold"], "back") == "back"
     return played_trace(trace, keys.number("scale", 1.0), keys.flag("rotation", True), smooth, back, pivot)
 

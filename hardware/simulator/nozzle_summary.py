@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from estimation.errors import InputError
 from hardware.process import checks
 from hardware.recording.messages import message_from_look
 from hardware.report.evaluation import Evaluation, Spread, figure, finite, percent, spread
@@ -121,13 +120,10 @@ class LimitVerdict:
 
 def limits_from_table(where: object, table: checks.Table) -> RunLimits:
     """The limits in a table [limits] of the file `where`; InputError names the key that makes no sense."""
-    checks.check_keys(where, "limits.", table, (), BOUNDS)
-    limits: RunLimits = {}
-    for name, value in table.items():
-        limits[name], unit = checks.number(where, f"limits.{name}", value), BOUNDS[name].unit
-        if not 0 <= limits[name] <= (math.inf if unit else 1.0):
-            raise InputError(where, f"limits.{name}", value, f"0 {unit} or more" if unit else "0 to 1")
-    return limits
+    keys: checks.Keys = {
+        name: (name, checks.within(0, math.inf if each.unit else 1.0, each.unit)) for name, each in BOUNDS.items()
+    }
+    return checks.record_from_table(where, "limits.", table, dict, keys)
 
 
 def check_limits(limits: RunLimits, figures: RunFigures) -> list[LimitVerdict]:

@@ -32,6 +32,7 @@ from hardware.files.session import row_from_head
 from hardware.motion.loop import Tick
 from hardware.offline.replay import CommandWriter
 from hardware.process.clock import utc_now
+from hardware.recording.loop_record import LoopKeeper
 from hardware.recording.recorder import Recorder
 from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.deposit import NozzleLog, PlannedLine
@@ -302,6 +303,11 @@ class RunFolder:
         self._line_points = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
         if self._session is not None:
             self._session[1].show_path(self._posed, self._line_points, self._line.knots)
+
+    @property
+    def keeper(self) -> LoopKeeper | None:
+        """Keeps what the motion's loop is given, in session.mcap; None without."""
+        return None if self._session is None else LoopKeeper(self._session[1].attach, self._session[1].write)
 
     def wire(self, stamp: float, data: bytes, sent: bool) -> None:
         """Bytes passed the arm's port, to the arm or from it."""

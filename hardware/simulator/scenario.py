@@ -56,7 +56,7 @@ from hardware.simulator.motion_table import motion_from_tables, waveform_from_ta
 from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
-from hardware.simulator.scene.beads import FRESH_ASPECT, Gel
+from hardware.simulator.scene.fields import FRESH_ASPECT, Gel
 from planning.kinematics import SimpleArm
 from planning.laid_beads import beads_between_looks
 
@@ -137,7 +137,7 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     checks.check_keys(path, "", table, ("title", "seconds", "path"), OPTIONAL_KEYS)
     if trace is not None:
         table["motion"] = [{"kind": "trace", "file": str(trace.resolve())}]
-    parts = {name: _table(path, table, name) for name in SCENARIO_TABLES}
+    parts = {name: checks.table_at(path, "", table, name) for name in SCENARIO_TABLES}
     seed = checks.integer(path, "seed", table.get("seed", 1), 0)
     rig = _rig(path, parts["rig"])
     arm, profile, baud = _arm(path, parts["arm"])
@@ -152,15 +152,15 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     return Scenario(
         file=path,
         title=checks.text(path, "title", table["title"]),
-        seconds=_within(path, "seconds", table["seconds"], 0.1, MAX_SECONDS, "s"),
+        seconds=checks.within(0.1, MAX_SECONDS, "s")(path, "seconds", table["seconds"]),
         seed=seed,
         path=path.parent / checks.text(path, "path", table["path"]),
-        clearance=_within(path, "clearance_mm", table["clearance_mm"], 0, 50, "mm")
+        clearance=checks.within(0, 50, "mm")(path, "clearance_mm", table["clearance_mm"])
         if "clearance_mm" in table
         else None,
-        bead=_within(path, "bead_mm", table.get("bead_mm", 1.0), 0.05, 20.0, "mm"),
-        nozzle=_switch(path, "scene.nozzle", parts["scene"].pop("nozzle", True)),
-        beads=_switch(path, "scene.beads", parts["scene"].pop("beads", True)),
+        bead=checks.within(0.05, 20.0, "mm")(path, "bead_mm", table.get("bead_mm", 1.0)),
+        nozzle=checks.flag(path, "scene.nozzle", parts["scene"].pop("nozzle", True)),
+        beads=checks.flag(path, "scene.beads", parts["scene"].pop("beads", True)),
         scene=parts["scene"],
         motion=motion_from_tables(path, table.get("motion", []), path.parent, seed),
         strain=waveform_from_table(path, "strain", parts["strain"], strain_rng) if parts["strain"] else None,
@@ -183,55 +183,38 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     )
 
 
+GEL_KEYS: checks.Keys = {
+    "aspect": ("aspect", checks.within(0.05, FRESH_ASPECT, "of the width")),
+    "sag_s": ("sag_time", checks.within(0.01, 1000, "s")),
+    "gloss": ("gloss", checks.within(0, 1)),
+}
+
+
 def _gel(path: Path, table: Table) -> Gel | None:
-    checks.check_keys(path, "gel.", table, (), ("aspect", "sag_s", "gloss"))
-    if not table:
-        return None
-    usual = Gel()
-    return Gel(
-        aspect=_within(path, "gel.aspect", table.get("aspect", usual.aspect), 0.05, FRESH_ASPECT, "of the width"),
-        sag_time=_within(path, "gel.sag_s", table.get("sag_s", usual.sag_time), 0.01, 1000, "s"),
-        gloss=_within(path, "gel.gloss", table.get("gloss", usual.gloss), 0, 1, ""),
-    )
+    return checks.record_from_table(path, "gel.", table, Gel, GEL_KEYS) if table else None
 
 
-def _table(path: Path, table: Table, name: str) -> Table:
-    part = table.get(name, {})
-    if not isinstance(part, dict):
-        raise InputError(path, name, part, f"a table [{name}]")
-    return dict(part)
+def _angles(where: object, key: str, value: object) -> Array:
+    angles = checks.numbers(where, key, value, (None,), "degrees")
+    if not 1 <= len(angles) <= MAX_CAMERAS:
+        raise InputError(where, key, value, f"1 to {MAX_CAMERAS} angles")
+    return angles
 
 
-def _within(path: Path, key: str, value: object, low: float, high: float, unit: str) -> float:
-    number = checks.number(path, key, value)
-    if not low <= number <= high:
-        raise InputError(path, key, number, f"{low:g} to {high:g} {unit}")
-    return number
+RIG_KEYS: checks.Keys = {  # of cameras on an arc
+    "angles_deg": ("angles_deg", _angles),
+    "distance_mm": ("distance", checks.within(100, 2000, "mm")),
+    "focal_px": ("focal", checks.within(100, 10_000, "px")),
+    "size": ("size", checks.whole_pair(*PICTURE_SIDES, "[width, height], whole px, {} to {}".format(*PICTURE_SIDES))),
+    "distortion": ("distortion", checks.array((5,), "k1 k2 p1 p2 k3")),
+}
 
 
 def _rig(path: Path, table: Table) -> Rig:
     if "file" in table:
         checks.check_keys(path, "rig.", table, ("file",))
         return read_rig(path.parent / checks.text(path, "rig.file", table["file"])).rig
-    checks.check_keys(path, "rig.", table, (), ("angles_deg", "distance_mm", "focal_px", "size", "distortion"))
-    given: dict[str, object] = {}
-    if "angles_deg" in table:
-        angles = checks.numbers(path, "rig.angles_deg", table["angles_deg"], (None,), "degrees")
-        if not 1 <= len(angles) <= MAX_CAMERAS:
-            raise InputError(path, "rig.angles_deg", table["angles_deg"], f"1 to {MAX_CAMERAS} angles")
-        given["angles_deg"] = tuple(angles)
-    if "distance_mm" in table:
-        given["distance"] = _within(path, "rig.distance_mm", table["distance_mm"], 100, 2000, "mm")
-    if "focal_px" in table:
-        given["focal"] = _within(path, "rig.focal_px", table["focal_px"], 100, 10_000, "px")
-    if "size" in table:
-        size = checks.numbers(path, "rig.size", table["size"], (2,), "[width, height] in px")
-        if (size != np.rint(size)).any() or size.min() < PICTURE_SIDES[0] or size.max() > PICTURE_SIDES[1]:
-            raise InputError(path, "rig.size", table["size"], f"whole px, {PICTURE_SIDES[0]} to {PICTURE_SIDES[1]}")
-        given["size"] = (int(size[0]), int(size[1]))
-    if "distortion" in table:
-        given["distortion"] = tuple(checks.numbers(path, "rig.distortion", table["distortion"], (5,), "k1 k2 p1 p2 k3"))
-    return arc_rig(**given)  # type: ignore[arg-type]
+    return checks.record_from_table(path, "rig.", table, arc_rig, RIG_KEYS)
 
 
 def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
@@ -247,7 +230,7 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
         raise InputError(path, "arm.wire_baud", baud, allowed)
     lag = settings.dead_time + settings.servo_lag + FRAME_LENGTH * BITS_PER_BYTE / baud
     if assumed is not None:
-        lag = _within(path, "arm.assumed_lag_s", assumed, 0, MAX_LAG, "s")
+        lag = checks.within(0, MAX_LAG, "s")(path, "arm.assumed_lag_s", assumed)
     elif lag > MAX_LAG:
         raise InputError(path, "arm.dead_time_s + servo_lag_s", lag, f"at most {MAX_LAG:g} s, or assumed_lag_s")
     if tool is not None:
@@ -256,28 +239,26 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
 
 
 def _tracking(path: Path, table: Table) -> TrackingSettings:
-    checks.check_keys(path, "tracking.", table, (), ("by", "processing_s", "register"))
-    methods = ("pictures", THESIS_METHOD, THESIS_FLOW_METHOD, *WITHOUT_PICTURES)
-    by = _one_of(path, "tracking.by", table.get("by", "pictures"), methods)
-    register = _one_of(path, "tracking.register", table.get("register", "texture"), ("texture", "scan"))
-    spent = table.get("processing_s", TrackingSettings().processing)
-    measured = spent == "measured"
-    processing = None if measured else _within(path, "tracking.processing_s", spent, 0, 10, 's, or "measured"')
+    return checks.record_from_table(path, "tracking.", table, _settings, TRACKING_KEYS)
+
+
+def _settings(by: str = "pictures", register: str = "texture", **more: float | None) -> TrackingSettings:
     method = MAP_METHOD if by in ("pictures", *WITHOUT_PICTURES) else by
-    return TrackingSettings(by not in WITHOUT_PICTURES, by == "tracks", processing, register == "scan", method)
+    pictures, scan = by not in WITHOUT_PICTURES, register == "scan"
+    return TrackingSettings(pictures, by == "tracks", **more, scan=scan, method=method)
 
 
-def _switch(path: Path, key: str, value: object) -> bool:
-    if not isinstance(value, bool):
-        raise InputError(path, key, value, "true or false")
-    return value
+def _processing(where: object, key: str, value: object) -> float | None:
+    if isinstance(value, str) and value != "measured":
+        raise InputError(where, key, value, '0 to 10 s, or "measured"')
+    return None if value == "measured" else float(checks.within(0, 10, 's, or "measured"')(where, key, value))
 
 
-def _one_of(path: Path, key: str, value: object, allowed: tuple[str, ...]) -> str:
-    word = checks.text(path, key, value)
-    if word not in allowed:
-        raise InputError(path, key, word, checks.one_of_text(word, allowed))
-    return word
+TRACKING_KEYS: checks.Keys = {
+    "by": ("by", checks.word(("pictures", THESIS_METHOD, THESIS_FLOW_METHOD, *WITHOUT_PICTURES))),
+    "processing_s": ("processing", _processing),
+    "register": ("register", checks.word(("texture", "scan"))),
+}
 
 
 def _faults(path: Path, value: object, cameras: int) -> tuple[Fault, ...]:

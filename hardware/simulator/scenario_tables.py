@@ -29,6 +29,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,11 +37,13 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
 from hardware.process import checks
-from hardware.process.checks import Table
+from hardware.process.checks import Check, Table
 from hardware.simulator.scene import shape as shapes
-from hardware.simulator.scene.appearance import MAX_BLUR, MAX_NOISE, MAX_VIGNETTING, Appearance, Sensor
+from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.scene import Scene
 from hardware.simulator.scene.shape import Deformation, Shape, Wound
+
+MISSING = object()  # for the default of a key that must be there
 
 
 @dataclass(slots=True)
@@ -57,26 +60,24 @@ class TableReader:
         self.known_keys.append(key)
         return key in self.table
 
+    def take(self, key: str, check: Check, default: Any = MISSING) -> Any:
+        """What a check makes of a key's value."""
+        if self.has(key):
+            return check(self.where, self.prefix + key, self.table[key])
+        if default is MISSING:
+            raise InputError(self.where, self.prefix + key, "missing", "this key")
+        return default
+
     def number(
         self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf, open: bool = False
     ) -> float:
         """A finite number from low (above it where `open`) to high."""
-        if not self.has(key) and default is not None:
-            return default
-        value = checks.number(self.where, self.prefix + key, self._required(key))
-        if not (low < value <= high or (value == low and not open)):
-            raise self.wrong(key, _range(low, high, open))
-        return value
-
-    def whole(self, key: str, default: int, low: int) -> int:
-        """A whole number from low."""
-        return checks.integer(self.where, self.prefix + key, self.table[key], low) if self.has(key) else default
+        check = checks.within(low, high, open=open)
+        return float(self.take(key, check, MISSING if default is None else default))
 
     def vector(self, key: str, default: Sequence[float], low: float = -math.inf) -> Array:
         """Three finite numbers, each at least `low`."""
-        if not self.has(key):
-            return np.array(default, float)
-        value = checks.numbers(self.where, self.prefix + key, self.table[key], (3,))
+        value = np.asarray(self.take(key, checks.array((3,)), default), float)
         if (value < low).any():
             raise self.wrong(key, f"3 numbers >= {low:g}")
         return value
@@ -89,53 +90,13 @@ class TableReader:
             raise self.wrong(key, "3 numbers, not all 0")
         return np.asarray(value / length)
 
-    def band(self, key: str, default: tuple[float, float]) -> tuple[float, float]:
-        """Two numbers, 0 < low < high."""
-        low, high = self.pair(key, default)
-        if not 0 < low < high:
-            raise self.wrong(key, "[low, high], 0 < low < high")
-        return low, high
-
-    def pair(
-        self, key: str, default: tuple[float, float], low: float = -math.inf, high: float = math.inf
-    ) -> tuple[float, float]:
-        """Two finite numbers from low to high."""
-        if not self.has(key):
-            return default
-        first, second = checks.numbers(self.where, self.prefix + key, self.table[key], (2,))
-        if not (low <= min(first, second) and max(first, second) <= high):
-            raise self.wrong(key, f"2 numbers, each {_range(low, high, False)}")
-        return float(first), float(second)
-
-    def list_of_numbers(self, key: str, default: Sequence[float]) -> Array:
-        """One finite number or more (N,)."""
-        if not self.has(key):
-            return np.array(default, float)
-        value = checks.numbers(self.where, self.prefix + key, self.table[key], (None,))
-        if not len(value):
-            raise self.wrong(key, "one number or more")
-        return value
-
     def flag(self, key: str, default: bool) -> bool:
         """true or false."""
-        value = self.table[key] if self.has(key) else default
-        if not isinstance(value, bool):
-            raise self.wrong(key, "true or false")
-        return value
+        return bool(self.take(key, checks.flag, default))
 
-    def word(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
+    def word(self, key: str, allowed: Sequence[str], default: object = MISSING) -> str:
         """One of several words."""
-        if not self.has(key) and default is not None:
-            return default
-        value = self._required(key)
-        if not isinstance(value, str) or value not in allowed:
-            raise self.wrong(key, checks.one_of_text(str(value), allowed))
-        return value
-
-    def text(self, key: str) -> str:
-        """A string that is not empty."""
-        self.has(key)
-        return checks.text(self.where, self.prefix + key, self._required(key))
+        return str(self.take(key, checks.word(allowed), default))
 
     def wrong(self, key: str, allowed: str) -> InputError:
         """The error that a key's value is not allowed."""
@@ -143,24 +104,19 @@ class TableReader:
 
     def done(self) -> None:
         """InputError for a key that was not read."""
-        checks.check_keys(self.where, self.prefix, self.table, (), list(dict.fromkeys(self.known_keys)))
-
-    def _required(self, key: str) -> object:
-        if key not in self.table:
-            raise InputError(self.where, self.prefix + key, "missing", "this key")
-        return self.table[key]
+        checks.check_keys(self.where, self.prefix, self.table, (), self.known_keys)
 
 
-def _range(low: float, high: float, open: bool) -> str:
-    if math.isinf(low) and math.isinf(high):
-        return "a finite number"
-    if math.isinf(high):
-        return f"{'>' if open else '>='} {low:g}"
-    if math.isinf(low):
-        return f"<= {high:g}"
-    return f"{low:g} {'<' if open else '<='} it <= {high:g}"
-
-
+SENSOR_KEYS: checks.Keys = {
+    "noise": ("noise", checks.number),
+    "vignetting": ("vignetting", checks.number),
+    "blur_px": ("blur", checks.number),
+}
+DEFORMATION_KEYS: checks.Keys = {
+    "stretch": ("stretch", checks.pair(*shapes.STRETCH_RANGE)),
+    "bulge_mm": ("bulge", checks.number),
+    "radius_mm": ("radius", checks.number),
+}
 TEXEL_RANGE = (0.05, 1.0)  # mm
 WOUND_SIZE_RANGE = (5.0, 80.0)  # mm across
 WOUND_DEPTH_RANGE = (0.0, 8.0)  # mm
@@ -183,12 +139,13 @@ def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Sh
         hair=keys.number("hair", usual.hair, 0, 4),
         drape=keys.flag("drape", usual.drape),
     )
-    size = keys.pair("wound_size_mm", usual_wound.size, *WOUND_SIZE_RANGE)
+    size = keys.take("wound_size_mm", checks.pair(*WOUND_SIZE_RANGE), usual_wound.size)
     depth = keys.number("wound_depth_mm", usual_wound.depth, *WOUND_DEPTH_RANGE)
     wound = Wound(size, depth) if keys.flag("wound", True) else None
-    deformation = _deformation(keys)
     kind = keys.word("body", tuple(shapes.BODIES), "forearm")
-    scan = keys.text("scan") if keys.has("scan") else None
+    scan = keys.take("scan", checks.text, None)
+    given = checks.table_at(where, "scene.", table, "deformation") if keys.has("deformation") else {}
+    deformation = checks.record_from_table(where, "scene.deformation.", given, Deformation, DEFORMATION_KEYS)
     keys.done()
     if scan is None:
         shape = shapes.body(kind, wound, seed)
@@ -205,30 +162,7 @@ def bare_scene(where: object, table: Table, folder: Path, seed: int) -> tuple[Sh
 
 def sensor_from_table(where: object, table: Table) -> Sensor:
     """The sensor that a [sensor] table describes; InputError names the key."""
-    keys, usual = TableReader(where, "sensor.", table, ["jpeg_quality"]), Sensor()
-    sensor = Sensor(
-        noise=keys.number("noise", usual.noise, 0, MAX_NOISE),
-        vignetting=keys.number("vignetting", usual.vignetting, 0, MAX_VIGNETTING),
-        blur=keys.number("blur_px", usual.blur, 0, MAX_BLUR),
-    )
-    keys.done()
-    return sensor
-
-
-def _deformation(scene: TableReader) -> Deformation:
-    if not scene.has("deformation"):
-        return Deformation()
-    table, usual = scene.table["deformation"], Deformation()
-    if not isinstance(table, dict):
-        raise scene.wrong("deformation", "a table [scene.deformation]")
-    keys = TableReader(scene.where, f"{scene.prefix}deformation.", table)
-    deformation = Deformation(
-        stretch=keys.pair("stretch", usual.stretch, *shapes.STRETCH_RANGE),
-        bulge=keys.number("bulge_mm", usual.bulge, -shapes.MAX_BULGE, shapes.MAX_BULGE),
-        radius=keys.number("radius_mm", usual.radius, *shapes.BULGE_RADIUS_RANGE),
-    )
-    keys.done()
-    return deformation
+    return checks.record_from_table(where, "sensor.", table, Sensor, SENSOR_KEYS, also=("jpeg_quality",))
 
 
 def _scanned(path: Path, wound: Wound | None, seed: int) -> Shape:

@@ -242,7 +242,9 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
             loop = step, exposures, folder, WallClock(), options.threads, line
             kept = options.cache if scenario.tracking.pictures else None
             store = None if kept is None else stack.enter_context(closing(PictureStore(file, kept)))
-            world = SimulatedWorld(scenario, scene, path, truth, *loop, store)
+            if (keeper := folder.keeper) is not None:
+                scenario = replace(scenario, profile=keeper.arm(scenario.profile))
+            world = SimulatedWorld(scenario, scene, path, truth, *loop, store, keeper)
             try:
                 world.run(progress)
                 if store is not None:

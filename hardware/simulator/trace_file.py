@@ -135,28 +135,9 @@ def _rotations(path: Path, columns: dict[str, Array], count: int) -> Array:
 
 def _columns(path: Path) -> dict[str, Array]:
     """The columns by name; those that this file knows are checked, the others may hold anything and are left out."""
-    rows = [(n, row) for n, row in checks.read_csv(path) if any(row)]
-    if not rows:
-        raise InputError(path, "file", "empty", "a header and 8 rows or more")
-    header = [name.strip() for name in rows[0][1]]
-    for n, row in rows[1:]:
-        if len(row) != len(header):
-            raise InputError(path, f"line {n}", f"{len(row)} values", f"{len(header)}, as in the header")
-    columns = {name: np.empty(0) for name in header}
-    for i, name in enumerate(header):
-        if name in KNOWN_COLUMNS:
-            columns[name] = np.array([_finite(path, f"line {n}: {name}", row[i]) for n, row in rows[1:]])
-    return columns
-
-
-def _finite(path: Path, what: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(path, what, text, "a finite number")
-    return value
+    lines, words = checks.csv_columns(path, checks.read_csv(path), "a header and 8 rows or more")
+    known = {name: checks.csv_numbers(path, lines, name, words[name]) for name in words if name in KNOWN_COLUMNS}
+    return {name: known.get(name, np.empty(0)) for name in words}
 
 
 SMOOTH_STEPS = 5  # of the trace's own: periods below are taken away, on the 10 Hz chests 0.03-0.1 mm, their noise

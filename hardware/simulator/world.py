@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from ctypes import c_double
 from dataclasses import replace
 from functools import partial
 from logging import INFO, WARNING
@@ -27,15 +26,16 @@ from estimation.observations import Observations
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
-from hardware.arm.link import Arm
 from hardware.arm.s6h4d import S6H4D
-from hardware.motion.loop import CommandedPose, MaterialControl, MotionLoop, Order, Tick
-from hardware.motion.step import PrintMotion
+from hardware.motion.loop import CommandedPose, MaterialControl, Order, Tick
+from hardware.motion.print_loop import LoopOrder, LoopSettings, PrintLoop
+from hardware.motion.step import BeginPrint, PauseOrder, PoseHandover
 from hardware.offline.looks import SurfaceLooks
 from hardware.offline.track import FrameSetStep
-from hardware.process.clock import Clock, PoseLockedSchedule, SimClock
+from hardware.process.clock import Clock, SimClock
 from hardware.process.faults import FaultKind, FaultPart, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
+from hardware.recording.loop_record import LoopKeeper, RecordingSource, drop_record
 from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults, VirtualDevice
 from hardware.simulator.camera_pipeline import (
@@ -110,33 +110,33 @@ class _Wire:
 class _SimulatedOperator:
     """Gives the orders that an operator gives. seen_to: s, at which he made a dispenser ready or put material in."""
 
-    def __init__(self, motion: PrintMotion, material: MaterialControl) -> None:
-        self._motion, self._material = motion, material
+    def __init__(self, material: MaterialControl) -> None:
+        self._material = material
         self._ordered, self._dry_since = -math.inf, -math.inf
         self._stands = False
         self.seen_to: list[float] = []
 
-    def __call__(self, state: ArmState, tracking: bool, now: float) -> list[Order]:
+    def __call__(self, progress: PrintProgress | None, state: ArmState, tracking: bool, now: float) -> list[LoopOrder]:
         """state: of the arm. tracking: whether the newest pose is sure of itself."""
         if not self._stands:
             self._stands = True
             return [Order.AT_HOME]
-        progress = self._motion.progress
         if progress is None:
             return []
+        orders: list[LoopOrder] = []
         dry = self._material.reason
         self._dry_since = self._dry_since if dry else now
         if progress.wanted and progress.wanted != LOOK:
             self.seen_to.append(now)
-            self._motion.put_in()
+            orders.append(PauseOrder.MATERIAL_IN)
         elif dry and now >= self._dry_since + SEEN_TO_AFTER:
             self._dry_since = now
             self.seen_to.append(now)
-            self._motion.resume()
+            orders.append(PauseOrder.RESUME)
         if state not in (ArmState.STOPPED, ArmState.DISARMED) or not tracking or now < self._ordered + ORDER_PERIOD:
-            return []
+            return orders
         self._ordered = now
-        return [Order.ARM]
+        return [*orders, Order.ARM]
 
 
 class _MotionKilledError(Exception):
@@ -146,7 +146,7 @@ class _MotionKilledError(Exception):
 class SimulatedWorld:
     """One run of one scenario; `run` lets its time pass. For its MotionLoop it is the clock.
 
-    link: of the arm, as the motion sees it. arm: as it is.
+    link: the arm, as the motion sees it. arm: as it is.
     """
 
     def __init__(
@@ -162,24 +162,21 @@ class SimulatedWorld:
         threads: int = 2,
         line: Callable[[bytes], bytes] = bytes,
         store: PictureStore | None = None,
+        keeper: LoopKeeper | None = None,
     ) -> None:
         """scene: the scenario's, None without pictures; beads are drawn into it. path: in the true surface frame.
-
-        exposures: filled with the shot of each picture, for a step that may know. clock: for tracking times. line:
-        carries bytes from the motion to the arm, e.g. over a pty. store: pictures of earlier runs.
+        exposures: filled with each picture's shot, for a step that may know. clock: of tracking. keeper: of the loop.
+        line: carries bytes from the motion to the arm, e.g. over a pty. store: pictures of earlier runs.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
-        self._step = step
         if scene is not None:
             scene.gel = scenario.gel
-        self._truth, self._exposures, self._time = truth, exposures, SimClock()
+        self._step, self._truth, self._exposures, self._keeper = step, truth, exposures, keeper
+        self._time = SimClock()
         self._events = EventQueue(self._time)
         profile, faults = scenario.profile, scenario.faults
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, faults, scenario.baud)
-        wire = _Wire(sink, self._time)
-        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=wire, line=line)
-        self.link = Arm(S6H4D(self._device, profile), profile, 0.0)
-        self._ticks = PoseLockedSchedule(profile.tick, self.link.settings.ease, 0.0)
+        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time), line=line)
         self._truth_log = TruthLog(path, scenario.true_arm, truth, profile.tick, profile.lag)
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
@@ -189,40 +186,42 @@ class SimulatedWorld:
         self._last_state: WorldState | None = None
         self._commanded = CommandedPose(profile)
         head = self._commanded.at if scenario.nozzle else lambda stamp: None
-        views = pictures, self._state_at, head
-        self.pipeline = CameraPipeline(scenario, self._events, step, exposures, sink, clock, self._on_pose, *views)
+        told = sink, clock, self._on_pose, pictures, self._state_at, head
+        self.pipeline = CameraPipeline(scenario, self._events, step, exposures, *told)
         self._hangs = faults_striking(faults, FaultPart.MOTION)
         self._lines = faults_striking(faults, FaultPart.DISPENSER, FaultKind.UNPLUG, FaultKind.BLOCK, FaultKind.DROP)
-        self._pose: SurfacePose | None = None
+        self._handover: PoseHandover | None = None
+        self._given: list[LoopOrder] = []  # since the loop last asked
         self.dispensers = SimulatedDispensers(path, scenario.dispenser, self._time, faults, scenario.path)
         material = self.dispensers.control
         material.begin(0.0, 0.0)
-        self.motion = PrintMotion(profile, self._time, c_double(), material, lambda: self.link.lag)
-        self._operator = _SimulatedOperator(self.motion, material)
-        self._rows_until = 0.0
+        self._operator = _SimulatedOperator(material)
+        settings, put = LoopSettings(until=scenario.seconds), keeper.write if keeper else drop_record
+        given = self, S6H4D(self._device, profile), lambda: self._handover, self._orders
+        source = RecordingSource(*given, put, profile, material, settings)
+        self._loop = PrintLoop(source, profile, settings, self._time, self._report)
+        self.motion, self.link = self._loop.motion, self._loop.arm
         beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
         self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
         self._looks: SurfaceLooks | None = None
-        self._end = scenario.seconds
-        self._killed = self._broken = False
+        self._rows_until, self._end, self._reported = 0.0, scenario.seconds, 0
+        self._begun = self._killed = self._broken = False
         self._progress: ProgressReport = no_progress
-        self._reported = 0  # frame sets
 
     def run(self, progress: ProgressReport = no_progress) -> None:
         """Let the scenario's time pass; `progress` is called for each frame set tracked."""
         self._progress = progress
         self.pipeline.begin()
-        material, poses = self.dispensers.control, lambda: self._pose
-        loop = MotionLoop(
-            *(self.motion, self.link, self, poses, self._orders, self._report),
-            *(self.motion.homed, self._ticks, material),
-        )
         try:
             with suppress(_MotionKilledError):
-                loop.run(self._end)
+                self._loop.run()
             self._advance(self._end)  # of a motion that was killed
         finally:
             self._emit_rows(self.ended)
+
+    def order(self, order: LoopOrder) -> None:
+        """Give the motion an order."""
+        self._given.append(order)
 
     def every(self, period: float, action: Callable[[float], None]) -> None:
         """Do `action` every `period` s from the beginning on; it is given the instant, s."""
@@ -332,10 +331,10 @@ class SimulatedWorld:
 
     def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
         """Begin the print with the path in the tracker's surface frame, as soon as that frame can be measured."""
-        self._pose, scenario = pose, self.scenario
-        self._ticks.arrived(self._time.now())
+        now, scenario = self._time.now(), self.scenario
+        self._handover = PoseHandover(pose, now, now)
         self._sink.given(pose)
-        if self.motion.progress is not None:
+        if self._begun:
             self._look_at(pose, frames)
             return
         if pose.state is not TrackState.TRACKING:
@@ -350,7 +349,8 @@ class SimulatedWorld:
         if change is None:
             return
         placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
-        self.motion.begin(placed_path, scenario.profile, 0.0, self.dispensers.outlets)
+        order, self._begun = BeginPrint(placed_path, scenario.profile, 0.0, self.dispensers.outlets, ""), True
+        self.order(order if self._keeper is None else self._keeper.begun(order))
         self._sink.registered(change)
         if scenario.looks is not None:
             self._looks = SurfaceLooks(scenario.known_rig, placed_path)
@@ -365,14 +365,15 @@ class SimulatedWorld:
             look = replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
             self._sink.look(look)
             self._sink.event(now, f"look: {look.text}", WARNING if look.laid.clogs else INFO)
-        self.motion.put_in()
+        self.order(PauseOrder.MATERIAL_IN)
 
-    def _orders(self) -> list[Order]:
+    def _orders(self) -> list[LoopOrder]:
         now = self._time.now()
         if now >= self._end:
             return [Order.QUIT]
-        tracking = self._pose is not None and self._pose.state is TrackState.TRACKING
-        return self._operator(self.link.state, tracking, now)
+        (given, self._given), last = (self._given, []), self._handover
+        tracking = last is not None and last.pose.state is TrackState.TRACKING
+        return [*given, *self._operator(self.motion.progress, self.link.state, tracking, now)]
 
     def _report(self, tick: Tick) -> None:
         now, progress = self._time.now(), self.motion.progress

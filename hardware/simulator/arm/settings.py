@@ -19,21 +19,19 @@ start on; with one, every frame that begins meanwhile.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import Reply, ReplyKind
-from hardware.arm.profile import BITS_PER_BYTE
+from hardware.arm.profile import AXIS_UNITS, BITS_PER_BYTE
 from hardware.arm.protocol import FRAME_LENGTH, encode_reply
 from hardware.process import checks
 from hardware.process.faults import (
@@ -46,12 +44,6 @@ from hardware.process.faults import (
     faults_striking,
 )
 
-ARM_KEYS = {  # key in a table [arm]: field of ArmSettings
-    **{"fifo": "fifo", "dead_time_s": "dead_time", "servo_lag_s": "servo_lag", "acceleration_mm_s2": "acceleration"},
-    **{"top_speed_mm_s": "top_speed", "top_turn_deg_s": "top_turn", "low_mm_deg": "low", "high_mm_deg": "high"},
-    **{"replies": "replies", "reply_period_s": "reply_period", "seed": "seed"},
-}
-_RADIANS_AND_MM = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])  # of mm and degrees
 _REACH_LIMIT = np.array([1600.0] * 3 + [np.deg2rad(320.0)] * 3)  # a reply's int16 must hold a place less an origin
 
 
@@ -103,43 +95,32 @@ class ArmSettings:
             raise InputError("arm", "low", self.low.tolist(), f"below high, {self.high.tolist()}")
 
 
+ARM_KEYS: checks.Keys = {  # in a table [arm]
+    "fifo": ("fifo", checks.whole(1)),
+    "dead_time_s": ("dead_time", checks.number),
+    "servo_lag_s": ("servo_lag", checks.number),
+    "acceleration_mm_s2": ("acceleration", checks.number),
+    "top_speed_mm_s": ("top_speed", checks.number),
+    "top_turn_deg_s": ("top_turn", checks.times(checks.number, float(np.deg2rad(1.0)))),
+    "low_mm_deg": ("low", checks.times(checks.array((6,)), AXIS_UNITS)),
+    "high_mm_deg": ("high", checks.times(checks.array((6,)), AXIS_UNITS)),
+    "replies": ("replies", checks.member(ReplyMode)),
+    "reply_period_s": ("reply_period", checks.number),
+    "seed": ("seed", checks.whole(0)),
+}
+
+
 def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
     """The settings in a table [arm]; what it leaves out keeps its default. InputError names the key."""
-    checks.check_keys(where, "arm.", table, (), ARM_KEYS)
-    try:
-        return ArmSettings(**{ARM_KEYS[key]: _value(where, key, value) for key, value in table.items()})
-    except InputError as error:
-        if error.where == str(where):
-            raise
-        key = next(key for key, name in ARM_KEYS.items() if name == str(error.what))
-        raise InputError(where, f"arm.{key}", error.got, error.allowed) from None
-
-
-def _value(where: object, key: str, value: object) -> Any:
-    name = f"arm.{key}"
-    if key in ("fifo", "seed"):
-        return checks.integer(where, name, value, 0)
-    if key == "replies":
-        words = [mode.value for mode in ReplyMode]
-        if value not in words:
-            raise InputError(where, name, value, checks.one_of_text(str(value), words))
-        return ReplyMode(value)
-    if key.endswith("_mm_deg"):
-        return checks.numbers(where, name, value, (6,)) * _RADIANS_AND_MM
-    number = checks.number(where, name, value)
-    return float(np.deg2rad(number)) if key.endswith("_deg_s") else number
+    return checks.record_from_table(where, "arm.", table, ArmSettings, ARM_KEYS)
 
 
 def write_virtual_arm(file: Path, settings: ArmSettings, faults: tuple[Fault, ...]) -> None:
     """Write what `read_virtual_arm` reads back as the same."""
-    lines = [f"faults = {json.dumps([str(fault) for fault in faults])}", "[arm]"]
-    for key, name in ARM_KEYS.items():
-        value = getattr(settings, name)
-        if key.endswith("_mm_deg"):
-            lines.append(f"{key} = {checks.toml_numbers(value / _RADIANS_AND_MM)}")
-        elif value is not None:
-            value = float(np.rad2deg(value)) if key.endswith("_deg_s") else value
-            lines.append(f"{key} = {json.dumps(value.value if isinstance(value, ReplyMode) else value)}")
+    values = {key: getattr(settings, name) for key, (name, _) in ARM_KEYS.items()}
+    values |= {key: values[key] / AXIS_UNITS for key in ("low_mm_deg", "high_mm_deg")}
+    values |= {"top_turn_deg_s": float(np.rad2deg(settings.top_turn)), "replies": settings.replies.value}
+    lines = [*checks.toml_lines({"faults": [str(fault) for fault in faults]}), "[arm]", *checks.toml_lines(values)]
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -147,11 +128,9 @@ def read_virtual_arm(file: Path) -> tuple[ArmSettings, tuple[Fault, ...]]:
     """Settings and faults of a virtual arm; InputError names the key that is wrong."""
     table = checks.read_toml(file)
     checks.check_keys(file, "", table, ("faults", "arm"))
-    if not isinstance(table["arm"], dict):
-        raise InputError(file, "arm", table["arm"], "a table [arm]")
     faults = faults_from_texts(file, "faults", table["faults"], FaultPart.ARM)
     check_faults(faults, FaultRunner.ARM, file, "faults")
-    return arm_settings_from_table(file, table["arm"]), faults
+    return arm_settings_from_table(file, checks.table_at(file, "", table, "arm")), faults
 
 
 class SerialWire:

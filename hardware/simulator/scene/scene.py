@@ -25,8 +25,7 @@ from hardware.simulator.scene.appearance import (
     lamps,
     node_axes,
 )
-from hardware.simulator.scene.beads import Gel, PrintedBeads
-from hardware.simulator.scene.fields import Field, Layers, as_field, linear_light
+from hardware.simulator.scene.fields import Field, Gel, Layers, PrintedBeads, as_field, linear_light
 from hardware.simulator.scene.rays import HeightField, RenderView, height_field
 from hardware.simulator.scene.shape import Deformation, Shape
 from hardware.simulator.scene.textures import draped_heights, half_opening, paint_layers
