@@ -41,11 +41,12 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
     write_arm(folder / "arm.toml", replace(profile, arm=replace(profile.arm, home=home)), "near the surface")
 
 
-def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 1.0) -> None:
+def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 1.0, deaf: bool = False) -> None:
     """The body of a tracking process that knows where the surface is, which breathes by `height` mm up and down.
 
-    last: phase of the print that it sees no more of, "" to see all of it.
+    last: phase of the print that it sees no more of, "" to see all of it. deaf: whether it ends by SIGKILL alone.
     """
+    import signal
     from dataclasses import replace
 
     import numpy as np
@@ -60,6 +61,8 @@ def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 
     from tests.moving import breathing, pose_at
 
     set_up_process("tracking")
+    if deaf:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     clock, outbox, picture = WallClock(), RecorderSender(channels.recorder), png()
     outbox.put(prepared.rig)
     outbox.put(SurfaceEntry(clock.now(), np.eye(3), ()))
@@ -70,7 +73,7 @@ def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 
     known = PathPlacement(lies, by, "known", earlier is None or earlier.certain, True), begin
     side = np.linspace(-70, 70, 15)
     ground = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
-    while not pipe_closed(channels.lifeline):
+    while deaf or not pipe_closed(channels.lifeline):
         due += 1 / RATE
         clock.wait_until(due)
         stamp, sets = due - AGE, round((due - begin) * RATE)
@@ -135,10 +138,11 @@ def main(folder: Path, record: Path, *flags: str) -> int:
         from hardware.live import run
 
         run.recorded_begin = unkept
+    heights = [float(flag.partition("=")[2]) for flag in flags if flag.startswith("--height=")]
+    last, deaf = "leaving" if "--until-printed" in flags else "", "--deaf" in flags
     with Console() as console:
-        heights = [float(flag.partition("=")[2]) for flag in flags if flag.startswith("--height=")]
-        last = "leaving" if "--until-printed" in flags else ""
-        outcome = LiveRun(prepared, console, partial(track_nothing, last=last, height=sum(heights) or 1.0))()
+        tracker = partial(track_nothing, last=last, height=sum(heights) or 1.0, deaf=deaf)
+        outcome = LiveRun(prepared, console, tracker)()
         console.say(outcome.words)
     return outcome.code
 

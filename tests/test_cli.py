@@ -19,6 +19,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from hardware.cli.main import main
 from hardware.files.pose_file import PoseWriter, read_poses
+from hardware.live.view import Console
 from hardware.offline.track import follow
 from hardware.process.clock import WallClock
 from hardware.process.progress import BAD, Progress, count_text, duration_text, left_files_text, painted, prepare_out
@@ -288,3 +289,21 @@ def test_a_shell_is_told_which_commands_and_options_there_are() -> None:
     command = f"{sys.executable} -m hardware.cli.main 8>&1 9>/dev/null"
     run = subprocess.run(command, shell=True, env=os.environ | asked, capture_output=True, text=True, timeout=60)
     assert run.stdout.strip() == "--page-address"
+
+
+def test_a_page_is_opened_by_what_the_system_has_and_else_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    Console(True).offer_page("http://127.0.0.1:1/x/")
+    assert "no browser could be opened" in capsys.readouterr().err
+    opener, opened = tmp_path / "xdg-open", tmp_path / "opened"
+    opener.write_text(f'#!/bin/sh\necho "$1" > {opened}.new\n/bin/mv {opened}.new {opened}\n')
+    opener.chmod(0o755)
+    Console(False).offer_page("http://127.0.0.1:1/never/")
+    Console(True).offer_page("http://127.0.0.1:1/x/")
+    clock, said = WallClock(), capsys.readouterr().err
+    until = clock.now() + 20
+    while not opened.exists() and clock.now() < until:
+        clock.wait_until(clock.now() + 0.02)
+    assert opened.read_text() == "http://127.0.0.1:1/x/\n" and "no browser" not in said

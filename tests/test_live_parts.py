@@ -679,3 +679,19 @@ def test_what_steps_back_is_ordinary_and_each_process_is_a_session() -> None:
     real = "real" in told
     assert told[0] == "True" and told[-1] == str(os.SCHED_OTHER)
     assert told[-3:-1] == ([str(os.SCHED_FIFO), "5"] if real else [str(os.SCHED_OTHER), "0"])
+
+
+def test_who_answers_goes_first_with_all_its_threads_and_what_it_starts_does_not() -> None:
+    code = (
+        "import os, subprocess, threading\n"
+        "from hardware.process.system import answer_first\n"
+        "threading.Thread(target=threading.Event().wait, daemon=True).start()\n"
+        "answer_first()\n"
+        "plain = lambda thread: os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK\n"
+        "print(*{plain(int(thread)) for thread in os.listdir('/proc/self/task')})\n"
+        "child = subprocess.Popen(['sleep', '9'])\n"
+        "print(plain(child.pid))\n"
+        "child.kill()\n"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert told in ([str(os.SCHED_FIFO), str(os.SCHED_OTHER)], [str(os.SCHED_OTHER)] * 2)  # whether granted or not

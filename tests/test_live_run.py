@@ -81,6 +81,17 @@ def test_a_run_that_still_loads_ends_at_once(start: Start, tmp_path: Path, numbe
     assert "nothing was recorded yet" in run.said and not (tmp_path / "run.mcap").exists()
 
 
+def test_before_a_path_is_begun_a_tracker_that_does_not_end_is_not_waited_for(start: Start, tmp_path: Path) -> None:
+    run = start(tmp_path / "run.mcap", "--page", "--deaf")
+    run.wait_for("confirm")
+    page = run.page()
+    assert os.getsid(page) == page  # Linux shares the processor among sessions
+    run.process.send_signal(signal.SIGINT)
+    begun = CLOCK.now()
+    assert run.end() == 130 and CLOCK.now() - begun < EARLY  # 1.5 s were seen, beside ten busy processes
+    assert not open_session(tmp_path / "run.mcap").damage and "ended: Ctrl-C" in run.said
+
+
 def kept(record: Path, path: Path) -> float:
     """The place on the path that is kept for the next run."""
     return read_progress(RunFiles(record).progress, read_path(path))

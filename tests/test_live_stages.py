@@ -350,6 +350,7 @@ def test_in_a_pause_the_operator_may_look_and_whoever_resumes_goes_on_without_it
     assert run.look(Wish.LOOK) is RunStage.PRINT and not run.orders  # not while it prints
     run.look(Wish.PAUSE)
     run.orders.clear()
+    assert "look at the print" in run.conductor.question
     assert run.look(Wish.LOOK) is RunStage.PAUSED and run.orders == [PauseOrder.LOOK]
     run.wanted = LOOK
     run.stays(RunStage.PAUSED, 5)
@@ -366,6 +367,7 @@ def test_without_amounts_in_the_path_nobody_may_look() -> None:
     run = Staged().to_print()
     run.look(Wish.PAUSE)
     assert Wish.RESUME in run.conductor.offers and Wish.LOOK not in run.conductor.offers
+    assert run.conductor.question == "Paused: resume, go home, or finish"
 
 
 def test_after_the_way_home_the_material_is_asked_for_again() -> None:

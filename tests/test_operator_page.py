@@ -364,3 +364,5 @@ def test_what_a_look_found_is_drawn_in_the_scene_piece_by_piece(run: Run) -> Non
                 return n.{wanted} > 100 && n.{"r" if wanted == "g" else "g"} === 0;
             }})()"""
         )
+        words = page.js("[...document.querySelectorAll('#scene .look')].map((line) => line.textContent)")
+        assert words == [{"g": "laid as planned", "r": "a gap"}[wanted], "not seen"]

@@ -101,6 +101,8 @@ def test_nothing_covers_a_question_or_stop_in_any_stage(run: Run, size: tuple[in
             FREE + '(["#question", "#sure-words", "#sure-yes", "#sure-no", "[data-wish=stop]"])'
         ):
             assert inside and own, (stage, name, inside, own)
+        wide = "[...document.querySelectorAll('button')].filter((b) => b.scrollWidth > b.clientWidth)"
+        assert page.js(f"{wide}.map((b) => b.textContent)") == [], stage
         width = page.js("[document.documentElement.scrollWidth, innerWidth]")
         assert width[0] <= width[1], stage
         page.click("#sure-no")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import json
 import re
@@ -37,6 +38,7 @@ from perception.lens import Lenses
 from planning.command import MotionLimits, Move
 from planning.kinematics import SimpleArm
 from planning.motion.planner import Planner
+from tests.browser import Browser, axe_findings
 from tests.moving import pose_at, still
 from tests.wounds import scan_of
 
@@ -102,6 +104,20 @@ def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) 
     data = re.search(r'<script type="application/json" id="plan-data">(.*?)</script>', page)
     held = json.loads(data[1])
     assert len(held["extrude"]) == -(-len(read_path(out)) // 3) * 4  # a byte each, as base64
+    moments = np.frombuffer(base64.b64decode(held["seconds"]), "<f4")  # the slider's last time is that of the tile
+    seconds = json.loads(out.with_suffix(".json").read_text())["total"]["seconds"]
+    assert len(moments) == len(read_path(out)) and moments[-1] == pytest.approx(seconds, rel=1e-5)
+
+
+def test_axe_finds_nothing_serious_in_a_plan_or_in_what_an_arm_can_reach(browser: Browser, tmp_path: Path) -> None:
+    out, arm = tmp_path / "path.csv", "data/arms/s6h4d.toml"
+    assert main(["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "0.8"]) == 0
+    assert main(["reach", str(out), "--arm", arm, "-o", str(tmp_path / "reach")]) in (0, 1)
+    for file in (out.with_suffix(".html"), tmp_path / "reach" / "reach.html"):
+        page = browser.page(file.as_uri())
+        page.until("document.readyState === 'complete' && Boolean(document.querySelector('footer'))")
+        assert axe_findings(page) == [], file
+        page.close()
 
 
 def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

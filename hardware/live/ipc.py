@@ -187,7 +187,7 @@ class PictureCache:
 
 
 EXIT_TIMEOUT = 10.0  # s that a process gets to close its files, on a busy machine
-EARLY_EXIT_TIMEOUT = 0.7  # s that the tracker gets before a path is begun: it may be within a map's adjustment
+EARLY_EXIT_TIME = 0.5, 0.2  # s that the tracker gets before a path is begun (it may adjust a map), and then once asked
 ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device
 ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy machine
 ARM_AFTERLIFE = 2.0  # s that a virtual arm goes on without the run: it has to come to rest by itself
@@ -256,7 +256,7 @@ class ProcessGroup:
 
     def kill_all(self) -> None:
         """Leave no process behind."""
-        for name in list(self.members):
+        for name in self.members:
             self.kill(name)
 
 
@@ -343,18 +343,18 @@ class RunChannels:
     def end(self) -> None:
         """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last.
 
-        One that has reported nothing still loads its libraries, which nobody has to wait for; before a path is begun
-        there is little to lose either.
+        One that has reported nothing still loads its libraries; before a path is begun there is little to lose either.
         """
+        until = (clock := WallClock()).now() + EARLY_EXIT_TIME[0]
         self.lifeline.close()  # the motion process was told to end: it needs no poses any more
         begun, tracks = self.place.value == self.place.value, self.tracking.get() is not None
         self.processes.end("motion", 0.0 if self.motion.get() is None else EXIT_TIMEOUT)
-        patience = EXIT_TIMEOUT if begun else EARLY_EXIT_TIMEOUT
-        self.processes.end("tracking", patience if tracks else 0.0, patience)
-        self.processes.end("feed", 0.0)  # it keeps nothing
+        patience, grace = (EXIT_TIMEOUT, EXIT_TIMEOUT) if begun else (max(until - clock.now(), 0.0), EARLY_EXIT_TIME[1])
+        self.processes.end("tracking", patience if tracks else 0.0, grace)
+        self.processes.kill("feed")  # it keeps nothing
         self.sender.close()
         self.processes.end("recorder", 30.0 if tracks or self.recorder.get() is not None else 0.0)
-        self.processes.end("arm", 0.1)
+        self.processes.end("arm", 0.1 if begun else 0.0)
 
 
 def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:

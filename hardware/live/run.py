@@ -18,6 +18,7 @@ from dataclasses import replace
 from logging import INFO, WARNING
 from multiprocessing.connection import wait
 from pathlib import Path as File
+from threading import Thread
 from types import FrameType
 
 import numpy as np
@@ -45,13 +46,12 @@ from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
-from hardware.process.system import state_inputs
+from hardware.process.system import answer_first, state_inputs
 from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT, recorded_arm, recorded_begin
 from planning.material import with_offsets
 from planning.placement import PlacedBy
 
-POLL_PERIOD = 0.02  # s between looks while nothing happens
-VIEW_PERIOD = 0.15  # s between views for the page
+POLL_PERIOD, VIEW_PERIOD = 0.02, 0.15  # s between looks while nothing happens, and between views for the page
 STATUS_PERIOD = 5.0  # s between status lines
 REST_TIMEOUT = 1.0  # s in which the arm has to report that it is at rest
 MOTION_HANG_TIMEOUT = 2.0  # s without a report, after which the motion process is ended and the arm stopped for it
@@ -101,6 +101,8 @@ class LiveRun:
             importlib.import_module("scipy.interpolate")  # the prediction needs it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
+            if prepared.settings.real_time:
+                answer_first()
             while not self._machine.ended:
                 self._cycle(wake, progress_writer)
             self._wait_for_rest(wake)
@@ -109,7 +111,8 @@ class LiveRun:
             outcome = self._outcome().write()
             if self._page is not None:
                 self._put_view(self._clock.now(), outcome.result())
-                self._page.hand_out_report()
+                if self._profile is not None:  # else it says nothing that anybody would wait for
+                    self._page.hand_out_report()
         return outcome
 
     def _outcome(self) -> RunOutcome:
@@ -145,11 +148,9 @@ class LiveRun:
     def _requests_by_key(self, ready: Sequence[object]) -> list[OperatorRequest]:
         if self._console.file is None or self._console.file not in ready:
             return []
-        requests = []
-        for wish in self._console.wishes():
-            self._key_requests -= 1  # the numbers of the page go upwards
-            requests.append(OperatorRequest(self._key_requests, wish, self._machine.turn))
-        return requests
+        wishes, last = self._console.wishes(), self._key_requests - 1
+        self._key_requests -= len(wishes)  # the numbers of the page go upwards
+        return [OperatorRequest(last - k, wish, self._machine.turn) for k, wish in enumerate(wishes)]
 
     def _check_failures(self, progress_writer: ProgressWriter, now: float) -> Orders:
         """End the run for a signal, for a process that has ended or hangs, or for progress that cannot be kept."""
@@ -193,9 +194,8 @@ class LiveRun:
         decided = self._clock.now()
         sent, reason = emergency_stop(self._channels.url, self._prepared.task.profile)
         if reason:
-            self._log(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
-        else:
-            self._statistics.times.add("motion process gone to stop on the wire", sent - decided)
+            return self._log(f"the arm could not be stopped: {reason}; its queue ends within 50 ms", WARNING)
+        self._statistics.times.add("motion process gone to stop on the wire", sent - decided)
 
     def _switch_off_material(self) -> None:
         """Switch the dispensers off in place of the motion process; those with a watchdog did it themselves."""
@@ -366,6 +366,7 @@ class LiveRun:
 
     def _shut_down(self) -> None:
         channels, reports = self._channels, self._reports
+        Thread(target=importlib.import_module, args=("hardware.report.report",), daemon=True).start()  # write needs it
         self._injector.close()
         with suppress(OSError):
             channels.orders.send(Order.QUIT)

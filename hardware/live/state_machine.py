@@ -117,7 +117,8 @@ class RunStateMachine:
                 return "The arm cannot reach the path here: move it, or look again"
             if not self.confirmable:
                 return "Move the path to where it should be printed"
-        return STAGE_QUESTIONS.get(self.stage, "")
+        question = STAGE_QUESTIONS.get(self.stage, "")
+        return question if Wish.LOOK in self.offers else question.replace(" look at the print,", "")
 
     def __call__(self, now: float, reports: RunReports, requests: Sequence[OperatorRequest]) -> Orders:
         """The orders that follow from reports and requests at `now`, s."""

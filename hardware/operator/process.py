@@ -14,8 +14,10 @@ import signal
 import socket
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 
 import numpy as np
 
@@ -24,12 +26,12 @@ from estimation.se3 import Array
 from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
 from hardware.process.clock import WallClock
-from hardware.process.system import SPAWN, SharedLatest, blocked_sigint, step_back
+from hardware.process.system import NICE_LEVEL, SPAWN, SharedLatest, ask_to_go_first, blocked_sigint, step_back
 from perception.frames import Image
 
-PAGE_NICENESS = 5  # below the loops, above what may wait for minutes
 RESTART_AFTER = 1.0  # s between two starts of a page that died
 REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
+EXIT_TIMEOUT = 0.5  # s for the page's process: 0.2 in which its windows show that the run is gone, and to close them
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
 CROP_WIDTH = 480  # px, of the part around the wound: seldom more than the camera has there
@@ -87,8 +89,9 @@ class OperatorPage:
     def close(self) -> None:
         """End the process and give the port back."""
         if self.process is not None:
-            self.process.terminate()
-            self.process.join(2.0)
+            if self._link.requests.windows:  # else nobody sees that the run is gone
+                self.process.terminate()
+                self.process.join(EXIT_TIMEOUT)
             self.process.kill()
             self.process.join()
             self.process = None
@@ -98,10 +101,21 @@ class OperatorPage:
 def operator_process(link: OperatorLink, settings: OperatorSettings, listener: socket.socket) -> None:
     """The body of the process: serve the page until SIGTERM or until the run is gone. Ctrl-C is for the run alone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(PAGE_NICENESS)
+    _lead_session()
     for name in ("aiohttp", "asyncio"):  # what strangers send is theirs: it is counted, and not written on the terminal
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     asyncio.run(_serve_until_end(link, settings, listener))
+
+
+def _lead_session() -> None:
+    """Be a session of one's own, with a large share of the processor where that is granted: a stop waits for no turn.
+
+    Not all of it, as in real time, since strangers can keep this process busy. Linux shares among sessions first.
+    """
+    with suppress(OSError):
+        os.setsid()
+        Path("/proc/self/autogroup").write_text(str(NICE_LEVEL), encoding="ascii")
+    ask_to_go_first()
 
 
 async def _serve_until_end(link: OperatorLink, settings: OperatorSettings, listener: socket.socket) -> None:

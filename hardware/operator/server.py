@@ -248,6 +248,11 @@ class OperatorServer:
         with suppress(TimeoutError):
             await asyncio.wait_for(asked.wait(), LINK_POLL_PERIOD)
 
+    @property
+    def windows(self) -> int:
+        """How many windows are open."""
+        return len(self._windows)
+
     def last_update(self) -> None:
         """Show the run's last view, and that it is gone."""
         self.broadcast.update(self._clock.now(), False)
@@ -325,7 +330,8 @@ async def serve(
     await asyncio.wait({updating, done}, return_when=asyncio.FIRST_COMPLETED)
     server.last_update()
     server.broadcast.wake()
-    await asyncio.sleep(SHUTDOWN_DELAY)
+    if server.windows:
+        await asyncio.sleep(SHUTDOWN_DELAY)
     await runner.cleanup()
     if updating.done():
         updating.result()  # what ended it

@@ -21,7 +21,7 @@ from hardware.report.page import document, figures_table, round_step, row_of_til
 from planning.fill.bead import Bead
 from planning.layers.checkpoints import tool_rotations
 from planning.layers.grid import interpolate
-from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, Unscanned, seconds_to
+from planning.layers.plan import LayerFigures, Plan, PlannedLayer, PlanTotal, Unscanned
 from planning.layers.wound import WoundFindings
 
 PICTURE_WIDTH, PICTURE_MARGIN, HEAD_HEIGHT, FOOT_HEIGHT = 940.0, 24.0, 34.0, 34.0  # px
@@ -188,18 +188,23 @@ class ReportText:
 
 
 def page_text(
-    plan: Plan, layers: Sequence[LayerFigures], total: PlanTotal, text: ReportText, pictures: Sequence[str]
+    plan: Plan,
+    layers: Sequence[LayerFigures],
+    total: PlanTotal,
+    text: ReportText,
+    pictures: Sequence[str],
+    moments: Array,
 ) -> str:
-    """The whole page."""
+    """The whole page. moments: times (N,), s, at which a run over a surface at rest is at the checkpoints."""
     body = [f"<style>{PAGE_STYLE}</style>", row_of_tiles(_tiles(layers, total))]
     if text.notes:
         notes = "".join(f'<div class="plan-note">{escape(note)}</div>' for note in text.notes)
         body.append(f"<section><h2>Look at this before printing</h2>{notes}</section>")
     script = (files("hardware.plan") / "view.js").read_text(encoding="utf-8")
-    view = f'<script type="application/json" id="plan-data">{_data(plan)}</script><script>{script}</script>'
+    view = f'<script type="application/json" id="plan-data">{_data(plan, moments)}</script><script>{script}</script>'
     help_text = (
         "Drag to turn, shift and drag to move, wheel to come nearer. By touch one finger turns it or scrolls the page, "
-        "two come nearer and tilt. The slider prints as far as it is moved."
+        "two come nearer and tilt. The slider prints as far as it is moved; its times are of a surface at rest."
     )
     body.append(section("The beads", help_text, VIEW_CONTROLS + view))
     body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
@@ -272,8 +277,8 @@ def _layer_table(layers: Sequence[LayerFigures], total: PlanTotal) -> str:
     return figures_table(head, rows, last_total=True)
 
 
-def _data(plan: Plan) -> str:
-    """The checkpoints and surfaces for the view, as JSON."""
+def _data(plan: Plan, moments: Array) -> str:
+    """The checkpoints, their times (N,), s, and surfaces for the view, as JSON."""
     points = plan.points
     names = list(dict.fromkeys(layer.slab.tissue.name for layer in plan.stack.layers))
     inks = dict((layer.slab.tissue.name, layer.slab.tissue.material) for layer in plan.stack.layers).items()
@@ -284,7 +289,7 @@ def _data(plan: Plan) -> str:
         "width_um": _base64(np.rint(1000 * points.width), "<u2"),
         "layer": _base64(points.layer, "<u2"),
         "extrude": _base64(points.extrude, "u1"),
-        "seconds": _base64(seconds_to(points), "<f4"),
+        "seconds": _base64(moments, "<f4"),
         "layers": len(plan.stack.layers),
         "names": [layer.slab.tissue.name for layer in plan.stack.layers],
         "paints": TISSUE_COLOURS,

@@ -104,11 +104,12 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
         write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
     with _progress("measure", "layers") as progress:
         profile = ArmProfile() if request.arm is None else read_arm(request.arm)
-        layers = figures_of(plan, progress, run_times(path, profile.arm, profile.limits, profile.tick))
+        moments = run_times(path, profile.arm, profile.limits, profile.tick)
+        layers = figures_of(plan, progress, moments)
     total = total_of(layers)
     written = [request.out.name, *_tables(request, plan, subject, layers, total, arm)]
     if request.pictures:
-        written += _pictures(request, plan, subject, layers, total, arm)
+        written += _pictures(request, plan, subject, layers, total, arm, moments)
     placed = []
     if request.session is not None:
         scan = request.out.with_name(f"{request.out.stem}_scan.ply")
@@ -166,9 +167,10 @@ def _surface(wound: WoundVolume) -> tuple[Array, Index]:
 
 
 def _pictures(
-    request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str
+    request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str,
+    moments: Array,
 ) -> list[str]:  # fmt: skip
-    """Write a picture of each layer and the report; their names."""
+    """Write a picture of each layer and the report; their names. moments: times (N,), s, of the checkpoints."""
     stem = request.out.with_suffix("")
     folder, report = stem.with_name(stem.name + "_layers"), stem.with_suffix(".html")
     folder.mkdir(exist_ok=True)
@@ -183,7 +185,7 @@ def _pictures(
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("what an arm can print", arm), ("the tool and the tissue", tool_text(plan))]
     text = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
-    page = page_text(plan, layers, total, text, pictures)
+    page = page_text(plan, layers, total, text, pictures, moments)
     write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
     return [f"{folder.name}/ ({len(pictures)} pictures)", report.name]
 

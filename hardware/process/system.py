@@ -122,6 +122,7 @@ def fill_standard_streams() -> None:
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
 TRACKING_PRIORITY = 5  # of those: the arm's motion goes before the tracking that it waits for
+ANSWER_PRIORITY = 1  # of those: whoever answers an operator goes after both
 NICE_LEVEL = -10  # before all that asked for nothing
 NO_PRIORITY = "nothing: an ordinary process"  # what is granted where no priority is
 
@@ -152,6 +153,14 @@ def ask_to_go_first() -> str:
         return f"nice {os.nice(NICE_LEVEL)}"
     except OSError:
         return NO_PRIORITY
+
+
+def answer_first() -> None:
+    """Have all threads of a process that does little go before ordinary ones; what it starts is ordinary again."""
+    with suppress(AttributeError, OSError):
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        for thread in os.listdir("/proc/self/task"):  # all of them, as each may hold the interpreter's lock
+            os.sched_setscheduler(int(thread), policy, os.sched_param(ANSWER_PRIORITY))
 
 
 def step_back(nice: int = 0) -> None:

@@ -17,7 +17,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from planning.clearance import ToolBody
 from planning.command import MotionLimits
-from planning.fill.bead import SHARP_TURN, Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
+from planning.fill.bead import Bead, FillCoverage, Pattern, PrintPace, fill_coverage, region_of
 from planning.fill.fill import fill, settle_angle
 from planning.kinematics import SimpleArm
 from planning.layers.checkpoints import (
@@ -236,21 +236,6 @@ class PlanTotal:
     travelled: float  # mm
     seconds: float
     volume: tuple[tuple[str, float], ...]  # mm^3 by material
-
-
-def seconds_to(points: Checkpoints) -> Array:
-    """Times (N,), s from the first, at which checkpoints are reached: ways at their speeds, sharp turns and waits.
-
-    A turn of more than SHARP_TURN costs SHARP_TURN_TIME, as in other planners' figures: for comparisons with these, and
-    for a picture that moves. `run_times` says how long the arm takes.
-    """
-    step = np.diff(points.tip, axis=0)
-    length = np.linalg.norm(step, axis=1)
-    cosine = np.einsum("ni,ni->n", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-12)
-    sharp = (cosine < np.cos(SHARP_TURN)) & points.extrude[1:-1] & points.extrude[2:]
-    durations = np.r_[0.0, length / points.speed[1:]] + points.wait
-    durations[1:-1] += SHARP_TURN_TIME * sharp
-    return np.asarray(np.cumsum(durations))
 
 
 def figures_of(

@@ -148,7 +148,7 @@ export class Timeline {
     g.textAlign = "left";
     g.fillText(`${this.from.toFixed(1)} s`, left, floor + 34 * ratio);
     let at = left;
-    for (const [words, colour] of [["x", COLOURS[0]], ["y", COLOURS[1]], ["z in mm, the base's axes", COLOURS[2]], ...(this.worst > 0 ? [[`error, to ${this.worst.toFixed(2)} mm`, ""]] : []), ...(held.some((each) => each) ? [["shaded: held", "soft"]] : [])]) {
+    for (const [words, colour] of [["x", COLOURS[0]], ["y", COLOURS[1]], ["z in mm, the base's axes", COLOURS[2]], ...(this.worst > 0 ? [[`error, from 0 below to ${Number(this.worst.toPrecision(2))} mm above`, ""]] : []), ...(held.some((each) => each) ? [["shaded: held", "soft"]] : [])]) {
       g.fillStyle = colours[colour] || "#a65fb8";
       g.fillText(words, at, h - 8 * ratio);
       at += g.measureText(words).width + 12 * ratio;

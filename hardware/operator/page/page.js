@@ -267,7 +267,7 @@ function tiles(seen) {
   put("age", milliseconds(tracking && tracking.age), "ms", "age of pose");
   put("latency", latency ? `${milliseconds(latency.median)} / ${milliseconds(latency.high)}` : "–", "ms", "image to arm", latency && beyond(latency.high, latency.limit));
   put("flight", milliseconds(motion && motion.in_flight), "ms", "under way", motion && beyond(motion.in_flight, motion.most_in_flight));
-  put("rest", figure(rest && rest.slip, 1), "mm", rest ? `under the nozzle, in ${rest.seconds.toFixed(0)} s` : "", true);
+  put("rest", figure(rest && rest.slip, 1), "mm", rest ? `surface moved, ${rest.seconds.toFixed(0)} s` : "", true);
   document.querySelector("[data-tile=rest]").hidden = !rest;
   put("cause", "–", "", cause ? cause.words : "", false);
   document.querySelector("[data-tile=cause]").hidden = !cause || cause.tile !== "cause";

@@ -9,12 +9,17 @@ const TURN = 0.12; // rad of a key
 const STEP = 0.1; // of what the view reaches, of a key
 const MAX_TILT = Math.PI / 2;
 const LONG = 4; // times the median edge of the landmarks' mesh: longer ones bridge what was not seen
+const LOOKED = [[0.6, "#c0392b", "a gap"], [0.8, "#e67e22", "too little or much"], [1.25, "#27ae60", "laid as planned"], [1.6, "#e67e22", "too little or much"], [Infinity, "#8e44ad", "a blob"]]; // shares of what was planned, up to
+const UNSEEN = [null, "#999", "not seen"];
 const PYRAMID = 0.2; // of a camera, as a share of what the view reaches
+
+const looked = (share) => (share === null ? UNSEEN : LOOKED.find(([most]) => share < most));
 
 export class SceneView {
   constructor(root) {
     this.canvas = root.querySelector("canvas");
     this.scale = root.querySelector(".scale");
+    this.legend = root.querySelector(".legend");
     this.fit = "near";
     this.eye = { turn: -0.6, tilt: 0.75, near: 1 };
     this.pan = [0, 0, 0]; // mm, of the middle of the view
@@ -29,6 +34,7 @@ export class SceneView {
     if (!scene.triangles.length && scene.surface.length > 9) scene.triangles = meshed(scene.surface);
     this.scene = scene;
     this.middle = null;
+    this.explain(scene.share || []);
     const places = scene.cameras.map((c) => [0, 1, 2].map((r) => c.base_from_camera[r][3])), one = places[0] || [0, 0, 0];
     const apart = Math.max(...places.map((p) => Math.hypot(...p.map((v, k) => v - one[k]))), ...places.map((p) => Math.hypot(...p)), 1);
     this.reach = { all: 0.5 * apart, near: this.radius(scene) };
@@ -149,13 +155,23 @@ export class SceneView {
     if (view && view.motion && view.motion.base_from_nozzle) this.tool(g, place, view.motion.base_from_nozzle);
     this.ruler(ratio);
   }
-  // what the last look found: green as planned to a quarter, orange less than 0.8 or more than 1.25, red a gap, violet a blob
+  // the colours of what the last look found, as far as they are there
+  explain(share) {
+    for (const each of this.legend.querySelectorAll(".look")) each.remove();
+    const found = new Map(share.map((s) => looked(s).slice(1)));
+    for (const [colour, words] of found) {
+      const line = document.createElement("span"), mark = document.createElement("i");
+      line.className = "look";
+      mark.style.background = colour;
+      line.append(mark, words);
+      this.legend.append(line);
+    }
+  }
   laid(g, at, ratio) {
     const { laid, share } = this.scene;
     g.lineWidth = 5 * ratio;
     for (let i = 0; share && i < share.length; i += 1) {
-      const s = share[i];
-      g.strokeStyle = s === null ? "#999" : s < 0.6 ? "#c0392b" : s < 0.8 ? "#e67e22" : s < 1.25 ? "#27ae60" : s < 1.6 ? "#e67e22" : "#8e44ad";
+      g.strokeStyle = looked(share[i])[1];
       g.beginPath();
       g.moveTo(...at(...laid.slice(6 * i, 6 * i + 3)));
       g.lineTo(...at(...laid.slice(6 * i + 3, 6 * i + 6)));
