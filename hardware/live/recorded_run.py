@@ -160,10 +160,11 @@ class PlayedSource:
         if self._calls[0][2] != kind:
             self._missed(kind)
         answer = self._calls.popleft()[3]
-        if isinstance(answer, dict) and UNPLUGGED in answer:
-            raise UnpluggedError(answer[UNPLUGGED])
-        if isinstance(answer, dict) and REFUSED in answer:
-            raise _RefusedError(answer[REFUSED])
+        raised = answer if isinstance(answer, dict) else {}
+        if (words := raised.get(UNPLUGGED)) is not None:
+            raise UnpluggedError(words)
+        if (words := raised.get(REFUSED)) is not None:
+            raise _RefusedError(words)
         return answer
 
     def flush(self) -> None:
