@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.scans.registration import MIN_REGISTRATION_POINTS, Registration, register
+from estimation.scans.registration import MIN_REGISTRATION_POINTS, Registration, better_of, register
 from estimation.scans.scan import Scan, ScanIndex, scan_from_triangles
 from estimation.se3 import Array
 from tests import scans
@@ -122,6 +124,26 @@ def test_the_covariance_is_wide_along_what_is_free_and_narrow_across() -> None:
 def test_a_shape_with_two_sides_alike_is_called_ambiguous() -> None:
     result, _ = found(scans.height_field(scans.twofold), 6, noise=0.02, count=400)
     assert not result.sure and "ambiguous" in result.verdict and len(result.free) == 0
+
+
+def refined(x: float, rms: float) -> Registration:
+    pose = se3.make(np.eye(3), np.array([x, 0.0, 0.0]))
+    return Registration(pose, rms, np.eye(6), np.zeros((0, 6)), True, f"found: {rms} mm rms")
+
+
+def test_an_ambiguous_place_is_settled_by_better_points_only_where_these_tell_its_rival_from_it() -> None:
+    ambiguous = replace(refined(0.0, 0.07), sure=False, verdict="ambiguous", rival=refined(3.0, 0.07).base_from_surface)
+    points = np.random.default_rng(0).uniform(-20, 20, (50, 3))
+    here, there = refined(0.0, 0.025), refined(3.0, 0.027)
+    asked = better_of(ambiguous, here, there, points)
+    assert not asked.sure and "ambiguous" in asked.verdict and asked.rival is ambiguous.rival
+    assert better_of(ambiguous, here, refined(3.0, 0.05), points) is here
+    poor = refined(0.0, 0.05)
+    assert better_of(ambiguous, poor, there, points) is there
+    assert better_of(ambiguous, here, refined(0.05, 0.027), points) is here  # the rival has come to the same place
+    turned = replace(there, base_from_surface=se3.exp(np.array([0, 0, 0.05, 0, 0, 0.0])))  # far at the rim
+    assert not better_of(ambiguous, here, turned, points).sure
+    assert not better_of(ambiguous, here, there, np.zeros((0, 3))).sure
 
 
 def test_points_of_another_surface_are_called_a_poor_fit() -> None:

@@ -32,6 +32,8 @@ STEP_DAMPING = 1e-6
 
 FREE_STD = 0.3  # mm: a direction known no better is called free; three times the error that is wanted
 FREE_SLOPE = 0.012  # mm of distance per mm of motion (0.7 degrees): below, errors of the scan's own shape decide
+RIVAL_RMS_RATIO = 1.5  # a rival pose whose points stand off this much more is none
+ONE_PLACE_MM = FREE_STD  # by which no point of two places is apart: they are one, as well as places are known
 SLIDE_TURN_SHARE = 0.2  # of turning, below which a motion is called a slide
 
 
@@ -107,6 +109,22 @@ def register_near(points_base: Array, sigma: float, shared: float, index: ScanIn
     pose, gate = _refine(index, near, points_base, sigma, 10 * sigma, 20, held=True)
     fit = _measure(index, pose, gate, points_base, sigma, shared)
     return _judge([fit], points_base, max(sigma, fit.rms))
+
+
+def better_of(ambiguous: Registration, best: Registration, rival: Registration, points: Array) -> Registration:
+    """What an `ambiguous` place is once it and its rival were refined on better points: the one that fits clearly
+    better, the first where both have become one place, else as ambiguous as before.
+
+    points: (N, 3) mm, surface frame, by which the distance of two places is judged; N may be 0.
+    """
+    if rival.rms > RIVAL_RMS_RATIO * best.rms:
+        return best
+    if best.rms > RIVAL_RMS_RATIO * rival.rms:
+        return rival
+    places = (se3.transform_points(each.base_from_surface, points) for each in (best, rival))
+    if len(points) and np.linalg.norm(np.subtract(*places), axis=1).max() < ONE_PLACE_MM:
+        return best
+    return replace(best, rival=ambiguous.rival, sure=False, verdict=f"{ambiguous.verdict}; {best.verdict}")
 
 
 def _judge(candidates: list[_Candidate], points: Array, sigma: float) -> Registration:

@@ -24,7 +24,7 @@ from estimation import se3
 from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
 from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
-from estimation.scans.registration import Registration, register, register_near
+from estimation.scans.registration import Registration, better_of, register, register_near
 from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
@@ -266,7 +266,6 @@ REFINEMENT_ROUNDS = 4  # of matching and settling: the third was measured to mov
 SCAN_MARGIN_MM = 2.0  # mm around the part that was seen
 # mm rms on the scan: 0.04 on the right one, 0.19 on another; the lower limit where the relief did not fit at first
 MAX_FIT_RMS_MM, EXACT_FIT_RMS_MM = 0.15, 0.06
-RIVAL_RMS_RATIO = 1.5  # a rival pose whose points stand off this much more is none
 
 
 class ScanPlacing:
@@ -292,16 +291,12 @@ class ScanPlacing:
         return self.refine(lenses, images, place)
 
     def refine(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
-        """A place known to a millimetre, refined on pictures of one instant; what was ambiguous before stays so."""
+        """A place known to a millimetre, refined on pictures of one instant; if it was ambiguous, the rival as well."""
         best = self._settled(lenses, images, near)
         if near.rival is None:
             return best
         other = self._settled(lenses, images, replace(near, base_from_surface=near.rival, rival=None))
-        if other.rms > RIVAL_RMS_RATIO * best.rms:
-            return best
-        if best.rms > RIVAL_RMS_RATIO * other.rms:
-            return other
-        return replace(best, rival=near.rival, sure=False, verdict=f"{near.verdict}; {best.verdict}")
+        return better_of(near, best, other, self._nodes[np.isfinite(self._nodes[..., 0])])
 
     def _settled(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
         """Matched on the scan where it lies, and registered again, repeatedly."""
