@@ -359,6 +359,8 @@ def adapted_flow(path: Path, looks: Sequence[Look], told: FlowShares = AS_PLANNE
     other = np.flatnonzero(path.layer[later] != path.layer[later[0]])
     pieces = pieces_between(path, later[0] - 1, later[other[0] - 1] if len(other) else later[-1])
     stations = stations_of(pieces)
+    if not len(stations.begin):  # a layer of dots without a way
+        return None
     away = np.linalg.norm(_at(path, knots, (stations.begin + stations.end) / 2)[:, None] - points[sure], axis=2)
     weight = np.exp(-((away / FILL_SIGMA) ** 2) / 2)
     lack = (weight * lacks[sure]).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)

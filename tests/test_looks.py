@@ -350,6 +350,9 @@ def test_nothing_is_done_after_an_uncertain_look_in_a_layer_or_after_the_last_on
     assert adapted_flow(path, [unsure]) is None and adapted_flow(path, [unseen]) is None
     assert adapted_flow(path, [replace(look, last=3.0)]) is None
     assert adapted_flow(*wrapped(layered(GAP, layer=2))) is None
+    dots = path.surface_from_nozzle.copy()
+    dots[5:12, :3, 3] = dots[5, :3, 3]  # the next layer has no ways
+    assert adapted_flow(replace(path, surface_from_nozzle=dots), [look]) is None
     told = adapted_flow(*wrapped(layered(np.full(24, 0.93))))
     assert told is not None and (told.share == 1.0).all()
     told = adapted_flow(*wrapped(layered(np.where(GAP, 1.0, 0.8), sigma=0.04)))

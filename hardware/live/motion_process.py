@@ -149,11 +149,9 @@ class _TickReporter:
         if progress is not None:
             stamp = math.nan if self._handover is None else self._handover.pose.stamp
             asked = motion.asked and motion.last.stamp == tick.stamp
-            frame, recalled = (
-                loop.arm.command_frame if asked else b"",
-                None if tick.recalled is None else tick.recalled.rows,
-            )
-            reached = tick.command, frame, progress.fraction, progress.phase, recalled
+            frame, recalled = loop.arm.command_frame if asked else b"", tick.recalled
+            rows = None if recalled is None else recalled.rows
+            reached = tick.command, frame, progress.fraction, progress.phase, rows
             self._sender.put(RecordedTick(tick.stamp, stamp, asked, *reached))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
