@@ -442,6 +442,7 @@ def test_a_dry_run_opens_no_dispenser_and_asks_for_no_material(tmp_path: Path) -
         ({"unattended": True}, ["print.unattended", "a dispenser for each material"]),
         ({"materials": "1"}, ["material", "2"]),
         ({"dead": 0.5}, ["d.toml", "syringe: delay on", "0 to 0.4 s"]),
+        ({"adapt": True, "look": "layer"}, ["d.toml", "print.adapt", "that are metered"]),
     ],
 )
 def test_what_no_dispenser_can_do_is_refused_before_the_run(

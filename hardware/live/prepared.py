@@ -292,10 +292,7 @@ def _path_named_in(scenario: File) -> File | None:
 
 
 def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -> tuple[str, Outlets]:
-    """The text of the dispenser file and the outlets of the path's materials; nothing in a dry run or without a file.
-
-    InputError where the path needs what no dispenser can do.
-    """
+    """The dispenser file's text and the materials' outlets, none in a dry run; InputError for what no dispenser can."""
     file = settings.dispensers
     if file is None or path is None or settings.dry_run:
         return "", {}
@@ -308,6 +305,8 @@ def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -
     if settings.unattended and len(set(map(id, carried))) < len(carried):
         allowed = "an operator, or a dispenser for each material: one carries several of this path's"
         raise InputError(file, "print.unattended", "true", allowed)
+    if settings.adapt and not all(each is None or each.profile.metered for each in carried):
+        raise InputError(file, "print.adapt", "true", "dispensers that are metered: others give one flow")
     return file.read_text(encoding="utf-8-sig"), outlets
 
 
@@ -325,9 +324,9 @@ def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
         return []
     if not dispensers:
         return [] if settings.simulated is not None else ["no dispenser is given: nothing is extruded"]
-    names = [each.profile.name for each in dispensers_from_text(dispensers, "") if each.profile.watchdog is None]
     why = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
-    return [f"dispenser {name} {why}" for name in names]
+    profiles = [each.profile for each in dispensers_from_text(dispensers, "")]
+    return [f"dispenser {profile.name} {why}" for profile in profiles if profile.watchdog is None]
 
 
 def rig_from_session(session: File) -> Rig:
