@@ -154,6 +154,14 @@ class Page:
         for kind in ("mousePressed", "mouseReleased"):
             self._tell("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
+    def drag_finger(self, begin: tuple[float, float], end: tuple[float, float], steps: int = 2) -> None:
+        """Put a finger down at a place in the window, px, move it evenly to another one and lift it there."""
+        way = [tuple(b + (e - b) * k / steps for b, e in zip(begin, end, strict=True)) for k in range(steps + 1)]
+        for k, (x, y) in enumerate(way):
+            kind = "touchMove" if k else "touchStart"
+            self._tell("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": float(x), "y": float(y)}])
+        self._tell("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     def key(self, code: str, key: str) -> None:
         for kind in ("keyDown", "keyUp"):
             self._tell("Input.dispatchKeyEvent", type=kind, code=code, key=key, text=key if len(key) == 1 else "")

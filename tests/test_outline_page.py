@@ -206,15 +206,7 @@ def test_the_space_bar_stops_while_the_outline_is_corrected(run: Outlined) -> No
 
 def test_a_finger_drags_a_point_as_a_mouse_does(run: Outlined) -> None:
     page, goal = run.open(), np.array([150.0, 60.0])
-    begin, end = run.place(FOUND[0]), run.place(goal)
-    for kind, place in (
-        ("touchStart", begin),
-        ("touchMove", (begin + end) / 2),
-        ("touchMove", end),
-        ("touchEnd", None),
-    ):
-        points = [] if place is None else [{"x": float(place[0]), "y": float(place[1])}]
-        page._tell("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+    page.drag_finger(run.place(FOUND[0]), run.place(goal))
     assert near(run.points(), np.vstack([goal, FOUND[1:]]))
 
 

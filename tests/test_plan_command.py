@@ -120,6 +120,21 @@ def test_axe_finds_nothing_serious_in_a_plan_or_in_what_an_arm_can_reach(browser
         page.close()
 
 
+def test_a_finger_scrolls_the_page_up_and_down_and_turns_the_plan_sideways(browser: Browser, tmp_path: Path) -> None:
+    out = tmp_path / "path.csv"
+    assert main(["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "0.8"]) == 0
+    page = browser.page(out.with_suffix(".html").as_uri(), (390, 844))
+    page.until("document.readyState === 'complete' && Boolean(document.querySelector('footer'))")
+    page.js("document.getElementById('plan-canvas').scrollIntoView({block: 'center'})")
+    at, (x, y) = page.js("scrollY"), (195.0, 422.0)
+    before = page.shot()
+    page.drag_finger((x, y), (x - 120, y), 6)
+    assert page.js("scrollY") == at and page.shot() != before
+    page.drag_finger((x, y), (x, y - 200), 10)
+    page.until(f"scrollY > {at} + 100")
+    page.close()
+
+
 def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vertices, triangles = scan_of()
     write_ply(tmp_path / "scan.ply", vertices / 1000, triangles)
