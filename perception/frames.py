@@ -145,8 +145,13 @@ _POOL = ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="camera")
 
 
 def parallel_map(function: Callable[..., Result], *arguments: Iterable[object]) -> list[Result]:
-    """As list(map(function, *arguments)); the function must not call this itself."""
-    return list(_POOL.map(function, *arguments))
+    """As list(map(function, *arguments)); the function must not call this itself.
+
+    The calling thread does the first: what it hands over may have to wait for a core.
+    """
+    calls = list(zip(*arguments, strict=True))
+    waiting = [_POOL.submit(function, *each) for each in calls[1:]]
+    return [*(function(*first) for first in calls[:1]), *(each.result() for each in waiting)]
 
 
 # Height above the tip and radius, mm: a luer needle of half an inch on a 5 ml cartridge in its holder.

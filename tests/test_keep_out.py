@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.runtime import median
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from perception.frames import SYRINGE, PrintHead
@@ -19,15 +21,23 @@ from perception.lens import Lenses
 from perception.mapping.masks import (
     BEAD_REACH_MM,
     BEAD_STEP_MM,
+    CLIPPED,
+    DARK_LEVELS,
     GEL_TIME_S,
     LIGHT_SIGMA,
+    MIN_NOISE,
+    NOISE_MEMORY_SETS,
+    NORMAL_COLUMNS,
     PRINT_HEAD_MARGIN_MM,
+    UNSEEN_PX,
     Ink,
     Tool,
     TrackingMasks,
     add_equations,
+    colour_ratios,
     highlights,
     near_bead,
+    place_pixels,
     trackable,
 )
 
@@ -178,11 +188,46 @@ def test_compiled_lenses_and_equations_are_those_of_the_formula(seed: int) -> No
     for which in (camera, np.full(40, camera), np.array([camera])):
         imaged, visible = LENSES.bend(which, x, y, depth)
         assert (imaged.reshape(2, -1) == [across, down]).all() and (visible.ravel() == seen).all()
-    sums, free, away, dark = rng.normal(size=(40, 14)), rng.uniform(size=40) < 0.7, *rng.normal(size=(2, 40))
-    squares, slopes, added = rng.normal(size=(40, 9)), rng.normal(size=(40, 3)), sums.copy()
-    add_equations(added, free, away, dark, 0.01, squares, slopes)
-    precision = free / (0.01 + (LIGHT_SIGMA * dark) ** 2)
-    sums[:, :9] += precision[:, None] * squares
-    sums[:, 9:12] -= (precision * away)[:, None] * slopes
-    sums[:, 12:] += np.stack([precision * away * away, free], -1)
-    assert (added == sums).all()
+
+
+@given(st.integers(0, 10**6))
+def test_compiled_colours_are_those_of_the_formula(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    camera, pose, points = int(rng.integers(3)), se3.exp(rng.normal(0, 0.2, 6)), rng.normal(0, 60.0, (80, 3))
+    in_camera = se3.transform_points(LENSES.rig.camera_from_base[camera] @ pose, points)
+    depth = np.maximum(in_camera[:, 2], 1.0)
+    imaged, seen = LENSES.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
+    lens = LENSES.models[camera], LENSES.radius[camera]
+    pixels = place_pixels(LENSES.rig.camera_from_base[camera] @ pose, points, *lens)
+    assert np.allclose(pixels, np.where(seen, imaged, UNSEEN_PX).T, rtol=0, atol=1e-9)
+    # averages of whole cells, between which OpenCV interpolates
+    scale, image = int(rng.integers(1, 4)), rng.integers(0, 256, (47, 61, 3)).astype(np.uint8)
+    height, width = 47 // scale, 61 // scale
+    cells = image[: height * scale, : width * scale].reshape(height, scale, width, scale, 3).mean((1, 3))
+    at = rng.uniform(-8, 64, (80, 2))
+    x, y = ((at + 0.5) / scale - 0.5).T
+    inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
+    maps = np.float32(x)[None], np.float32(y)[None]
+    levels = cv2.remap(cells.astype(np.float32), *maps, cv2.INTER_LINEAR)[0].T.astype(float) * inside
+    blue, green, red = levels + DARK_LEVELS
+    now, dark, free = colour_ratios(image, scale, at)
+    assert np.allclose(now, np.log([red / green, blue / green]), rtol=0, atol=1e-4)
+    assert np.allclose(dark, DARK_LEVELS * (1 / green - 1 / np.stack([red, blue])), rtol=0, atol=1e-4)
+    clear = np.abs(levels.max(0) - CLIPPED) > 1e-3
+    assert (free == (inside & (levels.max(0) < CLIPPED)))[clear].all()
+    # normal equations
+    sums, free = rng.normal(size=(80, 14)), rng.uniform(size=80) < 0.7
+    before, slopes, noise = rng.normal(size=(2, 80)), rng.normal(size=(2, 80, 3)), np.array([0.02, 0.002])
+    added, learned = sums.copy(), noise.copy()
+    add_equations(added, 11, free, now, dark, before, slopes, learned)
+    for k in range(2):
+        away = now[k] - before[k]
+        away -= median(away[free])
+        noise[k] += (1.4826 * median(np.abs(away[free])) - noise[k]) / NOISE_MEMORY_SETS
+        precision = free / (max(noise[k], MIN_NOISE) ** 2 + (LIGHT_SIGMA * dark[k]) ** 2)
+        rows, columns = np.triu_indices(3)
+        sums[:, :6] += precision[:, None] * (slopes[k][:, rows] * slopes[k][:, columns])
+        sums[:, 6:8] += np.stack([precision * away * away, free], -1)
+        sums[:, 11:14] -= (precision * away)[:, None] * slopes[k]
+    assert (added == sums).all() and (learned == noise).all()
+    assert (NORMAL_COLUMNS[rows, columns] == np.arange(6)).all() and (NORMAL_COLUMNS == NORMAL_COLUMNS.T).all()

@@ -1,8 +1,7 @@
 """The loops of patch alignment, compiled: grey levels under a grid, and the descent that shifts it until it fits.
 
 Grey levels are interpolated in floating point: OpenCV's `remap` rounds places to 1/32 px and its answer to whole grey
-levels, which the sum over a patch does not quite average out. The interpreter is free meanwhile, so that cameras can be
-aligned side by side.
+levels, which the sum over a patch does not quite average out. The interpreter is free meanwhile.
 """
 
 from __future__ import annotations

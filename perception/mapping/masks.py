@@ -20,11 +20,12 @@ from scipy.spatial import QhullError, cKDTree
 
 from estimation import se3
 from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces
-from estimation.runtime import compiled, median
+from estimation.online.fit import solve_symmetric3
+from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array, Mask
 from estimation.surface_map import SurfaceMap, Warp, bells
 from perception.frames import SYRINGE, Image, PrintHead, check_profile
-from perception.lens import Lenses
+from perception.lens import Lenses, bend_one
 from perception.mapping.aliases import TangentPlane
 from perception.mapping.alignment_kernels import PATCH_RADIUS
 from perception.mapping.features import ImageMask
@@ -199,6 +200,9 @@ MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a p
 WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
 MIN_PLACES = 20  # of a camera, to compare its picture
 AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
+# of `Colours`' sums: normal equations, the places of their (3, 3); energy and number; three pulls of each camera
+NORMAL_COLUMNS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+ENERGY_COLUMN, COUNT_COLUMN, PULL_COLUMNS = 6, 7, 8
 UNSEEN_PX = -1e6  # where a place is said to be that a camera cannot see: out of every picture
 
 
@@ -209,30 +213,86 @@ class _FirstPicture:
     scale: int  # pixels of the picture to one of its averages
     ratios: Array  # (2, P) logarithms, red and blue to green
     slopes: Array  # (2, P, 3) by a displacement of the surface, 1/mm, along both tangents and the normal
-    squares: Array  # (2, P, 9) outer products of the slopes
     free: Mask  # (P,) places that are seen, and not clipped
     noise: Array  # (2,) one sigma
 
 
-@compiled("void(f8[:,::1], b1[::1], f8[::1], f8[::1], f8, f8[:,::1], f8[:,::1])")
-def add_equations(
-    sums: Array, free: Mask, away: Array, dark: Array, variance: float, squares: Array, slopes: Array
-) -> None:
-    """Add one ratio's normal equations at P places to `sums` (P, 14), as `Colours` keeps them.
+@compiled("f8[:,::1](f8[:,::1], f8[:,::1], f8[::1], f8)")
+def place_pixels(camera_from_surface: Array, points: Array, model: Array, radius: float) -> Array:
+    """Where a camera images points (N, 3) mm, surface frame: (N, 2) px, UNSEEN_PX for those that it does not see.
 
-    free: (P,) where it counts. away: (P,) logarithms off the first picture. dark: (P,) how fast it changes with light.
-    variance: of its noise. squares (P, 9), slopes (P, 3): of the first picture.
+    camera_from_surface: (4, 4). model (9,), radius: of the camera, as `Lenses` has them.
     """
-    for p in range(len(away)):
-        light = LIGHT_SIGMA * dark[p]
-        precision = (1.0 if free[p] else 0.0) / (variance + light * light)
-        pull = precision * away[p]
-        for i in range(9):
-            sums[p, i] += precision * squares[p, i]
-        for i in range(3):
-            sums[p, 9 + i] -= pull * slopes[p, i]
-        sums[p, 12] += pull * away[p]
-        sums[p, 13] += 1.0 if free[p] else 0.0
+    pixels, pose = np.empty((len(points), 2)), camera_from_surface
+    for n in range(len(points)):
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        depth = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / max(depth, 1.0)
+        y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / max(depth, 1.0)
+        pixels[n, 0], pixels[n, 1], seen = bend_one(x, y, depth, model, radius)
+        if not seen:
+            pixels[n, 0] = pixels[n, 1] = UNSEEN_PX
+    return pixels
+
+
+@compiled("Tuple((f8[:,::1], f8[:,::1], b1[::1]))(u1[:,:,::1], i8, f8[:,::1])")
+def colour_ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array, Mask]:
+    """Logarithms (2, N) of red and blue to green at pixels (N, 2), averaged over `scale` of them; how fast each changes
+    (2, N) with the logarithm of the brightness, where a channel is dark; and which (N,) are in view and not clipped.
+
+    Averages lie on a grid, and are interpolated linearly. image: (H, W, 3) BGR.
+    """
+    right, low, area = image.shape[1] // scale - 1, image.shape[0] // scale - 1, float(scale * scale)
+    ratios, dark = np.zeros((2, len(pixels))), np.zeros((2, len(pixels)))
+    free, levels = np.zeros(len(pixels), np.bool_), np.empty(3)
+    for n in range(len(pixels)):
+        across, down = (pixels[n, 0] + 0.5) / scale - 0.5, (pixels[n, 1] + 0.5) / scale - 0.5
+        if not (across >= 0 and across < right and down >= 0 and down < low):
+            continue
+        column, row = int(across), int(down)
+        levels[:] = DARK_LEVELS
+        for cell in range(4):
+            i, j = cell % 2, cell // 2
+            share = (across - column if i else 1 - (across - column)) * (down - row if j else 1 - (down - row)) / area
+            for y in range((row + j) * scale, (row + j + 1) * scale):
+                for x in range((column + i) * scale, (column + i + 1) * scale):
+                    for channel in range(3):
+                        levels[channel] += share * image[y, x, channel]
+        blue, green, red = levels[0], levels[1], levels[2]
+        ratios[0, n], ratios[1, n] = np.log(red / green), np.log(blue / green)
+        dark[0, n], dark[1, n] = DARK_LEVELS * (1 / green - 1 / red), DARK_LEVELS * (1 / green - 1 / blue)
+        free[n] = max(blue, green, red) < CLIPPED + DARK_LEVELS
+    return ratios, dark, free
+
+
+@compiled("void(f8[:,::1], i8, b1[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[::1])")
+def add_equations(
+    sums: Array, pull: int, free: Mask, now: Array, dark: Array, before: Array, slopes: Array, noise: Array
+) -> None:
+    """Add one camera's normal equations at P places to `sums`, in columns as `Colours` keeps them; learn its noise.
+
+    pull: first of the camera's own three columns. free: (P,) places that count. now, before: (2, P) logarithms, of this
+    picture and the first. dark: (2, P) how fast they change with light. slopes: (2, P, 3), noise: (2,), of the first.
+    """
+    count = np.count_nonzero(free)
+    for k in range(2):
+        away = now[k] - before[k]
+        away -= np.partition(away[free], count // 2)[count // 2]
+        noise[k] += (1.4826 * np.partition(np.abs(away[free]), count // 2)[count // 2] - noise[k]) / NOISE_MEMORY_SETS
+        variance = max(noise[k], MIN_NOISE) ** 2
+        for p in range(len(away)):
+            if not free[p]:
+                continue
+            light = LIGHT_SIGMA * dark[k, p]
+            precision, slope, column = 1 / (variance + light * light), slopes[k, p], 0
+            pulls = precision * away[p]
+            for i in range(3):
+                sums[p, pull + i] -= pulls * slope[i]
+                for j in range(i, 3):
+                    sums[p, column] += precision * (slope[i] * slope[j])
+                    column += 1
+            sums[p, ENERGY_COLUMN] += pulls * away[p]
+            sums[p, COUNT_COLUMN] += 1.0
 
 
 class Colours:
@@ -255,6 +315,7 @@ class Colours:
         if not len(self._points) or not len(self._centres):
             return
         self._bells = bells(self._points, self._centres, BELL_MM).T
+        self._bell_sizes = self._bells.sum(1)
         self._inked = np.zeros(len(self._points), bool)
         self._sizes = np.zeros(len(self._centres))  # mm, of each bell while it is displaced, the largest since; else 0
         for camera, image in images.items():
@@ -273,37 +334,32 @@ class Colours:
         if not self._first:
             return NOTHING_DISPLACED
         points = self._points if warp is None else warp.apply(self._points)
-        sums = np.zeros((len(points), 14))  # normal equations, energy and number, of all cameras
-        pulls = list[Array]()  # (K, 3) of each
-        for camera, first in self._first.items():
-            if camera not in images or camera not in poses:
-                continue
-            pixels = self._pixels(camera, poses[camera], points)
-            now, dark, free = _ratios(images[camera], first.scale, pixels)
+        cameras = [camera for camera in self._first if camera in images and camera in poses]
+        sums, told = np.zeros((len(points), PULL_COLUMNS + 3 * len(cameras))), 0
+        for camera in cameras:
+            first, pixels = self._first[camera], self._pixels(camera, poses[camera], points)
+            now, dark, free = colour_ratios(contiguous(images[camera], np.uint8), first.scale, pixels)
             free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
             if np.count_nonzero(free) < MIN_PLACES:
                 continue
-            before = sums[:, 9:12].copy()
-            for k in range(2):
-                away = now[k] - first.ratios[k]
-                away -= median(away[free])
-                first.noise[k] += (1.4826 * median(np.abs(away[free])) - first.noise[k]) / NOISE_MEMORY_SETS
-                variance = max(first.noise[k], MIN_NOISE) ** 2
-                add_equations(sums, free, away, dark[k], variance, first.squares[k], first.slopes[k])
-            pulls.append(self._bells @ (sums[:, 9:12] - before))
-        if not pulls:
+            pull, told = PULL_COLUMNS + 3 * told, told + 1
+            add_equations(sums, pull, free, now, dark, first.ratios, first.slopes, first.noise)
+        if not told:
             return NOTHING_DISPLACED
         summed = self._bells @ sums
-        whole = 2 * len(pulls) * self._bells.sum(1)
-        known = np.where(summed[:, 13] > MIN_SEEN_SHARE * whole, summed[:, 13], np.inf)  # else its edge looks displaced
-        return self._judge(summed[:, :9].reshape(-1, 3, 3), np.stack(pulls), summed[:, 12], known)
+        pulls = summed[:, PULL_COLUMNS : PULL_COLUMNS + 3 * told].reshape(-1, told, 3).swapaxes(0, 1)
+        enough = summed[:, COUNT_COLUMN] > MIN_SEEN_SHARE * 2 * told * self._bell_sizes
+        known = np.where(enough, summed[:, COUNT_COLUMN], np.inf)  # else its edge looks displaced
+        return self._judge(summed[:, NORMAL_COLUMNS], pulls, summed[:, ENERGY_COLUMN], known)
 
     def _judge(self, normal: Array, pulls: Array, energy: Array, known: Array) -> DisplacedPlaces:
         """By normal equations (K, 3, 3), (C, K, 3) of each camera and bell, squared sigmas and how many are usual."""
         pull = pulls.sum(0)
-        shift = np.linalg.solve(normal + np.eye(3) / SHIFT_PRIOR_MM**2, pull[..., None])[..., 0]
+        shift = solve_symmetric3(contiguous(normal + np.eye(3) / SHIFT_PRIOR_MM**2), contiguous(pull))
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
         begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
+        if not (begins.any() or self._sizes.any()):
+            return NOTHING_DISPLACED
         begins &= explained > MIN_EXPLAINED * (energy - known)
         if len(pulls) > 1:  # else it may be what one camera sees there: a print head that its first picture showed
             begins &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
@@ -320,27 +376,21 @@ class Colours:
         return DisplacedPlaces(self._centres[apart], self._sizes[apart], BELL_MM, whole)
 
     def _picture(self, camera: int, image: Image, pose: Array) -> _FirstPicture:
-        pixels = self._pixels(camera, pose, self._points)
+        image, pixels = contiguous(image, np.uint8), self._pixels(camera, pose, self._points)
         beside = self._pixels(camera, pose, self._points + self._axes[0])
         scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(beside - pixels, axis=1)))))
-        ratios, _, free = _ratios(image, scale, pixels)
-        ends = [
-            _ratios(image, scale, self._pixels(camera, pose, self._points + side * axis))[0]
-            for axis in self._axes
-            for side in (1, -1)
-        ]
+        ratios, _, free = colour_ratios(image, scale, pixels)
+        places = (self._points + side * axis for axis in self._axes for side in (1, -1))
+        ends = [colour_ratios(image, scale, self._pixels(camera, pose, at))[0] for at in places]
         slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
-        squares = (slopes[..., :, None] * slopes[..., None, :]).reshape(2, -1, 9)
         for around in 2 * scale * AROUND:  # what an average or a slope reaches must be the surface's as well
             free &= ~self._masks.hides(camera, pixels + around)
-        return _FirstPicture(scale, ratios, slopes, squares, free, np.full(2, FIRST_NOISE))
+        return _FirstPicture(scale, ratios, slopes, free, np.full(2, FIRST_NOISE))
 
     def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
         """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px, far off for those unseen."""
-        in_camera = se3.transform_points(self._lenses.rig.camera_from_base[camera] @ pose, points)
-        depth = np.maximum(in_camera[:, 2], 1.0)
-        imaged, seen = self._lenses.bend(camera, in_camera[:, 0] / depth, in_camera[:, 1] / depth, in_camera[:, 2])
-        return np.asarray(np.where(seen, imaged, UNSEEN_PX).T)
+        lens = self._lenses.models[camera], self._lenses.radius[camera]
+        return place_pixels(self._lenses.rig.camera_from_base[camera] @ pose, contiguous(points), *lens)
 
 
 def _spread(plane: TangentPlane, step: float) -> Array:
@@ -348,19 +398,3 @@ def _spread(plane: TangentPlane, step: float) -> Array:
     cells = max(1, int(np.ptp(plane.places, axis=0).max() / step))
     flat = plane.grid(cells)[0].reshape(-1, 2)
     return plane.lift(flat[plane.inside(flat)])[0]
-
-
-def _ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array, Mask]:
-    """Logarithms (2, N) of red and blue to green at pixels (N, 2), averaged over `scale` of them; how fast each changes
-    (2, N) with the logarithm of the brightness, where a channel is dark; and which (N,) are in view and not clipped."""
-    size = np.array(image.shape[1::-1]) // scale
-    low = np.clip(pixels.min(0) // scale - 2, 0, size - 1).astype(int)
-    width, height = np.clip(pixels.max(0) // scale + 3, low + 1, size).astype(int) - low
-    part = image[low[1] * scale : (low[1] + height) * scale, low[0] * scale : (low[0] + width) * scale]
-    small = cv2.resize(part, (int(width), int(height)), interpolation=cv2.INTER_AREA)
-    across, down = ((pixels + 0.5) / scale - 0.5 - low).astype(np.float32).T
-    in_view = (across >= 0) & (across < width - 1) & (down >= 0) & (down < height - 1)
-    levels = cv2.remap(small.astype(np.float32), across[None], down[None], cv2.INTER_LINEAR)[0]
-    blue, green, red = (levels.astype(float) + DARK_LEVELS).T
-    ratios = np.log(np.stack([red, blue]) / green)
-    return ratios, DARK_LEVELS * (1 / green - 1 / np.stack([red, blue])), in_view & (levels.max(1) < CLIPPED)

@@ -13,7 +13,7 @@ from estimation import se3
 from estimation.observations import MissedLandmarks, Observations, no_observations
 from estimation.pose_solver import PointTracks, project, solve_pose
 from estimation.rig import ideal_pixels
-from estimation.se3 import Array
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap
 from perception.frames import Image, parallel_map
 from perception.lens import Lenses, undistort
@@ -27,7 +27,8 @@ from perception.mapping.patches import (
     grain_of,
     join,
     project_into,
-    sample,
+    project_tracks_into,
+    sample_each,
 )
 
 FLOW_WINDOW_PX = 21
@@ -319,12 +320,11 @@ class Matcher:
         fits, number = result.found, np.array(cameras, np.int64)
         camera = number[position[fits]]
         pixels = self._ideal(camera, result.pixels[fits])
-        shown = fits.copy()  # what shows its grain is there, though nothing measures it
-        for at, pictures in enumerate(images):
-            mine = np.flatnonzero(~fits & (position == at))
-            for spots in (where.centre[mine], result.pixels[mine]):
-                shown[mine] |= self._shows_grain(pictures, where.take(mine), spots, row[mine])
-        lost = np.flatnonzero(~shown)
+        # what shows its grain, where it should be or where it was found, is there, though nothing measures it
+        unmeasured = np.flatnonzero(~fits)
+        spots, twice = np.concatenate([where.centre[unmeasured], result.pixels[unmeasured]]), np.tile(unmeasured, 2)
+        shows = self._shows_grain(pyramids, number[position[twice]], where.take(twice), spots, row[twice])
+        lost = unmeasured[~shows.reshape(2, -1).any(0)]
         # what the refinement has dropped is missed as well: the surface may have left the place that the map gives it
         missing = number[np.concatenate([position[lost], lacking])], np.concatenate([row[lost], absent])
         return Observations(stamp, camera, row[fits], pixels, result.sigma[fits], MissedLandmarks(*missing))
@@ -333,22 +333,20 @@ class Matcher:
         self, pyramids: dict[int, Pyramid], poses: Array, tracks: Observations, outlier: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Which tracks (N,), of those that are outliers (N,), show their grain where poses (C, 4, 4) put them."""
-        shown = np.zeros(len(tracks), bool)
-        for c, images in pyramids.items():
-            mine = np.flatnonzero(outlier & (tracks.camera == c))
-            rows, axes = tracks.track[mine], self.templates.axes
-            at = self.map.points[rows], self.map.normals[rows], axes[rows]
-            where = project_into(self.lenses, [c], poses[c][None], *at)
-            shown[mine] = self._shows_grain(images, where, where.centre, rows)
+        shown, mine = np.zeros(len(tracks), bool), np.flatnonzero(outlier & np.isin(tracks.camera, list(pyramids)))
+        camera, rows = tracks.camera[mine], tracks.track[mine]
+        squares = self.map.points[rows], self.map.normals[rows], self.templates.axes[rows]
+        where = project_tracks_into(self.lenses, camera, poses, *squares)
+        shown[mine] = self._shows_grain(pyramids, camera, where, where.centre, rows)
         return shown
 
     def _shows_grain(
-        self, images: Pyramid, where: Projection, spots: Array, rows: NDArray[np.int64]
+        self, pyramids: dict[int, Pyramid], camera: Index, where: Projection, spots: Array, rows: Index
     ) -> NDArray[np.bool_]:
-        """Which landmarks (rows, (M,)) show their grain at spots (M, 2) px: a shadow's edge hides the rest of them."""
+        """Which landmarks (rows, (M,)) show their grain at spots (M, 2) px of cameras (M,): shadows hide the rest."""
         if not len(rows):
             return np.zeros(0, bool)
-        now = grain_of(sample(images[0], spots, where.per_sample))
+        now = grain_of(sample_each(pyramids, camera, spots, where.per_sample))
         first = grain_of(self.templates.picture[rows])
         alike, sizes = (now * first).sum(1), (now * now).sum(1) * (first * first).sum(1)
         return np.asarray(alike > MIN_SHOWN_GRAIN * np.sqrt(sizes))

@@ -8,7 +8,7 @@ is always compared with its reference picture, never with the previous frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,9 +19,16 @@ from numpy.typing import NDArray
 from estimation import se3
 from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
-from perception.frames import Image, parallel_map
+from perception.frames import Image
 from perception.lens import Lenses, bend_one
-from perception.mapping.alignment_kernels import PATCH_RADIUS, PATCH_SIDE, Float32, descend, sample_grids
+from perception.mapping.alignment_kernels import (
+    PATCH_RADIUS,
+    PATCH_SAMPLES,
+    PATCH_SIDE,
+    Float32,
+    descend,
+    sample_grids,
+)
 
 MIN_PATCH_CONTRAST = 3.0  # grey levels: a patch with less contrast is not worth a track
 
@@ -81,6 +88,16 @@ def sample(image: Image, centre: Array, per_sample: Array, spacing: float = 1.0,
     return np.asarray(sample_grids(image, on_level(centre, half), steps, scale), np.float32)
 
 
+def sample_each(images: Mapping[int, Pyramid], number: NDArray[np.int64], centre: Array, per_sample: Array) -> Float32:
+    """Grey levels (N, S) as `sample`, each of the full image of its own number (N,)."""
+    levels = np.zeros((len(number), PATCH_SAMPLES), np.float32)
+    for i, pyramid in images.items():
+        mine = np.flatnonzero(number == i)
+        if len(mine):
+            levels[mine] = sample(pyramid[0], centre[mine], per_sample[mine])
+    return levels
+
+
 def on_level(centre: Array, half: bool) -> Array:
     """Centres (N, 2) px of an image in the pixels of the image or of its half-size version."""
     # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
@@ -138,57 +155,87 @@ def project_into(
     lenses: Lenses, cameras: Sequence[int], base_from_surface: Array, points: Array, normals: Array, axes: Array
 ) -> Projection:
     """Squares projected into cameras, each with its base_from_surface (C, 4, 4); row c N + i: square i of camera c."""
-    which = np.asarray(cameras, np.int64)
-    camera_from_surface = lenses.rig.camera_from_base[which] @ base_from_surface
+    count, each = len(points), np.arange(len(cameras))
+    which = np.asarray(cameras, np.int64), np.repeat(each, count), np.tile(np.arange(count), len(each))
+    return _projected(lenses, *which, base_from_surface, points, normals, axes)
+
+
+def project_tracks_into(
+    lenses: Lenses, camera: NDArray[np.int64], base_from_surface: Array, points: Array, normals: Array, axes: Array
+) -> Projection:
+    """Squares (N,), each into its own camera (N,). base_from_surface: (C, 4, 4), of all cameras of the rig."""
+    every = np.arange(len(lenses.rig)), contiguous(camera, np.int64), np.arange(len(points))
+    return _projected(lenses, *every, base_from_surface, points, normals, axes)
+
+
+def _projected(
+    lenses: Lenses,
+    cameras: NDArray[np.int64],
+    place: NDArray[np.int64],
+    square: NDArray[np.int64],
+    base_from_surface: Array,
+    points: Array,
+    normals: Array,
+    axes: Array,
+) -> Projection:
+    """Each of R rows: its square (R,) in the camera whose place (R,) among `cameras` (C,) it has."""
+    camera_from_surface = lenses.rig.camera_from_base[cameras] @ base_from_surface
     step = 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding
-    corners = np.stack([points, points + step * axes[:, :, 0], points + step * axes[:, :, 1]]).reshape(-1, 3)
+    corners = np.concatenate([points, points + step * axes[:, :, 0], points + step * axes[:, :, 1]])
     in_camera = camera_from_surface[:, :3, :3] @ corners.T + camera_from_surface[:, :3, 3:]  # (C, 3, 3N)
     turned = camera_from_surface[:, :3, :3] @ normals.T  # (C, 3, N)
-    models, radius, sizes = lenses.models[which], lenses.radius[which], lenses.sizes[which]
-    return Projection(*project_corners(in_camera, turned, models, radius, sizes, step))
+    models, radius, sizes = lenses.models[cameras], lenses.radius[cameras], lenses.sizes[cameras]
+    return Projection(*project_corners(place, square, in_camera, turned, models, radius, sizes, step))
 
 
 @compiled(
-    "Tuple((f8[:,::1], f8[:,:,::1], b1[::1], f8[::1]))(f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8)"
+    "Tuple((f8[:,::1], f8[:,:,::1], b1[::1], f8[::1]))"
+    "(i8[::1], i8[::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8)"
 )
 def project_corners(
-    in_camera: Array, turned: Array, models: Array, radius: Array, sizes: Array, step: float
+    place: NDArray[np.int64],
+    square: NDArray[np.int64],
+    in_camera: Array,
+    turned: Array,
+    models: Array,
+    radius: Array,
+    sizes: Array,
+    step: float,
 ) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-    """The parts of a `Projection` of N squares into C cameras, one after the other.
+    """The parts of a `Projection` of R rows: squares (R,) of N, in the cameras at places (R,) of C.
 
     in_camera: (C, 3, 3N) mm, their places, and what lies `step` samples along both sides. turned: (C, 3, N) normals.
     models, radius, sizes: of the cameras, as `Lenses` has them.
     """
-    count, squares = len(in_camera), turned.shape[2]
-    centre, per_sample = np.empty((count * squares, 2)), np.empty((count * squares, 2, 2))
-    visible, facing = np.empty(count * squares, np.bool_), np.empty(count * squares)
-    for c in range(count):
-        for n in range(squares):
-            row = c * squares + n
-            seen, across, down = True, 0.0, 0.0
-            for corner in range(3):
-                k = corner * squares + n
-                depth = in_camera[c, 2, k]
-                inverse = 1 / (1e-6 if abs(depth) < 1e-6 else depth)
-                x, y = in_camera[c, 0, k] * inverse, in_camera[c, 1, k] * inverse
-                u, v, in_lens = bend_one(x, y, depth, models[c], radius[c])
-                seen = seen and in_lens
-                if corner == 0:
-                    across, down = u, v
-                else:
-                    per_sample[row, 0, corner - 1] = (u - across) / step
-                    per_sample[row, 1, corner - 1] = (v - down) / step
-            along = turned[c, 0, n] * in_camera[c, 0, n] + turned[c, 1, n] * in_camera[c, 1, n]
-            along += turned[c, 2, n] * in_camera[c, 2, n]
-            far = in_camera[c, 0, n] * in_camera[c, 0, n] + in_camera[c, 1, n] * in_camera[c, 1, n]
-            far += in_camera[c, 2, n] * in_camera[c, 2, n]
-            facing[row] = -along / max(np.sqrt(far), 1e-9)
-            centre[row, 0], centre[row, 1] = across, down
-            for axis in range(2):
-                reach = PATCH_RADIUS * (abs(per_sample[row, axis, 0]) + abs(per_sample[row, axis, 1])) + 2
-                limit = sizes[c, axis] - 1 - reach
-                seen = seen and centre[row, axis] >= reach and centre[row, axis] < limit
-            visible[row] = seen and facing[row] > 0.15
+    count, squares = len(square), turned.shape[2]
+    centre, per_sample = np.empty((count, 2)), np.empty((count, 2, 2))
+    visible, facing = np.empty(count, np.bool_), np.empty(count)
+    for row in range(count):
+        c, n = place[row], square[row]
+        seen, across, down = True, 0.0, 0.0
+        for corner in range(3):
+            k = corner * squares + n
+            depth = in_camera[c, 2, k]
+            inverse = 1 / (1e-6 if abs(depth) < 1e-6 else depth)
+            x, y = in_camera[c, 0, k] * inverse, in_camera[c, 1, k] * inverse
+            u, v, in_lens = bend_one(x, y, depth, models[c], radius[c])
+            seen = seen and in_lens
+            if corner == 0:
+                across, down = u, v
+            else:
+                per_sample[row, 0, corner - 1] = (u - across) / step
+                per_sample[row, 1, corner - 1] = (v - down) / step
+        along = turned[c, 0, n] * in_camera[c, 0, n] + turned[c, 1, n] * in_camera[c, 1, n]
+        along += turned[c, 2, n] * in_camera[c, 2, n]
+        far = in_camera[c, 0, n] * in_camera[c, 0, n] + in_camera[c, 1, n] * in_camera[c, 1, n]
+        far += in_camera[c, 2, n] * in_camera[c, 2, n]
+        facing[row] = -along / max(np.sqrt(far), 1e-9)
+        centre[row, 0], centre[row, 1] = across, down
+        for axis in range(2):
+            reach = PATCH_RADIUS * (abs(per_sample[row, axis, 0]) + abs(per_sample[row, axis, 1])) + 2
+            limit = sizes[c, axis] - 1 - reach
+            seen = seen and centre[row, axis] >= reach and centre[row, axis] < limit
+        visible[row] = seen and facing[row] > 0.15
     return centre, per_sample, visible, facing
 
 
@@ -260,29 +307,25 @@ def align_in(
     least: float = 0.75,
     coarse: bool = True,
 ) -> Alignment:
-    """Shift each template until it fits; the cameras side by side.
+    """Shift each template until it fits.
 
-    counts: how many of the rows belong to each of the images, one after the other. start: (N, 2) px as imaged, where to
-    begin. least: the correlation below which a landmark is not found. coarse: begin on the half-size images, which
-    reaches twice as far (5 px surely, 8 mostly) and costs as much again.
+    One camera after the other: a landmark takes microseconds, and on a busy machine other threads take milliseconds to
+    begin. counts: how many of the rows belong to each of the images, one after the other. start: (N, 2) px as imaged,
+    where to begin. least: the correlation below which a landmark is not found. coarse: begin on the half-size images,
+    which reaches twice as far (5 px surely, 8 mostly) and costs as much again.
     """
-    begin, per_sample = contiguous(start), contiguous(where.per_sample)
-    shift, ended = np.zeros((len(templates), 2)), np.zeros((len(templates), 3))  # shifts in samples of the template
-
-    def in_one(images: Pyramid, mine: slice) -> None:
-        t, at, steps, visible = templates, begin[mine], per_sample[mine], where.visible[mine]
+    t, begin, per_sample = templates, contiguous(start), contiguous(where.per_sample)
+    shift, ended = np.zeros((len(t), 2)), np.zeros((len(t), 3))  # shifts in samples of the template
+    for image, (first, last) in zip(images, pairwise(np.cumsum([0, *counts]).tolist()), strict=True):
+        mine = slice(first, last)
+        at, steps, visible = begin[mine], per_sample[mine], where.visible[mine]
         if coarse:
             looks = t.coarse_picture[mine], t.coarse_steepest[mine], t.coarse_inverse_hessian[mine]
-            descend(images[1], on_level(at, True), steps, visible, *looks, shift[mine], 0.5, 2.0, MAX_COARSE_STEPS)
+            descend(image[1], on_level(at, True), steps, visible, *looks, shift[mine], 0.5, 2.0, MAX_COARSE_STEPS)
         looks = t.picture[mine], t.steepest[mine], t.inverse_hessian[mine]
-        ended[mine] = descend(images[0], at, steps, visible, *looks, shift[mine], 1.0, 1.0, MAX_FINE_STEPS)
-
-    parts = [slice(first, last) for first, last in pairwise(np.cumsum([0, *counts]).tolist())]
-    if len(parts) > 1:
-        parallel_map(in_one, images, parts)
-    else:
-        in_one(images[0], parts[0])
-    return _accepted(templates, where, start, shift, ended, least)
+        ended[mine] = descend(image[0], at, steps, visible, *looks, shift[mine], 1.0, 1.0, MAX_FINE_STEPS)
+    hessian = contiguous(t.inverse_hessian)
+    return Alignment(*_accepted(begin, per_sample, where.visible, where.facing, hessian, shift, ended, least))
 
 
 def coarse_score(templates: Templates, images: Pyramid, where: Projection, centre: Array) -> Array:
@@ -291,19 +334,37 @@ def coarse_score(templates: Templates, images: Pyramid, where: Projection, centr
     return np.asarray((current * templates.coarse_picture).mean(1), float)
 
 
+@compiled(
+    "Tuple((f8[:,::1], f8[::1], f8[::1], b1[::1]))"
+    "(f8[:,::1], f8[:,:,::1], b1[::1], f8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], f8)"
+)
 def _accepted(
-    templates: Templates, where: Projection, start: Array, shift: Array, ended: Array, least: float
-) -> Alignment:
-    moved = (where.per_sample @ shift[..., None])[..., 0]
-    pixels = start + moved
-    score, contrast, rest = ended.T
-    noise = 2 * (1 - np.clip(score, -1, 1)) * 2.0  # variance per sample; neighbours share noise, hence the two
-    per_pixel = where.per_sample @ templates.inverse_hessian @ np.swapaxes(where.per_sample, 1, 2)
-    sidelong = np.clip(where.facing, MIN_FACING, 1.0)
-    bent = RELIEF_PX**2 * (1 / sidelong**2 - 1)  # the tangent's square
-    white = np.maximum(noise * (per_pixel[:, 0, 0] + per_pixel[:, 1, 1]) / 2, MIN_ALIGNMENT_SIGMA_PX**2)
-    sigma = np.sqrt(white + rest**2 + bent)
-    reach = np.sqrt((moved * moved).sum(1))
-    fits = (score > least) & (contrast > MIN_PATCH_CONTRAST)
-    found = where.visible & fits & (reach < 3 * PATCH_SIDE) & np.isfinite(pixels).all(1)
-    return Alignment(pixels, sigma, score, found)
+    start: Array,
+    per_sample: Array,
+    visible: NDArray[np.bool_],
+    facing: Array,
+    inverse_hessian: Array,
+    shift: Array,
+    ended: Array,
+    least: float,
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """The parts of an `Alignment`, of where shifts (N, 2), samples, have ended (N, 3), as `descend` answers."""
+    pixels, sigma, found = np.empty_like(start), np.empty(len(start)), np.zeros(len(start), np.bool_)
+    for n in range(len(start)):
+        step, inverse = per_sample[n], inverse_hessian[n]
+        score, contrast, rest = ended[n, 0], ended[n, 1], ended[n, 2]
+        across = step[0, 0] * shift[n, 0] + step[0, 1] * shift[n, 1]
+        down = step[1, 0] * shift[n, 0] + step[1, 1] * shift[n, 1]
+        pixels[n, 0], pixels[n, 1] = start[n, 0] + across, start[n, 1] + down
+        noise = 2 * (1 - min(max(score, -1.0), 1.0)) * 2.0  # variance per sample; neighbours share noise, hence the two
+        per_pixel = 0.0  # the trace of step @ inverse @ step.T
+        for i in range(2):
+            for j in range(2):
+                per_pixel += (step[i, 0] * inverse[0, j] + step[i, 1] * inverse[1, j]) * step[i, j]
+        sidelong = min(max(facing[n], MIN_FACING), 1.0)
+        bent = RELIEF_PX**2 * (1 / sidelong**2 - 1)  # the tangent's square
+        white = max(noise * per_pixel / 2, MIN_ALIGNMENT_SIGMA_PX**2)
+        sigma[n] = np.sqrt(white + rest**2 + bent)
+        near = np.sqrt(across * across + down * down) < 3 * PATCH_SIDE  # false where it is not finite
+        found[n] = visible[n] and score > least and contrast > MIN_PATCH_CONTRAST and near
+    return pixels, sigma, ended[:, 0].copy(), found

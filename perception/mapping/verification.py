@@ -35,7 +35,8 @@ from perception.mapping.patches import (
     cut_templates,
     grain_of,
     project_squares,
-    sample,
+    project_tracks_into,
+    sample_each,
 )
 
 NEAR_ALIASES = 4  # looked at in every frame set, the nearest: all of them when the surface looks odd,
@@ -269,10 +270,7 @@ class Grain:
         self._extend(templates.picture)
         self._newest = None
         some = tracks.only(tracks.track % GRAIN_STRIDE == 0)
-        seen = np.zeros((len(some), 3))
-        for c, images in pyramids.items():
-            mine = some.camera == c
-            seen[mine] = self._look(c, images, some.only(mine), pose, surface_map, templates.axes)
+        seen = self._look(pyramids, some, pose, surface_map, templates.axes)
         camera, landmark = some.camera, some.track
         self._newest = camera, landmark, seen
         usual = self._usual[camera, landmark]
@@ -316,16 +314,20 @@ class Grain:
             self._first = np.concatenate([self._first, new])
 
     def _look(
-        self, camera: int, images: Pyramid, tracks: Observations, pose: Array, surface_map: SurfaceMap, axes: Array
+        self,
+        pyramids: Mapping[int, Pyramid],
+        tracks: Observations,
+        pose: Array,
+        surface_map: SurfaceMap,
+        axes: Array,
     ) -> Array:
-        """(N, 3) of a camera's tracks: grain along the first picture, energy of all grain, contrast; grey levels."""
-        rows = tracks.track
-        if not len(rows):
-            return np.zeros((0, 3))
-        points, normals = surface_map.points[rows], surface_map.normals[rows]
-        where = project_squares(self._lenses, camera, pose, points, normals, axes[rows])
+        """(N, 3) of tracks: grain along the first picture, energy of all grain, contrast; grey levels."""
+        rows, camera = tracks.track, tracks.camera
+        poses = np.broadcast_to(pose, (len(self._lenses.rig), 4, 4))
+        squares = surface_map.points[rows], surface_map.normals[rows], axes[rows]
+        where = project_tracks_into(self._lenses, camera, poses, *squares)
         imaged = self._lenses.image(camera, tracks.pixels, np.full(len(rows), np.inf))[0]
-        levels = sample(images[0], imaged, where.per_sample)
+        levels = sample_each(pyramids, camera, imaged, where.per_sample)
         grain = grain_of(levels)
         along = np.einsum("ns,ns->n", grain, self._first[rows])
         return np.stack([along, np.einsum("ns,ns->n", grain, grain), levels.std(1)], -1)

@@ -46,6 +46,7 @@ ROUGH_START_SCALES = 4.0, 1.0  # of a fit whose start may be pixels off
 # One sigma of the prediction, px: alignment reaches three of it, on the full image and on the half-size one.
 FINE_REACH_PX, COARSE_REACH_PX = 0.8, 2.5
 MAX_PROBE_OFFSET_PX = 0.5  # by which a camera may stand off the pose: beyond, its own pose is asked for
+PARALLEL_BYTES = 4e6  # of all pictures: smaller ones are grey sooner than another thread begins
 FULL_SEARCH_INTERVAL = 10  # frame sets of an absent surface between searches at full size: a far one needs it
 
 
@@ -198,10 +199,11 @@ class TrackingStep:
 
     def _pyramids(self, frames: FrameSet) -> dict[int, Pyramid]:
         """The new pictures by camera; with a repeated one the surface would seem to stand still."""
-        greys = parallel_map(lambda image: self._prefilter(grey(image)), [f.image for f in frames.frames])
-        images = {f.camera: image for f, image in zip(frames.frames, greys, strict=True)}
-        fresh = {c: Pyramid(image) for c, image in images.items() if self._is_new(c, image)}
-        self._estimator.health.set_pictures(fresh, images.keys() - fresh.keys())
+        pictures, cameras = [f.image for f in frames.frames], [f.camera for f in frames.frames]
+        alone = sum(image.size for image in pictures) < PARALLEL_BYTES and self._prefilter is unfiltered
+        greys = [*map(grey, pictures)] if alone else parallel_map(lambda image: self._prefilter(grey(image)), pictures)
+        fresh = {c: Pyramid(image) for c, image in zip(cameras, greys, strict=True) if self._is_new(c, image)}
+        self._estimator.health.set_pictures(fresh, set(cameras) - fresh.keys())
         return fresh
 
     def _add_time(self, stage: str) -> None:
@@ -215,8 +217,8 @@ class TrackingStep:
         started = self._mapping.start(frames, pyramids)
         self._add_time("search")
         if isinstance(started, str):
-            nothing = no_observations(frames.stamp), np.zeros(len(self.rig), np.int64)
-            return identity_pose(frames.stamp, started), *nothing
+            none = np.zeros(len(self.rig), np.int64)
+            return identity_pose(frames.stamp, started), no_observations(frames.stamp), none
         self._matcher, pose, tracked = started
         self._forget_looks()
         return pose, tracked.observations, tracked.fit.used
@@ -364,11 +366,9 @@ class TrackingStep:
         first map does not wait for that: it is worth little until two cameras have seen it again.
         """
         tracked = self._realign(tracked, tracked.fit.solution.base_from_surface if tracked.fit.measured else predicted)
-        needed = min(2, len(tracked.pyramids))
-        if not self._estimator.confirmed and len(self._carrying_cameras(tracked)) < needed:
-            place = self._search.find(tracked.pyramids)
-            if place is not None:
-                tracked = self._realign(tracked, place.base_from_surface, place.single)
+        unsure = not self._estimator.confirmed and len(self._carrying_cameras(tracked)) < min(2, len(tracked.pyramids))
+        if unsure and (place := self._search.find(tracked.pyramids)) is not None:
+            tracked = self._realign(tracked, place.base_from_surface, place.single)
         return tracked
 
     def _realign(self, tracked: TrackedSet, start: Array, single: dict[int, Array] | None = None) -> TrackedSet:
