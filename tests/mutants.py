@@ -419,8 +419,8 @@ MUTANTS = (
     Mutant(
         "shadows over dark tissue move its colours",
         "perception/mapping/masks.py",
-        "light = LIGHT_SIGMA * dark[p]",
-        "light = 0 * dark[p]",
+        "light = LIGHT_SIGMA * dark[k, p]",
+        "light = 0 * dark[k, p]",
         ("test_colours.py::test_a_shadow_over_dark_tissue_is_no_displacement",),
     ),
     Mutant(
