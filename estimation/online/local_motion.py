@@ -142,13 +142,14 @@ class LocalMotion:
         size, square = np.linalg.norm(shift, axis=1) - smear, (shift * plain).sum(1)
         known = (weight > 0) & (self._looks >= MIN_LANDMARK_SETS) & (size < MAX_SMALL_MM)
         top = np.flatnonzero(known & (square > ONSET_CHI2) & (size > CLEAR_DISPLACEMENT_MM))
-        beside = np.flatnonzero(known & (square > END_CHI2) & (size > MIN_DISPLACEMENT_MM))
-        away = np.linalg.norm(self._points[top, None] - self._points[beside], axis=2)
-        way = shift / np.maximum(np.linalg.norm(shift, axis=1), 1e-9)[:, None]
-        along = (away < SMALL_MM) & (top[:, None] != beside) & (way[top] @ way[beside].T > MIN_COSINE)
         self._small[known & (size < MIN_DISPLACEMENT_MM)] = 0.0
         stands = np.zeros(len(size), bool)
-        stands[top[along.any(1)]] = True
+        if len(top):
+            beside = np.flatnonzero(known & (square > END_CHI2) & (size > MIN_DISPLACEMENT_MM))
+            away = np.linalg.norm(self._points[top, None] - self._points[beside], axis=2)
+            way = shift / np.maximum(np.linalg.norm(shift, axis=1), 1e-9)[:, None]
+            along = (away < SMALL_MM) & (top[:, None] != beside) & (way[top] @ way[beside].T > MIN_COSINE)
+            stands[top[along.any(1)]] = True
         again = stands & self._stood
         self._small[again], self._stood = (size + smear)[again], stands
 

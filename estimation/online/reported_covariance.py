@@ -192,7 +192,8 @@ class ReportedCovariance:
         covariance that of `pose` is made.
         """
         parts = fit.parts
-        own = self.error(window.covariance, parts, cameras.offset, cameras)
+        rescaled = rescaling(parts.noise, self._noise(parts, cameras))
+        own = self.error(window.covariance, parts, cameras.offset, cameras, rescaled)
         drifted = self._drift.variance * parts.by_shift @ parts.by_shift.T
         self._added = self._tracks.lasting * parts.scatter * parts.tracks + drifted
         change = own - window.covariance - parts.smear + drifted
@@ -202,16 +203,23 @@ class ReportedCovariance:
             assert fit.solution.shared is not None
             self._first = window.covariance, parts, cameras.offset
             self._drift.start(fit.solution.shared, cameras.shift)
-        return replace(widened(pose, (change + change.T) / 2), twist_covariance=self._of_twist(window, parts, cameras))
+        return replace(widened(pose, (change + change.T) / 2), twist_covariance=self._of_twist(window, parts, rescaled))
 
-    def error(self, marginal: Array, parts: FitCovariance, corrected: Array, cameras: CameraErrors) -> Array:
+    def error(
+        self,
+        marginal: Array,
+        parts: FitCovariance,
+        corrected: Array,
+        cameras: CameraErrors,
+        rescaled: Array | None = None,
+    ) -> Array:
         """Covariance (6, 6) of a pose, map and lenses apart, by what is known of tracks, images and clocks now.
 
         marginal: (6, 6), the window's. parts: of the newest of the fits averaged there. corrected: (C,) s, the delays
         that were taken out of them. The error of the first pose was drawn once and stays; its size is known better
-        with every frame set.
+        with every frame set. rescaled: (6, 6) from the noise believed to that known now, where it is there already.
         """
-        rescaled = rescaling(parts.noise, self._noise(parts, cameras))
+        rescaled = rescaling(parts.noise, self._noise(parts, cameras)) if rescaled is None else rescaled
         late = parts.by_delay @ cameras.beyond(corrected) @ parts.by_delay.T
         lasting = self._tracks.lasting * parts.scatter * parts.tracks
         return np.asarray(rescaled @ marginal @ rescaled.T + lasting + late)
@@ -221,9 +229,12 @@ class ReportedCovariance:
         shifted = cameras.unrest * parts.by_shift @ parts.by_shift.T
         return np.asarray(self._tracks.new * parts.scatter * parts.tracks + shifted)
 
-    def _of_twist(self, window: WindowEstimate, parts: FitCovariance, cameras: CameraErrors) -> Array:
-        """(6, 6) of the window's twist: by noise and late exposures as known now, and by motion as hindsight shows."""
-        claimed, rescaled = window.twist_covariance, rescaling(parts.noise, self._noise(parts, cameras))
+    def _of_twist(self, window: WindowEstimate, parts: FitCovariance, rescaled: Array) -> Array:
+        """(6, 6) of the window's twist: by noise and late exposures as known now, and by motion as hindsight shows.
+
+        rescaled: as `error` takes it.
+        """
+        claimed = window.twist_covariance
         by_pose = np.sqrt(np.diag(claimed) / np.diag(parts.noise))  # 1/s, of the window's noise
         by_noise = rescaled @ claimed @ rescaled.T + by_pose[:, None] * parts.smear * by_pose
         by_noise = NOISE_SHARE_OF_TWIST * by_noise
