@@ -74,10 +74,26 @@ def test_the_roundness_of_a_body_is_no_depression(sign: float) -> None:
     x, y = np.moveaxis(grid.nodes, -1, 0)
     bowl = sign * (x * x / 90 + y * y / 160) + 0.3 * x
     known = np.ones(grid.shape, bool)
-    assert all(d.depth < 0.05 for d in depressions(grid, bowl, known, 3))
+    assert all(d.depth < 0.05 for side in depressions(grid, bowl, known, 3) for d in side)
     pit = bowl - 3.0 * (np.hypot(x - 6, y + 4) < 8)
-    (found,) = depressions(grid, pit, known, 1)
+    (found,), _ = depressions(grid, pit, known, 1)
     assert np.hypot(found.middle[0] - 6, found.middle[1] + 4) < 2 and found.depth > 1.5
+
+
+def test_bulges_are_the_depressions_of_the_same_heights_turned_over() -> None:
+    grid = grid_over([-40, -30], [40, 30], 1.0)
+    x, y = np.moveaxis(grid.nodes, -1, 0)
+    heights = 7 + 0.1 * x + 2.0 * (np.hypot(x - 12, y + 4) < 6) - 1.5 * (np.hypot(x + 14, y) < 8)
+    known = (x < 33) | (y > 0)
+    for one, other in zip(depressions(grid, heights, known, 4), depressions(grid, -heights, known, 4)[::-1], strict=True):
+        np.testing.assert_allclose(
+            [[*a.middle, *a.slope, a.radius, a.depth, a.clarity] for a in one],
+            [[*b.middle, *b.slope, b.radius, b.depth, b.clarity] for b in other],
+            atol=1e-9,
+        )
+    hollow, bulge = (side[0] for side in depressions(grid, heights, known, 1))
+    assert np.hypot(hollow.middle[0] + 14, hollow.middle[1]) < 2
+    assert np.hypot(bulge.middle[0] - 12, bulge.middle[1] + 4) < 2
 
 
 @cache

@@ -4,7 +4,8 @@ After Kuipers et al. 2020: where the remaining thickness is no multiple of the s
 or narrower than nominal, or a single bead along the medial axis fills it. The line outside a corner widens into what is
 left open there.
 
-The medial axis comes from the Voronoi diagram of points along the boundary (Brandt and Algazi 1992). Only the part
+The medial axis comes from the Voronoi diagram of points along the boundary (Brandt and Algazi 1992), which is the dual
+of their Delaunay triangles. Only the part
 along which the thickness changes slowly is used: every kink and all noise of a contour adds a branch into its corners.
 """
 
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import QhullError, Voronoi, cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 from shapely.geometry.base import BaseGeometry
 
 from estimation.se3 import Array
@@ -60,24 +61,34 @@ def medial_axis(region: Region, step: float) -> MedialAxis:
     sites = points[np.diff(ring, prepend=-1) == 0]  # a ring repeats its first point
     if len(sites) < 4:
         return EMPTY_AXIS
+    shift = sites.mean(axis=0)  # so that squares keep their digits
+    sites = sites - shift
     try:
-        diagram = Voronoi(sites)
+        mesh = Delaunay(sites)
     except QhullError:  # all on one line: nothing inside
         return EMPTY_AXIS
-    ridge, pair = np.asarray(diagram.ridge_vertices), np.asarray(diagram.ridge_points)
-    bounded = (ridge >= 0).all(axis=1)
-    ridge, pair = ridge[bounded], pair[bounded]
-    chord = np.linalg.norm(sites[pair[:, 0]] - sites[pair[:, 1]], axis=1)
-    radius = np.linalg.norm(diagram.vertices[ridge] - sites[pair[:, :1]], axis=2)  # (E, 2)
-    flat = chord / 2 >= np.sqrt(1 - MAX_RADIUS_SLOPE**2) * radius.max(axis=1)
-    ridge, radius = ridge[flat], radius[flat]
+    middles, radii = _circumscribed(sites[mesh.simplices])
+    own, beside = np.nonzero(mesh.neighbors > np.arange(len(radii))[:, None])  # each two triangles with an edge, once
+    edges = np.stack([own, mesh.neighbors[own, beside]], axis=1)
+    ends = sites[mesh.simplices[own[:, None], np.stack([beside - 1, beside - 2], axis=1)]]  # (E, 2, 2), of the edge
+    chord = np.hypot(*(ends[:, 0] - ends[:, 1]).T)
+    edges = edges[chord / 2 >= np.sqrt(1 - MAX_RADIUS_SLOPE**2) * radii[edges].max(axis=1)]
+    middles += shift
     shapely.prepare(region)
-    inside = shapely.contains_xy(region, *diagram.vertices[ridge].reshape(-1, 2).T).reshape(-1, 2).all(axis=1)
-    used, edges = np.unique(ridge[inside], return_inverse=True)
-    edges = edges.reshape(-1, 2)
-    radii = np.zeros(len(used))
-    radii[edges] = radius[inside]
-    return MedialAxis(diagram.vertices[used], radii, edges)
+    inside = shapely.contains_xy(region, *middles[edges].reshape(-1, 2).T).reshape(-1, 2).all(axis=1)
+    used, edges = np.unique(edges[inside], return_inverse=True)
+    return MedialAxis(middles[used], radii[used], edges.reshape(-1, 2))
+
+
+def _circumscribed(corners: Array) -> tuple[Array, Array]:
+    """Middles (T, 2) and radii (T,) of the circles through the corners (T, 3, 2) of triangles; inf for flat ones."""
+    (bx, by), (cx, cy) = (corners[:, 1:] - corners[:, :1]).transpose(1, 2, 0)
+    b, c, det = bx * bx + by * by, cx * cx + cy * cy, 2 * (bx * cy - by * cx)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        middle = np.stack([(cy * b - by * c) / det, (bx * c - cx * b) / det], axis=1)
+    flat = ~np.isfinite(middle).all(axis=1)
+    middle[flat] = 0.0
+    return corners[:, 0] + middle, np.where(flat, np.inf, np.hypot(*middle.T))
 
 
 def graph_paths(edges: NDArray[np.intp]) -> list[list[int]]:
@@ -178,7 +189,7 @@ def ring_levels(region: Region, lost: float, fit: BeadFit, most: int | None = No
             outer, before = levels[-1], fit.at(len(levels) - 1)
             levels[-1] = RingLevel([widen_ring(ring, gaps, before) for ring in outer.rings], outer.single)
         between = _between(axis, float(fit.outside(len(levels))), here)
-        rings = shapely.get_rings(shapely.get_parts(_simple(middle, spacing)))
+        rings = shapely.get_rings(shapely.get_parts(middle))
         levels.append(RingLevel([_shared(ring, between, here) for ring in rings], own))
         left = _simple(shapely.buffer(left, -spacing, quad_segs=ARC_SEGMENTS), spacing)
     return levels, left
@@ -202,7 +213,7 @@ def _middle(left: Region, single: list[Bead], fit: BeadFit, radius: float) -> Re
         shapely.prepare(lines)
         middle = difference(middle, union_of(rest[shapely.intersects(lines, rest)]))
         middle = shapely.buffer(shapely.buffer(middle, -radius, quad_segs=4), radius, quad_segs=4)
-    parts = shapely.get_parts(middle)
+    parts = shapely.get_parts(_simple(middle, spacing))
     return shapely.multipolygons(parts[shapely.area(parts) > MIN_LOOP_AREA * spacing**2])
 
 

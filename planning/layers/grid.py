@@ -70,11 +70,17 @@ def interpolate(grid: Grid, values: Array, xy: ArrayLike) -> Array:
     u = (np.asarray(xy, float) - grid.origin) / grid.step
     x, y = np.clip(u[:, 0], 0, columns - 1), np.clip(u[:, 1], 0, rows - 1)
     i, j = np.minimum(x.astype(np.int64), columns - 2), np.minimum(y.astype(np.int64), rows - 2)
-    s, t = x - i, y - j
-    flat, k = values.reshape(rows * columns, -1), j * columns + i
-    parts = ((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t)
-    values_at = sum(w[:, None] * flat[k + d] for w, d in zip(parts, (0, 1, columns, columns + 1), strict=True))
-    return np.asarray(values_at).reshape(-1, *values.shape[2:])
+    s, t = (x - i)[:, None], (y - j)[:, None]
+    flat, k = np.asarray(values, float).reshape(rows * columns, -1), j * columns + i
+
+    def mixed(a: Array, b: Array, share: Array) -> Array:  # in place: half the time of a sum of products
+        b -= a
+        b *= share
+        b += a
+        return b
+
+    low, high = (mixed(flat.take(k + d, axis=0), flat.take(k + d + 1, axis=0), s) for d in (0, columns))
+    return np.asarray(mixed(low, high, t)).reshape(-1, *values.shape[2:])
 
 
 def gradient(grid: Grid, values: Array) -> Array:
@@ -235,18 +241,22 @@ class Chart:
 
     def from_plane(self, xy: Array) -> Array:
         """Points (N, 2) in the chart, mm, of points in the plane."""
-        edge = np.clip(xy, self.grid.origin, [self.grid.x[-1], self.grid.y[-1]])
-        return interpolate(self.grid, self.places, xy) + xy - edge
+        return self._beyond(interpolate(self.grid, self.places, xy), xy)
 
     def to_plane(self, uv: Array) -> Array:
         """Points (N, 2) in the plane, mm, of points in the chart."""
-        xy = np.array(uv, float)
+        xy, both = np.array(uv, float), np.concatenate([self.places, self.stretch], axis=-1)
         for _ in range(NEWTON_STEPS):
-            off = uv - self.from_plane(xy)
-            xy = xy + off / interpolate(self.grid, self.stretch, xy)
+            there = interpolate(self.grid, both, xy)
+            off = uv - self._beyond(there[:, :2], xy)
+            xy = xy + off / there[:, 2:]
             if not len(off) or np.abs(off).max() < 1e-6:
                 break
         return xy
+
+    def _beyond(self, places: Array, xy: Array) -> Array:
+        """The places (N, 2) of points in the plane, which go on evenly beyond the grid."""
+        return places + xy - np.clip(xy, self.grid.origin, [self.grid.x[-1], self.grid.y[-1]])
 
 
 def flat_chart(grid: Grid) -> Chart:

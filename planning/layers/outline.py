@@ -280,9 +280,11 @@ class ScanColour:
     shares: Array  # (N,) from 0, skin, to 1, wound; nan where no picture shows it
 
 
-def wound_places(scan: Scan, first: HeightMap, colour: ScanColour | None) -> list[tuple[WoundPlace, OutlinedWound]]:
-    """Places that may be the wound, the best first."""
-    found = depressions(first.grid, first.heights, first.known, MAX_PLACES)
+def wound_places(
+    scan: Scan, first: HeightMap, colour: ScanColour | None
+) -> tuple[list[tuple[WoundPlace, OutlinedWound]], Sequence[Depression]]:
+    """Places that may be the wound, the best first; and the clearest bulges, the clearest first."""
+    found, bulges = depressions(first.grid, first.heights, first.known, MAX_PLACES)
     judged = [
         place
         for each in found
@@ -296,7 +298,7 @@ def wound_places(scan: Scan, first: HeightMap, colour: ScanColour | None) -> lis
         size = np.sqrt(judgement.area)
         if all(np.linalg.norm(middle - k.outline.mean(axis=0)) > 0.5 * max(size, np.sqrt(k.area)) for k, _ in kept):
             kept.append((judgement, place))
-    return kept
+    return kept, bulges
 
 
 def _judged_depression(
@@ -362,27 +364,25 @@ def _coloured(colour: ScanColour, points: Array) -> float:
 
 
 def chosen_place(
-    places: list[tuple[WoundPlace, OutlinedWound]], number: int | None, first: HeightMap, where: object, flipped: bool
-) -> tuple[OutlinedWound, int]:
-    """The place that is clearly the wound, or the one that was named, and how many others there are."""
+    places: list[tuple[WoundPlace, OutlinedWound]], number: int | None, first: HeightMap, where: object, flipped: bool,
+    bulges: Sequence[Depression],
+) -> tuple[OutlinedWound, int]:  # fmt: skip
+    """The place that is clearly the wound, or the one that was named, and how many others there are.
+
+    bulges: of the first map, the clearest first.
+    """
     if number is not None:
         if not 1 <= number <= len(places):
             raise InputError(where, "number of the wound", number, f"1 to {len(places)}, the places that may be it")
         return places[number - 1][1], len(places) - 1
     likely = [p for p in places if p[0].score >= MIN_SCORE]
-    bulge = _clearest_bulge(first)
-    if not likely or (bulge is not None and bulge.clarity > max(p.clarity for p, _ in places)):
+    if not likely or (bulges and bulges[0].clarity > max(p.clarity for p, _ in places)):
         deepest = max((float(np.percentile(p.depth, 99)) for _, p in places), default=0.0)
         raise refusal(first, deepest, where, flipped)
     rivals = [p for p in likely if p[0].score > RIVAL_SHARE * likely[0][0].score]
     if len(rivals) > 1 or likely[0][0].score < SURE_SCORE:
         raise WoundQuestionError(where, [p for p, _ in rivals])
     return likely[0][1], len(likely) - 1
-
-
-def _clearest_bulge(first: HeightMap) -> Depression | None:
-    bulges = depressions(first.grid, -first.heights, first.known, 1)
-    return bulges[0] if bulges else None
 
 
 def refusal(first: HeightMap, depth: float, where: object, flipped: bool) -> InputError:
@@ -393,8 +393,8 @@ def refusal(first: HeightMap, depth: float, where: object, flipped: bool) -> Inp
         return InputError(where, "scan", f"{width:.3g} x {height:.3g} mm that hardly hang together", allowed)
     got = f"none found: no hollow with a steep rim; the deepest is {max(depth, 0):.2g} mm under the skin around it"
     allowed = f"{MIN_AREA:g} mm^2 deeper than {MIN_DEPTH:g} mm, with a rim; or --outline, or --clicks"
-    bulge = _clearest_bulge(first)
-    if bulge is not None and bulge.depth > MIN_DEPTH and bulge.clarity > INSIDE_OUT_CLARITY:
+    _, bulges = depressions(first.grid, first.heights, first.known, 1)
+    if bulges and bulges[0].depth > MIN_DEPTH and bulges[0].clarity > INSIDE_OUT_CLARITY:
         inside_out = "leave --flip out" if flipped else "if it was scanned inside out, say --flip"
-        allowed += f"; it bulges by {bulge.depth:.2g} mm: {inside_out}"
+        allowed += f"; it bulges by {bulges[0].depth:.2g} mm: {inside_out}"
     return InputError(where, "wound", got, allowed)

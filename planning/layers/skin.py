@@ -18,9 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import maximum_filter
-from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -269,6 +269,7 @@ DISC_RADII = (4.0, 6.0, 9.0, 13.0, 18.0, 25.0, 34.0)  # mm
 RING_GAP, RING_SCALE, RING_WIDTH = 1.5, 1.5, 6.0  # mm outside the disc, to so many radii and mm more
 DISC_STEP = 1.5  # mm between nodes where they are looked for
 MIN_RING_SHARE, MIN_DISC_SHARE = 0.6, 0.5  # of the ring and of the disc that must have been scanned
+QUADRIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y in its terms
 MIN_UNEVENNESS = 0.15  # mm, of the ring about its quadric: a smoother one is no surer
 
 
@@ -283,17 +284,27 @@ class Depression:
     clarity: float  # depth over the unevenness of the ring
 
 
-def depressions(grid: Grid, heights: Array, known: Mask, most: int) -> Sequence[Depression]:
-    """The clearest depressions of heights (H, W) where `known` (H, W), none in another's disc, the clearest first."""
+def depressions(
+    grid: Grid, heights: Array, known: Mask, most: int
+) -> tuple[Sequence[Depression], Sequence[Depression]]:
+    """The clearest depressions of heights (H, W) where `known` (H, W), none in another's disc, the clearest first.
+
+    And as many bulges, which are the depressions of the same heights turned over.
+    """
     coarse = grid.coarser(max(DISC_STEP, grid.step))
     nodes = coarse.nodes.reshape(-1, 2)
     values = interpolate(grid, heights, nodes).reshape(coarse.shape)
     valid = interpolate(grid, known.astype(float), nodes).reshape(coarse.shape) > 0.99
     if not valid.any():
-        return []
+        return [], []
     level = float(values[valid].mean())  # sums of squares keep their digits
     values = np.where(valid, values - level, 0.0)
-    found = [each for radius in DISC_RADII for each in _at_scale(coarse, values, valid, radius, level)]
+    found = [_at_scale(coarse, values, valid, radius, level) for radius in DISC_RADII]
+    hollows, bulges = (_clearest([each for scale in found for each in scale[k]], most) for k in range(2))
+    return hollows, bulges
+
+
+def _clearest(found: Sequence[Depression], most: int) -> Sequence[Depression]:
     chosen = list[Depression]()
     for each in sorted(found, key=lambda d: -d.clarity * np.sqrt(d.radius)):
         apart = [np.hypot(each.middle[0] - c.middle[0], each.middle[1] - c.middle[1]) for c in chosen]
@@ -304,50 +315,61 @@ def depressions(grid: Grid, heights: Array, known: Mask, most: int) -> Sequence[
     return chosen
 
 
-def _at_scale(grid: Grid, values: Array, valid: Mask, radius: float, level: float) -> Sequence[Depression]:
-    """The local best discs of one radius (mm)."""
+def _at_scale(
+    grid: Grid, values: Array, valid: Mask, radius: float, level: float
+) -> tuple[Sequence[Depression], Sequence[Depression]]:
+    """The local best discs of one radius (mm), hollow and bulging.
+
+    values: (H, W) mm over `level`, 0 where not valid.
+    """
     reach = RING_SCALE * radius + RING_WIDTH
     half = int(np.ceil(reach / grid.step))
     if 2 * half + 1 > 2 * max(grid.shape):
-        return []
+        return [], []
     x, y = np.meshgrid(*[np.arange(-half, half + 1) * grid.step / reach] * 2)
     far = np.hypot(x, y) * reach
     ring, disc = ((far >= radius + RING_GAP) & (far <= reach)).astype(float), (far <= radius).astype(float)
-    terms = [np.ones_like(x), x, y, x * x, x * y, y * y]
-    there = valid.astype(float)
-    around = [fftconvolve(there, _mirrored(ring), "same"), fftconvolve(there, _mirrored(disc), "same")]
-    enough = (around[0] > MIN_RING_SHARE * ring.sum()) & (around[1] > MIN_DISC_SHARE * disc.sum())
+    size = tuple(next_fast_len(n + 2 * half, real=True) for n in grid.shape)
+
+    def spectrum(field: Array) -> Array:
+        return np.asarray(rfft2(field, size))
+
+    def sums(field: Array, weight: Array) -> Array:  # (H, W) of a field's spectrum times a weight's around each node
+        return np.asarray(irfft2(field * weight.conj(), size)[: grid.shape[0], : grid.shape[1]])
+
+    there, height, square = (spectrum(np.pad(f, half)) for f in (valid.astype(float), values, values**2))
+    rings = {(a, b): spectrum(ring * x**a * y**b) for a in range(5) for b in range(5 - a)}
+    discs = {powers: spectrum(disc * x ** powers[0] * y ** powers[1]) for powers in QUADRIC}
+    enough = sums(there, rings[0, 0]) > MIN_RING_SHARE * ring.sum()
+    enough &= sums(there, discs[0, 0]) > MIN_DISC_SHARE * disc.sum()
     rows, columns = np.nonzero(enough)
     if not len(rows):
-        return []
-
-    def sums(field: Array, weight: Array) -> Array:
-        return np.asarray(fftconvolve(field, _mirrored(weight), "same"))[rows, columns]
-
-    normal = np.empty((len(rows), 6, 6))
-    for i in range(6):
-        for j in range(i, 6):
-            normal[:, i, j] = normal[:, j, i] = sums(there, ring * terms[i] * terms[j])
-    right = np.stack([sums(values, ring * term) for term in terms], axis=1)
+        return [], []
+    moments = {powers: sums(there, weight)[rows, columns] for powers, weight in rings.items()}
+    normal = np.stack([np.stack([moments[a + c, b + d] for c, d in QUADRIC], axis=1) for a, b in QUADRIC], axis=1)
+    right = np.stack([sums(height, rings[powers])[rows, columns] for powers in QUADRIC], axis=1)
     fit = np.linalg.solve(normal + 1e-9 * np.eye(6), right[..., None])[..., 0]
-    spread = np.sqrt(np.maximum(sums(values**2, ring) - np.einsum("ni,ni->n", fit, right), 0) / normal[:, 0, 0])
-    inside = np.stack([sums(there, disc * term) for term in terms], axis=1)
+    off = sums(square, rings[0, 0])[rows, columns] - np.einsum("ni,ni->n", fit, right)
+    spread = np.sqrt(np.maximum(off, 0) / normal[:, 0, 0])
+    inside = np.stack([sums(there, discs[powers])[rows, columns] for powers in QUADRIC], axis=1)
     slope = fit[:, 1:3] / reach
     cosine = 1 / np.sqrt(1 + (slope**2).sum(axis=1))
-    depth = (np.einsum("ni,ni->n", fit, inside) - sums(values, disc)) / inside[:, 0] * cosine
+    own = sums(height, discs[0, 0])[rows, columns]
+    depth = (np.einsum("ni,ni->n", fit, inside) - own) / inside[:, 0] * cosine
     clarity = np.full(grid.shape, -np.inf)
     clarity[rows, columns] = depth / (spread * cosine + MIN_UNEVENNESS)
-    size = 2 * max(1, round(radius / 2 / grid.step)) + 1
-    best = (clarity == maximum_filter(clarity, size=size)) & (clarity > 0)
-    return [
-        Depression(
-            (float(grid.x[columns[k]]), float(grid.y[rows[k]]), float(fit[k, 0] + level)),
-            (float(slope[k, 0]), float(slope[k, 1])), radius, float(depth[k]), float(clarity[rows[k], columns[k]]),
-        )
-        for k in np.flatnonzero(best[rows, columns])
-    ]  # fmt: skip
+    across = 2 * max(1, round(radius / 2 / grid.step)) + 1
 
+    def best(side: float) -> Sequence[Depression]:
+        clear = np.where(np.isfinite(clarity), side * clarity, -np.inf)
+        chosen = (clear == maximum_filter(clear, size=across)) & (clear > 0)
+        return [
+            Depression(
+                (float(grid.x[columns[k]]), float(grid.y[rows[k]]), float(side * (fit[k, 0] + level))),
+                (float(side * slope[k, 0]), float(side * slope[k, 1])),
+                radius, float(side * depth[k]), float(clear[rows[k], columns[k]]),
+            )
+            for k in np.flatnonzero(chosen[rows, columns])
+        ]  # fmt: skip
 
-def _mirrored(weight: Array) -> Array:
-    """The kernel whose convolution is the correlation with `weight`."""
-    return np.asarray(weight[::-1, ::-1])
+    return best(1.0), best(-1.0)

@@ -120,8 +120,8 @@ def find_wound(
     else:
         axes = axes_along(mean_normal(scan.vertices, scan.triangles, where), np.eye(3)[0])
         first = height_map(scan, se3.make(axes, scan.vertices.mean(axis=0)), SEARCH_STEP)
-        places = wound_places(scan, first, colour)
-        place, others = chosen_place(places, number, first, where, flipped)
+        places, bulges = wound_places(scan, first, colour)
+        place, others = chosen_place(places, number, first, where, flipped, bulges)
     surface_from_plane = _plane_over(place)
     coarse = place.fine
     turn = se3.inverse(surface_from_plane) @ coarse.surface_from_plane
