@@ -85,7 +85,9 @@ def test_bulges_are_the_depressions_of_the_same_heights_turned_over() -> None:
     x, y = np.moveaxis(grid.nodes, -1, 0)
     heights = 7 + 0.1 * x + 2.0 * (np.hypot(x - 12, y + 4) < 6) - 1.5 * (np.hypot(x + 14, y) < 8)
     known = (x < 33) | (y > 0)
-    for one, other in zip(depressions(grid, heights, known, 4), depressions(grid, -heights, known, 4)[::-1], strict=True):
+    for one, other in zip(
+        depressions(grid, heights, known, 4), depressions(grid, -heights, known, 4)[::-1], strict=True
+    ):
         np.testing.assert_allclose(
             [[*a.middle, *a.slope, a.radius, a.depth, a.clarity] for a in one],
             [[*b.middle, *b.slope, b.radius, b.depth, b.clarity] for b in other],
