@@ -68,6 +68,8 @@ LOOP = "stillbed bench loop --scenario breathing_deep -o out/new"
 LIVE = "stillbed bench live --minutes 0.1 --stops 0 --scenario data/live/small.toml"
 KILLED = "stillbed bench live --minutes 0 --stops 0 --kills 1 --seed 21 --scenario data/live/small.toml"
 SIMULATED = "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm"
+STILL = "stillbed bench estimator --only 'still, clean' --seeds 1 --seconds 0.5"
+FAULTS = "python -m tests.campaigns faults --count 1 -o out/faults"
 CLUSTER = "stillbed smooth sessions/ -o out/all --scheduler local --workers 4"
 PAGE = (
     "stillbed live monday/session.toml --page-address 0.0.0.0 --page-port 8443 --page-cert page.pem "
@@ -87,7 +89,9 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench bumps": ("stillbed bench bumps --count 1 --minutes 0.1", LONG),
     "stillbed bench calibration": ("stillbed bench calibration --instants 12 --runs 1", LONG),
     "stillbed bench cameras": ("stillbed bench cameras --minutes 0.05", LONG),
-    "stillbed bench estimator": ("stillbed bench estimator --only 'still, clean' --seeds 1 --seconds 0.5", LONG),
+    "stillbed bench estimator": (STILL, LONG),
+    "stillbed bench estimator --maps told --seeds 8 --seconds 5 --only 'still*'": (STILL, LONG),
+    "stillbed bench estimator --maps told seen --seeds 2": (STILL, LONG),
     "stillbed bench estimator --only 'breathing, [cno]*' --maps seen --seeds 2 --seconds 6": (
         "stillbed bench estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
         LONG,
@@ -108,7 +112,11 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench live --minutes 60 --stops 6": (LIVE, STARTED),
     "stillbed bench loop": (LOOP, LONG),
     "stillbed bench loop -o OUT": (LOOP, LONG),
+    "stillbed bench live --minutes 1 --busy 2 --scenario data/live/small.toml": (f"{LIVE} --busy 1", STARTED),
+    "stillbed bench look": ("stillbed bench look --layers 1", LONG),
     "stillbed bench map": ("stillbed bench map --seconds 2", LONG),
+    "stillbed bench plan": ("stillbed bench plan --body foot", "on a smaller wound"),
+    "stillbed bench planner": ("stillbed bench planner --updates 20", LONG),
     "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
     "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 2", LONG),
     "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),
@@ -117,6 +125,7 @@ INSTEAD = {  # (what is run in its place, why)
         "stillbed bench segmentation dataset --rendered 1 --areas 1",
         "has a small one",
     ),
+    "stillbed bench segmentation --areas 40": ("stillbed bench segmentation --areas 1", LONG),
     "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand "
     "breathing_calm breathing_deep turns steps_300um camera_lost --rendered 6": (
         "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",
@@ -185,12 +194,36 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed live --resume out/run.mcap": ("stillbed live --resume run.mcap", "the same outside of a folder"),
     "stillbed smooth sessions/ -o out/all --scheduler tcp://cluster:8786": (CLUSTER, "a cluster of one's own"),
     **{
-        f"make {target}": (f"make --dry-run {target}", INSTALLS)
-        for target in (
-            *("audit", "bench", "check", "demo", "fuzz", "hazards", "outages", "references", "slow", "test"),
-            "test PYTHON=python3.12",
+        f"python -m tests.campaigns faults{size}": (FAULTS, LONG)
+        for size in (
+            *("", " --count 147 --seed 1", " --count 42 --seed 1", " --count 5663 --seed 1"),
+            " --count 10000 --jobs 2 --log faults.csv",
+            " --count 10000 --jobs 2 --log faults.csv -o out/faults",
         )
     },
+    **{
+        f"python -m tests.campaigns fuzz --count {count}": ("python -m tests.campaigns fuzz --count 60", LONG)
+        for count in (20000, 1000000)
+    },
+    "python -m tests.campaigns guard --commands 1000000": ("python -m tests.campaigns guard --commands 2000", LONG),
+    "python -m tests.campaigns link --hours 24": ("python -m tests.campaigns link --hours 0.01", LONG),
+    "python -m tests.campaigns outages": ("python -m tests.campaigns outages --count 1", LONG),
+    "python -m tests.campaigns outages --count 1000 --seed 1": ("python -m tests.campaigns outages --count 1", LONG),
+    **{
+        f"make {target}": (f"make --dry-run {target}", INSTALLS)
+        for target in (
+            *("audit", "bench", "check", "counterparts", "deceit", "demo", "docs", "fuzz", "hazards", "mutants"),
+            *("outages", "references", "slow", "test", "test PYTHON=python3.12"),
+        )
+    },
+}
+LONG_KINDS = "make ", "pip ", "python -m tests.", "stillbed bench "  # these install or take long, unless said otherwise
+SHORT = {  # of these kinds, and no longer than it may take as it stands
+    "python -m tests.campaigns",
+    "stillbed bench --list",
+    "stillbed bench consistency --scenes 1 --seconds 4",
+    "stillbed bench fill --count 0 --picture docs/patterns.svg",
+    "stillbed bench smoothing --movements still sway --seeds 1 --seconds 4",
 }
 MOVED = "tests/test_arm_console.py moves a virtual arm before cameras that see its needle, which takes a minute"
 RECORDED = "--cameras rig.toml --record"
@@ -203,6 +236,10 @@ MADE = (  # by these tests/workspace.py makes what the others name
 )
 TRAINED = "tests/test_training.py trains, where torch is installed"
 NOT_RUN = {  # and why not
+    "pip install 'stillbed[franka]'": "installs from a network",
+    "python -m tests.campaigns.three_cameras": "needs Aravis's cameras; `make counterparts` runs the tests with them",
+    "python -m tests.dependency_table": "tests/test_shipped.py asks whether what it would write is there",
+    "python -m tests.stop_latency": "needs a machine with little else to do for minutes",
     "pip install -c constraints.txt .": "installs what the tests run with, from a network",
     "stillbed bench --all": "tests/test_bench.py runs the whole with small parts; all of them take 20 minutes",
     "stillbed bench --quick": "the same of fewer",

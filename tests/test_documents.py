@@ -15,7 +15,7 @@ from hardware.cli.main import main
 from tests.api_links import broken_links
 from tests.campaigns.__main__ import CAMPAIGNS
 from tests.documents import DOCUMENTS, ROOT, commands, leaf, parser, shown, subject_parser
-from tests.shown_commands import COMPLETED, INSTEAD, MADE, NAMES, NOT_RUN, to_run
+from tests.shown_commands import COMPLETED, INSTEAD, LONG_KINDS, MADE, NAMES, NOT_RUN, SHORT, to_run
 
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 
@@ -95,9 +95,10 @@ def test_every_page_can_be_found_from_the_first() -> None:
 def test_each_command_is_run_as_it_stands_or_in_another_way_that_is_told() -> None:
     """By tests/test_examples.py: a new one is run as it stands, with values for its placeholders."""
     texts = {text for _, text in commands()}
-    tables = [NAMES, COMPLETED, INSTEAD, NOT_RUN]
+    tables = [NAMES, COMPLETED, INSTEAD, NOT_RUN, SHORT]
     told = [text for table in tables for text in table]
     assert len(told) == len(set(told)) and set(told) <= texts
+    assert {text for text in texts if text.startswith(LONG_KINDS)} <= set(told), "in what size are these run?"
     runs = {text: run for text in texts if (run := to_run(text)) is not None}
     asked = {word for run in runs.values() for word in run.split() if re.fullmatch(r"[A-Z_]+(\.\w+)?", word)}
     assert not asked, "a placeholder without a value"

@@ -281,6 +281,8 @@ def every_command_run(text: str, cache: Path) -> int:
     words = shlex.split(text)
     if text.startswith(UNTIL_CTRL_C):
         return run_until_ctrl_c(words)
+    if words[:2] == ["python", "-m"]:
+        return subprocess.run([sys.executable, *words[1:]], check=False).returncode
     if words[0] == "make":
         return subprocess.run(words, cwd=ROOT, capture_output=True, check=False).returncode
     if words[:2] == ["stillbed", "live"]:
