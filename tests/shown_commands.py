@@ -196,7 +196,7 @@ INSTEAD = {  # (what is run in its place, why)
     **{
         f"python -m tests.campaigns faults{size}": (FAULTS, LONG)
         for size in (
-            *("", " --count 147 --seed 1", " --count 42 --seed 1", " --count 5663 --seed 1"),
+            *("", " --count 147 --seed 1", " --count 42 --seed 1", " --count 5663 --seed 1", " --count 1600 --seed 6"),
             " --count 10000 --jobs 2 --log faults.csv",
             " --count 10000 --jobs 2 --log faults.csv -o out/faults",
         )
