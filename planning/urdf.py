@@ -34,6 +34,7 @@ class UrdfArm:
     file: File
     flange: str  # link
     ready: Array  # (J,) rad, the posture that it keeps near
+    text: str = ""  # of the file, where it came along; "": it is read where it is needed
 
 
 class UrdfKinematics:
@@ -44,11 +45,11 @@ class UrdfKinematics:
             import pinocchio
         except ImportError as error:
             raise InputError(arm.file, "kinematics.urdf", "pinocchio is not installed", EXTRA) from error
-        if not arm.file.is_file():
+        if not arm.text and not arm.file.is_file():
             raise InputError(arm.file, "kinematics.urdf", "no such file", "a URDF file beside the arm file")
         try:
-            self._model = pinocchio.buildModelFromUrdf(str(arm.file))
-        except (ValueError, RuntimeError) as error:
+            self._model = pinocchio.buildModelFromXML(arm.text or arm.file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RuntimeError) as error:
             raise InputError(arm.file, "URDF", str(error).splitlines()[0], "a robot of one chain of joints") from error
         if not self._model.existFrame(arm.flange):
             names = ", ".join(frame.name for frame in self._model.frames)

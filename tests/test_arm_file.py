@@ -89,7 +89,7 @@ def test_on_a_slow_line_ticks_and_lag_follow_unless_they_are_given(tmp_path: Pat
     ("text", "words"),
     [
         ("", ["empty"]), ("baud = ", ["syntax"]), ("boud = 9600", ["boud", "did you mean 'baud'"]),
-        ("baud = 9600\ntick_s = 0.049", ["tick", "0.05"]), ("baud = 4800", ["tick", "0.1"]),
+        ("baud = 9600\ntick_s = 0.049", ["tick", "0.05"]), ("baud = 4800", [": baud = 4800", "9600"]),
         ("baud = -1", ["baud", ">= 1"]), ("motion_byte = 2", ["motion_byte", "0 or 1"]),
         ("origin_scale = 2", ["origin_scale", "1 or 10"]), ("pwm = 7", ["pwm", "1500"]),
         ('slots = ["J4", "J4", "J6"]', ["slots", "each once"]), ("slots = 3", ["slots"]),

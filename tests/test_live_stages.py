@@ -47,6 +47,7 @@ from hardware.operator.view import (
 from hardware.process.progress import TimeLeft
 from hardware.report.report import bead_map, track_map
 from planning.command import Hold
+from planning.material import AS_PLANNED
 from planning.path import LOOK, PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
 from tests.moving import raster
@@ -475,6 +476,20 @@ def test_a_guess_is_confirmed_by_nobody_before_it_was_moved(placement: PathPlace
     middle = path_middle(run.conductor.task.path)
     lies = se3.make(turned, middle + [1.0, -2.0, 0.0] - turned @ middle)
     assert begun.path.surface_from_nozzle == pytest.approx(lies @ run.conductor.task.path.surface_from_nozzle, abs=1e-9)
+
+
+def test_a_run_that_resumes_begins_with_the_flows_that_looks_asked_for() -> None:
+    flows = AS_PLANNED, AS_PLANNED.then(AS_PLANNED)
+    run = to_confirm(CERTAIN, flows=flows)
+    run.look()
+    run.look(Wish.CONFIRM)
+    run.look(Wish.START)
+    run.arm = ArmState.ARMED
+    run.look()
+    run.arm = ArmState.DISARMED
+    run.look()
+    at = next(i for i, order in enumerate(run.orders) if isinstance(order, BeginPrint))
+    assert tuple(run.orders[at + 1 : at + 3]) == flows
 
 
 def test_what_cannot_be_placed_is_neither_confirmed_nor_moved_nor_printed() -> None:

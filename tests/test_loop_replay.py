@@ -17,7 +17,7 @@ from estimation.errors import InputError
 from estimation.synthetic.world import arc_rig
 from hardware.arm.protocol import FRAME_LENGTH
 from hardware.cli.main import main
-from hardware.live.recorded_run import PartedError, replay_run
+from hardware.live.recorded_run import PartedError, asked_flows, read_run, replay_run
 from hardware.motion.loop import Order
 from hardware.motion.step import PauseOrder
 from hardware.recording.loop_record import LoopKeeper, LoopRecord
@@ -123,6 +123,8 @@ def test_a_simulated_run_replays_bit_by_bit(recordings: dict[str, tuple[Path, Re
     assert FAULTS[name][1] in said, said
     flows = [text for record in sink.records for *_, kind, given in record.calls if kind == "orders" for text in given]
     assert ("flow" in [text[0] for text in flows]) == ("stopped" in name)
+    asked = [shares.share.tolist() for shares in asked_flows(read_run(file, "/loop"))]
+    assert asked == ([[1.3]] if "stopped" in name else [])  # with which a run that resumes this one begins
 
 
 def test_the_same_in_another_process_with_two_threads(recordings: dict[str, tuple[Path, Recorded]]) -> None:

@@ -11,9 +11,10 @@ import pytest
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.files.arm_file import read_arm, write_arm
+from hardware.files.arm_file import arm_from_text, arm_text, read_arm, write_arm
 from hardware.files.path_file import write_path
 from hardware.offline.reach import ReachQuestion, run_reach
+from hardware.recording.loop_record import recorded_arm
 from planning.urdf import UrdfKinematics
 from tests.franka_bench import fr3
 from tests.moving import raster
@@ -43,6 +44,21 @@ def test_an_arm_file_names_its_urdf_and_comes_back(tmp_path: Path) -> None:
     assert again.urdf.file == profile.urdf.file.resolve() and again.urdf.name == "Franka Research 3"
     assert again.urdf.ready == pytest.approx(profile.urdf.ready)
     assert again.flange_from_nozzle == pytest.approx(profile.flange_from_nozzle)
+
+
+def test_what_a_recording_keeps_of_an_arm_has_its_urdf_where_the_file_is_not(tmp_path: Path) -> None:
+    file = tmp_path / "fr3.urdf"
+    file.write_bytes((FR3.parent / "fr3.urdf").read_bytes())
+    here = read_arm(FR3)
+    assert here.urdf is not None and here.flange_from_nozzle is not None
+    text, kept = recorded_arm(replace(here, urdf=replace(here.urdf, file=file)))
+    file.unlink()
+    assert str(tmp_path) not in text and kept.urdf is not None
+    pytest.importorskip("pinocchio", reason="pinocchio is not installed: make counterparts")
+    there = arm_from_text(arm_text(kept, whole=True), "elsewhere/run.mcap/arm.toml").urdf  # of a run that resumes
+    assert there is not None
+    model, known = (UrdfKinematics(each, here.flange_from_nozzle) for each in (there, here.urdf))
+    assert model.nozzle(known.ready) == pytest.approx(known.nozzle(known.ready), abs=1e-12)
 
 
 @pytest.mark.parametrize(("key", "wrong"), [("urdf", "none.urdf"), ("flange", "link9"), ("ready_deg", [0, 1])])

@@ -24,6 +24,7 @@ from planning.urdf import UrdfArm
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits, a stop bit
 MAX_SERVO_LAG = 0.3  # s: a lag measured beyond this is no servo's
+MAX_TICK = LOOKAHEAD / 2  # s: longer, and the planner's target would pass between two commands
 MAX_LAG = 1.0  # s: nothing moving can be followed that far ahead
 MAX_FLIGHT = 0.5  # s: what is under way cannot be called back by an arm without a stop of its own
 AXIS_LETTERS = "XYZABC"
@@ -78,11 +79,15 @@ class ArmProfile:
     def __post_init__(self) -> None:
         if not self.baud > 0:
             raise InputError("arm profile", "baud", self.baud, "> 0 bits/s")
-        if self.dead_time is not None and not 0 <= self.dead_time <= MAX_LAG:
-            raise InputError("arm profile", "dead_time", self.dead_time, f"0 to {MAX_LAG} s")
+        if self.dead_time is not None and not 0 <= self.dead_time <= MAX_TICK:
+            raise InputError("arm profile", "dead_time", self.dead_time, f"0 to {MAX_TICK} s, the longest tick")
         wire = self.frame_time
-        if not wire <= self.tick <= LOOKAHEAD / 2:
-            allowed = f"{wire:.5f} s, one frame on the wire, to {LOOKAHEAD / 2} s"
+        if wire > MAX_TICK:
+            least = math.ceil(FRAME_LENGTH * BITS_PER_BYTE / MAX_TICK)
+            allowed = f"{least} bits/s or more: a frame takes {wire:.3g} s, and a tick is {MAX_TICK} s at most"
+            raise InputError("arm profile", "baud", self.baud, allowed)
+        if not wire <= self.tick <= MAX_TICK:
+            allowed = f"{wire:.5f} s, one frame on the wire, to {MAX_TICK} s"
             raise InputError("arm profile", "tick", self.tick, allowed)
         if not 0 <= self.lag <= MAX_LAG:
             raise InputError("arm profile", "lag", self.lag, f"0 to {MAX_LAG} s")

@@ -41,11 +41,13 @@ arm_from_foot = [[...], ...]                  # 4x4, mm, from where the table st
 flange_from_nozzle = [[...], ...]             # 4x4, mm
 posture = ["front", "up", "negative"]
 # or, of an arm of another build: name; urdf = "fr3.urdf", beside this file; flange = "link8", the link that carries the
-# tool of flange_from_nozzle; ready_deg = [...], the posture that its joints keep near
+# tool of flange_from_nozzle; ready_deg = [...], the posture that its joints keep near; urdf_text, in a recording: what
+# that file held
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -104,7 +106,9 @@ URDF_KEYS: checks.Keys = {
     "urdf": ("file", lambda where, key, value: Path(str(where)).parent / checks.text(where, key, value)),
     "flange": ("flange", checks.text),
     "ready_deg": ("ready", checks.times(checks.array((None,), "degrees"), _RAD)),
+    "urdf_text": ("text", checks.text),
 }
+URDF_REQUIRED = tuple(key for key in URDF_KEYS if key != "urdf_text")
 
 
 def _kinematics(where: object, key: str, table: object) -> UrdfArm | tuple[JointModel, AngleMode]:
@@ -112,7 +116,7 @@ def _kinematics(where: object, key: str, table: object) -> UrdfArm | tuple[Joint
     if not isinstance(table, dict):
         raise InputError(where, key, table, "a table [kinematics]")
     if "urdf" in table:
-        return checks.record_from_table(where, "kinematics.", table, UrdfArm, URDF_KEYS, URDF_KEYS)
+        return checks.record_from_table(where, "kinematics.", table, UrdfArm, URDF_KEYS, URDF_REQUIRED)
     required = ("name", "dh_mm_deg", *JOINT_KEYS)
     return checks.record_from_table(where, "kinematics.", table, _model, MODEL_KEYS, required)
 
@@ -131,15 +135,20 @@ def _kinematics_lines(arm: SimpleArm) -> list[str]:
     return ["", "[kinematics]", *checks.toml_lines({**head, **joints, **places, "posture": model.posture})]
 
 
-def _urdf_lines(arm: UrdfArm | None) -> list[str]:
-    """The table of such an arm as lines of TOML."""
+def _urdf_lines(arm: UrdfArm | None, whole: bool) -> list[str]:
+    """The table of such an arm as lines of TOML. whole: with the text of the URDF file, and its name alone."""
     if arm is None:
         return []
+    text = arm.text
+    if whole and not text:
+        with suppress(OSError, UnicodeError):  # a run that needs no kinematics did not read it either
+            text = arm.file.read_text(encoding="utf-8")
     values = {
         "name": arm.name,
-        "urdf": str(arm.file.resolve()),
+        "urdf": arm.file.name if text else str(arm.file.resolve()),
         "flange": arm.flange,
         "ready_deg": np.rad2deg(arm.ready),
+        "urdf_text": text or None,
     }
     return ["", "[kinematics]", *checks.toml_lines(values)]
 
@@ -239,8 +248,8 @@ def write_arm(path: str | Path, profile: ArmProfile, remark: str = "") -> None:
     Path(path).write_text(arm_text(profile, remark), encoding="utf-8")
 
 
-def arm_text(profile: ArmProfile, remark: str = "") -> str:
-    """The text of an arm file, as `write_arm` writes it."""
+def arm_text(profile: ArmProfile, remark: str = "", whole: bool = False) -> str:
+    """The text of an arm file, as `write_arm` writes it. whole: it holds its URDF file, for other machines."""
     arm, dialect, limits = profile.arm, profile.dialect, profile.limits
     lean = arm.max_lean and float(np.rad2deg(arm.max_lean))
     values = {
@@ -271,7 +280,7 @@ def arm_text(profile: ArmProfile, remark: str = "") -> str:
         *_part_lines(profile.parts),
         *_no_go_lines(limits.zones),
         *_kinematics_lines(arm),
-        *_urdf_lines(profile.urdf),
+        *_urdf_lines(profile.urdf, whole),
     ]
     return "\n".join(lines) + "\n"
 

@@ -20,7 +20,7 @@ from hardware.process.progress import BAD, DOUBTFUL, GOOD, count_text, painted
 from planning.clearance import GUARD_TOUCH, TissueGuard
 from planning.command import AXIS_MARGIN, JOINT_MARGIN
 from planning.kinematics import axes_from_nozzle, joints_from_axes
-from planning.material import Outlets, with_offsets
+from planning.material import FlowShares, Outlets, with_offsets
 from planning.path import Path, fingerprint
 from planning.placement import NoSurfaceError, PathPlacement, PlacedBy, SurfaceMove, moved_along
 
@@ -48,6 +48,7 @@ class PrintTask:
     looks: bool = False  # whether what is laid can be looked at: the path says how much it is
     outlets: Outlets = field(default_factory=dict)  # of the path's materials
     tissue: TissueGuard | None = None  # that the tool is kept out of, in the path's own frame; None without a scan
+    flows: tuple[FlowShares, ...] = ()  # that looks of the run before asked for, in order
 
     @property
     def fingerprint(self) -> str:

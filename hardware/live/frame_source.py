@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from ctypes import c_bool
 from dataclasses import dataclass, field, replace
-from itertools import dropwhile, takewhile
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray, RawValue
 from pathlib import Path
@@ -17,18 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimation import se3
-from estimation.errors import InputError, StillbedError
+from estimation.errors import StillbedError
 from estimation.se3 import Array
 from hardware.process.clock import WallClock
 from perception.frames import Frame, FrameSet, Image, PrintHead, frame_set
 
 if TYPE_CHECKING:
     from hardware.cameras.feed import LiveHealth
-    from hardware.files.session import Session
-    from hardware.offline.track import FrameSetStep
 
-SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
 RING_SLOTS = 4  # sets: a reader that takes the newest one has 100 ms at 30 fps to copy it, which takes 2
 COLOUR_CHANNELS = 3
 ENCODED_BYTES_PER_PIXEL = 2  # room for an encoded picture: more than any PNG of a camera's picture takes
@@ -201,28 +196,3 @@ class LiveCameraSource:
 
 
 FrameSource = RingSource | LiveCameraSource
-
-
-def restore_map(step: FrameSetStep, record: Path, since: float, until: float, session: Session, shift: float) -> Array:
-    """Give the step the first pictures of an earlier run, so that it maps the same surface; new_from_old (4, 4) mm.
-
-    record, since, until: of the earlier run, s. shift: s, added to their stamps.
-
-    Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
-    runs' poses at the last of them. InputError where the surface is not found in its own pictures.
-    """
-    from hardware.recording.session_reader import read_poses  # of a run that resumes alone
-
-    poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
-    later = dropwhile(lambda frames: frames.stamp < since, session.frame_sets())
-    sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, later)
-    new_from_old: Array | None = None
-    for frames in sets:
-        shifted = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
-        pose, old = step(FrameSet(frames.stamp + shift, shifted, frames.head)), poses.get(frames.stamp)
-        step.idle()
-        if old is not None and old.state.measured and pose.state.measured and old.state is pose.state:
-            new_from_old = se3.inverse(pose.base_from_surface) @ old.base_from_surface
-    if new_from_old is None:
-        raise InputError(record, "recording", "no surface", "pictures in which it is found again")
-    return new_from_old

@@ -11,12 +11,10 @@ from collections import deque
 from logging import WARNING
 from types import FrameType
 
-import numpy as np
-
 from estimation.errors import StillbedError
 from estimation.pose import SurfacePose
 from hardware.arm.device import ArmEvent
-from hardware.arm.profile import ArmProfile, LinkSettings, open_arm
+from hardware.arm.profile import LinkSettings, open_arm
 from hardware.files.dispenser_file import dispensers_from_text, drivers_of
 from hardware.files.path_file import write_progress_durably
 from hardware.live.prepared import Prepared
@@ -34,13 +32,12 @@ from hardware.live.records import (
     WireEntry,
 )
 from hardware.live.trace import MOTION_LANE, ON_WIRE, TraceLane
-from hardware.motion.loop import CommandedPose, MaterialControl, MotionLoop, Order, RecordedTick, Tick
+from hardware.motion.loop import MaterialControl, MotionLoop, Order, RecordedTick, Tick
 from hardware.motion.print_loop import LoopOrder, LoopSettings, PrintLoop
 from hardware.motion.step import BeginPrint, PauseOrder, PoseHandover, PrintMotion
 from hardware.process.clock import WallClock
-from hardware.process.system import Bell, SharedLatest, ask_for_real_time, set_up_process, take_messages
+from hardware.process.system import Bell, ask_for_real_time, set_up_process, take_messages
 from hardware.recording.loop_record import RecordingSource
-from perception.frames import PrintHead
 from planning.material import FlowShares
 from planning.path import Path
 
@@ -208,19 +205,3 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         for entry in reporter.times.entries(clock.now()):
             sender.put(entry)
         sender.close()
-
-
-class CommandedHead:
-    """Where the print head should be, by the newest commands of the motion process."""
-
-    def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
-        self._reports, self._commanded = reports, CommandedPose(profile)
-        self._last = -np.inf
-
-    def at(self, stamp: float) -> PrintHead | None:
-        """The head at `stamp`, s; commands between two looks are on a straight line, 40 ms at most."""
-        report = self._reports.get()
-        if report is not None and report.tick.stamp > self._last and report.progress is not None:
-            self._last = report.tick.stamp
-            self._commanded.add(report.tick.command, self._last)
-        return self._commanded.at(stamp)

@@ -223,6 +223,10 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
     if placement is not None:
         profile = replace(profile, arm=replace(profile.arm, arm_from_base=placement.arm_from_base))
     task = replace(prepared.task, start=start, profile=profile, place=prepared.task.place and placement is None)
+    if settings.adapt:
+        from hardware.live.recorded_run import asked_flows, read_run  # loads OpenCV
+
+        task = replace(task, flows=asked_flows(read_run(record, "/loop")))
     share = start / max(len(path) - 1, 1)
     goes_on = f"goes on at {share:.0%}: checkpoint {start:.2f} of {len(path) - 1}, where {record.name} stopped"
     return replace(prepared, task=task, notes=(goes_on, *prepared.notes))

@@ -26,7 +26,7 @@ from estimation.se3 import Array
 from hardware.files.arm_file import read_arm, write_arm
 from hardware.files.folder_tables import rows_from_trajectory, trajectory_from_rows
 from hardware.files.path_file import read_path, write_path
-from hardware.live.recorded_run import commands_in, read_run
+from hardware.live.recorded_run import asked_flows, commands_in, read_run
 from hardware.process.clock import WallClock
 from hardware.process.faults import FaultPart
 from hardware.process.progress import (
@@ -56,7 +56,6 @@ from hardware.simulator.truth import Truth, TruthLog, drape_path, row_instants
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport, report_without_offsets
-from planning.material import flow_from_message
 from planning.path import PrintPhase
 
 STAMP_DIGITS = 9  # of a truth's stamp: exposures of one instant are one
@@ -199,7 +198,7 @@ def nozzle_errors(
     arm: as it truly stands. InputError without ticks.
     dispenser: what the one that was told truly does; None: it gives each bead what it needs, at once.
     """
-    run = read_run(record, "/tick", "/move", "/truth", "/dispenser", "/look")
+    run = read_run(record, "/tick", "/move", "/truth", "/dispenser", "/loop")
     if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
     true, profile = read_arm(arm), inputs_from_texts(run.texts, record).profile  # tick and lag as the run took them
@@ -213,8 +212,8 @@ def nozzle_errors(
     commands = commands_in(run)
     for command, progress in commands:
         truth_log.write(command, progress)
-    for look in run.messages["/look"]:
-        truth_log.adapt(flow_from_message(look["flow"]) if "flow" in look else None)
+    for shares in asked_flows(run):
+        truth_log.adapt(shares)
     with np.load(executed) as done:
         stamps, axes = done["stamps"], done["axes"]
         deepest, held_up = float(done["deepest"]), float(done["held_up"])

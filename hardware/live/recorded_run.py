@@ -33,7 +33,7 @@ from hardware.recording.messages import (
 )
 from hardware.recording.session_reader import PATH_ATTACHMENT, inputs_from_texts
 from planning.command import Command, Hold
-from planning.material import Outlet, Outlets, SwitchDelay, flow_from_message
+from planning.material import FlowShares, Outlet, Outlets, SwitchDelay, flow_from_message
 from planning.path import PrintPhase, PrintProgress
 
 RUN_REQUIRED = "the recording of a run that began to print, or give --path"
@@ -340,6 +340,13 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
         except PartedError as error:
             parted = str(error)
     return ReplayCount(len(same), same.count(False), run.damage, parted)
+
+
+def asked_flows(run: RecordedRun) -> tuple[FlowShares, ...]:
+    """The flows that a run's loop was asked for, in order, those of the run before it among them; of its /loop."""
+    calls = [call for record in run.messages["/loop"] for call in record["calls"]]
+    orders = [order for _, _, kind, answer in calls if kind == "orders" for order in answer]
+    return tuple(flow_from_message(order[1]) for order in orders if order[0] == "flow")
 
 
 def printed_range(record: File) -> tuple[float, float]:

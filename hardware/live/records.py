@@ -17,9 +17,10 @@ from estimation.pose import SurfacePose
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.device import ArmEvent
+from hardware.arm.profile import ArmProfile
 from hardware.live.frame_source import Encoded, FrameRing
 from hardware.live.trace import TraceBatch
-from hardware.motion.loop import DispenserRecord, MaterialStatus, RecordedTick, Tick
+from hardware.motion.loop import CommandedPose, DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.motion.step import PoseHandover
 from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
 from hardware.process.clock import Histogram
@@ -90,6 +91,22 @@ class LiveMotionReport:
     priority: str  # of the process, as granted
     pose_stamp: float = nan  # s, of the pose that the tick was made of; NaN of none
     lag: float = nan  # s, of the arm, as the motion has it; NaN before a path was begun
+
+
+class CommandedHead:
+    """Where the print head should be, by the newest commands of the motion process."""
+
+    def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
+        self._reports, self._commanded = reports, CommandedPose(profile)
+        self._last = -np.inf
+
+    def at(self, stamp: float) -> PrintHead | None:
+        """The head at `stamp`, s; commands between two looks are on a straight line, 40 ms at most."""
+        report = self._reports.get()
+        if report is not None and report.tick.stamp > self._last and report.progress is not None:
+            self._last = report.tick.stamp
+            self._commanded.add(report.tick.command, self._last)
+        return self._commanded.at(stamp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,7 @@ from hardware.live.checklist import (
 )
 from hardware.live.records import LiveMotionReport, RunReports, TrackingReport
 from hardware.motion.loop import Order
+from hardware.motion.print_loop import LoopOrder
 from hardware.motion.step import BeginPrint, PauseOrder
 from hardware.operator.shared_state import OperatorRequest, Polygons
 from hardware.operator.view import (
@@ -49,7 +50,7 @@ OUTLINED_TEXT = "inside the outline that the operator corrected"
 ARM_BACK_TEXT = "the arm is back: resume, or go home first"
 ARM_UNPLACED_TEXT = "the arm is back and does not say where it stands: move it to its home by hand, then ask for Home"
 
-Orders = list[Order | PauseOrder | BeginPrint]
+Orders = list[LoopOrder]
 
 
 @dataclass(slots=True)
@@ -322,14 +323,13 @@ class RunStateMachine:
         """
         if self._begun:
             return []
-        assert self.placed_path is not None
+        assert self.placed_path is not None and self.placement is not None
         self._begun = True
         task, profile, status = self.task, self.placed_path.profile, motion.tick.status
         path = self.placed_path.path if task.lift is None else raised_path(self.placed_path.path, task.lift)
         profile = replace(in_step(profile, interval), lag=measured_lag(task.profile, status.lag))
-        assert self.placement is not None
         tissue = None if task.tissue is None else task.tissue.moved(self.placement.surface_from_path)
-        return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint, tissue)]
+        return [BeginPrint(path, profile, task.start, task.outlets, task.fingerprint, tissue), *task.flows]
 
     def _follow_print(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
         progress = motion.progress

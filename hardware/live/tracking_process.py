@@ -22,18 +22,11 @@ from estimation.se3 import Array
 from hardware.files.mesh_file import read_mesh
 from hardware.files.rig_file import agreed_scan
 from hardware.files.session import Session, head_from_row, row_from_head
-from hardware.live.frame_source import (
-    SETTLING_TIME,
-    FrameSource,
-    LiveCameraSource,
-    RingSource,
-    TimedFrameSet,
-    restore_map,
-)
-from hardware.live.motion_process import CommandedHead
+from hardware.live.frame_source import FrameSource, LiveCameraSource, RingSource, TimedFrameSet
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender
 from hardware.live.records import (
+    CommandedHead,
     EventEntry,
     PoseEntry,
     ScanEntry,
@@ -46,7 +39,7 @@ from hardware.live.records import (
 from hardware.live.trace import QUEUE_STAGE, TRACKING_LANE, TraceLane, in_turn
 from hardware.motion.step import PoseHandover
 from hardware.offline.looks import LiveLooks, station_places
-from hardware.offline.track import region_search, tracker
+from hardware.offline.track import SETTLING_TIME, region_search, restore_map, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
 from hardware.operator.shared_state import LaidDrawing
@@ -166,7 +159,7 @@ class _TrackingLoop:
         self._sheet: OutlineSheet | None = None  # of this look, where a network looked
         task = prepared.task
         adapt = channels.shares.put if prepared.settings.adapt else None
-        self._looks = LiveLooks(rig, task.path, stack, adapt) if task.looks else None
+        self._looks = LiveLooks(rig, task.path, stack, adapt, task.flows) if task.looks else None
         self._steps = stack.enter_context(ExitStack())
         self._look(0)
 

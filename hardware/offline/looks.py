@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from html import escape
 from pathlib import Path as File
 
@@ -78,13 +78,17 @@ FLOW_COLOURS = ((0.8, "#1f618d"), (0.99, "#7fb3d5"), (1.01, "#bbb"), (1.25, "#f5
 class SurfaceLooks:
     """The looks of one print. surface: as it was measured last, None before the first. last: what the last one told."""
 
-    def __init__(self, rig: Rig, path: Path, start: float = 0.0, adapt: bool = False) -> None:
+    def __init__(
+        self, rig: Rig, path: Path, start: float = 0.0, adapt: bool = False, flows: Sequence[FlowShares] = ()
+    ) -> None:
         """path: in the surface frame of the poses. start: where it begins, in checkpoints. adapt: whether to adapt it.
+
+        flows: that were asked for before.
 
         InputError where the path says no amounts.
         """
         self._lenses, self._path = Lenses(rig), path
-        self._adapts, self._told = adapt, AS_PLANNED
+        self._adapts, self._told = adapt, reduce(FlowShares.then, flows, AS_PLANNED)
         self._layer: list[Look] = []  # those at the layer that is laid
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
@@ -182,10 +186,18 @@ class LiveLooks:
     """
 
     def __init__(
-        self, rig: Rig, path: Path, stack: ExitStack, adapt: Callable[[FlowShares], None] | None = None
+        self,
+        rig: Rig,
+        path: Path,
+        stack: ExitStack,
+        adapt: Callable[[FlowShares], None] | None = None,
+        flows: Sequence[FlowShares] = (),
     ) -> None:
-        """path: in its own frame. stack: at whose end what is still judged is left. adapt: is told the next flows."""
-        self._adapt = adapt
+        """path: in its own frame. stack: at whose end what is still judged is left. adapt: is told the next flows.
+
+        flows: that looks of the run before asked for.
+        """
+        self._adapt, self._flows = adapt, flows
         self._rig, self._path = rig, path
         self._looks: SurfaceLooks | None = None
         self._bare = deque[SurfaceView](maxlen=VIEWS)
@@ -220,7 +232,8 @@ class LiveLooks:
             return None
         if self._looks is None:
             self.placed = replace(self._path, surface_from_nozzle=lies @ self._path.surface_from_nozzle)
-            self._looks = SurfaceLooks(self._rig, self.placed, progress.fraction, self._adapt is not None)
+            how = progress.fraction, self._adapt is not None, self._flows
+            self._looks = SurfaceLooks(self._rig, self.placed, *how)
             self._counts = False
             self.busy = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
             self._bare.clear()

@@ -9,7 +9,9 @@ import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
+from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
     PoseSink = Callable[[FrameSet, SurfacePose, StepReport], None]  # takes each pose once it is written
 
+SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
 MAP_PROCESS_NICE = 10  # added to the niceness of the map's process
 MAP_METHOD, THESIS_METHOD, THESIS_FLOW_METHOD = "map", "thesis", "thesis-flow"
 TRACKING_METHODS = {
@@ -182,6 +185,34 @@ def _network_segmenter(model: Path | None) -> NetworkSegmenter:
 
     network = WoundNetwork(shipped_model() if model is None else model, threads=1)  # the other core is the tracker's
     return NetworkSegmenter(network, network.settings)
+
+
+def restore_map(step: FrameSetStep, record: Path, since: float, until: float, session: Session, shift: float) -> Array:
+    """Show a new tracker the first pictures of an earlier run, to map the same surface; new_from_old (4, 4) mm.
+
+    record, since, until: of the earlier run, s. shift: s, added to their stamps.
+
+    Pictures recorded without loss give the same map; from others its frame may lie elsewhere, by the difference of both
+    runs' poses at the last of them. InputError where the surface is not found in its own pictures.
+    """
+    from estimation import se3
+    from estimation.errors import InputError
+    from hardware.recording.session_reader import read_poses
+    from perception.frames import FrameSet
+
+    poses = {pose.stamp: pose for pose in read_poses(record) if pose.stamp <= until + SETTLING_TIME}
+    later = dropwhile(lambda frames: frames.stamp < since, session.frame_sets())
+    sets = takewhile(lambda frames: frames.stamp <= until + SETTLING_TIME, later)
+    new_from_old: Array | None = None
+    for frames in sets:
+        shifted = tuple(replace(frame, stamp=frame.stamp + shift) for frame in frames.frames)
+        pose, old = step(FrameSet(frames.stamp + shift, shifted, frames.head)), poses.get(frames.stamp)
+        step.idle()
+        if old is not None and old.state.measured and pose.state.measured and old.state is pose.state:
+            new_from_old = se3.inverse(pose.base_from_surface) @ old.base_from_surface
+    if new_from_old is None:
+        raise InputError(record, "recording", "no surface", "pictures in which it is found again")
+    return new_from_old
 
 
 def run_track(

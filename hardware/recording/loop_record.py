@@ -226,7 +226,7 @@ def recorded_arm(profile: ArmProfile) -> tuple[str, ArmProfile]:
     """The text of an arm, and the arm with what is read of that text."""
     from hardware.files.arm_file import arm_from_text, arm_text
 
-    text = arm_text(profile, "as the loop of a print had it at first")
+    text = arm_text(profile, "as the loop of a print had it at first", whole=True)
     return text, arm_from_text(text, LOOP_ARM_ATTACHMENT)
 
 

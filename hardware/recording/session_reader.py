@@ -378,7 +378,7 @@ class PrintInputs:
 
 def input_texts(path: PrintPath, profile: ArmProfile, dispensers: str = "", tissue: str = "") -> dict[str, str]:
     """Path, arm, dispenser file and tissue as texts, by the names of the recording's attachments; "" without."""
-    texts = {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it")}
+    texts = {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it", whole=True)}
     rest = {DISPENSER_ATTACHMENT: dispensers, TISSUE_ATTACHMENT: tissue}
     return texts | {name: text for name, text in rest.items() if text}
 
