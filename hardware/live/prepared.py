@@ -212,14 +212,13 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
     if settings.page:
         page_settings(settings, files.session)
     prepared = _prepared(settings, again, placement, faults, files.session)
-    path = prepared.task.path
+    path, profile = prepared.task.path, prepared.task.profile
     start = read_progress(files.progress, path) if files.progress.exists() else 0.0
     if start >= len(path) - 1:
         raise InputError(files.progress, "fraction", start, f"below {len(path) - 1}: the path is printed")
     for earlier, later in ((files.progress, again.progress), (files.surface, again.surface)):
         if earlier.exists():  # before it comes as far itself, this run is where that one was
             shutil.copyfile(earlier, later)
-    profile = prepared.task.profile
     if placement is not None:
         profile = replace(profile, arm=replace(profile.arm, arm_from_base=placement.arm_from_base))
     task = replace(prepared.task, start=start, profile=profile, place=prepared.task.place and placement is None)
@@ -227,9 +226,8 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
         from hardware.live.recorded_run import asked_flows, read_run  # loads OpenCV
 
         task = replace(task, flows=asked_flows(read_run(record, "/loop")))
-    share = start / max(len(path) - 1, 1)
-    goes_on = f"goes on at {share:.0%}: checkpoint {start:.2f} of {len(path) - 1}, where {record.name} stopped"
-    return replace(prepared, task=task, notes=(goes_on, *prepared.notes))
+    place = f"{start / max(len(path) - 1, 1):.0%}: checkpoint {start:.2f} of {len(path) - 1}"
+    return replace(prepared, task=task, notes=(f"goes on at {place}, where {record.name} stopped", *prepared.notes))
 
 
 def _prepared(
@@ -316,10 +314,9 @@ def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -
 
 def _switching(profile: ArmProfile, dispensers: str) -> ArmProfile:
     """The profile with the numbers of its G1 frames by which they switch a dispenser, where one hangs there."""
-    for each in dispensers_from_text(dispensers, "dispenser.toml") if dispensers else ():
-        if each.pwm is not None:
-            on, off = each.pwm
-            profile = replace(profile, dialect=replace(profile.dialect, pwm=off, pwm_on=on))
+    given = dispensers_from_text(dispensers, "dispenser.toml") if dispensers else ()
+    for on, off in (each.pwm for each in given if each.pwm is not None):
+        profile = replace(profile, dialect=replace(profile.dialect, pwm=off, pwm_on=on))
     return profile
 
 
@@ -329,8 +326,8 @@ def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
     if not dispensers:
         return [] if settings.simulated is not None else ["no dispenser is given: nothing is extruded"]
     why = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
-    profiles = [each.profile for each in dispensers_from_text(dispensers, "")]
-    return [f"dispenser {profile.name} {why}" for profile in profiles if profile.watchdog is None]
+    given = dispensers_from_text(dispensers, "")
+    return [f"dispenser {each.profile.name} {why}" for each in given if each.profile.watchdog is None]
 
 
 def rig_from_session(session: File) -> Rig:
