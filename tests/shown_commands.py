@@ -240,7 +240,7 @@ NOT_RUN = {  # and why not
     "python -m tests.campaigns.three_cameras": "needs Aravis's cameras; `make counterparts` runs the tests with them",
     "python -m tests.dependency_table": "tests/test_shipped.py asks whether what it would write is there",
     "stillbed arm franka://172.16.0.2": "needs a robot; tests/test_arm_laws.py meets a simulated one",
-    "stillbed arm gcode:///dev/ttyACM0 --arm data/arms/gantry.toml": "needs a machine; tests/test_gcode.py meets OctoPrint's",
+    "stillbed arm gcode:///dev/ttyACM0 --arm data/arms/gantry.toml": "needs a machine; see tests/test_gcode.py",
     "python -m tests.stop_latency": "needs a machine with little else to do for minutes",
     "pip install -c constraints.txt .": "installs what the tests run with, from a network",
     "stillbed bench --all": "tests/test_bench.py runs the whole with small parts; all of them take 20 minutes",
