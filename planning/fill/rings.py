@@ -5,8 +5,8 @@ or narrower than nominal, or a single bead along the medial axis fills it. The l
 left open there.
 
 The medial axis comes from the Voronoi diagram of points along the boundary (Brandt and Algazi 1992), which is the dual
-of their Delaunay triangles. Only the part
-along which the thickness changes slowly is used: every kink and all noise of a contour adds a branch into its corners.
+of their Delaunay triangles. Only the part along which the thickness changes slowly is used: every kink and all noise of
+a contour adds a branch into its corners.
 """
 
 from __future__ import annotations
