@@ -47,7 +47,7 @@ from hardware.operator.view import (
 from hardware.process.progress import TimeLeft
 from hardware.report.report import bead_map, track_map
 from planning.command import Hold
-from planning.material import AS_PLANNED
+from planning.material import FlowShares
 from planning.path import LOOK, PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
 from tests.moving import raster
@@ -479,7 +479,9 @@ def test_a_guess_is_confirmed_by_nobody_before_it_was_moved(placement: PathPlace
 
 
 def test_a_run_that_resumes_begins_with_the_flows_that_looks_asked_for() -> None:
-    flows = AS_PLANNED, AS_PLANNED.then(AS_PLANNED)
+    flows = tuple(
+        FlowShares(np.array([at]), np.array([at + 5.0]), np.array([share])) for at, share in ((0.0, 1.2), (5.0, 0.8))
+    )
     run = to_confirm(CERTAIN, flows=flows)
     run.look()
     run.look(Wish.CONFIRM)
