@@ -130,6 +130,8 @@ def main(folder: Path, record: Path, *flags: str) -> int:
         }
         ports = [int(flag.partition("=")[2]) for flag in flags if flag.startswith("--foxglove=")]
         more |= {"foxglove_port": sum(ports), "operator": "Ada" if ports else ""}
+        files = [Path(flag.partition("=")[2]) for flag in flags if flag.startswith("--dispensers=")]
+        more |= {"dispensers": next(iter(files), None)}
         given = LiveSettings(rig=rig, path=path, arm=device, profile=profile, record=record, **more)
         texts = [flag.partition("=")[2] for flag in flags if flag.startswith("--fault=")]
         faults = faults_from_texts("command line", "--fault", texts)  # allowed, as what is tracked is simulated

@@ -44,7 +44,7 @@ class OctoPrintServer(CounterpartServer):
         self.link.unlink(missing_ok=True)
 
     def truth(self) -> Array:
-        """End it; rows (N, 4) of s, X Y Z mm."""
+        """End it; rows (N, 5) of s, X Y Z and E mm."""
         self.end()
         return np.loadtxt(self.log)
 
@@ -66,4 +66,4 @@ class GcodeBench(ServedBench):
 
     def truth(self) -> tuple[Array, Array]:
         rows = self.server.truth()
-        return rows[:, 0], np.hstack([rows[:, 1:], np.zeros((len(rows), 3))])
+        return rows[:, 0], np.hstack([rows[:, 1:4], np.zeros((len(rows), 3))])

@@ -2,8 +2,9 @@
 
 .octoprint/bin/python tests/octoprint_server.py LINK LOG X Y Z [ERROR ...]
 
-It stands at X Y Z, mm, and runs until SIGTERM; LOG then has rows: s of the clock, X Y Z. An ERROR is one of the
-printer's own, such as 100:resend for the line of that number, or checksum_mismatch, or resend_with_timeout.
+It stands at X Y Z, mm, and runs until SIGTERM; LOG then has rows: s of the clock, X Y Z, and how far E has gone. An
+ERROR is one of the printer's own, such as 100:resend for the line of that number, or checksum_mismatch, or
+resend_with_timeout.
 
 Its own moves take a tenth of their time; a tenth of the feed rate, which M220 S10 would set, makes that up. It moves at
 the beginning of each move, and counts way back as no time.
@@ -24,6 +25,7 @@ from pathlib import Path
 from octoprint import plugin
 from octoprint.plugins.virtual_printer import VirtualPrinterPlugin
 from octoprint.plugins.virtual_printer.virtual import VirtualPrinter
+from serial import SerialTimeoutException
 
 FEED_PERCENT = 10
 ERRORS = sys.argv[
@@ -61,16 +63,30 @@ def main(link, log, *place):
     printer = VirtualPrinter(Settings(), Profiles(), tempfile.mkdtemp(), read_timeout=0.005)
     printer._lastX, printer._lastY, printer._lastZ = map(float, place)
     printer._gcode_G21 = lambda data: None  # its own scales the place as if it had counted in inches before
-    printer._feedrate_multiplier = FEED_PERCENT
+    printer._feedrate_multiplier = printer._flowrate_multiplier = FEED_PERCENT
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
     Path(link).unlink(missing_ok=True)
     Path(link).symlink_to(os.ttyname(theirs))
-    rows = []
+    rows, pushed, relative, moved, absolute = [], [0.0], [False], printer._performMove, printer._gcode_G90
+
+    def move(line):
+        if relative[0]:
+            printer._lastE = [0.0] * len(printer._lastE)
+        before = printer._lastE[0]
+        moved(line)
+        pushed[0] += printer._lastE[0] - before
+
+    def switch(to):  # it knows no M83: E is relative from there until a G90, as in Marlin
+        relative[0] = to
+
+    printer._performMove = move
+    printer._gcode_M83 = lambda data: switch(True)
+    printer._gcode_G90 = lambda data: switch(False) or absolute(data)
 
     def watch():
         while True:
-            rows.append((time.monotonic(), printer._lastX, printer._lastY, printer._lastZ))
+            rows.append((time.monotonic(), printer._lastX, printer._lastY, printer._lastZ, pushed[0]))
             time.sleep(0.001)
 
     def answer():
@@ -93,7 +109,8 @@ def main(link, log, *place):
         for line in lines:  # it looks at one line of what it is given at a time
             left = line + b"\n"
             while left:
-                left = left[printer.write(left) :]
+                with contextlib.suppress(SerialTimeoutException):  # it had no time to read: its line waits
+                    left = left[printer.write(left) :]
 
 
 if __name__ == "__main__":

@@ -13,18 +13,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
+from hardware.arm.profile import ArmProfile, Extruder
 from hardware.cli.main import main
-from hardware.dispenser.dispenser import ArmPwmDispenser, DispenserProfile, check_path_materials
+from hardware.dispenser.dispenser import ArmAxisDispenser, ArmPwmDispenser, DispenserProfile, check_path_materials
 from hardware.dispenser.line_dispenser import LineDispenser
 from hardware.dispenser.messages import PRESETS
 from hardware.files.dispenser_file import (
     PRESET_NAMES,
+    arm_with_dispensers,
+    check_arm_moves,
     dispensers_from_text,
     open_dispensers,
     read_dispensers,
     write_delays,
 )
 from hardware.files.path_file import read_path
+from hardware.recording.loop_record import recorded_arm
 from hardware.simulator.dispenser import DIALECTS
 from tests.test_dispenser import served
 
@@ -52,7 +56,8 @@ def test_each_example_is_read_and_carries_a_shipped_path(file: Path) -> None:
     assert each.preset == file.stem
     dispensers = open_dispensers(file)
     (driver,) = dispensers
-    assert isinstance(driver, ArmPwmDispenser if file.stem == "arm_pwm" else LineDispenser)
+    by_arm = {"arm_pwm": ArmPwmDispenser, "arm_axis": ArmAxisDispenser}
+    assert isinstance(driver, by_arm.get(file.stem, LineDispenser))
     path = read_path("data/paths/square_10mm.csv")
     if each.profile.metered:
         with pytest.raises(InputError, match="meters its flow"):
@@ -155,6 +160,8 @@ def test_each_message_that_makes_no_sense_is_named(message: str, key: str, words
 
 
 PWM = '[[dispenser]]\nname = "t"\nmaterials = [1]\npreset = "arm_pwm"\npwm_on = {on}\npwm_off = 0\n{more}\n'
+AXIS = '[[dispenser]]\nname = "t"\nmaterials = [1]\npreset = "arm_axis"\n{more}\n'
+AXIS_NEEDS = "plunger_mm2 = 2.0\nflow_range_mm3_s = [0.1, 5]\n"
 
 
 @pytest.mark.parametrize(
@@ -169,12 +176,48 @@ PWM = '[[dispenser]]\nname = "t"\nmaterials = [1]\npreset = "arm_pwm"\npwm_on = 
         (PWM.format(on=1e9, more=""), "dispenser.pwm_on = 1000000000.0"),
         (PWM.format(on=1, more='port = "x"'), "dispenser.port = 'unknown key'"),
         (PWM.format(on=1, more="metered = true"), "dispenser.metered = True, allowed left out of arm_pwm"),
+        (PWM.format(on=1, more="") + text(), "dispenser.preset = 'arm_pwm', allowed the only one"),
+        (text() + AXIS.format(more=AXIS_NEEDS), "dispenser.preset = 'arm_axis', allowed the only one"),
+        (AXIS.format(more="plunger_mm2 = 2.0"), "dispenser.flow_range_mm3_s = 'missing'"),
+        (AXIS.format(more="flow_range_mm3_s = [0.1, 5]"), "dispenser.plunger_mm2 = 'missing'"),
+        (AXIS.format(more=AXIS_NEEDS + "prime_mm3 = 1"), "dispenser.prime_mm3 = 1, allowed left out of arm_axis"),
+        (AXIS.format(more=AXIS_NEEDS + 'port = "x"'), "dispenser.port = 'unknown key'"),
     ],
 )
 def test_a_file_that_makes_no_sense_is_refused(table: str, words: str) -> None:
     with pytest.raises(InputError) as caught:
         dispensers_from_text(table, "d.toml")
     assert words in str(caught.value), str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("dispenser", "arm", "needed"),
+    [
+        (PWM.format(on=1, more=""), "/dev/ttyUSB0", ""),
+        (PWM.format(on=1, more=""), "virtual", ""),
+        (PWM.format(on=1, more=""), "gcode:///dev/ttyACM0", "SEED S6H4D"),
+        (AXIS.format(more=AXIS_NEEDS), "gcode:///dev/ttyACM0", ""),
+        (AXIS.format(more=AXIS_NEEDS), "/dev/ttyUSB0", "G-code machine"),
+        (text(), "gcode:///dev/ttyACM0", ""),
+    ],
+)
+def test_what_an_arm_is_to_switch_or_push_itself_needs_an_arm_that_does(dispenser: str, arm: str, needed: str) -> None:
+    given = dispensers_from_text(dispenser, "d.toml")
+    if needed:
+        with pytest.raises(InputError, match=f"d.toml: dispenser.preset = .*{needed}"):
+            check_arm_moves(given, arm, "d.toml")
+    else:
+        check_arm_moves(given, arm, "d.toml")
+
+
+def test_an_arm_is_told_how_it_switches_or_pushes() -> None:
+    plain = ArmProfile()
+    assert arm_with_dispensers(plain, "") is plain
+    pwm = arm_with_dispensers(plain, PWM.format(on=1500, more=""))
+    assert (pwm.dialect.pwm_on, pwm.dialect.pwm, pwm.extruder) == (1500, 0, None)
+    pushed = arm_with_dispensers(plain, AXIS.format(more=f"{AXIS_NEEDS}retract_mm3 = 0.5"))
+    assert pushed.extruder == Extruder(2.0, 5.0, 0.5) and pushed.dialect == plain.dialect
+    assert recorded_arm(pushed)[1].extruder == pushed.extruder  # as a live run takes it
 
 
 @settings(max_examples=50, deadline=None)

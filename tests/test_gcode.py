@@ -10,6 +10,7 @@ import pty
 import re
 import tty
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +22,16 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
-from hardware.arm.driver import G1, Pause, ReplyKind
+from hardware.arm.driver import G1, G4, Pause, ReplyKind
 from hardware.arm.gcode import GcodeMachine, emergency_stop, find_arms, numbered, open_arm
+from hardware.arm.profile import Extruder
 from hardware.files.arm_file import arm_from_text, arm_text
+from hardware.files.path_file import write_path
 from hardware.live.recorded_run import replay_run
 from planning.kinematics import axes_from_nozzle, nozzle_from_axes, tool_lean
 from tests import octoprint_bench
 from tests.arm_benches import closing_bench
+from tests.moving import raster
 from tests.octoprint_bench import GcodeBench, OctoPrintServer, gantry
 from tests.test_arm_laws import straight
 from tests.test_franka_live import Live, nozzle_errors
@@ -44,6 +48,8 @@ class Board:
         self.moves: list[Array] = []
         self.place, self.made, self.expected, self.stops = PARKED.copy(), PARKED.copy(), 1, 0
         self.lines: list[str] = []
+        self.pushed: list[tuple[float, float]] = []  # of each G1, mm and mm/s of E
+        self.relative, self.e = False, 0.0  # of E, which G90 makes absolute as all axes
         self._in, self._out = b"", b""
 
     def write(self, data: bytes) -> int:
@@ -89,10 +95,23 @@ class Board:
         if fate != "unanswered":
             self.say("ok")
 
+    def _push(self, text: str) -> None:
+        """Make a move, and note how fast E went in it."""
+        words = {word[0]: float(word[1:]) for word in text.split()[1:]}
+        place = np.array([words.get(axis, here) for axis, here in zip("XYZ", self.place, strict=True)])
+        end = words.get("E", 0.0) + self.e if self.relative else words.get("E", self.e)
+        pushed, self.e = end - self.e, end
+        way = float(np.linalg.norm(place - self.place)) or abs(pushed)
+        self.pushed.append((pushed, pushed / (way / words["F"] * 60) if way else 0.0))
+        if "X" in words:
+            self.moves.append(place)
+        self.place = place
+
     def _do(self, text: str) -> None:
         if text.startswith("G1"):
-            self.place = np.array([float(each) for each in re.findall(r"[XYZ](-?[\d.]+)", text)])
-            self.moves.append(self.place)
+            self._push(text)
+        elif text in ("G90", "M83"):
+            self.relative = text == "M83"
         elif text == "M115":
             self.say(f"FIRMWARE_NAME:{self.firmware} SOURCE_CODE_URL:x MACHINE_TYPE:y")
         elif text == "M92":
@@ -108,10 +127,11 @@ class Board:
 class Driven:
     """A driver before a board, in a time of its own."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, extruder: Extruder | None = None) -> None:
         self.board, self.now, self.fault = board, 0.0, ""
         self.places: list[Array] = []
-        self.machine = GcodeMachine("gcode://here", lambda: board, gantry())
+        profile = replace(gantry(), extruder=extruder)
+        self.machine = GcodeMachine("gcode://here", lambda: board, profile)
         self.machine.connect(0.0)
         self.run(1.5)
 
@@ -124,8 +144,8 @@ class Driven:
             self.machine.flush(self.now)
             each()
 
-    def go(self, x: float) -> None:
-        self.machine.send(G1(np.array([x, 110, 60, 0, 0, 0]), 10.0), self.now)
+    def go(self, x: float, volume: float = 0.0) -> None:
+        self.machine.send(G1(np.array([x, 110, 60, 0, 0, 0]), 10.0, volume > 0, volume), self.now)
 
 
 def test_a_line_has_the_checksum_that_reprap_s_own_examples_have() -> None:
@@ -207,6 +227,108 @@ def test_a_stop_before_it_has_said_who_it_is_greets_it_again() -> None:
     assert driven.machine.enable(driven.now) == "" and driven.places[-1] == pytest.approx(PARKED)
 
 
+PUSHED = Extruder(area=2.0, max_flow=40.0, retract_volume=1.0)  # mm^2, mm^3/s, mm^3: 20 mm/s of E at most
+
+
+def rest(driven: Driven, ticks: int = 10) -> None:
+    for _ in range(ticks):
+        driven.machine.send(G4(0.001), driven.now)
+        driven.run(0.02)
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.sampled_from(["", "", "lost", "garbled", "unanswered"]), max_size=40),
+    st.lists(st.tuples(st.floats(-0.3, 0.3) | st.just(0.0), st.floats(0.001, 0.2)), min_size=1, max_size=20),
+)
+def test_whatever_is_lost_a_bead_gets_its_volume_and_what_is_drawn_back_is_given_again(
+    fates: list[str], bead: list[tuple[float, float]]
+) -> None:
+    driven = Driven(board := Board(), PUSHED)
+    driven.go(110.0)
+    driven.run(0.05)
+    board.fates, x = fates, 110.0
+    for _ in range(2):
+        for step, volume in bead:
+            x += step
+            driven.go(x, volume)
+            driven.run(0.02)
+        rest(driven)
+    driven.run(60.0 if "lost" in fates or "unanswered" in fates else 1.0)
+    laid = sum(volume for _, volume in bead)
+    out, speeds = (np.array(column) for column in zip(*board.pushed, strict=True))
+    assert np.abs(speeds).max() <= PUSHED.max_flow / PUSHED.area * 1.01
+    back = np.flatnonzero(out < 0)
+    again = int(np.flatnonzero(out[back[0] :] > 0)[0]) + back[0]  # where the second bead begins
+    assert PUSHED.area * out[: back[0]].sum() == pytest.approx(laid, abs=1e-4)
+    assert PUSHED.area * out[back[0] : again].sum() == pytest.approx(-1.0, abs=1e-4)
+    assert PUSHED.area * out.sum() == pytest.approx(2 * laid - 1.0, abs=1e-4)
+    assert board.place[0] == pytest.approx(x, abs=1e-4)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 12), st.integers(0, 12), st.booleans())
+def test_what_is_called_back_before_it_went_out_is_neither_pushed_nor_counted(
+    answered: int, waiting: int, bead: bool
+) -> None:
+    driven = Driven(board := Board(), PUSHED)
+    driven.go(110.0)
+    driven.go(110.3, 0.1)
+    driven.run(0.1)
+    board.fates = [""] * answered + ["unanswered"] * 8
+    for k in range(waiting):
+        driven.go(110.6 + 0.3 * k, 0.1 if bead else 0.0)
+    driven.machine.recall()
+    driven.run(30.0)
+    rest(driven)
+    lines = [float(line.partition(" E")[2].partition(" ")[0]) for line in dict.fromkeys(board.lines) if " E" in line]
+    assert PUSHED.area * sum(lines) == pytest.approx(PUSHED.area * board.e, abs=1e-4)
+    went = sum(" E" in line and " E-" not in line for line in dict.fromkeys(board.lines))
+    assert PUSHED.area * board.e == pytest.approx(0.1 * went - 1.0, abs=1e-4)
+
+
+def test_a_machine_without_moves_or_stopped_or_without_an_axis_pushes_nothing() -> None:
+    driven = Driven(board := Board(), replace(PUSHED, retract_volume=0.0))
+    driven.go(110.0)
+    driven.go(110.3, 0.1)
+    driven.run(0.1)
+    assert board.e == pytest.approx(0.05)
+    rest(driven, 20)
+    driven.machine.stop(driven.now)
+    driven.run(1.0)
+    driven.go(110.6)
+    driven.run(0.1)
+    assert board.e == pytest.approx(0.05)
+    plain = Driven(board := Board())
+    plain.go(110.0)
+    plain.go(110.3, 0.1)
+    plain.run(0.1)
+    assert not any(" E" in line or "M83" in line for line in board.lines)
+
+
+def test_a_board_that_starts_anew_is_told_again_that_e_is_relative() -> None:
+    driven = Driven(board := Board(), PUSHED)
+    driven.go(110.0)
+    driven.go(110.3, 0.1)
+    driven.run(0.1)
+    board.expected, board.relative, board.e = 1, False, 7.0
+    board.say("start", "echo:Marlin 2.1.2")
+    driven.run(0.5)
+    driven.machine.enable(driven.now)
+    driven.run(0.5)
+    driven.go(110.0)
+    driven.go(110.3, 0.1)
+    driven.run(0.1)
+    assert board.e == pytest.approx(7.05)
+
+
+def test_a_machine_that_pushes_nothing_cold_says_so() -> None:
+    driven = Driven(board := Board(), PUSHED)
+    board.say("echo: cold extrusion prevented")
+    driven.run(0.01)
+    assert "M302 P1" in driven.fault
+
+
 def test_a_turn_is_refused() -> None:
     driven = Driven(Board())
     with pytest.raises(InputError, match="does not turn"):
@@ -233,6 +355,7 @@ def test_its_tip_goes_where_the_path_wants_it_and_its_tool_leans_no_further_than
         assert float(np.arccos(np.clip(there[:3, 2] @ pose[:3, 2], -1, 1))) == pytest.approx(lean, abs=1e-6)
 
 
+RETRACTS = "retract_mm3 = 0.0", "retract_mm3 = 0.5"
 ERRORS = "60:resend", "75:checksum_mismatch", "90:resend_with_timeout", "130:missing_lineno"
 needs_octoprint = pytest.mark.skipif(not octoprint_bench.installed(), reason=octoprint_bench.MISSING)
 
@@ -254,12 +377,16 @@ def test_lines_that_octoprint_s_printer_asks_for_again_are_made_good(tmp_path: P
 
 @needs_octoprint
 @pytest.mark.slow
-def test_a_breathing_surface_is_printed_with_octoprint_s_printer(tmp_path: Path) -> None:
+def test_a_breathing_surface_is_printed_with_octoprint_s_printer_and_its_axis_pushes_the_beads(tmp_path: Path) -> None:
     link = tmp_path / "printer"
     live = Live(tmp_path, lambda folder, home: OctoPrintServer(folder, home), f"gcode://{link}")
+    path = raster(lines=12, speed=5.0)
+    path = replace(path, extra={"width_mm": np.full(len(path), 0.8), "height_mm": np.full(len(path), 0.5)})
+    write_path(tmp_path / "path.csv", path)
+    (tmp_path / "axis.toml").write_text(Path("data/dispensers/arm_axis.toml").read_text().replace(*RETRACTS))
     try:
         record = tmp_path / "run.mcap"
-        run = live.start(record, "--yes", "--until-printed")
+        run = live.start(record, "--yes", "--until-printed", f"--dispensers={tmp_path / 'axis.toml'}")
         run.wait_for(r"\nprint\n")
         run.wait_for("done|finished|ended")
         assert run.end() == 0, run.said
@@ -267,13 +394,18 @@ def test_a_breathing_surface_is_printed_with_octoprint_s_printer(tmp_path: Path)
         rows = live.server.truth()
     finally:
         live.close()
-    axes = np.hstack([rows[:, 1:], np.zeros((len(rows), 3))])
+    axes = np.hstack([rows[:, 1:4], np.zeros((len(rows), 3))])
+    ways = np.linalg.norm(np.diff(path.surface_from_nozzle[:, :3, 3], axis=0), axis=1)
+    pushed, planned = 78.5 * rows[:, 4], 0.8 * 0.5 * ways.sum()  # mm^3
     errors, duty = nozzle_errors(record, tmp_path / "path.csv", live.profile, rows[:, 0], axes)
-    words = f"P95 {np.percentile(errors, 95):.2f} mm, max {errors.max():.2f} mm, duty {100 * duty:.0f} %"
+    words = f"P95 {np.percentile(errors, 95):.2f} mm, max {errors.max():.2f} mm, duty {100 * duty:.0f} %, "
+    words += f"pushed {pushed.max():.2f} mm^3 of {planned:.2f}, at the end {pushed[-1]:.2f}"
     print(words)
     ticks = list(replay_run(record))
     assert len(ticks) > 200 and all(tick.frame == tick.recorded for tick in ticks)
     assert np.percentile(errors, 95) <= 0.5 and duty >= 0.8, words
+    assert pushed.max() == pytest.approx(planned, rel=0.03), words
+    assert pushed.max() - pushed[-1] == pytest.approx(0.5, abs=0.01), words
 
 
 @needs_octoprint

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState
+from hardware.arm.driver import G1, G4, Sent
 from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import Dialect, decode
 from hardware.dispenser.dispenser import ArmPwmDispenser, DispenserProfile, Dispensers
@@ -19,7 +20,7 @@ from hardware.motion.loop import MaterialControl, MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock
 from hardware.simulator.arm.ports import PortFaults
-from planning.command import Hold, Move
+from planning.command import Command, Hold, Move
 from planning.material import Outlet, SwitchDelay
 from tests.dispensing import Bench
 from tests.linked import Linked, linked
@@ -266,6 +267,54 @@ def test_an_arm_switches_the_material_with_its_own_frames() -> None:
             state = getattr(frame, "material", state)
             if not isinstance(tick.command, Move):
                 assert not state
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(0.018, 0.055), st.floats(0.5, 4.0), st.floats(0.0, 0.018)), min_size=2, max_size=20),
+    st.integers(0, 20),
+)
+def test_an_arm_s_moves_are_given_all_that_flows_and_nothing_over_a_hold(
+    ticks: list[tuple[float, float, float]], hold: int
+) -> None:
+    """ticks: s to the next one, mm^3/s that flow from then on, and s into a tick that opens or closes."""
+    arm, clock, given_out, tick = (link := linked()).arm, link.clock, list[G1 | G4](), ArmProfile().tick
+    send = arm.driver.send
+
+    def noted(instruction: G1 | G4, now: float) -> Sequence[Sent]:
+        given_out.append(instruction)
+        return send(instruction, now)
+
+    arm.driver.send = noted  # type: ignore[method-assign]
+    flows, end = list[tuple[float, float]](), 0.0  # s, and mm^3/s from then on; s, when the last move ends
+    for k, (gap, flow, after) in enumerate([*ticks, (0.03, 0.0, ticks[-1][2])]):
+        now = clock.now()
+        command: Command = Hold(now, 0.001, "")
+        if k == hold < len(ticks):
+            flows.append((end, 0.0))
+        else:
+            told = after if k in (0, hold + 1, len(ticks)) else 0.0
+            axes = arm.profile.arm.home + [0.01 * (k + 1), 0, 0, 0, 0, 0]
+            command, end = Move(now, axes, 1.0, 0, True, "", flow, told), now + tick
+            flows.append((now + told, flow))
+        assert arm.send(command, now) == ""
+        while (now := clock.now()) < command.stamp + gap - 1e-9:
+            arm.poll(now)
+            clock.wait_until(min(now + 0.002, command.stamp + gap))
+    stamps, values = np.array(flows).T
+    volumes = [each.volume for each in given_out if isinstance(each, G1)]
+    assert sum(volumes) == pytest.approx((values[:-1] * np.diff(stamps)).sum(), abs=4 * 0.002)
+    assert min(volumes) >= 0
+
+
+def test_an_arm_that_was_given_no_move_for_longer_than_is_under_way_is_not_given_what_was_not_laid() -> None:
+    arm, clock, given_out = (link := linked()).arm, link.clock, list[G1 | G4]()
+    arm.driver.send = lambda instruction, now: given_out.append(instruction) or ()  # type: ignore[method-assign]
+    for gap in (0.04, 0.3, 0.02):
+        now = clock.now()
+        assert arm.send(Move(now, arm.profile.arm.home + 0.01, 1.0, 0, True, "", 2.0), now) == ""
+        clock.wait_until(now + gap)
+    assert [each.volume for each in given_out if isinstance(each, G1)] == pytest.approx([0.04, 0.08, 0.04])
 
 
 def test_another_temperature_on_the_path_is_waited_for() -> None:

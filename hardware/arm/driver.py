@@ -32,6 +32,7 @@ class G1:
     axes: Array  # (6,) X Y Z A B C, mm and rad
     feed: float  # mm/s; degrees/s of a move that only turns
     material: bool = False  # whether it is to flow; says nothing in a dialect without pwm_on
+    volume: float = 0.0  # mm^3 that are to leave meanwhile, for an arm with an `Extruder`; no frame holds it
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,10 @@ M114 tells twice where the machine is: X Y Z, where its planner ends, and Count,
 With Count and the steps per mm (M92) its place is known at each instant; a firmware that gives no Count in steps of X Y
 Z is taken by its word, and its lag is then not what it tells. It does not turn: A B C stay where the arm file has them,
 and X Y Z alone are sent. It is never homed from here, as G28 drives the needle down to where Z ends.
+
+With an `Extruder`, its axis E goes with the moves of a bead, relative (M83): a line pushes what its own move is to lay,
+so a machine that gets no lines, or is stopped, pushes nothing. After a bead E draws back, also in a pause. What that
+takes is counted as lines go out, so that a move that is taken back changes nothing.
 """
 
 from __future__ import annotations
@@ -24,8 +28,9 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import G1, G4, ByteListener, Pause, Reply, ReplyKind, Reported, Sent
 from hardware.arm.port import Opener, PortOpener, serial_ports, write_last
-from hardware.arm.profile import ArmProfile
+from hardware.arm.profile import ArmProfile, Extruder
 from hardware.arm.s6h4d import SerialDriver
+from planning.command import TICK_FRACTION
 
 SCHEME = "gcode://"
 LINES = 2  # that may be unanswered: a move, and the question where it is
@@ -35,10 +40,11 @@ MAX_ANSWER_TIME = 1.0  # s, likewise of one that says nothing: it doubles with e
 GREETING_TIME = 1.0  # s between greetings of a machine that has said nothing yet: a board starts for as long
 REMEMBERED = 64  # lines that may be asked for again: a second of them
 MIN_STEPS_PER_MM = 1.0  # of an axis: fewer are no machine's that prints
-PLACE_DIGITS = 4  # of mm, in a line
+PLACE_DIGITS, PUSH_DIGITS = 4, 5  # of mm, in a line: of X Y Z, and of E
 MAX_LINE = 512  # bytes of a line from the machine: what is longer came at another baud rate
 STOP = b"M410\n"  # without a number: it overtakes lines that have one
 GREETING = "M115", "G21", "G90", "M92", "M400", "M114"  # who it is; mm; absolute; steps per mm; at rest, where is it?
+RELATIVE_E = "M83"  # behind G90, which makes E absolute as well
 FIRMWARE = re.compile(r"FIRMWARE_NAME: ?(.*?)(?= [A-Z_]+:|$)")
 PLACE = re.compile(r"X: ?(-?[\d.]+) +Y: ?(-?[\d.]+) +Z: ?(-?[\d.]+)")
 COUNT = re.compile(r"Count:? *X: ?(-?\d+) +Y: ?(-?\d+) +Z: ?(-?\d+)")
@@ -46,6 +52,7 @@ STEPS = re.compile(r"M92 X([\d.]+) Y([\d.]+) Z([\d.]+)")
 RESEND = re.compile(r"(?:Resend|rs):? *N?:?(\d+)", re.IGNORECASE)
 # in a line that tells of an error
 HALTED = re.compile(r"halted|kill|fatal|(max|min)temp|thermal|stopped|^!!", re.IGNORECASE)
+COLD = re.compile("cold extrusion", re.IGNORECASE)
 KNOWN = "marlin"  # in the name of the firmware
 
 
@@ -53,8 +60,8 @@ KNOWN = "marlin"  # in the name of the firmware
 class Line:
     """What is given out as one line."""
 
-    text: str
-    instruction: G1 | None = None
+    text: str  # "" of an instruction, which becomes a line as it goes out
+    instruction: G1 | G4 | None = None
     anchor: bool = False  # of an M114: the machine rests, so that its planner and its steps are at one place
 
 
@@ -64,6 +71,9 @@ class GcodeMachine(SerialDriver):
     def __init__(self, address: str, opener: Opener, profile: ArmProfile, listener: ByteListener | None = None) -> None:
         """address: as the operator gave it. Otherwise as SerialDriver's."""
         self._address, self._turn = address, profile.arm.home[3:].copy()
+        self._axis = None if profile.extruder is None else _PushedAxis(profile.extruder)
+        self._greeting = GREETING if profile.extruder is None else (*GREETING, RELATIVE_E)
+        self._spare = TICK_FRACTION * profile.tick / 2  # s that E has in any line: ticks may be half as long
         super().__init__(opener, listener)
 
     def _reset(self) -> None:
@@ -82,6 +92,7 @@ class GcodeMachine(SerialDriver):
         self._asked, self._greeted = 0.0, -np.inf  # s
         self._patience = ANSWER_TIME  # s, for an answer
         self._known = False  # whether it has said where it is
+        self._end: Array | None = None  # (3,) mm, where the last line leads; None: not known
 
     # -- the machine's words
 
@@ -112,6 +123,8 @@ class GcodeMachine(SerialDriver):
             self._resend = int(found[1])
         elif (line.startswith(("Error", "echo:", "fatal", "!!"))) and HALTED.search(line):
             self._fault = f"the machine says: {line}; it has to be reset"
+        elif COLD.search(line) and self._axis is not None:
+            self._fault = f"the machine says: {line}; M302 P1 lets it push material that is cold"
         if found := FIRMWARE.search(line):
             self._firmware = found[1]
         if found := STEPS.search(line):
@@ -156,35 +169,56 @@ class GcodeMachine(SerialDriver):
     def _greet(self, now: float) -> None:
         """Count lines from 1, learn who it is, and where."""
         self._greeted, self._known, self._offset = now, False, None
-        self._count_anew(GREETING, now)
+        self._count_anew(self._greeting, now)
 
     def _count_anew(self, texts: Sequence[str], now: float) -> None:
         """Number lines from 0, with `texts` next; nothing that was given before is sent, or sent again."""
         for lines in (self._waits, self._sent, self._again, self._unanswered):
             lines.clear()
-        self._number, self._resend, self._question = -1, 0, None
+        self._number, self._resend, self._question, self._end = -1, 0, None, None
         self._waits.extend(Line(text, anchor=text == "M114") for text in ("M110 N0", *texts))
         self._since = now
 
     # -- what it is given
 
     def send(self, instruction: G1 | G4, now: float) -> Sequence[Sent]:
-        """Give out a move; in a pause nothing is sent."""
+        """Give out a move; in a pause nothing is sent but what is left to be drawn back."""
         if isinstance(instruction, G4):
-            return (Sent(instruction),)
+            pushed = self._axis is not None and self._axis.pressed
+            return self._put(Line("", instruction), now) if pushed else (Sent(instruction),)
         if np.abs(instruction.axes[3:] - self._turn).max() > 1e-6:
             got, allowed = np.rad2deg(instruction.axes[3:]).tolist(), f"{np.rad2deg(self._turn).tolist()} degrees"
             raise InputError("arm", "A B C", got, f"{allowed}: a G-code machine does not turn")
-        axes = np.concatenate([np.round(instruction.axes[:3], PLACE_DIGITS), self._turn])
-        x, y, z = (f"{v:.{PLACE_DIGITS}f}" for v in axes[:3])
-        feed = max(round(60 * instruction.feed, 1), 0.1)  # mm/min
-        return self._put(Line(f"G1 X{x} Y{y} Z{z} F{feed:g}", replace(instruction, axes=axes, feed=feed / 60)), now)
+        return self._put(Line("", instruction), now)
+
+    def _line(self, given: G1 | G4) -> tuple[str, G1 | G4]:
+        """The text of an instruction that goes out now, "" where nothing has to, and what the machine does by it."""
+        if isinstance(given, G4):
+            push = self._pushed(0.0, 0.0)
+            return (f"G1{push.word} F{push.feed(push.seconds):.3f}", G4(push.seconds)) if push.word else ("", given)
+        axes = np.concatenate([np.round(given.axes[:3], PLACE_DIGITS), self._turn])
+        goal = "G1" + "".join(f" {name}{v:.{PLACE_DIGITS}f}" for name, v in zip("XYZ", axes[:3].tolist(), strict=True))
+        last, self._end = self._end, axes[:3]
+        way = 0.0 if last is None else float(np.linalg.norm(axes[:3] - last))
+        seconds, feed = way / given.feed, given.feed
+        push = self._pushed(given.volume, seconds)
+        if push.word and last is not None:  # what it pushes takes its time
+            seconds = max(seconds, push.seconds)
+            if not way:  # the feed of such a line is E's
+                return f"{goal}{push.word} F{push.feed(seconds):.3f}", G4(seconds)
+            feed = way / seconds
+        feed = max(round(60 * feed, 1), 0.1)  # mm/min
+        return f"{goal}{push.word} F{feed:g}", replace(given, axes=axes, feed=feed / 60)
+
+    def _pushed(self, volume: float, seconds: float) -> Push:
+        """What E does in a line of `seconds` s of which `volume`, mm^3, is to leave."""
+        return NO_PUSH if self._axis is None else self._axis.push(volume, max(seconds, self._spare))
 
     def stop(self, now: float) -> Sequence[Sent]:
         """Halt the axes; what it was given and has not read is not sent again."""
         assert self.port is not None
         self._half += STOP
-        self._count_anew(("M400", "M114") if self._known else GREETING, now)
+        self._count_anew(("M400", "M114") if self._known else self._greeting, now)
         self._stops = True
         return self._write(now)
 
@@ -233,14 +267,17 @@ class GcodeMachine(SerialDriver):
             if not self._waits or (asks and self._question is not None and now < self._question[0] + ANSWER_TIME):
                 break
             line = self._waits.popleft()
+            text, done = (line.text, None) if line.instruction is None else self._line(line.instruction)
+            if done is not None:
+                out.append(Sent(done))
+            if not text:
+                continue
             self._since, self._number = now, self._number + 1
-            self._half = numbered(self._number, line.text)
+            self._half = numbered(self._number, text)
             self._sent.append((self._number, self._half))
             self._unanswered.append((self._number, now))
             if asks:
                 self._question, self._asked = (now, line.anchor), now
-            if line.instruction is not None:
-                out.append(Sent(line.instruction))
         return out
 
     def _write_rest(self, out: list[Sent]) -> bool:
@@ -252,6 +289,55 @@ class GcodeMachine(SerialDriver):
             self._stops = False
             out.append(Sent(Pause()))
         return not self._half
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """What the axis E does in a line."""
+
+    word: str  # "" where it rests
+    way: float  # mm, however it goes
+    seconds: float  # s that it takes at least
+
+    def feed(self, seconds: float) -> float:
+        """The feed of a line in which E alone moves, mm/min, if it is to take so long."""
+        return max(60 * self.way / seconds, 0.001)
+
+
+NO_PUSH = Push("", 0.0, 0.0)
+
+
+class _PushedAxis:
+    """The axis E: how much of its material is drawn back. Volumes in mm^3.
+
+    pressed: whether material has left since it was drawn back.
+    """
+
+    def __init__(self, extruder: Extruder) -> None:
+        self._extruder, self.pressed = extruder, False
+        self._drawn = 0.0  # back by now
+        self._rest = 0.0  # mm, what the last words were rounded by
+
+    def push(self, volume: float, seconds: float) -> Push:
+        """A line of `seconds` s in which `volume` is to leave; what was drawn back is pushed as well, bit by bit."""
+        most, whole = self._extruder.max_flow * seconds, self._extruder.retract_volume
+        if volume > 0:
+            given, self.pressed = min(self._drawn, max(most - volume, 0.0)), True
+            self._drawn -= given
+            return self._push(volume + given)
+        if not self.pressed:
+            return NO_PUSH
+        taken = min(whole - self._drawn, most)
+        self._drawn, self.pressed = self._drawn + taken, taken == most > 0
+        return self._push(-taken)
+
+    def _push(self, volume: float) -> Push:
+        exact = volume / self._extruder.area + self._rest
+        way = round(exact, PUSH_DIGITS)
+        self._rest = exact - way
+        word = f" E{way:.{PUSH_DIGITS}f}" if way else ""
+        most = max(abs(volume), abs(way) * self._extruder.area)
+        return Push(word, abs(way), most / self._extruder.max_flow)
 
 
 def numbered(number: int, text: str) -> bytes:

@@ -8,6 +8,9 @@ and the answers.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from estimation.errors import InputError
@@ -25,6 +28,7 @@ DEFAULT_SETTINGS = LinkSettings()
 RECALLED = Reason("what was queued is called back", LinkCode.RECALLED)
 ORIGIN_ROUNDING = 0.11  # mm: an answer counts 0.1 mm
 MIN_SHUTDOWN_TIME = 0.05  # s in which a last frame goes out
+MAX_FLOW_GAP = 3  # ticks without a command over which a flow goes on: no more is under way
 MAX_SHUTDOWN_TIME = 1.0  # s in which the stop is repeated to an arm that goes on moving
 
 
@@ -44,6 +48,7 @@ class Arm(ArmDevice):
         self._doubt_since: float | None = None
         self.command_frame = b""
         self._material = False  # whether the last frame let material flow
+        self._leaving = 0.0, -math.inf  # mm^3/s that flow as the last command ends, and s, when it does
         super().__init__(driver, profile, now, settings)
 
     # -- an operator's orders
@@ -186,6 +191,7 @@ class Arm(ArmDevice):
             command = Move(command.stamp, np.array(self._queue.target), MIN_FEED, 0, extrude=False)
         self.command_frame = frame_from_command(command, dialect)
         instruction = motion_from_frame(self.command_frame, dialect)
+        leaving, self._leaving = self._leaving, (0.0, -math.inf)
         if reason := self.hold(now):
             return reason
         assert self._queue is not None
@@ -194,8 +200,17 @@ class Arm(ArmDevice):
             return Reason(words, LinkCode.LIMIT)
         self._own.last = None
         self._material = dialect.pwm_on is not None and isinstance(instruction, G1) and instruction.material
+        if isinstance(instruction, G1) and isinstance(command, Move):
+            instruction = replace(instruction, volume=self._volume(command, *leaving))
         self._give(instruction, now)
         return DONE
+
+    def _volume(self, move: Move, before: float, since: float) -> float:
+        """mm^3 that leave from `since`, s, until a tick after the move; before: mm^3/s, until it tells another flow."""
+        told, end = move.stamp + move.flow_after, move.stamp + self.profile.tick
+        late = told - since if told - since <= MAX_FLOW_GAP * self.profile.tick else 0.0
+        self._leaving = move.flow, end
+        return max(before * late + move.flow * (end - told), 0.0)
 
     def take_up(self) -> RecalledMoves | None:
         """Where the arm stands after moves were called back, once it obeys again; until then no command is sent."""

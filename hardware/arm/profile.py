@@ -56,6 +56,15 @@ DISPLAY_UNITS = np.array([1.0, 1, 1, *np.rad2deg([1.0, 1, 1])])  # of axes, mm a
 ARM_FROM_BENCH = se3.make(np.eye(3), [202.5, 225.0, 50.0])  # arm_from_surface under the thesis's home, z up
 
 
+@dataclass(frozen=True, slots=True)
+class Extruder:
+    """An axis of the arm itself that pushes material as a part of its moves: it rests where they end."""
+
+    area: float  # mm^2, cross-section of what it pushes
+    max_flow: float  # mm^3/s that it pushes, and draws back
+    retract_volume: float = 0.0  # mm^3 drawn back after a bead, and pushed again as the next one begins
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmProfile:
     """One arm. InputError names a setting that makes no sense.
@@ -75,6 +84,7 @@ class ArmProfile:
     parts: tuple[ToolPart, ...] = ()  # of the tool, beside what `tool` describes
     urdf: UrdfArm | None = None  # the joints of an arm that `arm` has no model of
     flange_from_nozzle: Array | None = None  # (4, 4) mm, for an arm that is told where its flange goes
+    extruder: Extruder | None = None  # of a dispenser file; no arm file has one
 
     def __post_init__(self) -> None:
         if not self.baud > 0:
@@ -244,6 +254,7 @@ class DriverKind:
     extra: str = ""  # of stillbed, that brings what it imports; "": it needs none
     needs: str = ""  # what it imports, by which its extra is known to be there
     file: str = ""  # of data/arms, the arm file that stands in where none is given; "": the S6H4D's defaults
+    dispenser: str = ""  # preset of a dispenser file, of one that this arm moves by itself; "": it moves none
 
     @property
     def installed(self) -> bool:
@@ -257,13 +268,15 @@ class DriverKind:
 
 
 DRIVERS = (
-    DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0"),
+    DriverKind("SEED S6H4D", (), "hardware.arm.s6h4d", "/dev/ttyUSB0", dispenser="arm_pwm"),
     DriverKind(
         *("Franka FR3, Panda", ("franka",), "hardware.arm.franka", "franka://172.16.0.2"),
         *("franka", "franky", "fr3.toml"),
     ),
     DriverKind(
-        *("G-code machine (Marlin)", ("gcode",), "hardware.arm.gcode", "gcode:///dev/ttyACM0"), file="gantry.toml"
+        *("G-code machine (Marlin)", ("gcode",), "hardware.arm.gcode", "gcode:///dev/ttyACM0"),
+        file="gantry.toml",
+        dispenser="arm_axis",
     ),
 )
 

@@ -119,7 +119,9 @@ def _connect(a: argparse.Namespace) -> int:
 def description(settings: DispenserSettings) -> str:
     """What a dispenser is by its file, in a few lines."""
     profile, line = settings.profile, settings.line
-    where = "switched by the arm's frames" if line is None else f"at {line.port}"
+    by_arm = "switched by the arm's frames" if settings.extruder is None else "pushed by the arm's own axis"
+    where = by_arm if line is None else f"at {line.port}"
+    without = watchdog_text(profile) if settings.extruder is None else "flows in moves alone: without them it rests"
     if profile.metered:
         flow = f"metered, {profile.flow_range[0]:g} to {profile.flow_range[1]:g} mm^3/s"
     else:
@@ -127,7 +129,7 @@ def description(settings: DispenserSettings) -> str:
     return (
         f"{profile.name} ({settings.preset}, {where}): {', '.join(profile.materials)}; {flow}\n"
         f"  half its flow {1000 * profile.on_delay:.0f} ms after on, {1000 * profile.off_delay:.0f} ms after off\n"
-        f"  {watchdog_text(profile)}"
+        f"  {without}"
     )
 
 

@@ -226,11 +226,12 @@ class SwitchedDispenser:
         """switch: lets material out (True) or stops it, at once; why it could not, "" where it could."""
         self.profile, self._switch = profile, switch
         self._state, self._reason, self._log = DispenserState.CLOSED, "not prepared yet", EventLog()
+        self._flow = profile.flow  # mm^3/s while it is on
 
     @property
     def status(self) -> DispenserStatus:
         """As of the last call."""
-        flow = self.profile.flow if self._state is DispenserState.ON else 0.0
+        flow = self._flow if self._state is DispenserState.ON else 0.0
         return DispenserStatus(self._state, self._reason, flow, None, None)
 
     def prepare(self, now: float, celsius: float | None = None) -> None:
@@ -277,7 +278,7 @@ class SwitchedDispenser:
         if error := self._switch(on):
             state, reason, on = DispenserState.FAILED, error, False
         if (state, reason) != (self._state, self._reason):
-            self._log.add(now, f"{state.value}: {reason}", self.profile.flow * on if on != was_on else None)
+            self._log.add(now, f"{state.value}: {reason}", self._flow * on if on != was_on else None)
         self._state, self._reason = state, reason
 
 
@@ -295,6 +296,22 @@ class ArmPwmDispenser(SwitchedDispenser):
     def _hold(self, on: bool) -> str:
         self.pwm = self._numbers[on]
         return ""
+
+
+class ArmAxisDispenser(SwitchedDispenser):
+    """Material that an axis of the arm pushes as a part of its moves: here is only kept what that is told."""
+
+    def __init__(self, profile: DispenserProfile) -> None:
+        super().__init__(profile, lambda on: "")
+
+    def on(self, flow: float, now: float) -> str:
+        """Let another flow leave."""
+        if reason := self.profile.wrong_flow(flow):
+            return reason
+        was, self._flow = self.status.flow, flow
+        if not (reason := super().on(flow, now)) and was and was != flow:
+            self._log.add(now, f"{flow:g} mm^3/s", flow)
+        return reason
 
 
 class Dispensers:

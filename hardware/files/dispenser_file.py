@@ -3,7 +3,7 @@
 [[dispenser]]
 name = "syringe"
 materials = ["gel", 1]           # as the path's column `material` names them; a material is in one dispenser
-preset = "arduino"               # one of PRESETS, or arm_pwm: the arm's own frames switch it
+preset = "arduino"               # one of PRESETS; arm_pwm: the arm's own frames switch it; arm_axis: its axis E pushes
 port = "/dev/ttyACM0"            # a device's path, a URL of pyserial's, or http://HOST:PORT
 baud = 115200
 on_dead_time_s = 0.03            # from the line taking the message until material begins to flow
@@ -23,7 +23,7 @@ temperature_range_c = [4, 60]    # that it can set
 kept_at_c = 22                   # or: at which something else keeps it
 prime_mm3 = 0.0                  # pushed before on, where it was drawn back before
 retract_mm3 = 0.0                # drawn back after off
-plunger_mm2 = 78.5               # cross-section of what pushes, for messages in mm
+plunger_mm2 = 78.5               # cross-section of what pushes, for messages in mm; needed by arm_axis
 pwm_on, pwm_off = 2000, 0        # of arm_pwm: bytes 27 to 30 of a G1 frame (a key each)
 [dispenser.messages]             # instead of the preset's, see hardware/dispenser/messages.py
 on = "ON {flow_ul_s}"
@@ -40,14 +40,15 @@ from pathlib import Path
 from typing import Any
 
 from estimation.errors import InputError
-from hardware.dispenser.dispenser import ArmPwmDispenser, Dispenser, DispenserProfile, Dispensers
+from hardware.arm.profile import DRIVERS, ArmProfile, Extruder, driver_kind
+from hardware.dispenser.dispenser import ArmAxisDispenser, ArmPwmDispenser, Dispenser, DispenserProfile, Dispensers
 from hardware.dispenser.line_dispenser import LineDispenser, opener_for
 from hardware.dispenser.messages import PRESETS, DispenserLine, DispenserMessages, MessageValues, Preset
 from hardware.process import checks
 from planning.material import Outlet, Outlets, SwitchDelay
 
-ARM_PWM = "arm_pwm"
-PRESET_NAMES = (*PRESETS, ARM_PWM)
+ARM_PWM, ARM_AXIS = "arm_pwm", "arm_axis"
+PRESET_NAMES = (*PRESETS, ARM_PWM, ARM_AXIS)
 DELAY_KEYS = {f"{name}_s": name for name in ("on_dead_time", "on_lag", "off_dead_time", "off_lag")}
 
 
@@ -83,17 +84,24 @@ LINE_KEYS: checks.Keys = {
 }
 PWM_NUMBER = checks.within(-1e6, 1e6)  # as a binary32 it is exact to a tenth there
 PWM_KEYS: checks.Keys = {key: (key, PWM_NUMBER) for key in ("pwm_on", "pwm_off")}
+AXIS_KEYS: checks.Keys = {"plunger_mm2": LINE_KEYS["plunger_mm2"]}
 KEEPALIVE_SHARE = 0.4  # of the watchdog, at most: one keepalive may be lost and the next late
 
 
 @dataclass(frozen=True, slots=True)
 class DispenserSettings:
-    """One table of a dispenser file. line: None of arm_pwm, which has pwm instead, the numbers for on and off."""
+    """One table of a dispenser file.
+
+    line: None where the arm itself switches or pushes it.
+    pwm: of arm_pwm, the numbers for on and off.
+    extruder: of arm_axis.
+    """
 
     profile: DispenserProfile
     preset: str
     line: DispenserLine | None
     pwm: tuple[float, float] | None = None
+    extruder: Extruder | None = None
 
 
 def read_dispensers(path: str | Path) -> tuple[DispenserSettings, ...]:
@@ -108,9 +116,10 @@ def dispensers_from_text(text: str, where: str | Path) -> tuple[DispenserSetting
 
 def dispenser_from_settings(settings: DispenserSettings) -> Dispenser:
     """The driver of one; nothing is opened yet."""
-    if settings.line is None:
-        assert settings.pwm is not None
+    if settings.pwm is not None:
         return ArmPwmDispenser(settings.profile, *settings.pwm)
+    if settings.line is None:
+        return ArmAxisDispenser(settings.profile)
     return LineDispenser(settings.profile, settings.line)
 
 
@@ -127,6 +136,24 @@ def outlets_from(settings: Sequence[DispenserSettings], where: object = "dispens
         x, y, z = profile.nozzle_offset.tolist()
         outlets |= {material: Outlet(delay, (x, y, z)) for material in profile.materials}
     return outlets
+
+
+def arm_with_dispensers(profile: ArmProfile, text: str) -> ArmProfile:
+    """The profile of the arm, which itself switches or pushes what the text of a dispenser file says; "": nothing."""
+    for each in dispensers_from_text(text, "dispenser.toml") if text else ():
+        if each.pwm is not None:
+            on, off = each.pwm
+            profile = replace(profile, dialect=replace(profile.dialect, pwm=off, pwm_on=on))
+        profile = replace(profile, extruder=each.extruder)
+    return profile
+
+
+def check_arm_moves(settings: Sequence[DispenserSettings], arm: str, where: object) -> None:
+    """InputError (where) for a dispenser that the arm at that address cannot switch or push by itself."""
+    for preset in (each.preset for each in settings if each.line is None):
+        if preset != driver_kind(arm).dispenser:
+            kinds = " or ".join(kind.name for kind in DRIVERS if kind.dispenser == preset)
+            raise InputError(where, "dispenser.preset", preset, f"one for {arm}; this one needs a {kinds} as the arm")
 
 
 def open_dispensers(path: str | Path) -> Dispensers:
@@ -147,15 +174,27 @@ def _settings(path: Path, table: checks.Table) -> tuple[DispenserSettings, ...]:
     for i, name in enumerate(names):
         if name in names[:i]:
             raise InputError(path, "dispenser.name", name, "a name, and each once")
+    for each in found if len(found) > 1 else ():
+        if each.line is None:
+            raise InputError(path, "dispenser.preset", each.preset, "the only one: the arm's moves say not for which")
     Dispensers([ArmPwmDispenser(each.profile, 0, 0) for each in found], path)  # whether two carry one material
     return tuple(found)
 
 
 def _one(path: Path, table: checks.Table) -> DispenserSettings:
     preset = checks.word(PRESET_NAMES)(path, "dispenser.preset", table["preset"]) if "preset" in table else ""
-    special = PWM_KEYS if preset == ARM_PWM else {**LINE_KEYS, "messages": ()}
-    required = ("name", "materials", "preset", *(PWM_KEYS if preset == ARM_PWM else ("port",)))
-    checks.check_keys(path, "dispenser.", table, required, [*PROFILE_KEYS, *special])
+    own = {ARM_PWM: PWM_KEYS, ARM_AXIS: AXIS_KEYS}.get(preset)
+    special, needs = ({**LINE_KEYS, "messages": ()}, ["port"]) if own is None else (own, list(own))
+    needs += ["flow_range_mm3_s"] if preset == ARM_AXIS else []
+    checks.check_keys(path, "dispenser.", table, ("name", "materials", "preset", *needs), [*PROFILE_KEYS, *special])
+    if preset == ARM_AXIS:
+        for key in ("metered", "temperature_range_c", "watchdog_s", "prime_mm3", "flow_mm3_s"):
+            if table.get(key):
+                raise InputError(path, f"dispenser.{key}", table[key], "left out of arm_axis, a part of the moves")
+        axis = replace(_profile(path, table, None), metered=True)
+        area = checks.table_fields(path, "dispenser.", table, AXIS_KEYS)["plunger"]
+        extruder = Extruder(area, axis.flow_range[1], axis.retract_volume)
+        return DispenserSettings(axis, preset, None, extruder=extruder)
     if preset == ARM_PWM:
         for key in ("metered", "temperature_range_c", "watchdog_s", "prime_mm3", "retract_mm3"):
             if table.get(key):

@@ -32,6 +32,8 @@ from hardware.arm.profile import ArmProfile, far_limits_text
 from hardware.dispenser.dispenser import check_path_materials
 from hardware.files.arm_file import arm_over, read_arm
 from hardware.files.dispenser_file import (
+    arm_with_dispensers,
+    check_arm_moves,
     dispensers_from_text,
     drivers_of,
     outlets_from,
@@ -263,7 +265,7 @@ def _prepared(
         path=path,
         dispensers=dispensers,
         outlets=outlets,
-        profile=_switching(given or ArmProfile(), dispensers),
+        profile=arm_with_dispensers(given or ArmProfile(), dispensers),
         place=given is None,
         stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
         virtual=settings.arm == VIRTUAL_ARM,
@@ -299,6 +301,7 @@ def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -
     if file is None or path is None or settings.dry_run:
         return "", {}
     read = read_dispensers(file)
+    check_arm_moves(read, settings.arm, file)
     dispensers = drivers_of(read, file)
     check_path_materials(dispensers, path, where)
     outlets = outlets_from(read, file)
@@ -312,21 +315,13 @@ def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -
     return file.read_text(encoding="utf-8-sig"), outlets
 
 
-def _switching(profile: ArmProfile, dispensers: str) -> ArmProfile:
-    """The profile with the numbers of its G1 frames by which they switch a dispenser, where one hangs there."""
-    given = dispensers_from_text(dispensers, "dispenser.toml") if dispensers else ()
-    for on, off in (each.pwm for each in given if each.pwm is not None):
-        profile = replace(profile, dialect=replace(profile.dialect, pwm=off, pwm_on=on))
-    return profile
-
-
 def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
     if settings.dry_run:
         return []
     if not dispensers:
         return [] if settings.simulated is not None else ["no dispenser is given: nothing is extruded"]
     why = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
-    given = dispensers_from_text(dispensers, "")
+    given = (each for each in dispensers_from_text(dispensers, "") if each.extruder is None)
     return [f"dispenser {each.profile.name} {why}" for each in given if each.profile.watchdog is None]
 
 

@@ -223,11 +223,11 @@ class LoopKeeper:
 
 
 def recorded_arm(profile: ArmProfile) -> tuple[str, ArmProfile]:
-    """The text of an arm, and the arm with what is read of that text."""
+    """The text of an arm, and the arm with what is read of that text; its extruder is in the dispensers' text."""
     from hardware.files.arm_file import arm_from_text, arm_text
 
     text = arm_text(profile, "as the loop of a print had it at first", whole=True)
-    return text, arm_from_text(text, LOOP_ARM_ATTACHMENT)
+    return text, replace(arm_from_text(text, LOOP_ARM_ATTACHMENT), extruder=profile.extruder)
 
 
 def recorded_begin(order: BeginPrint, dispensers: str = "") -> tuple[dict[str, str], BeginPrint]:
