@@ -48,6 +48,11 @@ class OctoPrintServer(CounterpartServer):
         self.end()
         return np.loadtxt(self.log)
 
+    def places(self) -> tuple[Array, Array]:
+        """End it; stamps (N,), s, and axes (N, 6), mm."""
+        rows = self.truth()
+        return rows[:, 0], np.hstack([rows[:, 1:4], np.zeros((len(rows), 3))])
+
 
 class GcodeBench(ServedBench):
     """The driver of G-code machines before OctoPrint's virtual printer."""
@@ -65,5 +70,4 @@ class GcodeBench(ServedBench):
         return super().begin()
 
     def truth(self) -> tuple[Array, Array]:
-        rows = self.server.truth()
-        return rows[:, 0], np.hstack([rows[:, 1:4], np.zeros((len(rows), 3))])
+        return self.server.places()

@@ -25,7 +25,6 @@ from pathlib import Path
 from octoprint import plugin
 from octoprint.plugins.virtual_printer import VirtualPrinterPlugin
 from octoprint.plugins.virtual_printer.virtual import VirtualPrinter
-from serial import SerialTimeoutException
 
 FEED_PERCENT = 10
 ERRORS = sys.argv[
@@ -109,8 +108,10 @@ def main(link, log, *place):
         for line in lines:  # it looks at one line of what it is given at a time
             left = line + b"\n"
             while left:
-                with contextlib.suppress(SerialTimeoutException):  # it had no time to read: its line waits
-                    left = left[printer.write(left) :]
+                # a write that waits for room holds a lock that the printer needs to ask for a line again: for good
+                while printer.incoming.qsize() and printer.incoming.qsize() + len(left) > printer.incoming.maxsize:
+                    time.sleep(0.001)
+                left = left[printer.write(left) :]
 
 
 if __name__ == "__main__":
