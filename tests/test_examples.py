@@ -57,6 +57,7 @@ def test_a_folder_of_pictures_is_tracked(tmp_path: Path, capsys: pytest.CaptureF
     assert 0 < float(lines[-1].split("+-")[1]) < 0.2  # mm
 
 
+@pytest.mark.slow  # test_plan_command plans the same
 def test_a_scanned_wound_is_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from hardware.files.mesh_file import write_ply
     from hardware.plan.order import example_scan
@@ -88,6 +89,7 @@ def test_another_dispenser_is_opened_and_closed(tmp_path: Path, capsys: pytest.C
     assert "No such file" in capsys.readouterr().out
 
 
+@pytest.mark.slow  # test_prediction_bench compares predictors
 def test_a_predictor_of_ones_own_is_compared(capsys: pytest.CaptureFixture[str]) -> None:
     run("own_predictor.py", 9)
     rows = [line.replace(",", "").split() for line in capsys.readouterr().out.splitlines()]

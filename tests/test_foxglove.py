@@ -202,6 +202,7 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
             check_settings(LiveSettings(**files, arm="virtual", foxglove_port=port), "x")
 
 
+@pytest.mark.slow  # what a client sees of a recorder is tried above
 def test_a_live_run_is_seen_while_it_prints_and_says_who_made_it_of_what(tmp_path: Path) -> None:
     port, record = free_port(), tmp_path / "run.mcap"
 

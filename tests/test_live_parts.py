@@ -338,7 +338,10 @@ def scan_given(folder: Path, surface: str, scan: str) -> Path | None:
 
 @pytest.mark.parametrize(
     ("surface", "scan", "used"),
-    [("", "", None), ("one.ply", "", "one.ply"), ("", "one.ply", "one.ply"), ("one.ply", "copy.ply", "copy.ply")],
+    [("", "", None), ("one.ply", "copy.ply", "copy.ply")]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow) for more in (("one.ply", "", "one.ply"), ("", "one.ply", "one.ply"))
+    ],
 )
 def test_the_scan_of_live_cameras_is_the_one_that_is_named(
     surface: str, scan: str, used: str | None, tmp_path: Path
@@ -596,7 +599,7 @@ def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_a
     assert not (tmp_path / "cache" / "stillbed").exists() and files.progress.read_text() == "an earlier place"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
+@pytest.mark.parametrize("number", slowly(signal.SIGINT, signal.SIGTERM))
 def test_a_signal_while_a_scene_is_rendered_ends_it_at_once_and_leaves_nothing(tmp_path: Path, number: int) -> None:
     cache = tmp_path / "stillbed"
     (cache / "old-1.part-999999999").mkdir(parents=True)  # left by one that was killed

@@ -68,7 +68,7 @@ def confirmed(run: Running) -> int:
 EARLY = 5.0  # s: 1.1 to 1.6 s were seen beside seven busy processes, where 14 to 20 s were waited for libraries
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
 def test_a_run_that_still_loads_ends_at_once(start: Start, tmp_path: Path, number: int) -> None:
     """Ctrl-C reaches all of its processes, SIGTERM only the first."""
     run = start(tmp_path / "run.mcap", "--page")
@@ -102,6 +102,7 @@ def last_place(record: Path) -> float:
     return float(str(messages(record, "/tick")[-1]["fraction"]))
 
 
+@pytest.mark.slow  # test_every_button stops, pauses and goes home; what the operator moves is resumed
 def test_stopped_paused_home_and_without_its_page_a_run_goes_on_until_ctrl_c(start: Start, tmp_path: Path) -> None:
     record, second = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
     run = start(record, "--page")
@@ -131,12 +132,17 @@ def test_stopped_paused_home_and_without_its_page_a_run_goes_on_until_ctrl_c(sta
     resumed.keys = -1
     assert resumed.end() == 128 + signal.SIGHUP and rests(second, now, 0.5) and not open_session(second).damage
     printed_once(record, second)
-    for file in (record, second):  # with a stop, a pause and a way home in the first
-        ticks = list(replay_run(file))
-        assert len(ticks) > 40 and all(tick.frame == tick.recorded for tick in ticks)
-        wire = b"".join(base64.b64decode(str(m["data"])) for m in messages(file, "/arm/sent"))
-        moves = [tick.frame for tick in ticks if tick.frame[1:2] == b"1"]
-        assert np.mean([move in wire for move in moves]) > 0.95
+    for file in (record, second):
+        sends_its_bytes_again(file)
+
+
+def sends_its_bytes_again(record: Path) -> None:
+    """That a recording replays frame by frame, and that its moves are what went to the arm."""
+    ticks = list(replay_run(record))
+    assert len(ticks) > 40 and all(tick.frame == tick.recorded for tick in ticks)
+    wire = b"".join(base64.b64decode(str(m["data"])) for m in messages(record, "/arm/sent"))
+    moves = [tick.frame for tick in ticks if tick.frame[1:2] == b"1"]
+    assert np.mean([move in wire for move in moves]) > 0.95
 
 
 @pytest.mark.parametrize("name", ["motion", *slowly("tracking", "recorder")])
@@ -188,8 +194,7 @@ def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: St
     assert printed.surface_from_nozzle == pytest.approx(placed.surface_from_path @ path.surface_from_nozzle, abs=1e-6)
     assert any("moved by hand, move 1: x 3.00 mm" in event.text for event in events(record))
     nozzle_lies_on(record, printed, profile)
-    ticks = list(replay_run(record))
-    assert len(ticks) > 20 and all(tick.frame == tick.recorded for tick in ticks)
+    sends_its_bytes_again(record)
 
     again = start(record, "--resume", "--yes")
     again.wait_for(r"\nprint\n")
@@ -197,6 +202,7 @@ def test_what_the_operator_moves_is_printed_there_recorded_and_resumed(start: St
     again.press("q")
     again.end()
     second = RunFiles(record).next().record.with_name("run-2.mcap")
+    printed_once(record, second)
     assert (used_inputs(second).path.surface_from_nozzle == printed.surface_from_nozzle).all()
     assert read_placement(RunFiles(second).surface).surface_from_path == pytest.approx(lies, abs=1e-9)
 
@@ -354,6 +360,7 @@ def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browse
     assert waits[:, 2].min() > printing[:, 2].max() + 5.0
     at_home = axes[(stamps > home + SETTLED) & (stamps < home_ends)]
     assert np.abs(at_home[:, 2] - HOME).max() < 0.1
+    sends_its_bytes_again(record)  # with stops, a pause and a way home in it
 
 
 def prints(page: Page) -> None:

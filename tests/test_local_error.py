@@ -270,7 +270,7 @@ def resting(stamp: float) -> Array:
 PARTED = [(slipping, 0.2), (resting, 0.7), *slowly((slipping, 0.5), (slipping, 0.7), (resting, 0.2), (resting, 0.5))]
 
 
-@pytest.mark.parametrize("case", PARTED)
+@pytest.mark.parametrize("case", [PARTED[0], *slowly(*PARTED[1:])])
 def test_without_a_region_the_claim_covers_both_groups(case: tuple[Motion, float]) -> None:
     slides, share = case
     poses, off, _ = parted(share, False, slides)
@@ -291,7 +291,7 @@ def test_what_slips_beside_the_surface_that_a_region_tells_is_told_and_left_out(
     assert not any("draw" in p.reason for p in poses)
 
 
-@pytest.mark.parametrize("share", [0.25, 0.5])
+@pytest.mark.parametrize("share", [0.25, *slowly(0.5)])
 def test_a_region_that_holds_two_groups_is_sure_of_neither(share: float) -> None:
     poses, _, _ = parted(share, True, slipping, 1.0)
     last = poses[-1]

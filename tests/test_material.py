@@ -19,6 +19,7 @@ from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path, PrintPhase, PrintProgress
 from tests.moving import Motion, breathing, path_through, pose_at, raster, still
+from tests.slowly import slowly
 
 TICK, LIMITS = 0.02, MotionLimits()
 CLOSE = SimpleArm(home=SimpleArm().home - [0, 0, 62, 0, 0, 0])  # 1 mm above the surface: prints begin at once
@@ -178,7 +179,7 @@ def test_no_material_flows_while_a_bead_rests() -> None:
     assert [result.place(stamp + 0.05, 0.0) for stamp, _ in result.switches()] == pytest.approx([0, 6, 6, 18], abs=0.05)
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.0, 20.0, 5.0)])
+@pytest.mark.parametrize("offset", [(0.0, 20.0, 5.0), *slowly((0.0, 0.0, 0.0))])
 def test_another_material_is_asked_for_above_the_surface(offset: tuple[float, float, float]) -> None:
     path = replace(gapped(5.0), material=np.array(["gel", "gel", "gel", "gel", "cells", "cells"]))
     outlets = {"gel": Outlet(SwitchDelay(0.1, 0.1)), "cells": Outlet(SwitchDelay(0.2, 0.1), offset)}

@@ -191,7 +191,7 @@ class Paused:
 
 
 @pytest.mark.parametrize("motion", [breathing, *slowly(still)])
-@pytest.mark.parametrize("gone", [(9.0, 9.0), (6.1, 6.3)])  # s: the surface is lost on the way up
+@pytest.mark.parametrize("gone", [(6.1, 6.3), *slowly((9.0, 9.0))])  # s: the surface is lost on the way up
 def test_it_waits_above_the_surface_and_goes_on_where_it_left_off(motion: Motion, gone: tuple[float, float]) -> None:
     run = Paused(motion, (6.0, 9.0), 13.0, lambda now: gone[0] <= now < gone[1])
     stamps, heights, places = (np.array(x) for x in (run.stamps, run.heights, run.places))

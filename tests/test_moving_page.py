@@ -18,6 +18,7 @@ from planning.placement import PathPlacement, PlacedBy, SurfaceMove, moved_along
 from tests.browser import Browser, Page
 from tests.moving import raster
 from tests.operator_page import Served, full_view
+from tests.slowly import slowly
 
 SIZE = (640, 360)
 PLACE = se3.make(np.diag([1.0, -1.0, -1.0]) @ se3.exp_rotation([0.5, 0.2, 0.3]), [60.0, 160.0, 280.0])  # seen aslant
@@ -174,7 +175,12 @@ def test_the_handle_turns_the_path_about_its_middle(run: Moved) -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "way"), [("ArrowLeft", (-1, 0)), ("ArrowRight", (1, 0)), ("ArrowUp", (0, -1)), ("ArrowDown", (0, 1))]
+    ("code", "way"),
+    [
+        ("ArrowLeft", (-1, 0)),
+        ("ArrowDown", (0, 1)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("ArrowRight", (1, 0)), ("ArrowUp", (0, -1)))),
+    ],
 )
 def test_arrow_keys_move_it_a_millimetre_as_the_picture_shows_it(run: Moved, code: str, way: tuple[int, int]) -> None:
     before = run.middle
@@ -270,7 +276,7 @@ def test_the_browser_finds_the_ray_of_a_pixel_as_the_estimator_does(run: Moved) 
     assert np.allclose(found, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("size", [(1024, 768), (768, 1024), (1440, 900)], ids=lambda s: f"{s[0]}x{s[1]}")
+@pytest.mark.parametrize("size", [(1024, 768), *slowly((768, 1024), (1440, 900))], ids=lambda s: f"{s[0]}x{s[1]}")
 def test_nothing_covers_the_question_or_stop_while_the_path_is_moved(run: Moved, size: tuple[int, int]) -> None:
     run.page.resize(*size)
     run.page.js("new Promise((done) => setTimeout(done, 300))")

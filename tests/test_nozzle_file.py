@@ -119,6 +119,7 @@ def test_no_rows_make_an_empty_table(tmp_path: File) -> None:
     assert len(read_nozzle(tmp_path / "nozzle.csv")) == 0
 
 
+@pytest.mark.slow  # a busy machine is slower
 def test_a_run_of_20_s_is_written_within_a_second(tmp_path: File) -> None:
     log = nozzle_log(raster(30, 60), breathing, seconds=20.0)
     start = time.process_time()

@@ -89,7 +89,7 @@ def test_few_tracks_that_stand_off_are_no_measurement_though_nothing_surprises(r
     assert fit.measured is measured
 
 
-@pytest.mark.parametrize("tracks", [(0.5, 5.0, False), (0.5, 0.0, True), *slowly((1.0, 5.0, True))])
+@pytest.mark.parametrize("tracks", [(0.5, 5.0, False), *slowly((0.5, 0.0, True), (1.0, 5.0, True))])
 def test_shape_and_clocks_learn_nothing_where_half_the_tracks_are_off(tracks: tuple[float, float, bool]) -> None:
     share, reach, sound = tracks
     estimator = followed()

@@ -154,6 +154,7 @@ def test_the_two_files_say_the_same(tmp_path: Path) -> None:
             assert row["reason"]
 
 
+@pytest.mark.slow  # the process replay of `make check`, and test_loop_replay
 def test_the_same_bytes_in_every_process() -> None:
     environment = {**os.environ, "PYTHONHASHSEED": "1"}
     command = [sys.executable, "-c", DIGEST]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,22 +82,31 @@ def test_two_runs_and_any_number_of_threads_give_the_same_bytes(recorded: Path) 
     assert sum(name.endswith(".jpg") for name in names) > 40
 
 
-def test_pictures_of_an_earlier_run_are_found_again_and_no_others(
-    recorded: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    rendered: list[int] = []
+@pytest.fixture
+def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many pictures were rendered, each time some were."""
+    counts: list[int] = []
 
     def counting(*arguments: Any) -> Any:
-        rendered.append(len(arguments[1]))
+        counts.append(len(arguments[1]))
         return render(*arguments)
 
     monkeypatch.setattr(camera_pipeline, "render", counting)
+    return counts
+
+
+def test_pictures_of_an_earlier_run_are_found_again(recorded: Path, rendered: list[int], tmp_path: Path) -> None:
     options = SimulationOptions(cache=recorded / "cache")
     run_simulation(recorded / "scenario.toml", tmp_path / "again", options)
     again, one = tmp_path / "again" / "session.mcap", recorded / "one" / "session.mcap"
     assert not rendered and again.read_bytes() == one.read_bytes()
+
+
+@pytest.mark.slow  # the store's key is tried below
+def test_what_a_fault_changes_is_rendered_and_no_more(recorded: Path, rendered: list[int], tmp_path: Path) -> None:
     later = faults_from_texts("test", "fault", ["camera1 black at 0.5s"])
-    run_simulation(recorded / "scenario.toml", tmp_path / "covered", replace(options, faults=later))
+    options = SimulationOptions(cache=recorded / "cache", faults=later)
+    run_simulation(recorded / "scenario.toml", tmp_path / "covered", options)
     whole = sum(file.suffix == ".jpg" for file in (recorded / "one" / "session").rglob("*"))
     assert 5 < sum(rendered) < 0.9 * whole  # what is black, and what the nozzle does because of it
 

@@ -206,9 +206,9 @@ def test_two_runs_give_the_same_bits() -> None:
         assert a.twist.tobytes() == b.twist.tobytes() and a.twist_covariance.tobytes() == b.twist_covariance.tobytes()
 
 
-def test_the_window_holds_as_much_after_a_minute_as_after_a_second() -> None:
+def test_the_window_holds_as_much_after_15_seconds_as_after_one() -> None:
     smoother, sizes = Smoother(), []
-    for m in measure(breathing, np.arange(1800) / 30, 8):
+    for m in measure(breathing, np.arange(450) / 30, 8):
         smoother.add(m)
         sizes.append((smoother._window.getFactors().size(), len(smoother._window.timestamps())))
     factors, keys = np.array(sizes).T

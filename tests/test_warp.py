@@ -20,6 +20,7 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, Warp
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
 from hardware.simulator.scene.shape import Deformation
+from tests.slowly import slowly
 from tests.synthetic import Motion, breathing, still
 
 RIG = arc_rig()
@@ -130,7 +131,7 @@ def bulging() -> Follow:
     return Follow(BULGE)
 
 
-@pytest.mark.parametrize("motion", [still, breathing])
+@pytest.mark.parametrize("motion", [breathing, *slowly(still)])
 def test_a_rigid_motion_gives_no_warp_at_all(motion: Motion) -> None:
     rigid = Follow(Deformation(), motion, seconds=3.0)
     assert all(pose.warp is None and pose.deformation == 0.0 for pose in rigid.poses)

@@ -67,9 +67,9 @@ def late_arm(arm: dict[str, object], **more: object) -> dict[str, object]:
     "late",
     [
         (late_arm({"dead_time_s": 0.02, "servo_lag_s": 0.02}), 0.04),
-        (late_arm({"wire_baud": 115200}), 48 * 10 / 115200),
         (late_arm({"assumed_lag_s": 0.04}), -0.04),  # told of more than there is, it is early
         *slowly(
+            (late_arm({"wire_baud": 115200}), 48 * 10 / 115200),
             (late_arm({"dead_time_s": 0.05}), 0.05),
             (late_arm({"servo_lag_s": 0.03}), 0.03),
             (late_arm({"dead_time_s": 0.05, "assumed_lag_s": 0.02}), 0.03),
@@ -90,7 +90,7 @@ def test_an_unknown_delay_costs_speed_times_delay(late: tuple[dict[str, object],
     "change",
     [
         {"arm": {"dead_time_s": 0.05, "servo_lag_s": 0.02, "wire_baud": 115200, "assumed_lag_s": 0.07 + 480 / 115200}},
-        {"cameras": {"transport_s": 0.08}, "tracking": {"processing_s": 0.05}},
+        *slowly({"cameras": {"transport_s": 0.08}, "tracking": {"processing_s": 0.05}}),
         {"cameras": {"exposure_s": 0.016}},
         {"cameras": {"phase_s": [0.0, 0.004, 0.008]}},
     ],

@@ -27,6 +27,7 @@ from tests.board_session import BOARD
 from tests.light_live import prepare_files
 from tests.recorded import write_frames
 from tests.session_files import rig
+from tests.slowly import slowly
 from tests.started import ROOT
 
 WRONG = """
@@ -349,7 +350,7 @@ def test_they_end_with_their_parent(pool: str, end: Callable[[int, int], None], 
             os.killpg(started.pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("how", ["tracked", "begun"])
+@pytest.mark.parametrize("how", ["begun", *slowly("tracked")])
 def test_ctrl_c_while_a_process_loads_is_its_parents_alone(how: str, tmp_path: Path) -> None:
     (script := tmp_path / "starts.py").write_text(STARTS.replace("{how}", how))
     started = subprocess.Popen(
@@ -405,6 +406,7 @@ def test_a_wrong_command_line_is_exit_code_2_where_nobody_hears_it() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
 
 
+@pytest.mark.slow  # the console without one is tried below
 def test_a_live_run_needs_no_standard_input(tmp_path: Path) -> None:
     prepare_files(tmp_path, lines=2, speed=10.0)
     """And a session that is over once all is printed is enough."""
