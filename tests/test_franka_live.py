@@ -13,15 +13,19 @@ import pytest
 
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
-from hardware.files.arm_file import arm_over, write_arm
+from hardware.files.arm_file import arm_over, read_arm, write_arm
 from hardware.files.path_file import read_path
+from hardware.live.prepared import RunFiles
+from hardware.live.prerender import nozzle_errors as nozzle_errors_from_pictures
+from hardware.live.prerender import prerender
 from hardware.live.recorded_run import commands_of, replay_run
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.path import PrintPhase
+from tests import octoprint_bench
 from tests.arm_benches import closing_bench
 from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, installed
 from tests.light_live import HOME, TILT, prepare_files
-from tests.live_runs import CLOCK, Running, messages
+from tests.live_runs import CLOCK, PATH, Running, messages
 from tests.moving import breathing
 from tests.octoprint_bench import OctoPrintServer
 from tests.test_arm_laws import straight
@@ -29,6 +33,27 @@ from tests.test_live_run import confirmed
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
 ADDRESS = f"franka://{HOST}"
+PICTURES = """
+title = "Pictures that leave a core to MuJoCo, which must keep real time"
+seconds = 4.3
+seed = 3
+path = "path.csv"
+clearance_mm = 0.4
+bead_mm = 1.0
+[scene]
+body = "chest"
+wound = false
+texel_mm = 0.3
+[[motion]]
+kind = "breathing"
+amplitude_mm = 4.0
+rate_hz = 0.25
+[rig]
+size = [320, 180]
+focal_px = 275
+[cameras]
+fps = 15.0
+"""
 HEIGHT = 2.0  # mm up and 2 mm down: breaths of 4 mm
 STANDSTILL = 0.05  # mm from where it comes to rest
 
@@ -121,6 +146,56 @@ def test_a_breathing_surface_is_printed_and_the_true_flange_says_how_well(live: 
     ticks = replay_run(record)
     assert len(ticks) > 200 and all(tick.frame == tick.recorded for tick in ticks)
     assert p95 <= 0.5 and most <= 1.0 and duty >= 0.8, words
+
+
+def test_from_pictures_the_true_flange_says_how_well_a_franka_prints(tmp_path: Path) -> None:
+    server = FrankaServer(tmp_path)
+    try:
+        print_from_pictures(tmp_path, ADDRESS, server.truth)
+    finally:
+        server.end(signal.SIGKILL)
+
+
+@pytest.mark.skipif(not octoprint_bench.installed(), reason=octoprint_bench.MISSING)
+def test_from_pictures_octoprint_s_printer_says_how_well_it_prints(tmp_path: Path) -> None:
+    address = f"gcode://{tmp_path / 'printer'}"
+    server = OctoPrintServer(tmp_path, arm_over(ArmProfile(), address).arm.home)
+    try:
+        print_from_pictures(tmp_path, address, lambda profile: server.places())
+    finally:
+        server.end(signal.SIGKILL)
+
+
+def print_from_pictures(folder: Path, address: str, truth: Callable[[ArmProfile], tuple[Array, Array]]) -> None:
+    """Print a scenario, all tracking included, and compare the nozzle with its place on the true surface.
+
+    truth: ends the arm; stamps (N,), s, and axes (N, 6), where it truly was.
+    """
+    scenario, record = folder / "scenario.toml", folder / "run.mcap"
+    scenario.write_text(PICTURES, encoding="utf-8")
+    (folder / "path.csv").write_text(PATH, encoding="utf-8")
+    rendered = prerender(scenario, folder / "cache" / "stillbed").folder
+    profile = arm_over(read_arm(rendered / "arm.toml"), address)
+    write_arm(folder / "arm.toml", profile, "where a simulated run puts it")
+    what = "--simulated", str(scenario), "--arm", address, "--yes", "--no-page", "--record", str(record)
+    run = Running(*what, cache=folder / "cache")
+    try:
+        run.wait_for(r"\nprint\n")
+        run.wait_for("done|finished|stopped|failed")
+        code = run.end()
+    finally:
+        run.close()
+    stamps, axes = truth(profile)
+    executed = RunFiles(record).executed
+    np.savez(executed, stamps=stamps, axes=axes, deepest=np.nan, held_up=np.nan)
+    error = nozzle_errors_from_pictures(record, executed, rendered / "path.csv", folder / "arm.toml")
+    p95, most, load = error.figure(95), error.figure(100), os.getloadavg()[0]
+    steps = np.diff(stamps)
+    pace = f"places every {1000 * np.median(steps):.1f} ms, at most {1000 * steps.max():.0f} ms apart"
+    words = f"P95 {p95:.2f} mm, max {most:.2f} mm, duty {100 * error.duty:.0f} %, load {load:.1f}, {pace}"
+    print(words)
+    assert code == 0, run.said
+    assert p95 <= 0.5 and most <= 1.0 and error.duty >= 0.8, words
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
