@@ -113,7 +113,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench loop": (LOOP, LONG),
     "stillbed bench loop -o OUT": (LOOP, LONG),
     "stillbed bench live --minutes 1 --busy 2 --scenario data/live/small.toml": (f"{LIVE} --busy 1", STARTED),
-    "stillbed bench look": ("stillbed bench look --layers 1", LONG),
+    "stillbed bench look": ("stillbed bench look --layers 1 --stacks 0", LONG),
     "stillbed bench map": ("stillbed bench map --seconds 2", LONG),
     "stillbed bench plan": ("stillbed bench plan --body foot", "on a smaller wound"),
     "stillbed bench planner": ("stillbed bench planner --updates 20", LONG),

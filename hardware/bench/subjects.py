@@ -177,7 +177,8 @@ _SUBJECTS = (
         number("--jobs", 1, None, "processes that share the prints (default: 1)"),
     ),
     _subject("look", "scan", "layers of gel, as a look between layers measures them; clogs found")(
-        number("--layers", 60, "N", "every sixth with a clog; default 60")
+        number("--layers", 36, "N", "on bare beds, every sixth with a clog; default 36"),
+        number("--stacks", 8, "N", "of three layers each, three of four with a clog; default 8"),
     ),
     _subject("map", "mapping", "landmarks off the true surface beside their claim, and the map's growth")(
         number("--seconds", 3.0, "S", "of each still standing; default 3")

@@ -265,18 +265,21 @@ def look_at(
     pieces: BeadPieces,
     widths: Sequence[float] = WIDTHS,
 ) -> tuple[LaidBeads, SurfaceHeights, float]:
-    """What lies of planned beads, the surface after, and how wide beads are by the planned, one of `widths`."""
+    """What lies of planned beads, the surface after, and how wide beads are by the planned, within `widths`."""
     nodes = before.nodes
     stations = stations_of(pieces)
     station, _ = nearest_station(pieces, stations, nodes)
-    dues = [bead_heights(replace(pieces, width=pieces.width * width), nodes) for width in widths]
-    swept = sweep_beads(lenses, views, before, dues, station, np.diff(stations.bead) == 0)
-    width, due = widths[swept.width], dues[swept.width]
+
+    def due_at(width: float) -> Array:
+        return bead_heights(replace(pieces, width=pieces.width * width), nodes)
+
+    swept = sweep_beads(lenses, views, before, due_at, widths, station, np.diff(stations.bead) == 0)
+    due = due_at(swept.width)
     after = heights_with_beads(before, due, station, swept)
     known = replace(before, sigma=0.0 * before.sigma)  # a share's sigma holds what the ground is off by
-    laid = judge_beads(known, after, replace(pieces, width=pieces.width * width))
+    laid = judge_beads(known, after, replace(pieces, width=pieces.width * swept.width))
     ground = heights_with_beads(before, due, station, replace(swept, share=ground_shares(swept)))
-    return laid, replace(after, heights=ground.heights), width
+    return laid, replace(after, heights=ground.heights), swept.width
 
 
 def ground_shares(swept: BeadShares) -> Array:

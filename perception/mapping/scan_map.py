@@ -14,6 +14,7 @@ wound's walls by tenths of a millimetre, and corrects it from coarse to fine.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -43,6 +44,7 @@ MAX_EPIPOLAR_ERROR_PX = 0.5  # px off the epipolar line, or three times the medi
 MIN_NODE_FACING = 0.2  # cosine of the viewing angle below which a camera sees too little of a node
 
 Float32 = NDArray[np.float32]
+Picture = Image | Float32  # (H, W) one channel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +73,7 @@ def node_size(lenses: Lenses, cameras: list[int], centre: Array) -> float:
 
 
 def match_near(
-    lenses: Lenses, images: dict[int, Image], nodes: Array, reference: int, every: int = 1
+    lenses: Lenses, images: Mapping[int, Picture], nodes: Array, reference: int, every: int = 1
 ) -> DenseMatch | None:
     """Where the surface near `nodes` (H, W, 3), base frame, really is; None where no two cameras see any of it.
 
@@ -132,7 +134,7 @@ def lattice_normals(nodes: Array) -> Array:
 
 
 def lattice_image(
-    lenses: Lenses, camera: int, image: Image, nodes: Array, normals: Array, evening: float = EVENING_SIGMA_NODES
+    lenses: Lenses, camera: int, image: Picture, nodes: Array, normals: Array, evening: float = EVENING_SIGMA_NODES
 ) -> LatticeImage:
     """A picture laid on nodes (H, W, 3), base frame, with normals; evened over `evening` nodes."""
     lens = lenses.rig.cameras[camera]

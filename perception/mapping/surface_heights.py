@@ -5,15 +5,16 @@ After: a bead is a few pixels wide and its edges have the strongest texture, whi
 (foreground fattening: a single bead was measured twice as large). What is planned there is known, though. So each piece
 of bead is swept: pictures are laid on the surface before plus 0, 1/4, ... 9/4 of the planned bead, and where they look
 most alike is how much lies there; then every other bead again, with its neighbours as they were found: steep sides
-stand beside it. Where the shape is right, a patch has nothing to fatten.
+stand beside it. Where the shape is right, a patch has nothing to fatten. A node that a bead hides from a camera is not
+seen by it.
 
-On matt gel, seen 9 pixels wide, this was measured right to 5 %; on glossy gel it lies low, as a mirrored lamp stands
-behind the surface that mirrors it (docs/simulator.md).
+Both go by colour where there is enough: what a lamp leaves on a surface lies behind it. In grey pictures beds came out
+0.03 mm too low, of 0.36 mm that a layer has in the mean, and glossy gel at 0.75 to 0.85 (docs/simulator.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -28,6 +29,8 @@ from estimation.surface_map import SurfaceHeights
 from perception.frames import FrameSet, Image
 from perception.lens import Lenses
 from perception.mapping import scan_map
+from perception.mapping.features import grey
+from perception.mapping.scan_map import Picture
 
 FIRST_WIDTHS = (2.0, 2.0, 1.0, 1.0)  # widths of a node, in its finest size, from landmarks on (scan_map.NODE_WIDTHS)
 NEXT_WIDTHS = (1.0, 1.0)  # in a further view, from the surface of the first
@@ -36,9 +39,11 @@ COARSE_SHARES = np.arange(-0.25, 2.26, 0.25)  # of the planned bead
 FINE_SHARES = np.arange(-0.25, 0.251, 0.125)  # about what the coarse sweep found
 EVENING = 1.0  # mm over which brightness is evened out in the sweep: about a bead
 MIN_SWEEP_FACING = 0.35  # cosine of the viewing angle: a bead's steep side hides itself
+HIDING_REACH, HIDING_HEIGHT = 3.0, 0.03  # mm beside a node within which a bead hides it, and mm by which at least
 MIN_ALIKE = 0.35  # mean correlation at the best share below which nothing is said
 WIDTH_VIEWS = 1  # views by which the width is found
-AS_ALIKE = 0.02  # of the correlation: of widths as good as the best the narrowest is taken, as a pixel blurs outwards
+# Grey pictures are off by what lamps leave, matte ones weak where a surface has little colour: healthy skin, dry
+AS_ALIKE, AS_MUCH_SEEN = 0.1, 0.05  # by which grey ones must be more alike, and the share that they must show besides
 BESIDE_WEIGHT = 0.5  # of the pieces before and after in one piece's correlation: alone it is too short to be sure
 SHARE_FLOOR = 0.05  # of the planned bead: what the sweep is off by however many frame sets there are
 # By the errors on ten beds of three layers: 0.06 where pictures agree to 0.98, 0.15 at 0.75, 0.26 at 0.42. On other
@@ -51,16 +56,33 @@ MIN_STATION_NODES = 20  # nodes of a piece of bead that are seen
 class SurfaceView:
     """The pictures of one instant, and where the surface was."""
 
-    images: dict[int, Image]  # grey, by camera
+    images: dict[int, Image]  # (H, W) grey or (H, W, 3) BGR, by camera
     base_from_surface: Array  # (4, 4) mm
+
+    @property
+    def coloured(self) -> bool:
+        """Whether all pictures have colours."""
+        return all(image.ndim == 3 for image in self.images.values())
+
+    def pictures(self, by_colour: bool) -> dict[int, Picture]:
+        """Each camera's picture (H, W), matte or grey."""
+        return {camera: matte(image) if by_colour else grey(image) for camera, image in self.images.items()}
 
 
 def view_of(frames: FrameSet, base_from_surface: Array) -> SurfaceView:
-    """A frame set as a view."""
-    grey = {
-        f.camera: f.image if f.image.ndim == 2 else cv2.cvtColor(f.image, cv2.COLOR_BGR2GRAY) for f in frames.frames
-    }
-    return SurfaceView({camera: np.asarray(image) for camera, image in grey.items()}, base_from_surface)
+    """A frame set as a view, its pictures copied."""
+    return SurfaceView({f.camera: f.image.copy() for f in frames.frames}, base_from_surface)
+
+
+def matte(image: Image) -> Picture:
+    """A picture (H, W, 3) BGR without what lamps leave on a wet or glossy surface: red less half of green and blue.
+
+    A mirrored lamp has the lamp's colour, about white, and lies behind the surface that mirrors it; what the
+    subtraction leaves has the surface's own colour (dichromatic reflection, Shafer 1985). A picture's numbers are taken
+    for the square root of the light.
+    """
+    light = image.astype(np.float32) ** 2 / 255
+    return np.asarray(light[..., 2] - 0.5 * (light[..., 0] + light[..., 1]), np.float32)
 
 
 def first_heights(points: Array, low: Array, high: Array, step: float) -> SurfaceHeights:
@@ -72,34 +94,56 @@ def first_heights(points: Array, low: Array, high: Array, step: float) -> Surfac
 
 
 def dense_heights(lenses: Lenses, views: Sequence[SurfaceView], start: SurfaceHeights) -> SurfaceHeights:
-    """The surface by dense matching in each view, near `start`; NaN where no two cameras see it in most of them."""
+    """The surface by dense matching in each view, near `start`; NaN where no two cameras see it in most of them.
+
+    By matte pictures, unless grey ones show clearly more of it.
+    """
     finest = scan_map.node_size(lenses, sorted(views[0].images), views[0].base_from_surface[:3, 3])
-    heights, seen, found = start.heights, np.zeros(start.heights.shape, bool), list[tuple[Array, NDArray[np.bool_]]]()
-    for view in views:
-        for width in NEXT_WIDTHS if found else FIRST_WIDTHS:
-            heights, seen = _matched_heights(lenses, view, start, heights, max(width * finest, start.step))
-        found.append((heights, seen))
+    steps = [max(width * finest, start.step) for width in FIRST_WIDTHS]
+    tried = {how: _matched_heights(lenses, views[0], how, start, start.heights, steps) for how in _ways(views)}
+    most = max(float(seen.mean()) for _, seen in tried.values())
+    by_colour = next(how for how, (_, seen) in tried.items() if seen.mean() > most - AS_MUCH_SEEN)
+    found, steps = [tried[by_colour]], [max(width * finest, start.step) for width in NEXT_WIDTHS]
+    for view in views[1:]:
+        found.append(_matched_heights(lenses, view, by_colour, start, found[-1][0], steps))
     each, sure = np.stack([h for h, _ in found]), np.mean([s for _, s in found], axis=0)
     spread = np.sqrt(each.var(axis=0) / max(len(views) - 1, 1) + MATCH_FLOOR**2)
     return replace(start, heights=np.where(sure > 0.5, np.median(each, axis=0), np.nan), sigma=spread)
 
 
+def _ways(views: Sequence[SurfaceView]) -> tuple[bool, ...]:
+    """By which pictures to measure, the better first: matte ones where there are colours, or grey ones."""
+    return (True, False) if all(view.coloured for view in views) else (False,)
+
+
 def _matched_heights(
-    lenses: Lenses, view: SurfaceView, field: SurfaceHeights, heights: Array, step: float
+    lenses: Lenses, view: SurfaceView, by_colour: bool, field: SurfaceHeights, heights: Array, steps: Sequence[float]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Heights (H, W) on the lattice of `field`, matched near `heights` on one of `step` mm, and where they are sure."""
+    """Heights (H, W) on the lattice of `field`, matched near `heights` on ones of `steps` mm, and where to believe."""
+    pictures, seen = view.pictures(by_colour), np.zeros(heights.shape, bool)
+    for step in steps:
+        heights, seen = _matched_once(lenses, view.base_from_surface, pictures, field, heights, step)
+    return heights, seen
+
+
+def _matched_once(
+    lenses: Lenses,
+    base_from_surface: Array,
+    pictures: dict[int, Picture],
+    field: SurfaceHeights,
+    heights: Array,
+    step: float,
+) -> tuple[Array, NDArray[np.bool_]]:
     shape = heights.shape
     high = field.low + field.step * (np.array(shape[::-1]) - 1)
     count = np.maximum(np.rint((high - field.low) / step).astype(int) + 1, 2)
     flat = np.stack(np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(field.low, high, count, strict=True))), -1)
     nodes = np.dstack([flat, _resampled(heights, flat.shape[:2])])
-    reference = scan_map.middle_camera(lenses, sorted(view.images), view.base_from_surface[:3, 3])
-    match = scan_map.match_near(
-        lenses, view.images, scan_map.transformed_nodes(view.base_from_surface, nodes), reference
-    )
+    reference = scan_map.middle_camera(lenses, sorted(pictures), base_from_surface[:3, 3])
+    match = scan_map.match_near(lenses, pictures, scan_map.transformed_nodes(base_from_surface, nodes), reference)
     if match is None:
         return heights, np.zeros(shape, bool)
-    inner = scan_map.transformed_nodes(se3.inverse(view.base_from_surface), match.points)
+    inner = scan_map.transformed_nodes(se3.inverse(base_from_surface), match.points)
     corrected = scan_map.corrected_heights(nodes, inner, match.sure, step).astype(float)
     return _resampled(corrected, shape), _resampled(match.sure.astype(float), shape) > 0.5
 
@@ -111,33 +155,36 @@ class BeadShares:
     share: Array  # (S,) of the planned
     sigma: Array  # (S,)
     alike: Array  # (S,) mean correlation of the cameras' pictures at that share
-    width: int  # which of the widths that were tried fits
+    width: float  # of beads, by the planned
 
 
 def sweep_beads(
     lenses: Lenses,
     views: Sequence[SurfaceView],
     before: SurfaceHeights,
-    dues: Sequence[Array],
+    due_at: Callable[[float], Array],
+    widths: Sequence[float],
     station: NDArray[np.int64],
     joined: NDArray[np.bool_],
 ) -> BeadShares:
     """The share of each piece of bead by sweeping, and how wide beads are.
 
-    dues: (H, W) mm each, the planned beads on the lattice of `before`, of one volume and rising widths. station: (H, W)
-    piece of bead that a node belongs to, -1 for none. joined: (S - 1,) whether the next piece is of the same bead.
+    due_at: the planned beads (H, W) mm on the lattice of `before`, of one volume, by how wide they are by the planned.
+    widths: that are tried, or the one that is known. station: (H, W) piece of bead that a node belongs to, -1 for none.
+    joined: (S - 1,) whether the next piece is of the same bead.
     """
     rows, columns = (_reach(np.flatnonzero((station >= 0).any(axis=axis)), before.step) for axis in (1, 0))
     box = (slice(*rows), slice(*columns))
-    station, dues, count = station[box], [due[box] for due in dues], len(joined) + 1
+    station, count = station[box], len(joined) + 1
     low = before.low + before.step * np.array([columns[0], rows[0]])
     before = replace(before, low=low, heights=before.heights[box], sigma=before.sigma[box])
     ground = np.where(np.isfinite(before.heights), before.heights, np.nanmedian(before.heights))
     lattice = _SweepLattice(replace(before, heights=ground), station, joined)
-    laid = [lattice.views(lenses, view) for view in views]
-    tried = np.array([_swept(lattice, laid[:WIDTH_VIEWS], due)[1].mean() for due in dues]) if len(dues) > 1 else None
-    width = 0 if tried is None else int(np.flatnonzero(tried >= tried.max() - AS_ALIKE)[0])
-    shares, alike = _swept(lattice, laid, dues[width])
+    by_colour = _by_colour(lenses, lattice, views, due_at(widths[len(widths) // 2])[box])
+    laid = [lattice.views(lenses, view, by_colour) for view in views]
+    tried = [_swept(lattice, laid[:WIDTH_VIEWS], due_at(w)[box])[1].mean() for w in widths[len(widths) == 1 :]]
+    width = widths[0] if len(widths) == 1 else _best_width(np.array(widths), np.array(tried))
+    shares, alike = _swept(lattice, laid, due_at(width)[box])
     inside = station >= 0
     nodes = np.bincount(station[inside], np.isfinite(before.heights[inside]), count)
     known = (alike.mean(axis=0) > MIN_ALIKE) & (nodes >= MIN_STATION_NODES)
@@ -146,6 +193,22 @@ def sweep_beads(
     unlike = UNLIKE_VARIANCE * np.clip(1 - alike.mean(axis=0), 0.0, 1.0)
     sigma = np.sqrt(shares.var(axis=0) / max(len(views) - 1, 1) + SHARE_FLOOR**2 + unlike)
     return BeadShares(np.where(known, share, np.nan), sigma, alike.mean(axis=0), width)
+
+
+def _by_colour(lenses: Lenses, lattice: _SweepLattice, views: Sequence[SurfaceView], due: Array) -> bool:
+    """Whether to go by matte pictures: unless grey ones are clearly more alike, over beads or where none came."""
+    alike = []
+    for by_colour in _ways(views):
+        ground = lattice.views(lenses, views[0], by_colour)
+        alike.append(max(lattice.alike(ground, share * due).mean() for share in (0.0, 1.0)))
+    return len(alike) > 1 and bool(alike[0] > alike[1] - AS_ALIKE)
+
+
+def _best_width(widths: Array, alike: Array) -> float:
+    """The width at which pictures are most alike, by the parabola through all: a step of width is a tenth of volume."""
+    bend, slope, _ = np.polyfit(widths, alike, 2)
+    best = -slope / (2 * bend) if bend < 0 else widths[int(alike.argmax())]
+    return float(np.clip(best, widths[0], widths[-1]))
 
 
 def heights_with_beads(
@@ -170,19 +233,34 @@ def _reach(taken: NDArray[np.int64], step: float) -> tuple[int, int]:
 class _GroundView:
     """Where one camera's picture shows the nodes of a lattice, H rows of W, on the ground and above it."""
 
-    image: Image
+    image: Picture
     pixels: NDArray[np.float32]  # (H, W, 2) px of the ground,
     rise: NDArray[np.float32]  # (H, W, 2) px, and how they move a mm above it: heights are thousandths of the distance
     inside: NDArray[np.bool_]  # (H, W) whether the picture has them
     towards: Array  # (H, W, 3) unit, to the camera, surface frame
 
-    def even(self, heights: Array, evening: float) -> NDArray[np.float32]:
-        """Grey levels (H, W) at `heights` (H, W) mm above the ground, evened over `evening` nodes; about 0."""
+    def even(self, heights: Array, evening: float, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Grey levels (H, W) at `heights` (H, W) mm above the ground, evened over `evening` nodes seen; about 0."""
         where = self.pixels + heights[..., None].astype(np.float32) * self.rise
         grey = np.asarray(cv2.remap(self.image, where[..., 0], where[..., 1], cv2.INTER_CUBIC), np.float32)
-        centred = grey - cv2.GaussianBlur(grey, (0, 0), evening)
-        spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), evening))
+        weight = seen.astype(np.float32) + 1e-3
+        total = cv2.GaussianBlur(weight, (0, 0), evening)
+        centred = grey - cv2.GaussianBlur(weight * grey, (0, 0), evening) / total
+        spread = np.sqrt(cv2.GaussianBlur(weight * centred * centred, (0, 0), evening) / total)
         return np.asarray(scan_map.EVENED_CONTRAST * centred / (spread + 2.0), np.float32)
+
+    def unhidden(self, surface: Array, step: float) -> NDArray[np.bool_]:
+        """Nodes (H, W) between which and the camera no part of the surface (H, W) mm stands; step: mm, of nodes."""
+        x, y, z = self.towards.mean(axis=(0, 1))
+        aside = max(float(np.hypot(x, y)), 1e-6)
+        rise, heights = step * max(z, 1e-6) / aside, surface.astype(np.float32)  # mm that a ray rises from node to node
+        clear = np.ones(surface.shape, bool)
+        for k in range(1, min(int(np.ptp(surface) / rise), int(HIDING_REACH / step)) + 1):
+            shift = np.array([[1, 0, k * x / aside], [0, 1, k * y / aside]])
+            how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            nearer = cv2.warpAffine(heights, shift, heights.shape[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
+            clear &= nearer < heights + k * rise + HIDING_HEIGHT
+        return clear
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,10 +271,10 @@ class _SweepLattice:
     station: NDArray[np.int64]  # (H, W)
     joined: NDArray[np.bool_]  # (S - 1,) whether the next piece is of the same bead
 
-    def views(self, lenses: Lenses, view: SurfaceView) -> dict[int, _GroundView]:
-        """How each camera sees the ground."""
+    def views(self, lenses: Lenses, view: SurfaceView, by_colour: bool) -> dict[int, _GroundView]:
+        """How each camera sees the ground, in matte pictures or grey ones."""
         found = {}
-        for camera, image in view.images.items():
+        for camera, image in view.pictures(by_colour).items():
             lens, shape, where = lenses.rig.cameras[camera], self.station.shape, []
             for height in (0.0, 1.0):
                 nodes = np.dstack([self.ground.nodes, self.ground.heights + height]).reshape(-1, 3)
@@ -219,8 +297,10 @@ class _SweepLattice:
         number, grey, visible = self.station[inside], {}, {}
         for camera, view in views.items():
             x, y, z = np.moveaxis(view.towards, -1, 0)
-            grey[camera] = view.even(heights, evening)[inside].astype(float)
-            visible[camera] = (view.inside & (z - right * x - down * y > MIN_SWEEP_FACING * steep))[inside]
+            seen = view.inside & (z - right * x - down * y > MIN_SWEEP_FACING * steep)
+            seen &= view.unhidden(self.ground.heights + heights, self.ground.step)
+            grey[camera] = view.even(heights, evening, seen)[inside].astype(float)
+            visible[camera] = seen[inside]
         total, pairs = np.zeros(len(self.joined) + 1), np.zeros(len(self.joined) + 1)
         for pair in combinations(sorted(grey), 2):
             both = np.logical_and(*(visible[c] for c in pair)).astype(float)
