@@ -133,11 +133,11 @@ def run_look(options: argparse.Namespace) -> list[Figure]:
     clogged, others = [x for x in layers if x.clog], [x for x in layers if not x.clog]
     found = sum(any(a < x.clog.along[1] and b > x.clog.along[0] for a, b in x.laid.clogs) for x in layers if x.clog)
     false = sum(len(x.laid.clogs) for x in others) + sum(max(len(x.laid.clogs) - 1, 0) for x in clogged)
-    missed, upper = f"clogs of {CLOG_SPAN:g} mm or more missed", sum(x.below > 0 for x in clogged)
+    missed, above = f"clogs of {CLOG_SPAN:g} mm or more missed", sum(x.below > 0 for x in clogged)
     among = f"in {len(layers)} layers, {sum(x.below > 0 for x in layers)} of them on others"
     return [
         *figures,
-        Figure(missed, len(clogged) - found, "", at_most(0), "", f"of {len(clogged)}, {upper} of them in upper layers"),
+        Figure(missed, len(clogged) - found, "", at_most(0), "", f"of {len(clogged)}, {above} of them in upper layers"),
         Figure("clogs found that were none", false, "", at_most(0), "", among),
         Figure("a look, judged in", float(np.median([x.seconds for x in layers])), "s", at_most(2.5), "", "median"),
     ]
@@ -189,7 +189,8 @@ class _Bed:
         points = self.scene.shape.points(self.rng.uniform(-25.0, 25.0, (150, 2)))
         low, high = start[0, :2] - 10.0, self._pieces.end[-1, :2] + 10.0
         self._bare = dense_heights(self._lenses, self._views(), first_heights(points, low, high, 0.2))
-        self._ground, self._widths = self._bare, WIDTHS
+        self._ground = self._bare
+        self._widths: tuple[float, ...] = WIDTHS
 
     def look(self, number: int, below: int, clog: _Clog | None) -> _LookedLayer:
         """Lay the `number`-th layer of this bed, on so many others, and look at it."""
