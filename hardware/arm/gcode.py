@@ -200,14 +200,15 @@ class GcodeMachine(SerialDriver):
         goal = "G1" + "".join(f" {name}{v:.{PLACE_DIGITS}f}" for name, v in zip("XYZ", axes[:3].tolist(), strict=True))
         last, self._end = self._end, axes[:3]
         way = 0.0 if last is None else float(np.linalg.norm(axes[:3] - last))
-        seconds, feed = way / given.feed, given.feed
+        seconds = way / given.feed
         push = self._pushed(given.volume, seconds)
         if push.word and last is not None:  # what it pushes takes its time
             seconds = max(seconds, push.seconds)
             if not way:  # the feed of such a line is E's
                 return f"{goal}{push.word} F{push.feed(seconds):.3f}", G4(seconds)
-            feed = way / seconds
-        feed = max(round(60 * feed, 1), 0.1)  # mm/min
+            feed = max(np.floor(60_000 * way / seconds), 1) / 1000  # mm/min, down: E is at its speed's limit
+            return f"{goal}{push.word} F{feed:.3f}", replace(given, axes=axes, feed=feed / 60)
+        feed = max(round(60 * given.feed, 1), 0.1)  # mm/min
         return f"{goal}{push.word} F{feed:g}", replace(given, axes=axes, feed=feed / 60)
 
     def _pushed(self, volume: float, seconds: float) -> Push:
