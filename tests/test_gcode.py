@@ -152,7 +152,6 @@ def test_a_line_has_the_checksum_that_reprap_s_own_examples_have() -> None:
     assert numbered(3, "T0") == b"N3 T0*57\n" and numbered(4, "G92 E0") == b"N4 G92 E0*67\n"
 
 
-@settings(max_examples=60)
 @given(st.lists(st.sampled_from(["", "", "", "lost", "garbled", "unanswered"]), max_size=60))
 def test_whatever_is_lost_each_move_is_made_once_and_in_order(fates: list[str]) -> None:
     driven = Driven(board := Board())

@@ -271,7 +271,6 @@ def test_an_arm_switches_the_material_with_its_own_frames() -> None:
                 assert not state
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0.018, 0.055), st.floats(0.5, 4.0), st.floats(0.0, 0.018)), min_size=2, max_size=20),
     st.integers(0, 20),
