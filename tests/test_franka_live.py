@@ -25,7 +25,7 @@ from tests import octoprint_bench
 from tests.arm_benches import closing_bench
 from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, installed
 from tests.light_live import HOME, TILT, prepare_files
-from tests.live_runs import CLOCK, PATH, Running, messages
+from tests.live_runs import CLOCK, PATH, SCENARIO, Running, messages
 from tests.moving import breathing
 from tests.octoprint_bench import OctoPrintServer
 from tests.test_arm_laws import straight
@@ -33,27 +33,9 @@ from tests.test_live_run import confirmed
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not installed(), reason=MISSING)]
 ADDRESS = f"franka://{HOST}"
-PICTURES = """
-title = "Pictures that leave a core to MuJoCo, which must keep real time"
-seconds = 4.3
-seed = 3
-path = "path.csv"
-clearance_mm = 0.4
-bead_mm = 1.0
-[scene]
-body = "chest"
-wound = false
-texel_mm = 0.3
-[[motion]]
-kind = "breathing"
-amplitude_mm = 4.0
-rate_hz = 0.25
-[rig]
-size = [320, 180]
-focal_px = 275
-[cameras]
-fps = 15.0
-"""
+# pictures that leave a core to MuJoCo, which must keep real time, and breaths of 4 mm
+PICTURES = SCENARIO.replace("seconds = 2.7", "seconds = 4.3").replace("fps = 20.0", "fps = 15.0")
+PICTURES = PICTURES.replace("amplitude_mm = 2.0", "amplitude_mm = 4.0").replace("rate_hz = 0.4", "rate_hz = 0.25")
 HEIGHT = 2.0  # mm up and 2 mm down: breaths of 4 mm
 STANDSTILL = 0.05  # mm from where it comes to rest
 
