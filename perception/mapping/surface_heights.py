@@ -39,6 +39,7 @@ COARSE_SHARES = np.arange(-0.25, 2.26, 0.25)  # of the planned bead
 FINE_SHARES = np.arange(-0.25, 0.251, 0.125)  # about what the coarse sweep found
 EVENING = 1.0  # mm over which brightness is evened out in the sweep: about a bead
 MIN_SWEEP_FACING = 0.35  # cosine of the viewing angle: a bead's steep side hides itself
+HIDING_STRIDE = 2  # nodes from one place of a ray to the next: a bead is eight wide
 HIDING_REACH, HIDING_HEIGHT = 3.0, 0.03  # mm beside a node within which a bead hides it, and mm by which at least
 MIN_ALIKE = 0.35  # mean correlation at the best share below which nothing is said
 WIDTH_VIEWS = 1  # views by which the width is found
@@ -255,7 +256,7 @@ class _GroundView:
         aside = max(float(np.hypot(x, y)), 1e-6)
         rise, heights = step * max(z, 1e-6) / aside, surface.astype(np.float32)  # mm that a ray rises from node to node
         clear = np.ones(surface.shape, bool)
-        for k in range(1, min(int(np.ptp(surface) / rise), int(HIDING_REACH / step)) + 1):
+        for k in range(1, min(int(np.ptp(surface) / rise), int(HIDING_REACH / step)) + 1, HIDING_STRIDE):
             shift = np.array([[1, 0, k * x / aside], [0, 1, k * y / aside]])
             how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             nearer = cv2.warpAffine(heights, shift, heights.shape[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
