@@ -510,14 +510,15 @@ def test_a_killed_client_leaves_it_off_within_its_watchdog(tmp_path: File) -> No
         killed = clock.now()
         os.kill(client.pid, signal.SIGKILL)
         client.communicate()
-        clock.wait_until(killed + 0.5)
+        dead = clock.now()  # its last line may be read a little later, on a machine that is busy
+        clock.wait_until(dead + 0.5)
     (model,) = models
     assert len(model.closed_itself) == 1 and not model.on
-    assert killed + 0.03 < model.closed_itself[0] < killed + 0.105
+    assert killed + 0.03 < model.closed_itself[0] < dead + 0.1 + 0.03
     stamps, flow, switched = np.loadtxt(tmp_path / "line.csv", delimiter=",", skiprows=1).T
     assert np.diff(stamps) == pytest.approx(0.001, abs=1e-5)
     assert flow[(stamps > killed - 0.1) & (stamps < killed)] == pytest.approx(1.0, abs=0.01)
-    assert flow[stamps > killed + 0.4].max() < 0.01
+    assert flow[stamps > dead + 0.4].max() < 0.01
     assert (switched[stamps < model.closed_itself[0]][-100:] == 1).all() and switched[-1] == 0
 
 

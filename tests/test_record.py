@@ -73,7 +73,8 @@ def test_what_another_program_shows_is_recorded_whole(recorded: Path) -> None:
     assert not session.damage and [camera.name for camera in session.rig.cameras] == list(NAMES)
     stamps = [np.array([ref.stamp for refs in session.sets for ref in refs if ref.camera == c]) for c in range(3)]
     for own in stamps:
-        assert len(own) > 0.8 * (SECONDS - 3) * FPS and abs(np.median(np.diff(own)) - 1 / FPS) < 0.01
+        assert len(own) > 0.65 * SECONDS * FPS  # also those of the seconds in which a recorder loads
+        assert abs(np.median(np.diff(own)) - 1 / FPS) < 0.01
     assert np.mean([len(refs) == 3 for refs in session.sets]) > 0.5
     for roi, camera in zip(session.roi, rig().cameras, strict=True):
         assert np.abs(roi.polygon - corners_at(0.0, camera, 2.0)).max() <= 0.05 + 1e-9

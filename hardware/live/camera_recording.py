@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -39,6 +40,7 @@ from perception.frames import FrameSet, region_since
 from perception.tracking.wound_step import FindRegion
 
 FIRST_PICTURE_TIME = 10.0  # s in which cameras open; a recording of so many seconds counts from its first picture
+READY_POLL = 0.05  # s between looks at a recorder that starts
 PICTURE_WAIT = 0.1  # s of a wait for pictures, after which signals and the page are looked at
 VIEW_PERIOD = 0.3  # s between views for the page
 SHARPNESS_PERIOD = 1.0  # s between looks at the pictures' sharpness, which takes some ms each
@@ -148,6 +150,7 @@ class CameraRecording:
         self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
         self._begun, self._first, self._last = self._clock.now(), nan, nan
         self._sets = self._passed = 0
+        self._counts = Counter[int]()  # of pictures, by camera
         self._lost: dict[str, None] = {}  # names of cameras that were without pictures for a while, in that order
         self._viewed = self._looked = -1e9
         self._arrived = nan  # s, when the first set was there
@@ -167,8 +170,9 @@ class CameraRecording:
             self._sender.put(rig)
             if self._order.page:
                 self._open_page(stack, rig)
-            self._seek_region(stack, rig)
             progress = stack.enter_context(Progress("record", "frame sets", self._clock.now, self._stream))
+            self._wait_for_recorder(progress)
+            self._seek_region(stack, rig)
             why = ""
             while not (why := self._ended()):
                 self._cycle(progress)
@@ -193,6 +197,15 @@ class CameraRecording:
         stack.callback(self._processes.kill_all)
         self._processes.start(RECORDER, record, (settings, [theirs], self._reports), [theirs])
         self._sender = RecorderSender(ours)
+
+    def _wait_for_recorder(self, progress: Progress) -> None:
+        """Take no picture before the recorder has room for it: it loads for seconds, and few pictures can wait."""
+        progress.note = "the recorder starts"
+        while self._reports.get() is None and not self._ended():
+            self._clock.wait_until(self._clock.now() + READY_POLL)
+            progress(0, 0)
+            self._begun = self._clock.now()
+        self._source.take(0.0)  # what came meanwhile
 
     def _open_page(self, stack: ExitStack, rig: Rig) -> None:
         self._page = RecordingPage(self._clock, rig)
@@ -244,6 +257,7 @@ class CameraRecording:
         if isnan(self._first):
             self._first, self._arrived = frames.stamp, self._clock.now()
         self._last, self._sets = frames.stamp, self._sets + 1
+        self._counts.update(frame.camera for frame in frames.frames)
         self._passed += arrived.dropped
         self._sender.put(SetEntry({frame.camera: frame.stamp for frame in frames.frames}, {}, frames.frames))
         if self._page is not None:
@@ -298,7 +312,8 @@ class CameraRecording:
         if report is not None and report.failed and not self.failed:  # the last of it found no place
             self.failed, why = True, report.failed
         wrong = self._now_wrong()
-        counts = ", ".join(f"{state.name} {state.given}" for state in self._source.health().cameras)
+        names = [camera.name for camera in self._source.rig.cameras]
+        counts = ", ".join(f"{name} {self._counts[k]}" for k, name in enumerate(names))
         lines = [why, f"{self._order.out}: {self._sets} frame sets ({counts} pictures) {self._span()}"]
         if self._sender.dropped:
             lines.append(f"left out, as they found no room on their way to the disk: {self._sender.dropped}")

@@ -279,6 +279,7 @@ class _EntryWriter:
         self._early: list[Entry] = []
         self._used, self._tracked = UsedPoses(()), -np.inf  # and the stamp, s, of the last pose by the tracking process
         self._failed, self._reported = "", 0.0
+        self.report()  # pictures may come
 
     def run(self, senders: Sequence[RecorderReceiver]) -> None:
         """Write entries until all senders have ended."""
