@@ -201,7 +201,7 @@ def _by_colour(lenses: Lenses, lattice: _SweepLattice, views: Sequence[SurfaceVi
     alike = []
     for by_colour in _ways(views):
         ground = lattice.views(lenses, views[0], by_colour)
-        alike.append(max(lattice.alike(ground, share * due).mean() for share in (0.0, 1.0)))
+        alike.append(max(lattice.alike_at(ground, share * due, [share * due]).mean() for share in (0.0, 1.0)))
     return len(alike) > 1 and bool(alike[0] > alike[1] - AS_ALIKE)
 
 
@@ -231,6 +231,15 @@ def _reach(taken: NDArray[np.int64], step: float) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """The nodes of a lattice, H rows of W, that a camera sees of a surface: found once for many heights about it."""
+
+    nodes: NDArray[np.bool_]  # (H, W)
+    weight: NDArray[np.float32]  # (H, W) of each in its surroundings' brightness,
+    total: NDArray[np.float32]  # (H, W) and of all surroundings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _GroundView:
     """Where one camera's picture shows the nodes of a lattice, H rows of W, on the ground and above it."""
 
@@ -240,15 +249,22 @@ class _GroundView:
     inside: NDArray[np.bool_]  # (H, W) whether the picture has them
     towards: Array  # (H, W, 3) unit, to the camera, surface frame
 
-    def even(self, heights: Array, evening: float, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def even(self, heights: Array, evening: float, seen: _Seen) -> NDArray[np.float32]:
         """Grey levels (H, W) at `heights` (H, W) mm above the ground, evened over `evening` nodes seen; about 0."""
         where = self.pixels + heights[..., None].astype(np.float32) * self.rise
         grey = np.asarray(cv2.remap(self.image, where[..., 0], where[..., 1], cv2.INTER_CUBIC), np.float32)
-        weight = seen.astype(np.float32) + 1e-3
-        total = cv2.GaussianBlur(weight, (0, 0), evening)
-        centred = grey - cv2.GaussianBlur(weight * grey, (0, 0), evening) / total
-        spread = np.sqrt(cv2.GaussianBlur(weight * centred * centred, (0, 0), evening) / total)
+        centred = grey - cv2.GaussianBlur(seen.weight * grey, (0, 0), evening) / seen.total
+        spread = np.sqrt(cv2.GaussianBlur(seen.weight * centred * centred, (0, 0), evening) / seen.total)
         return np.asarray(scan_map.EVENED_CONTRAST * centred / (spread + 2.0), np.float32)
+
+    def seen(self, surface: Array, step: float, evening: float) -> _Seen:
+        """The nodes that the camera sees of a surface (H, W) mm, whose nodes are `step` mm apart; evening: nodes."""
+        down, right = np.gradient(surface, step)
+        x, y, z = np.moveaxis(self.towards, -1, 0)
+        facing = z - right * x - down * y > MIN_SWEEP_FACING * np.sqrt(1 + down**2 + right**2)
+        nodes = self.inside & facing & self.unhidden(surface, step)
+        weight = nodes.astype(np.float32) + 1e-3
+        return _Seen(nodes, weight, np.asarray(cv2.GaussianBlur(weight, (0, 0), evening), np.float32))
 
     def unhidden(self, surface: Array, step: float) -> NDArray[np.bool_]:
         """Nodes (H, W) between which and the camera no part of the surface (H, W) mm stands; step: mm, of nodes."""
@@ -290,26 +306,27 @@ class _SweepLattice:
             found[camera] = _GroundView(image, ground, rise, inside.reshape(shape), towards)
         return found
 
-    def alike(self, views: dict[int, _GroundView], heights: Array) -> Array:
+    def alike_at(self, views: dict[int, _GroundView], about: Array, tried: Sequence[Array]) -> Array:
+        """Mean correlations (K, S) at K `tried` heights (H, W) mm, of what is seen of heights (H, W) `about` them."""
+        surface, step = self.ground.heights + about, self.ground.step
+        seen = {camera: view.seen(surface, step, EVENING / step) for camera, view in views.items()}
+        return np.stack([self._alike(views, seen, heights) for heights in tried])
+
+    def _alike(self, views: dict[int, _GroundView], seen: dict[int, _Seen], heights: Array) -> Array:
         """Mean correlation (S,) of the cameras' pictures, laid `heights` (H, W) above the ground, over each piece."""
         inside, evening = self.station >= 0, EVENING / self.ground.step
-        down, right = np.gradient(self.ground.heights + heights, self.ground.step)
-        steep = np.sqrt(1 + down**2 + right**2)
         number, grey, visible = self.station[inside], {}, {}
         for camera, view in views.items():
-            x, y, z = np.moveaxis(view.towards, -1, 0)
-            seen = view.inside & (z - right * x - down * y > MIN_SWEEP_FACING * steep)
-            seen &= view.unhidden(self.ground.heights + heights, self.ground.step)
-            grey[camera] = view.even(heights, evening, seen)[inside].astype(float)
-            visible[camera] = seen[inside]
+            grey[camera] = view.even(heights, evening, seen[camera])[inside].astype(float)
+            visible[camera] = seen[camera].nodes[inside]
         total, pairs = np.zeros(len(self.joined) + 1), np.zeros(len(self.joined) + 1)
         for pair in combinations(sorted(grey), 2):
             both = np.logical_and(*(visible[c] for c in pair)).astype(float)
-            seen = self._summed(number, both)
-            means = [self._summed(number, both * grey[c]) / np.maximum(seen, 1) for c in pair]
+            many = self._summed(number, both)
+            means = [self._summed(number, both * grey[c]) / np.maximum(many, 1) for c in pair]
             a, b = (both * (grey[c] - mean[number]) for c, mean in zip(pair, means, strict=True))
             strength = self._summed(number, a * a) * self._summed(number, b * b)
-            enough = seen >= MIN_STATION_NODES
+            enough = many >= MIN_STATION_NODES
             total += np.where(enough, self._summed(number, a * b), 0.0) / np.sqrt(strength + 1)
             pairs += enough
         return total / np.maximum(pairs, 1)
@@ -328,25 +345,27 @@ class _SweepLattice:
 
 def _swept(lattice: _SweepLattice, views: Sequence[dict[int, _GroundView]], due: Array) -> tuple[Array, Array]:
     """Share (V, S) of each piece of a planned bead at which each view's pictures are most alike, and how much so."""
-    first = _coarse(lattice, views, due, np.zeros(len(lattice.joined) + 1), np.ones(len(lattice.joined) + 1, bool))
+    first = _coarse(lattice, views, due, np.ones(len(lattice.joined) + 1), np.ones(len(lattice.joined) + 1, bool))
     bead = np.concatenate([[0], np.cumsum(~lattice.joined)])
     for turn in (0, 1):
         first = _coarse(lattice, views, due, first, bead % 2 == turn)
     own = lattice.spread(first) * due
-    fine = (_peak(np.stack([lattice.alike(v, own + s * due) for s in FINE_SHARES]), FINE_SHARES) for v in views)
+    fine = (_peak(lattice.alike_at(v, own, [own + s * due for s in FINE_SHARES]), FINE_SHARES) for v in views)
     change, alike = (np.stack(part) for part in zip(*fine, strict=True))
     return first + change, alike
 
 
 def _coarse(
-    lattice: _SweepLattice, views: Sequence[dict[int, _GroundView]], due: Array, others: Array, moved: NDArray[np.bool_]
+    lattice: _SweepLattice, views: Sequence[dict[int, _GroundView]], due: Array, shares: Array, moved: NDArray[np.bool_]
 ) -> Array:
-    """Shares (S,) at which the pictures are most alike, of the pieces that are `moved` while `others` (S,) stay."""
-    tried = []
-    for share in COARSE_SHARES:
-        heights = lattice.spread(np.where(moved, share, others)) * due
-        tried.append(np.mean([lattice.alike(view, heights) for view in views], axis=0))
-    return np.where(moved, _peak(np.stack(tried), COARSE_SHARES)[0], others)
+    """Shares (S,) at which the pictures are most alike, of the pieces that are `moved` while others keep `shares` (S,).
+
+    What hides what is found once, by `shares`.
+    """
+    about = lattice.spread(shares) * due
+    tried = [lattice.spread(np.where(moved, share, shares)) * due for share in COARSE_SHARES]
+    alike = np.mean([lattice.alike_at(view, about, tried) for view in views], axis=0)
+    return np.where(moved, _peak(alike, COARSE_SHARES)[0], shares)
 
 
 def _peak(alike: Array, shares: Array) -> tuple[Array, Array]:
