@@ -108,7 +108,7 @@ def test_garbage_and_emptiness_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"surface{suffix}"
     for data in (b"", b"\n", np.random.default_rng(0).bytes(5000)):
         path.write_bytes(data)
-        assert f"{len(data)} bytes" in refusal(path) or "line 1 = " in refusal(path)
+        assert f"{len(data)} bytes" in refusal(path) or (data and "line 1 = " in refusal(path))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])

@@ -276,6 +276,8 @@ def read_raw_mesh(path: str | Path, reader: MeshReader | None = None) -> RawMesh
     before = path.stat()
     if before.st_size > MAX_MESH_FILE_BYTES:
         raise InputError(path, "size of the file", f"{before.st_size} bytes", f"{MAX_MESH_FILE_BYTES} or fewer")
+    if not before.st_size:
+        raise InputError(path, "scan", "0 bytes", WHOLE_MESH)
     suffix = path.suffix.lower()
     plain = PLAIN_READERS.get(suffix)
     mesh = _read_apart(path, ANNOUNCED[suffix](path), reader) if plain is None else plain(path)
