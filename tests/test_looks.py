@@ -241,6 +241,8 @@ def test_the_report_says_and_draws_what_was_found() -> None:
     assert "clogged from 10 to 18 mm" in look.text and "lack gel" in look.text
     page, picture = looks_section([look], path), look_picture(look, path)
     assert picture.count("<path") == len(look.laid.planned) and "10 to 18 mm" in page and picture in page
+    volume, planned, _ = look.laid.total
+    assert f"<td>{volume:.2f}</td><td>{planned:.2f}</td>" in page and f"<td>{look.last:.0f}</td>" in page
     assert "clog" not in some_look(gap=False).text and looks_section([], path) == ""
     adapted = replace(look, flow=FlowShares(np.array([1.2, 1.6]), np.array([1.6, 2.4]), np.array([1.3, 0.8])))
     page = looks_section([adapted], path)

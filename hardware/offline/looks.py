@@ -28,7 +28,6 @@ from hardware.process.system import step_back
 from hardware.recording import messages
 from hardware.recording.session_reader import read_channels
 from hardware.report import page
-from hardware.report.evaluation import figure
 from perception.frames import FrameSet
 from perception.lens import Lenses
 from perception.mapping.scan_map import node_size
@@ -317,9 +316,10 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
         off = laid.height[np.isfinite(laid.height)] - crest[np.isfinite(laid.height)]
         heights = [np.median(crest) + _median(off), np.median(crest), float(np.std(off)) if len(off) else math.nan]
         clogs = "; ".join(f"{a:.0f} to {b:.0f} mm" for a, b in laid.clogs) or "none"
-        values = f"{look.stamp:.1f}", f"{look.seconds:.1f}", figure(volume), figure(planned), *map(figure, heights)
-        rows.append([*values, str(int(laid.gap.sum())), str(int(laid.blob.sum())), clogs])
-    head = ("at, s", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "as planned, mm", "uneven, mm")
+        values = (f"{value:.2f}" if math.isfinite(value) else "–" for value in (volume, planned, *heights))
+        counts = str(int(laid.gap.sum())), str(int(laid.blob.sum()))
+        rows.append([f"{look.last:.0f}", f"{look.seconds:.1f}", *values, *counts, clogs])
+    head = ("after checkpoint", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "as planned, mm", "uneven, mm")
     table = page.figures_table((*head, "gaps", "blobs", "clogs"), rows)
     drawn = "".join(
         f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
