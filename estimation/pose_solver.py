@@ -6,8 +6,7 @@ the tracks stuck to a static drape, the error was 0.107 mm with Huber's loss and
 Some errors are shared by all tracks of a camera and do not average out: a late exposure, or a lens that shifts its
 image. `SharedErrors` holds their expected size. They are solved for beside the pose (linear mixed-effects model;
 Henderson 1975), so that they are not mistaken for outliers and can be learned. They do not change the weights between
-cameras: that moved poses farther from the reference of the webcams' recordings. What delays do to the pose is taken out
-of it afterwards, as far as the cameras' disagreement shows them (`delay_gain`).
+cameras: that moved poses farther from the reference of the webcams' recordings.
 """
 
 from __future__ import annotations
@@ -29,9 +28,6 @@ GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quart
 # (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89
 EFFICIENCY = 1.235
 INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
-DELAY_ERROR_PX = 0.05  # half the least sigma of a track
-MIN_KNOWN_SHARE = 1e-6  # of the information of the best known effect; less is rounding
-CLOCK_SIGMAS = 2.0  # of what is known of a clock: what lies farther off is something else
 CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
 
 
@@ -122,145 +118,101 @@ def solve_pose(
     tolerance: rad and mm, largest entry of the last step.
     shared: expected size of the errors that all tracks of a camera share.
     """
-    pose, unit, precision = start, 1.0, contiguous(1 / tracks.sigma**2)
-    camera, points = contiguous(tracks.camera, np.int64), contiguous(tracks.points)
-    pixels = tracks.pixels
-    predicted, depth, jacobian = project(rig, camera, pose, points)
-    residual = predicted - pixels
-    common = None if shared is None else _SharedErrorSolver(shared, camera)
-    weight, moved = np.zeros(len(points)), np.zeros(6)
-    information = np.zeros((6, 6))
-    for widening in scales:
-        for iteration in range(iterations if widening == scales[-1] else 3):
-            # robust weights; the unit of residuals is estimated anew in the first three iterations
-            weight, unit = weights_of(residual, precision, depth, GATE * widening, 0.0 if iteration < 3 else unit)
-            # normal equations (information, gradient), damped
-            if common is None:
-                whole = gram_by_camera(len(rig), camera, jacobian, residual, weight * precision, np.zeros(6)).sum(0)
-                information, gradient = whole[:6, :6], whole[:6, 9]
-            else:
-                trusted = weight * precision * (EFFICIENCY / unit**2)
-                information, gradient = common.normal(jacobian, predicted - pixels, trusted)
-            damped = information + np.diag(1e-9 + 1e-9 * np.diag(information))
-            if prior is not None:
-                damped = damped + prior
-                gradient = gradient + prior @ moved
-            # Gauss-Newton step, right perturbation
-            step = -np.linalg.solve(damped, gradient)
-            pose, moved = pose @ se3.exp(step), moved + step
-            predicted, depth, jacobian = project(rig, camera, pose, points)
-            residual = predicted - pixels
-            if common is not None:
-                residual = residual + common.explained(jacobian, anew=iteration < 2)
-            if np.abs(step).max() < tolerance or -step @ gradient < CONVERGED_CHI2:
-                break
-    if common is None:
-        return PoseFit(pose, EFFICIENCY / unit**2 * information, residual, weight, jacobian, unit)
-    return PoseFit(pose, information, residual, weight, jacobian, unit, common.fit())
+    count, none = len(rig), np.zeros((6, 6))
+    twist, effects = (none[0], np.zeros((3 * count,) * 2)) if shared is None else (shared.twist, shared.covariance())
+    seen = contiguous(tracks.camera, np.int64), contiguous(tracks.points), contiguous(tracks.pixels)
+    fixed = rig.camera_from_base, rig.matrices, *seen, contiguous(1 / tracks.sigma**2), contiguous(start)
+    how = np.array(scales, float), iterations, tolerance, none if prior is None else contiguous(prior)
+    *fitted, unit, grams = _gauss_newton(*fixed, *how, shared is not None, contiguous(twist), effects)
+    if shared is not None:
+        own, pull = _shared_equations(grams)
+        return PoseFit(*fitted, unit, SharedFit(own, pull.ravel()))
+    pose, information, *rest = fitted
+    return PoseFit(pose, EFFICIENCY / unit**2 * information, *rest, unit)
 
 
-class _SharedErrorSolver:
-    """The normal equations of the pose and of the errors that each camera's tracks share."""
-
-    def __init__(self, shared: SharedErrors, camera: Index) -> None:
-        self._twist, self._prior, self._count = shared.twist, shared.covariance(), len(shared.shift)
-        self._camera = camera
-        self._effect, self._eye = np.zeros((3, self._count)), np.eye(3 * self._count)
-
-    def normal(self, jacobian: Array, residual: Array, weight: Array) -> tuple[Array, Array]:
-        """Information (6, 6) and gradient (6,) of the pose. residual: (N, 2) px, whole. weight: (N,) px^-2."""
-        n = self._count
-        grams = gram_by_camera(n, self._camera, jacobian, residual, weight, self._twist)
-        self._whole = grams[:, :6].sum(0)
-        self._cross, self._right = grams[:, :6, 6:9].transpose(1, 2, 0).reshape(6, 3 * n), grams[:, 6:9, 9].T.ravel()
-        self._own = np.zeros((3, n, 3, n))
-        each = np.arange(n)
-        self._own[:, each, :, each] = grams[:, 6:9, 6:9]
-        self._fit: SharedFit | None = None
-        return self._whole[:, :6], self._whole[:, 9]
-
-    def explained(self, jacobian: Array, anew: bool) -> Array:
-        """The shared part of the residuals (N, 2) px, the pose free; anew: estimated from the last `normal`."""
-        if anew:
-            fit = self.fit()
-            # (information + prior^-1)^-1, also where the prior is singular
-            gain = self._prior @ np.linalg.inv(self._eye + fit.information @ self._prior)
-            self._effect = (gain @ fit.pull).reshape(3, -1)
-        return shared_residuals(self._camera, jacobian, self._twist, self._effect)
-
-    def fit(self) -> SharedFit:
-        """Of the last `normal`, with the pose eliminated (Schur complement)."""
-        if self._fit is None:
-            pose = self._whole[:, :6]
-            information = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
-            solved = np.linalg.solve(information, np.concatenate([self._cross, self._whole[:, 9:]], axis=1))
-            own = self._own.reshape(self._cross.shape[1], -1) - self._cross.T @ solved[:, :-1]
-            self._fit = SharedFit((own + own.T) / 2, -(self._right - self._cross.T @ solved[:, -1]))
-        return self._fit
+exp_entries = compiled("UniTuple(f8, 12)(f8, f8, f8, f8, f8, f8)")(se3.exp_entries)
 
 
-def delay_gain(solution: PoseFit, shared: SharedErrors, twist_variance: Array) -> Array:
-    """(C, 3C), s: the cameras' delays in one frame set, from the pull of `solution.shared` (3C,).
-
-    The best linear prediction (Henderson 1975) from how the cameras disagree, the pose free. Three things reduce it:
-
-    - Chance, as many cameras are triggered together, and whatever makes them disagree in other ways, as lenses do
-      (James and Stein 1961, positive part).
-    - Delays beyond what is known of the clocks: a surface that bends looks like late cameras, too.
-    - What is not linear: a delay acts along the velocity, and where that errs too, the product of both errors must stay
-      below DELAY_ERROR_PX. So what is waved by hand at 6 Hz stays as it is fitted.
-    """
-    count, seen, unknown = len(shared.shift), solution.shared, 0.0
-    assert seen is not None
-    prior = shared.covariance()
-    gain = (prior @ np.linalg.inv(np.eye(3 * count) + seen.information @ prior))[:count]
-    if solution.weights.any():
-        squares = (solution.jacobians**2 @ twist_variance).sum(1)  # (N,) px^2/s^2
-        unknown = float(solution.weights @ squares / solution.weights.sum())
-    known = np.diag(shared.delay)
-    product = unknown * float(np.mean(known)) / DELAY_ERROR_PX**2
-    far = float(np.max((gain @ seen.pull) ** 2 / np.maximum(known, 1e-12))) / CLOCK_SIGMAS**2
-    clear = max(0.0, 1 - 1 / max(_delay_clarity(seen, prior, count), 1e-9))
-    return np.asarray(gain * (clear / ((1 + product**3) * (1 + far**3))))  # sharp, and yet without a jump of the pose
-
-
-def _delay_clarity(seen: SharedFit, prior: Array, count: int) -> float:
-    """What delays explain of the disagreement of `count` cameras, in parts of what they do not; of each a mean.
-
-    Both in squared sigmas for a degree of freedom, the latter one at least. prior: (3C, 3C).
-    """
-    own, cross, rest = seen.information[:count], seen.information[:count, count:], seen.information[count:, count:]
-    shifts = prior[count:, count:] @ np.linalg.inv(np.eye(2 * count) + rest @ prior[count:, count:])
-    information = own[:, :count] - cross @ shifts @ cross.T
-    explained, freedom = _squared_sigmas(information, seen.pull[:count] - cross @ shifts @ seen.pull[count:])
-    whole, every = _squared_sigmas(seen.information, seen.pull)
-    other = max(1.0, (whole - explained) / max(1, every - freedom))
-    return explained / max(1, freedom) / other
+@compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
+def solved(matrix: Array, right: Array) -> Array:
+    """matrix^-1 @ right, (N, N) and (N, K) of few rows, by elimination with pivots; not finite where it is singular."""
+    left, out, count = matrix.copy(), right.copy(), len(matrix)
+    for k in range(count):
+        pivot = k
+        for i in range(k + 1, count):
+            if abs(left[i, k]) > abs(left[pivot, k]):
+                pivot = i
+        if pivot != k:
+            for j in range(k, count):
+                left[k, j], left[pivot, j] = left[pivot, j], left[k, j]
+            for j in range(out.shape[1]):
+                out[k, j], out[pivot, j] = out[pivot, j], out[k, j]
+        for i in range(k + 1, count):
+            share = left[i, k] / left[k, k]
+            for j in range(k + 1, count):
+                left[i, j] -= share * left[k, j]
+            for j in range(out.shape[1]):
+                out[i, j] -= share * out[k, j]
+    for k in range(count - 1, -1, -1):
+        for j in range(out.shape[1]):
+            for i in range(k + 1, count):
+                out[k, j] -= left[k, i] * out[i, j]
+            out[k, j] /= left[k, k]
+    return out
 
 
-def _squared_sigmas(information: Array, pull: Array) -> tuple[float, int]:
-    """What the effects come to that pull (K,), and how many are known; information (K, K) may be singular."""
-    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    known, axes = np.linalg.eigh(information * size[:, None] * size)
-    sure = known > MIN_KNOWN_SHARE * max(float(known[-1]), 1e-300)
-    along = axes[:, sure].T @ (size * pull)
-    return float((along**2 / known[sure]).sum()), int(sure.sum())
+@compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
+def product(a: Array, b: Array) -> Array:
+    """a @ b of few rows and columns, without the library's call."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            for j in range(b.shape[1]):
+                out[i, j] += a[i, k] * b[k, j]
+    return out
 
 
-def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
-    """Residuals (N, 2) px that are left when each camera has a pose of its own, to first order.
+@compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
+def _stepped(pose: Array, step: Array) -> Array:
+    """pose (4, 4) @ exp(-step), of (6, 1)."""
+    moved = np.zeros((4, 4))
+    entries = exp_entries(-step[0, 0], -step[1, 0], -step[2, 0], -step[3, 0], -step[4, 0], -step[5, 0])
+    for i in range(12):
+        moved[i // 4, i % 4] = entries[i]
+    moved[3, 3] = 1.0
+    return product(pose, moved)
 
-    sure: (N,) weights of the tracks that determine it. Cameras with fewer than eight keep their residuals.
-    """
-    left = fit.residuals.copy()
-    for c in np.unique(camera):
-        mine = camera == c
-        root = np.sqrt(np.repeat(sure[mine], 2))
-        if np.count_nonzero(root) >= 16:
-            jacobian, residual = fit.jacobians[mine].reshape(-1, 6), fit.residuals[mine].ravel()
-            own = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
-            left[mine] = (residual - jacobian @ own).reshape(-1, 2)
-    return left
+
+@compiled("Tuple((f8[:,::1], f8[:,::1]))(f8[:,:,::1])")
+def _shared_equations(grams: Array) -> tuple[Array, Array]:
+    """As in `SharedFit`, (3C, 3C) and (3C, 1), of products as `gram_by_camera` has them (Schur complement)."""
+    n = len(grams)
+    pose, right, cross = np.zeros((6, 6)), np.zeros((3 * n, 1)), np.zeros((6, 3 * n + 1))
+    own = np.zeros((3 * n, 3 * n))
+    for c in range(n):
+        for a in range(6):
+            cross[a, 3 * n] += grams[c, a, 9]
+            for b in range(6):
+                pose[a, b] += grams[c, a, b]
+            for k in range(3):
+                cross[a, k * n + c] = grams[c, a, 6 + k]
+        for k in range(3):
+            right[k * n + c, 0] = grams[c, 6 + k, 9]
+            for m in range(3):
+                own[k * n + c, m * n + c] = grams[c, 6 + k, 6 + m]
+    damping = 1e-12
+    for a in range(6):
+        damping += 1e-9 * pose[a, a]
+    for a in range(6):
+        pose[a, a] += damping
+    taken = product(cross.T.copy(), solved(pose, cross))
+    out = np.empty((3 * n, 3 * n))
+    for i in range(3 * n):
+        right[i, 0] = taken[i, 3 * n] - right[i, 0]
+        for j in range(3 * n):
+            out[i, j] = (own[i, j] - taken[i, j] + own[j, i] - taken[j, i]) / 2
+    return out, right
 
 
 @compiled("Tuple((f8[:,::1], f8[::1], f8[:,:,::1]))(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1])")
@@ -323,41 +275,18 @@ def gram_by_camera(cameras: int, camera: Index, jacobian: Array, residual: Array
     return grams
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1])")
-def pose_pulls(
-    cameras: int, landmarks: int, camera: Index, landmark: Index, jacobian: Array, weight: Array, twist: Array
-) -> tuple[Array, Array]:
-    """How each landmark (6, L, 3), px^-2 per mm, and each camera's delay and shifts (6, 3, C) pull at the pose.
-
-    The pose gives way by its covariance times that. landmark: (N,) below L. The rest as in `gram_by_camera`.
-    """
-    by_landmark, by_camera = np.zeros((6, landmarks, 3)), np.zeros((6, 3, cameras))
-    for i in range(len(camera)):
-        for k in range(2):
-            row, along = jacobian[i, k], 0.0
-            for a in range(6):
-                along += row[a] * twist[a]
-            for a in range(6):
-                weighted = weight[i] * row[a]
-                by_camera[a, 0, camera[i]] += weighted * along
-                by_camera[a, 1 + k, camera[i]] += weighted
-                for b in range(3):
-                    by_landmark[a, landmark[i], b] += weighted * row[3 + b]
-    return by_landmark, by_camera
-
-
-@compiled("f8[:,::1](i8[::1], f8[:,:,::1], f8[::1], f8[:,::1])")
-def shared_residuals(camera: Index, jacobian: Array, twist: Array, effect: Array) -> Array:
-    """What of the residuals (N, 2) px the cameras' delays and shifts, effect (3, C), make."""
-    explained = np.empty((len(camera), 2))
+@compiled("f8[:,::1](i8[::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[:,::1])")
+def shared_residuals(camera: Index, jacobian: Array, twist: Array, effect: Array, whole: Array) -> Array:
+    """Residuals (N, 2) px, of the whole ones, with what the cameras' delays and shifts, effect (3, C), make added."""
+    residual = np.empty((len(camera), 2))
     for i in range(len(camera)):
         c = camera[i]
         for k in range(2):
             along = 0.0
             for a in range(6):
                 along += jacobian[i, k, a] * twist[a]
-            explained[i, k] = effect[0, c] * along + effect[1 + k, c]
-    return explained
+            residual[i, k] = whole[i, k] + (effect[0, c] * along + effect[1 + k, c])
+    return residual
 
 
 @compiled("Tuple((f8[::1], f8))(f8[:,::1], f8[::1], f8[::1], f8, f8)")
@@ -383,3 +312,88 @@ def weights_of(residual: Array, precision: Array, depth: Array, gate: float, uni
             beside = 1.0 + squared[i] / (gate * unit) ** 2
             weight[i] = 1.0 / (beside * beside)
     return weight, unit
+
+
+@compiled(
+    "Tuple((f8[::1], f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1], f8[:,::1], f8[:,::1])"
+)
+def _reprojected(
+    camera_from_base: Array, matrices: Array, camera: Index, points: Array, pixels: Array, pose: Array
+) -> tuple[Array, Array, Array]:
+    """Depths (N,), Jacobians (N, 2, 6) and residuals (N, 2), px, predicted minus seen, as `project_tracks` has them."""
+    from_surface = product(camera_from_base.reshape(-1, 4), pose).reshape(-1, 4, 4)
+    left, depth, jacobian = project_tracks(from_surface, matrices, camera, points)
+    for i in range(len(left)):
+        left[i, 0] -= pixels[i, 0]
+        left[i, 1] -= pixels[i, 1]
+    return depth, jacobian, left
+
+
+@compiled("f8[:,::1](f8[:,::1], f8[:,::1], f8[:,::1])")
+def _expected_effects(own: Array, pull: Array, effects: Array) -> Array:
+    """Effects (3, C) expected by their equations (3C, 3C), (3C, 1) and their covariance (3C, 3C)."""
+    weighed = product(own, effects)
+    for a in range(len(own)):
+        weighed[a, a] += 1.0
+    return product(effects, solved(weighed, pull)).reshape(3, len(own) // 3)
+
+
+@compiled(
+    "Tuple((f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8, f8[:,:,::1]))"
+    "(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], i8, f8, f8[:,::1], b1,"
+    " f8[::1], f8[:,::1])"
+)
+def _gauss_newton(
+    camera_from_base: Array,
+    matrices: Array,
+    camera: Index,
+    points: Array,
+    pixels: Array,
+    precision: Array,
+    start: Array,
+    scales: Array,
+    iterations: int,
+    tolerance: float,
+    prior: Array,
+    shared: bool,
+    twist: Array,
+    effects: Array,
+) -> tuple[Array, Array, Array, Array, Array, float, Array]:
+    """The parts of the `PoseFit` that `solve_pose` finds. effects: (3C, 3C), `SharedErrors.covariance`, if `shared`."""
+    count, pose, unit, moved = len(matrices), start, 1.0, np.zeros((6, 1))
+    weight, trusted, information = np.zeros(len(points)), np.zeros(len(points)), np.zeros((6, 6))
+    grams, effect = np.zeros((count, TRACK_COLUMNS, TRACK_COLUMNS)), np.zeros((3, count))
+    depth, jacobian, whole = _reprojected(camera_from_base, matrices, camera, points, pixels, pose)
+    residual = whole
+    for widening in scales:
+        for iteration in range(iterations if widening == scales[-1] else 3):
+            # robust weights; the unit of residuals is estimated anew in the first three iterations
+            weight, unit = weights_of(residual, precision, depth, GATE * widening, 0.0 if iteration < 3 else unit)
+            # normal equations (information, gradient), damped
+            clear = EFFICIENCY / unit**2 if shared else 1.0
+            for i in range(len(weight)):
+                trusted[i] = weight[i] * precision[i] * clear
+            grams = gram_by_camera(count, camera, jacobian, whole, trusted, twist)
+            information, damped, gradient = np.zeros((6, 6)), prior.copy(), product(prior, moved)
+            for a in range(6):
+                for c in range(count):
+                    gradient[a, 0] += grams[c, a, 9]
+                    for b in range(6):
+                        information[a, b] += grams[c, a, b]
+                        damped[a, b] += grams[c, a, b]
+                damped[a, a] += 1e-9 + 1e-9 * information[a, a]
+            # Gauss-Newton step, right perturbation
+            step, largest, gain = solved(damped, gradient), 0.0, 0.0
+            for a in range(6):
+                moved[a, 0] -= step[a, 0]
+                largest, gain = max(largest, abs(step[a, 0])), gain + step[a, 0] * gradient[a, 0]
+            pose = _stepped(pose, step)
+            depth, jacobian, whole = _reprojected(camera_from_base, matrices, camera, points, pixels, pose)
+            residual = whole
+            if shared:
+                if iteration < 2:  # the shared part by the last equations, the pose free; effects may be singular
+                    effect = _expected_effects(*_shared_equations(grams), effects)
+                residual = shared_residuals(camera, jacobian, twist, effect, whole)
+            if largest < tolerance or gain < CONVERGED_CHI2:
+                break
+    return pose, information, residual, weight, jacobian, unit, grams

@@ -13,6 +13,7 @@ from estimation import se3
 from estimation.se3 import Array, Index
 
 INVERSE_STEPS = 4  # steps of the inverse: each leaves a share as large as the strain, a few hundredths
+UNCERTAIN_MM = 0.3  # along some direction: landmarks of two cameras are better known, those of one alone are not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,6 +26,53 @@ class SurfaceMap:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+class MapError:
+    """A map's joint covariance: as it reaches the pose, and as it widens the sigmas of single tracks.
+
+    The whole is megabytes, and reading it every frame took longer than the fit. The landmarks in use change slowly, so
+    a block of theirs is kept.
+    """
+
+    MAX_BLOCK_RATIO = 1.5  # times the landmarks in use, that the block may hold before it is cut anew
+
+    def __init__(self, surface_map: SurfaceMap) -> None:
+        count = len(surface_map)
+        self._whole = surface_map.covariance.reshape(count, 3, count, 3)
+        self._position = np.full(count, -1)  # of each landmark in the block
+        self._block = np.zeros((0, 0))
+        own = np.einsum("ninj->nij", self._whole)
+        self._uncertain = np.linalg.eigvalsh(own)[:, -1] > UNCERTAIN_MM**2
+        self._own = np.where(self._uncertain[:, None, None], own, 0.0)
+
+    def reaching_pose(self, rows: Index, pull: Array) -> Array:
+        """Covariance (6, 6) of the sum of the landmarks' pulls (6, K, 3), of rows (K,), ascending."""
+        if (self._position[rows] < 0).any() or len(self._block) > 3 * self.MAX_BLOCK_RATIO * len(rows):
+            held = np.union1d(rows, np.flatnonzero(self._position >= 0))
+            held = held if len(held) < self.MAX_BLOCK_RATIO * len(rows) else rows
+            self._position[:] = -1
+            self._position[held] = np.arange(len(held))
+            self._block = self._whole[held][:, :, held].reshape(3 * len(held), -1)
+        spread = np.zeros((6, len(self._block) // 3, 3))
+        spread[:, self._position[rows]] = pull
+        flat = spread.reshape(6, -1)
+        return np.asarray(flat @ self._block @ flat.T)
+
+    def widened(self, sigma: Array, track: Index, jacobians: Array) -> Array:
+        """Sigmas (N,) px of tracks with the error of their own landmark, where that is UNCERTAIN_MM or more.
+
+        A landmark that one camera alone has seen lies exactly on that camera's ray, and anywhere along it. In that
+        camera it counts in full, in another next to nothing until it is known better. track: (N,) rows of the map.
+        jacobians: (N, 2, 6) px by the pose.
+        """
+        rows = np.flatnonzero(self._uncertain[track])
+        if not len(rows):
+            return sigma
+        by_point, wide = jacobians[rows, :, 3:], sigma.copy()
+        square = np.einsum("mki,mij,mkj->m", by_point, self._own[track[rows]], by_point) / 2  # of one axis
+        wide[rows] = np.sqrt(sigma[rows] ** 2 + square)
+        return wide
 
 
 def moved_map(surface_map: SurfaceMap, new_from_old: Array) -> SurfaceMap:

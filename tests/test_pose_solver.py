@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.observations import Observations
+from estimation.online.deformation import pose_pulls
+from estimation.online.fit import delay_gain
 from estimation.pose_solver import (
     EFFICIENCY,
     PointTracks,
     PoseFit,
     SharedErrors,
-    delay_gain,
-    pose_pulls,
     project,
     solve_pose,
 )

@@ -19,11 +19,10 @@ from estimation.mapping.triangulation import (
     triangulate,
     updated_by_looks,
 )
-from estimation.online.fit import UNCERTAIN_MM, MapError
 from estimation.pose_solver import project
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, local_normals
+from estimation.surface_map import UNCERTAIN_MM, MapError, SurfaceMap, local_normals
 from estimation.synthetic.world import BASE_FROM_REST, WOUND_CENTRE, arc_rig, patch
 
 RIG = arc_rig()

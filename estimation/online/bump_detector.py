@@ -24,14 +24,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from estimation.observations import Observations
-from estimation.online.fit import (
-    PICTURE_DOF,
-    CameraEquations,
-    RivalPose,
-    camera_equations,
-    displacement_sums,
-    solve_symmetric3,
-)
+from estimation.online.deformation import displacement_sums
+from estimation.online.fit import PICTURE_DOF, CameraEquations, RivalPose, camera_equations, solve_symmetric3
 from estimation.pose_solver import INLIER_WEIGHT, PoseFit, project
 from estimation.rig import Rig
 from estimation.se3 import Array

@@ -17,9 +17,10 @@ import numpy as np
 from estimation.observations import Observations
 from estimation.online.bump_detector import MIN_UNEQUAL_PX, BumpDetector, contradicts, spread_anchors
 from estimation.online.camera_errors import RivalWatch
+from estimation.online.deformation import own_residuals
 from estimation.online.fit import RivalPose, camera_numbers, motion_sigmas, picture_noise
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, own_residuals, project, solve_pose
+from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, project, solve_pose
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index, Mask

@@ -20,7 +20,7 @@ from estimation import se3
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit
 from estimation.runtime import compiled, contiguous
-from estimation.se3 import Array, Index
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, Warp, bells, farthest_points
 
 CONTROL_POINTS = 12
@@ -127,15 +127,15 @@ class WarpFilter:
             return surface_map.points
         return np.asarray(surface_map.points + self._modes.landmarks @ self._state[: len(self._modes.share)])
 
-    def pull(self, track: Index, weighted: Array, by_point: Array) -> Array:
+    def pull(self, track: Index, weight: Array, jacobians: Array) -> Array:
         """Covariance (6, 6) that the deformation's covariance adds to the weighted sum of residuals.
 
-        track: (N,) rows of the map. weighted: (N, 2, 6) Jacobians times weights. by_point: (N, 2, 3) px per mm.
+        track: (N,) rows of the map. weight: (N,) px^-2. jacobians: (N, 2, 6) px per rad and mm.
         """
         if self.warp is None or self._modes is None:
             return np.zeros((6, 6))
-        count = len(self._modes.share)
-        moved = by_point @ self._modes.landmarks[track]  # (N, 2, M)
+        count, weighted = len(self._modes.share), jacobians * weight[:, None, None]
+        moved = jacobians[:, :, 3:] @ self._modes.landmarks[track]  # (N, 2, M)
         sensitivity = np.einsum("nki,nkm->im", weighted, moved, optimize=True)
         return np.asarray(sensitivity @ self._covariance[:count, :count] @ sensitivity.T)
 
@@ -268,3 +268,95 @@ def rows_of_modes(
             row[count + 6 + camera[i]] = root[i] * along
             row[count + 6 + cameras] = root[i] * left
     return rows
+
+
+@compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
+def displacement_sums(
+    landmarks: int, landmark: Index, jacobian: Array, residual: Array, precision: Array
+) -> tuple[Array, Array, Array, Index]:
+    """Normal equations (L, 3, 3) and (L, 3) of each landmark's own displacement in the surface frame, mm.
+
+    Then the weighted square (L,) of its residuals (N, 2) px, predicted minus seen, and how many cameras see it (L,).
+    landmark: (N,) below L. precision: (N,) px^-2, 0 for tracks that do not count.
+    """
+    normal, right = np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3))
+    square, views = np.zeros(landmarks), np.zeros(landmarks, np.int64)
+    for i in range(len(landmark)):
+        own, weight = landmark[i], precision[i]
+        views[own] += weight > 0
+        for k in range(2):
+            left = -residual[i, k]
+            square[own] += weight * left * left
+            for a in range(3):
+                scaled = weight * jacobian[i, k, 3 + a]
+                right[own, a] += scaled * left
+                for b in range(3):
+                    normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
+    return normal, right, square, views
+
+
+@compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
+def landmark_sights(
+    cameras: int,
+    landmarks: int,
+    camera: Index,
+    track: Index,
+    jacobian: Array,
+    residual: Array,
+    agrees: Mask,
+    near: float,
+) -> tuple[Mask, Mask]:
+    """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
+
+    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm from the place, at which a
+    landmark is there though it does not agree.
+    """
+    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
+    for i in range(len(camera)):
+        away, by_point = 0.0, 0.0
+        for k in range(2):
+            away += residual[i, k] * residual[i, k]
+            for b in range(3):
+                by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
+        seen[camera[i], track[i]] = True
+        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
+    return found, seen
+
+
+@compiled("Tuple((f8[:,:,::1], f8[:,:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1])")
+def pose_pulls(
+    cameras: int, landmarks: int, camera: Index, landmark: Index, jacobian: Array, weight: Array, twist: Array
+) -> tuple[Array, Array]:
+    """How each landmark (6, L, 3), px^-2 per mm, and each camera's delay and shifts (6, 3, C) pull at the pose.
+
+    The pose gives way by its covariance times that. landmark: (N,) below L. The rest as in `gram_by_camera`.
+    """
+    by_landmark, by_camera = np.zeros((6, landmarks, 3)), np.zeros((6, 3, cameras))
+    for i in range(len(camera)):
+        for k in range(2):
+            row, along = jacobian[i, k], 0.0
+            for a in range(6):
+                along += row[a] * twist[a]
+            for a in range(6):
+                weighted = weight[i] * row[a]
+                by_camera[a, 0, camera[i]] += weighted * along
+                by_camera[a, 1 + k, camera[i]] += weighted
+                for b in range(3):
+                    by_landmark[a, landmark[i], b] += weighted * row[3 + b]
+    return by_landmark, by_camera
+
+
+def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
+    """Residuals (N, 2) px that are left when each camera has a pose of its own, to first order.
+
+    sure: (N,) weights of the tracks that determine it. Cameras with fewer than eight keep their residuals.
+    """
+    left = fit.residuals.copy()
+    for c in np.unique(camera):
+        mine = camera == c
+        root = np.sqrt(np.repeat(sure[mine], 2))
+        if np.count_nonzero(root) >= 16:
+            jacobian, residual = fit.jacobians[mine].reshape(-1, 6), fit.residuals[mine].ravel()
+            own = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
+            left[mine] = (residual - jacobian @ own).reshape(-1, 2)
+    return left

@@ -17,7 +17,7 @@ from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces, Observat
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
 from estimation.online.camera_health import CameraHealth, FrameTracks
 from estimation.online.deformation import WarpFilter
-from estimation.online.fit import FrameFit, MapError, failed_fit, fit_covariance
+from estimation.online.fit import FrameFit, failed_fit, fit_covariance
 from estimation.online.parted_texture import Elsewhere
 from estimation.online.reported_covariance import (
     NO_ALIASES,
@@ -38,7 +38,7 @@ from estimation.pose_solver import INLIER_WEIGHT, project
 from estimation.rig import Rig
 from estimation.runtime import median
 from estimation.se3 import Array, Index
-from estimation.surface_map import SurfaceMap
+from estimation.surface_map import MapError, SurfaceMap
 
 MIN_FORECAST_PSD = np.array([1e-4] * 3 + [1.0] * 3)  # rad^2/s^3, mm^2/s^3: what lies still may begin to breathe
 # s, of the cameras' instants: more than of webcams at first. They then come late, or hang, now and then, and the pose

@@ -8,18 +8,20 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.deformation import WarpFilter
+from estimation.online.deformation import WarpFilter, pose_pulls
 from estimation.pose import SurfacePose
-from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, delay_gain, pose_pulls, project
+from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, product, project, solved
 from estimation.rig import Rig
-from estimation.runtime import compiled, median
+from estimation.runtime import compiled, contiguous, median
 from estimation.se3 import Array, Index, Mask
-from estimation.surface_map import SurfaceMap
+from estimation.surface_map import MapError
 
 PRIOR_RESIDUALS = 20.0  # for which the stated sigmas count when the scatter is estimated
+DELAY_ERROR_PX = 0.05  # half the least sigma of a track
+MIN_KNOWN_SHARE = 1e-6  # of the information of the best known effect; less is rounding
+CLOCK_SIGMAS = 2.0  # of what is known of a clock: what lies farther off is something else
 MIN_WEIGHT_SLOPE = 0.1  # of the weights' sum: with less of it most tracks are outliers, and the rest tells nothing
 DISPLACEMENT_FLOOR = 1e-3  # mm^-2: prior of a displacement along a line that all cameras look along
-UNCERTAIN_MM = 0.3  # along some direction: landmarks of two cameras are better known, those of one alone are not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,51 +120,90 @@ def failed_fit(
     )
 
 
-class MapError:
-    """A map's joint covariance: as it reaches the pose, and as it widens the sigmas of single tracks.
+def delay_gain(solution: PoseFit, shared: SharedErrors, twist_variance: Array) -> Array:
+    """(C, 3C), s: the cameras' delays in one frame set, from the pull of `solution.shared` (3C,).
 
-    The whole is megabytes, and reading it every frame took longer than the fit. The landmarks in use change slowly, so
-    a block of theirs is kept.
+    The best linear prediction (Henderson 1975) from how the cameras disagree, the pose free. Three things reduce it:
+
+    - Chance, as many cameras are triggered together, and whatever makes them disagree in other ways, as lenses do
+      (James and Stein 1961, positive part).
+    - Delays beyond what is known of the clocks: a surface that bends looks like late cameras, too.
+    - What is not linear: a delay acts along the velocity, and where that errs too, the product of both errors must stay
+      below DELAY_ERROR_PX. So what is waved by hand at 6 Hz stays as it is fitted.
     """
+    seen, known = solution.shared, np.diag(shared.delay)
+    assert seen is not None
+    prior, information, pull = shared.covariance(), contiguous(seen.information), contiguous(seen.pull[:, None])
+    speed = mean_square_along(contiguous(solution.jacobians), contiguous(solution.weights), contiguous(twist_variance))
+    gain, clarity = _gain_and_clarity(prior, information, pull)
+    product_px = speed * float(np.mean(known)) / DELAY_ERROR_PX**2
+    far = float(np.max((gain @ seen.pull) ** 2 / np.maximum(known, 1e-12))) / CLOCK_SIGMAS**2
+    clear = max(0.0, 1 - 1 / max(clarity, 1e-9))
+    return np.asarray(gain * (clear / ((1 + product_px**3) * (1 + far**3))))  # sharp, yet without a jump of the pose
 
-    MAX_BLOCK_RATIO = 1.5  # times the landmarks in use, that the block may hold before it is cut anew
 
-    def __init__(self, surface_map: SurfaceMap) -> None:
-        count = len(surface_map)
-        self._whole = surface_map.covariance.reshape(count, 3, count, 3)
-        self._position = np.full(count, -1)  # of each landmark in the block
-        self._block = np.zeros((0, 0))
-        own = np.einsum("ninj->nij", self._whole)
-        self._uncertain = np.linalg.eigvalsh(own)[:, -1] > UNCERTAIN_MM**2
-        self._own = np.where(self._uncertain[:, None, None], own, 0.0)
+@compiled("f8(f8[:,:,::1], f8[::1], f8[::1])")
+def mean_square_along(jacobian: Array, weight: Array, square: Array) -> float:
+    """Weighted mean, px^2, of what entries of the pose with mean squares (6,) move tracks: (N, 2, 6), (N,)."""
+    total, weights = 0.0, 0.0
+    for i in range(len(weight)):
+        one = 0.0
+        for k in range(2):
+            for a in range(6):
+                one += jacobian[i, k, a] ** 2 * square[a]
+        total, weights = total + weight[i] * one, weights + weight[i]
+    return total / weights if weights > 0 else 0.0
 
-    def reaching_pose(self, rows: Index, pull: Array) -> Array:
-        """Covariance (6, 6) of the sum of the landmarks' pulls (6, K, 3), of rows (K,), ascending."""
-        if (self._position[rows] < 0).any() or len(self._block) > 3 * self.MAX_BLOCK_RATIO * len(rows):
-            held = np.union1d(rows, np.flatnonzero(self._position >= 0))
-            held = held if len(held) < self.MAX_BLOCK_RATIO * len(rows) else rows
-            self._position[:] = -1
-            self._position[held] = np.arange(len(held))
-            self._block = self._whole[held][:, :, held].reshape(3 * len(held), -1)
-        spread = np.zeros((6, len(self._block) // 3, 3))
-        spread[:, self._position[rows]] = pull
-        flat = spread.reshape(6, -1)
-        return np.asarray(flat @ self._block @ flat.T)
 
-    def widened(self, sigma: Array, track: Index, jacobians: Array) -> Array:
-        """Sigmas (N,) px of tracks with the error of their own landmark, where that is UNCERTAIN_MM or more.
+@compiled("Tuple((f8, i8))(f8[:,::1], f8[:,::1])")
+def _squared_sigmas(information: Array, pull: Array) -> tuple[float, int]:
+    """What the effects come to that pull (K, 1), and how many are known; information (K, K) may be singular."""
+    count = len(pull)
+    scaled, size = np.empty_like(information), np.empty(count)
+    for i in range(count):
+        size[i] = 1 / np.sqrt(max(information[i, i], 1e-300))
+    for i in range(count):
+        for j in range(count):
+            scaled[i, j] = information[i, j] * size[i] * size[j]
+    known, axes = np.linalg.eigh(scaled)
+    squares, sure = 0.0, 0
+    for k in range(count):
+        if known[k] > MIN_KNOWN_SHARE * max(known[-1], 1e-300):
+            along = 0.0
+            for i in range(count):
+                along += axes[i, k] * size[i] * pull[i, 0]
+            squares, sure = squares + along * along / known[k], sure + 1
+    return squares, sure
 
-        A landmark that one camera alone has seen lies exactly on that camera's ray, and anywhere along it. In that
-        camera it counts in full, in another next to nothing until it is known better. track: (N,) rows of the map.
-        jacobians: (N, 2, 6) px by the pose.
-        """
-        rows = np.flatnonzero(self._uncertain[track])
-        if not len(rows):
-            return sigma
-        by_point, wide = jacobians[rows, :, 3:], sigma.copy()
-        square = np.einsum("mki,mij,mkj->m", by_point, self._own[track[rows]], by_point) / 2  # of one axis
-        wide[rows] = np.sqrt(sigma[rows] ** 2 + square)
-        return wide
+
+@compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
+def _gain(prior: Array, information: Array) -> Array:
+    """prior @ (1 + information @ prior)^-1 of symmetric (K, K), whatever of them is singular."""
+    weighed = product(prior, information)  # transposed
+    for i in range(len(prior)):
+        weighed[i, i] += 1.0
+    return solved(weighed, prior)
+
+
+@compiled("Tuple((f8[:,::1], f8))(f8[:,::1], f8[:,::1], f8[:,::1])")
+def _gain_and_clarity(prior: Array, information: Array, pull: Array) -> tuple[Array, float]:
+    """The prediction's gain (C, 3C), and how clearly it is delays that make the cameras disagree.
+
+    That is what delays explain of the disagreement, in parts of what they do not; of each a mean, in squared sigmas for
+    a degree of freedom, the latter one at least. prior: (3C, 3C) of the effects. The rest as `SharedFit`.
+    """
+    count = len(prior) // 3
+    cross = information[:count, count:].copy()
+    shifts = product(cross, _gain(prior[count:, count:].copy(), information[count:, count:].copy()))
+    own, by_shifts = product(shifts, cross.T.copy()), product(shifts, pull[count:])
+    for i in range(count):
+        by_shifts[i, 0] = pull[i, 0] - by_shifts[i, 0]
+        for j in range(count):
+            own[i, j] = information[i, j] - own[i, j]
+    explained, freedom = _squared_sigmas(own, by_shifts)
+    whole, every = _squared_sigmas(information, pull)
+    other = max(1.0, (whole - explained) / max(1, every - freedom))
+    return _gain(prior, information)[:count].copy(), explained / max(1, freedom) / other
 
 
 def residual_scatter(observations: Observations, solution: PoseFit) -> float:
@@ -172,19 +213,28 @@ def residual_scatter(observations: Observations, solution: PoseFit) -> float:
     of the stated size, which counts as PRIOR_RESIDUALS. Tracks of clean pictures are two or three times better than
     stated. Where some are worse without being outliers, the weights alone would show too little of it.
     """
-    root = observations.sigma * solution.scale
-    square = (solution.residuals**2).sum(1) / root**2
-    used = solution.weights > 0
-    weight = (1 + square[used] / GATE**2) ** -2
-    freedom = weight.sum() * 2 - 6
-    if freedom <= 0:
+    parts = contiguous(solution.residuals), contiguous(solution.weights), contiguous(observations.sigma)
+    return _scatter(*parts, float(solution.scale))
+
+
+@compiled("f8(f8[:,::1], f8[::1], f8[::1], f8)")
+def _scatter(residual: Array, weights: Array, sigma: Array, scale: float) -> float:
+    """`residual_scatter` of residuals (N, 2), weights (N,) and stated sigmas (N,) px."""
+    count, total, slope, pull = 0, 0.0, 0.0, 0.0
+    for i in range(len(weights)):
+        if weights[i] > 0:
+            root = sigma[i] * scale
+            square = (residual[i, 0] ** 2 + residual[i, 1] ** 2) / (root * root)
+            weight = 1 / (1 + square / GATE**2) ** 2
+            slope += weight * (1 - 2 * square / (GATE**2 + square))
+            pull += weight * weight * square
+            count, total = count + 1, total + weight
+    freedom = total * 2 - 6
+    if freedom <= 0 or slope <= MIN_WEIGHT_SLOPE * count:
         return 1.0
-    slope = float(np.mean(weight * (1 - 2 * square[used] / (GATE**2 + square[used]))))
-    if slope <= MIN_WEIGHT_SLOPE:
-        return 1.0
-    pull = float(np.mean(weight**2 * square[used])) / 2 * (2 * weight.sum() / freedom)
-    ratio = EFFICIENCY * float(weight.mean()) * pull / slope**2
-    return float((PRIOR_RESIDUALS + freedom * ratio) / (PRIOR_RESIDUALS + freedom))
+    pull = pull / count / 2 * (2 * total / freedom)
+    ratio = EFFICIENCY * (total / count) * pull / (slope / count) ** 2
+    return (PRIOR_RESIDUALS + freedom * ratio) / (PRIOR_RESIDUALS + freedom)
 
 
 def fit_covariance(
@@ -200,16 +250,15 @@ def fit_covariance(
     The pose is the fitted one without what the cameras' delays in this frame set did to it, as far as their tracks show
     these delays (`delay_gain`). twist_variance: (6,) of `shared.twist`.
     """
-    information = solution.information + 1e-9 * np.eye(6) * np.trace(solution.information)
-    noise = np.linalg.pinv(information, hermitian=True)
+    noise = _inverse(contiguous(solution.information), 1e-9, 0.0)
     weight = EFFICIENCY * solution.weights / (observations.sigma * solution.scale) ** 2
-    rows, landmark = np.unique(observations.track, return_inverse=True)
-    cameras = len(shared.shift)
-    camera = np.ascontiguousarray(observations.camera)
+    places = np.zeros(observations.track.max(initial=0) + 1, np.int64)
+    places[observations.track] = 1
+    rows, landmark = np.flatnonzero(places), (np.cumsum(places) - 1)[observations.track]
+    cameras, camera = len(shared.shift), contiguous(observations.camera, np.int64)
     by_landmark, by_camera = pose_pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
-    weighted = solution.jacobians * weight[:, None, None]
     lasting = map_error.reaching_pose(rows, by_landmark)
-    lasting = noise @ (lasting + warp.pull(observations.track, weighted, solution.jacobians[:, :, 3:])) @ noise
+    lasting = noise @ (lasting + warp.pull(observations.track, weight, solution.jacobians)) @ noise
     # the pose by each delay, shift right and shift down; what a correction by the seen delays leaves of that, and adds
     effects, seen = noise @ by_camera.reshape(6, -1), solution.shared
     assert seen is not None
@@ -220,31 +269,6 @@ def fit_covariance(
     new = tracks + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
     smear, scatter = by_delay @ shared.delay @ by_delay.T, residual_scatter(observations, solution)
     return FitCovariance(new, smear, lasting, scatter, tracks, by_delay, by_shift, -gain @ seen.pull)
-
-
-@compiled("Tuple((f8[:,:,::1], f8[:,::1], f8[::1], i8[::1]))(i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
-def displacement_sums(
-    landmarks: int, landmark: Index, jacobian: Array, residual: Array, precision: Array
-) -> tuple[Array, Array, Array, Index]:
-    """Normal equations (L, 3, 3) and (L, 3) of each landmark's own displacement in the surface frame, mm.
-
-    Then the weighted square (L,) of its residuals (N, 2) px, predicted minus seen, and how many cameras see it (L,).
-    landmark: (N,) below L. precision: (N,) px^-2, 0 for tracks that do not count.
-    """
-    normal, right = np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3))
-    square, views = np.zeros(landmarks), np.zeros(landmarks, np.int64)
-    for i in range(len(landmark)):
-        own, weight = landmark[i], precision[i]
-        views[own] += weight > 0
-        for k in range(2):
-            left = -residual[i, k]
-            square[own] += weight * left * left
-            for a in range(3):
-                scaled = weight * jacobian[i, k, 3 + a]
-                right[own, a] += scaled * left
-                for b in range(3):
-                    normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
-    return normal, right, square, views
 
 
 @compiled("f8[:,::1](f8[:,:,::1], f8[:,::1])")
@@ -285,34 +309,6 @@ def unusual_displacements(
         ridged[:, a, a] += DISPLACEMENT_FLOOR
     moved = solve_symmetric3(ridged, plain)
     return plain, about, (moved * plain).sum(1)
-
-
-@compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
-def landmark_sights(
-    cameras: int,
-    landmarks: int,
-    camera: Index,
-    track: Index,
-    jacobian: Array,
-    residual: Array,
-    agrees: Mask,
-    near: float,
-) -> tuple[Mask, Mask]:
-    """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
-
-    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm from the place, at which a
-    landmark is there though it does not agree.
-    """
-    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
-    for i in range(len(camera)):
-        away, by_point = 0.0, 0.0
-        for k in range(2):
-            away += residual[i, k] * residual[i, k]
-            for b in range(3):
-                by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
-        seen[camera[i], track[i]] = True
-        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
-    return found, seen
 
 
 PICTURE_DOF = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
@@ -371,16 +367,32 @@ def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
 def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
     """By how many sigmas a pose differs from the one expected by the motion, at least one."""
     off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
-    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)  # without information: one
-    spread = expected.covariance + np.linalg.inv(damped)
-    return max(1.0, float(np.sqrt(off @ np.linalg.solve(spread, off) / 6)))
+    spread = expected.covariance + _inverse(contiguous(fit.information), 1e-9, 1e-12)  # without information: one
+    return max(1.0, float(np.sqrt(off @ solved(spread, off[:, None])[:, 0] / 6)))
 
 
 def picture_noise(fit: PoseFit, rows: Mask) -> float:
     """Root mean square, px, one sigma, by which a pose's noise moves the tracks `rows` (N,)."""
-    damped = fit.information + (1e-9 * np.trace(fit.information) + 1e-12) * np.eye(6)
-    jacobians = fit.jacobians[rows]
-    return float(np.sqrt(np.einsum("nki,nki->", jacobians @ np.linalg.inv(damped), jacobians) / len(jacobians)))
+    spread, jacobians = _inverse(contiguous(fit.information), 1e-9, 1e-12), fit.jacobians[rows]
+    return float(np.sqrt(np.einsum("nki,nki->", jacobians @ spread, jacobians) / len(jacobians)))
+
+
+@compiled("f8[:,::1](f8[:,::1], f8, f8)")
+def _inverse(information: Array, share: float, least: float) -> Array:
+    """Covariance (N, N) of an information with that share of its trace, and `least`, added; zero of none at all."""
+    damped, eye, damping = information.copy(), np.zeros_like(information), least
+    for i in range(len(damped)):
+        damping += share * information[i, i]
+    if damping == 0.0:
+        return eye
+    for i in range(len(damped)):
+        damped[i, i] += damping
+        eye[i, i] = 1.0
+    out = solved(damped, eye)
+    for i in range(len(damped)):
+        for j in range(i):
+            out[i, j] = out[j, i] = (out[i, j] + out[j, i]) / 2
+    return out
 
 
 def camera_numbers(cameras: Mask) -> frozenset[int]:

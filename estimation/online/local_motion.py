@@ -20,7 +20,8 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.fit import FrameFit, displacement_sums, landmark_sights, solve_symmetric3, unusual_displacements
+from estimation.online.deformation import displacement_sums, landmark_sights
+from estimation.online.fit import FrameFit, solve_symmetric3, unusual_displacements
 from estimation.pose_solver import GATE
 from estimation.runtime import contiguous, median
 from estimation.se3 import Array, Mask

@@ -22,14 +22,14 @@ from estimation import se3
 from estimation.forecast.predictor import Predictor
 from estimation.observations import NOTHING_DISPLACED, Observations
 from estimation.online.deformation import WarpFilter
-from estimation.online.fit import FrameFit, MapError
+from estimation.online.fit import FrameFit
 from estimation.online.local_motion import LocalMotion
 from estimation.online.parted_texture import PartedTexture
 from estimation.online.reported_covariance import CalibrationError, ReportedCovariance
 from estimation.pose import MotionState, SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.surface_map import LocalError, SurfaceMap
+from estimation.surface_map import LocalError, MapError, SurfaceMap
 
 AVERAGED_POSES = (2, 4, 8)  # newest poses looked at together; one alone may be a glitch
 POSES_BEFORE = 16  # before the newest ones, to which a step is compared too: lasting noise is alike in both
