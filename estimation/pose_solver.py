@@ -123,12 +123,12 @@ def solve_pose(
     seen = contiguous(tracks.camera, np.int64), contiguous(tracks.points), contiguous(tracks.pixels)
     fixed = rig.camera_from_base, rig.matrices, *seen, contiguous(1 / tracks.sigma**2), contiguous(start)
     how = np.array(scales, float), iterations, tolerance, none if prior is None else contiguous(prior)
-    *fitted, unit, grams = _gauss_newton(*fixed, *how, shared is not None, contiguous(twist), effects)
-    if shared is not None:
-        own, pull = _shared_equations(grams)
-        return PoseFit(*fitted, unit, SharedFit(own, pull.ravel()))
-    pose, information, *rest = fitted
-    return PoseFit(pose, EFFICIENCY / unit**2 * information, *rest, unit)
+    fitted = _gauss_newton(*fixed, *how, shared is not None, contiguous(twist), effects)
+    pose, information, residuals, weights, jacobians, unit, grams = fitted
+    if shared is None:
+        return PoseFit(pose, EFFICIENCY / unit**2 * information, residuals, weights, jacobians, unit)
+    own, pull = _shared_equations(grams)
+    return PoseFit(pose, information, residuals, weights, jacobians, unit, SharedFit(own, pull.ravel()))
 
 
 exp_entries = compiled("UniTuple(f8, 12)(f8, f8, f8, f8, f8, f8)")(se3.exp_entries)

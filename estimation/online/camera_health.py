@@ -271,9 +271,8 @@ class FrameTracks:
         for c in range(len(self.rig)):
             mine = self.seen.camera == c
             if np.count_nonzero(mine) >= self.min_tracks:
-                noise = USUAL_LENGTH_SIGMAS * median(self.seen.sigma[mine])
-                off[c] = np.sqrt(max(median(away[mine]) ** 2 - noise**2, 0.0))
-        return off
+                off[c] = max(median(away[mine]) ** 2 - (USUAL_LENGTH_SIGMAS * median(self.seen.sigma[mine])) ** 2, 0.0)
+        return np.asarray(np.sqrt(off))
 
     def without_outliers(
         self, left_out: Collection[int], allowed: Array, expected: SurfacePose, stay: int = 1, within: float = np.inf

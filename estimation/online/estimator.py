@@ -190,7 +190,8 @@ class Estimator:
 
     def as_exposed(self, base_from_surface: Array, twist: Array) -> Array:
         """Where the surface is (C, 4, 4) when each camera exposes, from its pose (4, 4) and twist (6,)."""
-        return np.asarray(base_from_surface @ se3.exp(twist * self.cameras.offset[:, None]))
+        off = twist * self.cameras.offset[:, None]
+        return np.asarray(base_from_surface @ se3.exp(off)) if off.any() else np.stack([base_from_surface] * len(off))
 
     def _rejection(self, count: int, used: Index, covariance: Array, incoherent: float) -> str:
         """Why a fit is no measurement, or ''. count: tracks. used: (C,) inliers. incoherent: px, median residual."""
@@ -259,8 +260,7 @@ class Estimator:
         (fit, seen, seconds, sound), surface.unlearned = surface.unlearned, None
         assert fit.solution.shared is not None
         exposed = self.as_exposed(fit.solution.base_from_surface, fit.twist)
-        points = surface.warp.points(surface.map)[seen.track]
-        smear = self.cameras.delays.sigma * fit.twist
+        points, smear = surface.warp.points(surface.map)[seen.track], self.cameras.delays.sigma * fit.twist
         self.health.bumps.update(self.rig, seen, points, exposed, fit.solution.jacobians, fit.outliers, smear)
         if not sound:
             return

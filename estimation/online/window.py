@@ -219,13 +219,12 @@ class Smoother:
         values.insert(pose, gtsam.Pose3(measured.pose))
         values.insert(twist, start)
         self._window.update(graph, values, {pose: measured.stamp, twist: measured.stamp})
-        estimate = self._window.calculateEstimate()
-        self._revise(measured.stamp, estimate)
+        self._revise(measured.stamp)
         window = WindowEstimate(
             measured.stamp,
-            np.asarray(estimate.atPose3(pose).matrix()),
+            np.asarray(self._window.calculateEstimatePose3(pose).matrix()),
             _symmetric(self._window.marginalCovariance(pose)),
-            np.asarray(estimate.atVector(twist)),
+            np.asarray(self._window.calculateEstimateVector(twist)),
             _symmetric(self._window.marginalCovariance(twist)),
             self._psd,
             self._revised[0] / self._revised[1],
@@ -237,13 +236,13 @@ class Smoother:
         self._key += 1
         return window
 
-    def _revise(self, stamp: float, estimate: gtsam.Values) -> None:
+    def _revise(self, stamp: float) -> None:
         """Learn from twists that are old enough at `stamp`, s, how far the poses since then have changed them."""
         while self._unrevised and self._unrevised[0][1].stamp <= stamp - HINDSIGHT_S:
             key, then = self._unrevised.popleft()
-            if not estimate.exists(gtsam.symbol("v", key)):  # after a gap: it has left the window
+            if then.stamp < stamp - WINDOW_LAG_S:  # after a gap: it may have left the window
                 continue
-            change = estimate.atVector(gtsam.symbol("v", key)) - then.twist
+            change = self._window.calculateEstimateVector(gtsam.symbol("v", key)) - then.twist
             self._revised *= 1 - 1 / REVISION_MEMORY_SETS
             self._revised += [change**2 / np.diag(then.twist_covariance), np.ones(6)]
 
