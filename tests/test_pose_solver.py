@@ -19,6 +19,7 @@ from estimation.pose_solver import (
     SharedErrors,
     project,
     solve_pose,
+    solved,
 )
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
@@ -263,3 +264,15 @@ def test_cameras_in_step_lose_next_to_nothing() -> None:
         errors.append([np.linalg.norm(pose[:3, 3] - BASE_FROM_REST[:3, 3]) for pose in both])
     plain, corrected = np.sqrt(np.mean(np.square(errors), axis=0))
     assert corrected < 1.02 * plain
+
+
+@given(seeds, st.integers(1, 9), st.integers(1, 4))
+def test_small_equations_are_solved_whatever_stands_on_their_diagonal(seed: int, rows: int, columns: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix, right = rng.normal(size=(rows, rows)), rng.normal(size=(rows, columns))
+    matrix[np.diag_indices(rows)] *= rng.random(rows) < 0.5  # none may be a pivot as it stands
+    kept = matrix.copy()
+    size = np.linalg.cond(matrix)
+    if size < 1e8:
+        assert np.allclose(solved(matrix, right), np.linalg.solve(matrix, right), rtol=1e-15 * size, atol=1e-13 * size)
+    assert (matrix == kept).all()
