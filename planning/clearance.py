@@ -17,7 +17,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from estimation import se3
 from estimation.errors import InputError
@@ -230,6 +229,8 @@ class Envelope:
 
         Beside the grid the tissue goes on as at its edge; above and below it the distance is that of its last layer.
         """
+        from scipy.ndimage import map_coordinates  # a third of a second, which others need not spend
+
         scaled = self.nodes_from_surface
         u = points @ scaled[:3, :3].T + scaled[:3, 3]
         return np.asarray(map_coordinates(self.distance, u.T, np.float64, 1, "nearest", prefilter=False))

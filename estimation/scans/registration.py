@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.scans.scan import Scan, ScanIndex
@@ -240,6 +239,8 @@ def _costs(index: ScanIndex, poses: Array, points: Array, reach: float) -> Array
 
 def _starts(points: Array, outward: Array, index: ScanIndex) -> Array:
     """Poses (H, 4, 4) that lay each part of the scan under the points, centres and normals matched, at every yaw."""
+    from scipy.spatial import cKDTree  # half a second, which processes without a scan need not spend
+
     radius = _radius(points)
     base_from_cap = _cap(points, np.asarray(outward, float))
     stride = max(1, len(index.samples) // COARSE_SAMPLES)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from estimation.se3 import Array, Index, Mask
 
@@ -160,6 +159,8 @@ DARKEST_SHADE = 0.45  # of what faces away from the light
 
 def picture_of_scan(scan: Scan, colours: NDArray[np.uint8], way: Array, pixels: int) -> NDArray[np.uint8]:
     """A picture (pixels, pixels, 3) of a scan with colours (V, 3), as seen from far away in direction `way` (3,)."""
+    from scipy.spatial import cKDTree  # half a second, which processes without a scan need not spend
+
     z = way / np.linalg.norm(way)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.5 else [0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
@@ -212,6 +213,8 @@ class ScanIndex:
     """A scan made ready for many queries, by samples spread over its triangles, at least one on each."""
 
     def __init__(self, scan: Scan) -> None:
+        from scipy.spatial import cKDTree  # as above
+
         self.scan, self._scene, self._corners, areas = scan, _Scene(scan), scan.corners, face_areas(scan)
         spacing = float(np.sqrt(areas.sum() / SAMPLE_COUNT))
         self.spacing = max(spacing, float(np.sqrt(np.quantile(areas, 0.9))))  # mm, about the largest between samples

@@ -5,6 +5,7 @@ Loads nothing that holds Python's lock for long: no gtsam, cv2 or onnxruntime.
 
 from __future__ import annotations
 
+import importlib
 import math
 import signal
 from collections import deque
@@ -43,6 +44,7 @@ from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
 LAST_POSES = 8  # kept for the recording: more do not wait in the tracking process when it is killed
+importlib.import_module("planning.motion.retime")  # before the arm moves: a planner is made where the path begins
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
 
 
