@@ -1,4 +1,4 @@
-"""Speed and memory of long runs: compiled loops (numba), a fast median, and the C library's heap.
+"""Speed and memory: compiled loops (numba), a fast median, the C library's heap, and what is not loaded.
 
 Dozens of short numpy calls a frame cost more than what they compute, so loops over tracks are compiled. Their types are
 stated: a loop is compiled once, when its module is first imported, and cached. Other threads run meanwhile.
@@ -7,7 +7,10 @@ stated: a loop is compiled once, when its module is first imported, and cached. 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # sums may be taken in parts, the same ones every time; nan stays nan
+OPEN3D_PAGES = "dash", "plotly", "plotly.graph_objects"  # half of the time that open3d takes to load
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # glibc's numbers of the options of mallopt
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -51,6 +55,29 @@ def median(values: Array) -> float:
         return float("nan")
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
+
+
+class _LeftOut(ModuleType):
+    """A module in which every name is None."""
+
+    def __getattr__(self, name: str) -> None:
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+
+@contextmanager
+def left_out(*names: str) -> Iterator[None]:
+    """Within it these modules are not loaded, whoever imports them, but stand empty: for what a library loads in vain.
+
+    names: full ones, of each package on the way as well. What was loaded before stays.
+    """
+    absent = [name for name in names if name not in sys.modules]
+    sys.modules.update({name: _LeftOut(name) for name in absent})
+    try:
+        yield
+    finally:
+        for name in absent:
+            del sys.modules[name]
 
 
 def trim_heap() -> None:

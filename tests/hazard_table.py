@@ -14,6 +14,7 @@ import sys
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -102,11 +103,16 @@ def missing(names: Iterable[str], root: Path = ROOT) -> list[str]:
 def _is_test(file: str, function: str, root: Path) -> bool:
     if not (root / file).is_file():
         return False
-    for node in ast.parse((root / file).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef) and node.name == function:
-            marks = {ast.unparse(each).split("(")[0] for each in node.decorator_list}
-            return not marks & {"pytest.mark.skip", "pytest.mark.xfail"}
-    return False
+    marks = _functions(root / file).get(function)
+    return marks is not None and not marks & {"pytest.mark.skip", "pytest.mark.xfail"}
+
+
+@cache
+def _functions(path: Path) -> dict[str, set[str]]:
+    """The functions of a file, and what each is marked with."""
+    nodes = ast.parse(path.read_text(encoding="utf-8")).body
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    return {node.name: {ast.unparse(each).split("(")[0] for each in node.decorator_list} for node in functions}
 
 
 def failed(names: Iterable[str], cache: Path = LAST_FAILED) -> list[str]:

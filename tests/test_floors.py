@@ -8,6 +8,7 @@ needed fails as well.
 from __future__ import annotations
 
 import ast
+import gc
 import re
 import subprocess
 import sys
@@ -302,7 +303,11 @@ RULES: tuple[Rule, ...] = (
 
 @cache
 def ours() -> House:
-    return House(ROOT)
+    gc.disable()  # the trees are a million objects that stay: to look through them again and again took longer than all
+    house = House(ROOT)
+    gc.freeze()
+    gc.enable()
+    return house
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)

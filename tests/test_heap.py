@@ -1,4 +1,4 @@
-"""The heap gives free memory back to the system or keeps it, as was asked; the quick median is the slow one."""
+"""The heap gives free memory back or keeps it, as was asked; the quick median is the slow one; what is left out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimation.runtime import median, trim_heap
+from estimation.runtime import left_out, median, trim_heap
 from hardware.bench.estimator import resident
 
 
@@ -81,3 +81,15 @@ def test_what_is_not_a_number_is_not_hidden(place: int) -> None:
     values = np.arange(3.0)
     values[place] = np.nan
     assert np.isnan(median(values))
+
+
+def test_what_is_left_out_stands_empty_for_a_while_and_what_was_there_stays() -> None:
+    before = sys.modules["numpy"]
+    with left_out("no_such_package", "no_such_package.part", "numpy"):
+        from no_such_package import anything
+        from no_such_package.part import whatever
+
+        assert anything is None and whatever is None and sys.modules["numpy"] is before
+    assert "no_such_package" not in sys.modules and sys.modules["numpy"] is before
+    with pytest.raises(ImportError):
+        import no_such_package  # noqa: F401

@@ -12,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose
+from estimation.runtime import left_out
 from hardware.arm.profile import ArmProfile
 from hardware.bench.planner import (
     STILL,
@@ -24,7 +25,6 @@ from hardware.bench.planner import (
 )
 from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axes_from_nozzle
-from planning.motion import plots_left_out
 from planning.motion import retime as retime_module
 from planning.motion.curve import PathCurve, curve_through, gridpoints_on
 from planning.motion.retime import (
@@ -39,7 +39,7 @@ from planning.motion.retime import (
 from planning.path import Path
 from tests.moving import Motion, path_through, pose_at, raster, still
 
-with plots_left_out():
+with left_out("matplotlib", "matplotlib.pyplot"):
     from toppra.algorithm import TOPPRA
 
 TRIED_TOPPRA = {

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimation.runtime import OPEN3D_PAGES, left_out
 from estimation.se3 import Array, Index, Mask
 
 MIN_INCIDENCE = 0.1  # cosine of ray and normal: no landmark is seen more from the side
@@ -103,7 +104,8 @@ class _Scene:
     """
 
     def __init__(self, scan: Scan) -> None:
-        import open3d as o3d  # most of a second and 100 MB, which processes without a scan need not spend
+        with left_out(*OPEN3D_PAGES):
+            import open3d as o3d  # a second and 100 MB, which processes without a scan need not spend
 
         self.scan, self._tensor = scan, o3d.core.Tensor
         self._middle = scan.vertices.mean(axis=0)  # float32 has 7 digits: they are spent on the scan, not on its place

@@ -44,7 +44,7 @@ from planning.path import Path
 
 MAX_REPORTED_EVENTS = 50  # the last ones
 LAST_POSES = 8  # kept for the recording: more do not wait in the tracking process when it is killed
-importlib.import_module("planning.motion.retime")  # before the arm moves: a planner is made where the path begins
+importlib.import_module("planning.motion.planner")  # now, and not when a path begins
 INSTRUCTION_BYTE, MOVE_INSTRUCTION = 1, ord("1")  # place in a frame, and what stands there in a move
 
 

@@ -26,7 +26,6 @@ from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.material import FlowShares, Outlets, with_offsets
 from planning.motion.guard import Guard
-from planning.motion.planner import LOOKS, Planner
 from planning.path import Path, PrintProgress
 
 
@@ -45,7 +44,10 @@ class MotionStep:
 
         tissue: that the tool is kept out of, where a scan tells of it.
         """
+        from planning.motion.planner import LOOKS, Planner  # half a second, spent by who plans alone
+
         self.profile = ArmProfile() if profile is None else profile
+        self.looks = LOOKS  # the reason of a hold beside what is printed
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
         path = with_offsets(path, outlets or {})
@@ -292,7 +294,7 @@ class PrintMotion:
         if abs(lag - self._step.lag) > LAG_STEP:
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
+        if waits and isinstance(self.last, Hold) and self.last.reason != self._step.looks:
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -48,10 +47,8 @@ from planning.motion.curve import (
     pose_aside,
     straight_curve,
 )
+from planning.motion.retime import AxisDerivatives, Timing, axis_derivatives, retime
 from planning.path import LOOK, Path, PrintPhase, PrintProgress, check_path, check_start
-
-if TYPE_CHECKING:
-    from planning.motion.retime import AxisDerivatives, Timing
 
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second
 PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
@@ -89,9 +86,6 @@ class Planner:
         start: how much of the path is printed already, in checkpoints (PrintProgress.fraction). outlets: of materials;
         one that is not among them leaves at once.
         """
-        from planning.motion import retime  # with toppra half a second, which processes that plan nothing need not spend
-
-        self._retime, self._axis_derivatives = retime.retime, retime.axis_derivatives
         self._path, self._limits, self._arm, self._tick, self.lag = check_path(path), limits, arm, tick, lag
         self._curve = curve_through(path.surface_from_nozzle, path.speed[1:], ~path.extrude[1:])
         self._zone = path.zone
@@ -295,7 +289,7 @@ class Planner:
             self._segment = None
             return reason
         self.horizons += 1
-        timing = self._retime(grid, derivatives, 0.0, begin, self._bounds)
+        timing = retime(grid, derivatives, 0.0, begin, self._bounds)
         self._segment = None if isinstance(timing, str) else Segment(phase, curve, timing)
         return timing if isinstance(timing, str) else ""
 
@@ -304,7 +298,7 @@ class Planner:
         place = float(segment.timing.at(np.array([now]))[0])
         grid, derivatives = self._horizon(pose, segment.curve, place, now)
         self.horizons += 1
-        timing = self._retime(grid, derivatives, segment.timing.speed_at(now), now, self._bounds)
+        timing = retime(grid, derivatives, segment.timing.speed_at(now), now, self._bounds)
         if isinstance(timing, str):
             return timing if now >= segment.timing.end else ""
         self._segment = replace(segment, timing=timing)
@@ -317,7 +311,7 @@ class Planner:
         """The next horizon's grid points from `place`, mm, passed at `begin`, s, and the axes' derivatives there."""
         end = self._rests.end if curve is self._curve else curve.length
         grid = gridpoints_on(curve, place, min(curve.after(place, HORIZON_TIME), end))
-        return grid, self._axis_derivatives(self._arm, pose, curve, grid, begin)
+        return grid, axis_derivatives(self._arm, pose, curve, grid, begin)
 
     # -- the motion
 

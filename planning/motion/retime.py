@@ -24,15 +24,15 @@ from scipy.ndimage import maximum_filter1d
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
+from estimation.runtime import left_out
 from estimation.se3 import Array
 from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axis_limits, limited_axes, max_axis_change, nozzle_from_axes
 from planning.material import material_plan
-from planning.motion import plots_left_out
 from planning.motion.curve import HORIZON_TIME, Gridpoints, PathCurve, curve_through, gridpoints_on
 from planning.path import Path
 
-with plots_left_out():
+with left_out("matplotlib", "matplotlib.pyplot"):  # 0.4 s, for plots that nobody asks for
     from toppra import constraint
     from toppra.constants import MAX_TRIES, SMALL, TINY
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
