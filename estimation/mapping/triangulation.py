@@ -49,9 +49,8 @@ def triangulate(
     """
     origins, directions = rays(rig, camera, pixels)
     across = np.eye(3) - directions[:, :, None] * directions[:, None]
-    normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    np.add.at(normal, point, across)
-    np.add.at(right, point, np.einsum("mij,mj->mi", across, origins))
+    normal = _summed(point, across, count)
+    right = _summed(point, np.einsum("mij,mj->mi", across, origins), count)
     ridge = 1e-12 * np.eye(3)
     points = np.asarray(np.linalg.solve(normal + ridge, right[..., None])[..., 0], float)
     identity = np.eye(4)
@@ -59,12 +58,18 @@ def triangulate(
         predicted, _, jacobian = project(rig, camera, identity, points[point])
         jacobian = jacobian[:, :, 3:]
         residual = predicted - pixels
-        normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        np.add.at(normal, point, np.swapaxes(jacobian, 1, 2) @ jacobian)
-        np.add.at(right, point, np.einsum("mki,mk->mi", jacobian, residual))
+        normal = _summed(point, np.swapaxes(jacobian, 1, 2) @ jacobian, count)
+        right = _summed(point, np.einsum("mki,mk->mi", jacobian, residual), count)
         points = np.asarray(points - np.linalg.solve(normal + ridge, right[..., None])[..., 0], float)
     residual = project(rig, camera, identity, points[point])[0] - pixels
     return points, np.asarray(np.linalg.inv(normal + ridge), float), residual
+
+
+def _summed(point: Index, values: Array, count: int) -> Array:
+    """Sums (count, ...) of values (M, ...) by the point (M,) of each."""
+    size = int(np.prod(values.shape[1:]))
+    each = (point[:, None] * size + np.arange(size)).ravel()  # half of what np.add.at takes
+    return np.bincount(each, values.ravel(), count * size).reshape(count, *values.shape[1:])
 
 
 def epipolar_distance(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> Array:
