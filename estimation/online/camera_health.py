@@ -17,12 +17,12 @@ import numpy as np
 from estimation.observations import Observations
 from estimation.online.bump_detector import MIN_UNEQUAL_PX, BumpDetector, contradicts, spread_anchors
 from estimation.online.camera_errors import RivalWatch
-from estimation.online.deformation import own_residuals
+from estimation.online.deformation import camera_medians, own_residuals, squared_speeds
 from estimation.online.fit import RivalPose, camera_numbers, motion_sigmas, picture_noise
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, project, solve_pose
+from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, project, solve_pose, solved
 from estimation.rig import Rig
-from estimation.runtime import median
+from estimation.runtime import contiguous, median
 from estimation.se3 import Array, Index, Mask
 
 MAX_OUTLIERS = 2  # cameras that may be wrong at once: exchanged cables
@@ -165,21 +165,21 @@ class CameraHealth:
         offsets, allowed: (C,) px. expected: by the motion, a rival of a fit that contradicts it and lacks cameras.
         """
         moves = (tracks.shared.twist, FAST_KEPT * self._fast)
-        self._fast = max(moves, key=lambda twist: float(np.mean((fit.jacobians @ twist) ** 2)))
+        self._fast = max(moves, key=lambda twist: float(squared_speeds(contiguous(fit.jacobians), twist).sum()))
         if expected is None:
             return ()
         limit, late = OUTLIER_RATIO * allowed, float(np.sqrt(np.mean(np.diag(tracks.shared.delay)))) * self._fast
         farthest = frozenset([int(np.nanargmax(offsets / limit))] if (offsets > limit).any() else [])
         unlike = self.bumps.unequal.apart or frozenset(self.bumps.bumped)
         apart = outliers or unlike or tracks.out_of_step(fit) or farthest
-        motion, usual = motion_sigmas(fit, expected), UNUSUAL_RATIO * self._usual
-        goes_on = expected if outliers and motion <= MAX_MOTION_SIGMAS else None
-        rivals = tracks.rivals(fit, apart, limit, usual, late, self.rivals.own_poses(), goes_on) if apart else ()
+        goes_on = expected if outliers and motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS else None
+        known = UNUSUAL_RATIO * self._usual, late, self.rivals.own_poses(), goes_on
+        rivals = tracks.rivals(fit, apart, limit, *known) if apart else ()
         found = np.bincount(tracks.seen.camera[fit.weights > INLIER_WEIGHT], minlength=len(self._names))
         few = (found < MIN_USUAL_SHARE * self._tracks) & (self._missed == 0)
         lost_now = camera_numbers(few) & self._fresh - outliers
         carriers = camera_numbers(found > 0) - lost_now
-        if rivals or not lost_now or not carriers or motion <= MAX_MOTION_SIGMAS:
+        if rivals or not lost_now or not carriers or motion_sigmas(fit, expected) <= MAX_MOTION_SIGMAS:
             return rivals
         poses, nothing = (fit.base_from_surface, expected.base_from_surface), np.zeros(len(fit.weights), bool)
         return (RivalPose(lost_now, carriers, *poses, (0.0, 0.0), nothing),)
@@ -267,12 +267,9 @@ class FrameTracks:
 
     def offsets(self, fit: PoseFit) -> Array:
         """Offsets (C,) px of the cameras from a pose: median residual less its noise, nan below `min_tracks` tracks."""
-        away, off = np.linalg.norm(fit.residuals, axis=1), np.full(len(self.rig), np.nan)
-        for c in range(len(self.rig)):
-            mine = self.seen.camera == c
-            if np.count_nonzero(mine) >= self.min_tracks:
-                off[c] = max(median(away[mine]) ** 2 - (USUAL_LENGTH_SIGMAS * median(self.seen.sigma[mine])) ** 2, 0.0)
-        return np.asarray(np.sqrt(off))
+        of_tracks = contiguous(self.seen.camera, np.int64), contiguous(fit.residuals), contiguous(self.seen.sigma)
+        away, sigma = camera_medians(len(self.rig), *of_tracks, max(self.min_tracks, 1.0))
+        return np.asarray(np.sqrt(np.maximum(away**2 - (USUAL_LENGTH_SIGMAS * sigma) ** 2, 0.0)))
 
     def without_outliers(
         self, left_out: Collection[int], allowed: Array, expected: SurfacePose, stay: int = 1, within: float = np.inf
@@ -321,7 +318,7 @@ class FrameTracks:
         if fit.shared is None:
             return frozenset()
         prior, eye = self.shared.covariance(), np.eye(len(fit.shared.pull))
-        effect = prior @ np.linalg.solve(eye + fit.shared.information @ prior, fit.shared.pull)
+        effect = prior @ solved(eye + fit.shared.information @ prior, fit.shared.pull[:, None])[:, 0]
         delay, usual = np.abs(effect[: len(self.rig)]), np.sqrt(np.mean(np.diag(self.shared.delay)))
         return frozenset([int(np.argmax(delay))] if delay.max() > MAX_DELAY_SIGMAS * usual else [])
 

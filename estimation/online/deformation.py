@@ -360,3 +360,34 @@ def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
             own = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
             left[mine] = (residual - jacobian @ own).reshape(-1, 2)
     return left
+
+
+@compiled("f8[::1](f8[:,:,::1], f8[::1])")
+def squared_speeds(jacobian: Array, twist: Array) -> Array:
+    """Squared velocities (N,), px^2/s^2, of tracks by their Jacobians (N, 2, 6) and a twist (6,)."""
+    squares = np.zeros(len(jacobian))
+    for i in range(len(jacobian)):
+        for k in range(2):
+            along = 0.0
+            for a in range(6):
+                along += jacobian[i, k, a] * twist[a]
+            squares[i] += along * along
+    return squares
+
+
+@compiled("Tuple((f8[::1], f8[::1]))(i8, i8[::1], f8[:,::1], f8[::1], f8)")
+def camera_medians(cameras: int, camera: Index, residual: Array, sigma: Array, least: float) -> tuple[Array, Array]:
+    """Upper medians (C,) of each camera's residuals' (N, 2) lengths and sigmas (N,); nan of fewer than `least`."""
+    lengths, sigmas, middle = np.full(cameras, np.nan), np.full(cameras, np.nan), np.empty((2, len(camera)))
+    for c in range(cameras):
+        count = 0
+        for i in range(len(camera)):
+            if camera[i] == c:
+                middle[0, count] = np.sqrt(residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1])
+                middle[1, count] = sigma[i]
+                count += 1
+        if count >= least:
+            ordered = np.sort(middle[0, :count])  # nan comes last, and leaves nothing known
+            lengths[c] = ordered[-1] if np.isnan(ordered[-1]) else ordered[count // 2]
+            sigmas[c] = np.sort(middle[1, :count])[count // 2]
+    return lengths, sigmas

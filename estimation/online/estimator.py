@@ -16,7 +16,7 @@ from estimation import se3
 from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces, Observations
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
 from estimation.online.camera_health import CameraHealth, FrameTracks
-from estimation.online.deformation import WarpFilter
+from estimation.online.deformation import WarpFilter, squared_speeds
 from estimation.online.fit import FrameFit, failed_fit, fit_covariance
 from estimation.online.parted_texture import Elsewhere
 from estimation.online.reported_covariance import (
@@ -180,12 +180,11 @@ class Estimator:
         sigma, camera = np.maximum(observations.sigma, self.settings.floor_sigma), observations.camera
         at_once, _, jacobians = project(self.rig, camera, start, points)
         sigma = self._surface.map_error.widened(sigma, observations.track, jacobians)
-        velocity = jacobians @ twist
         pixels = observations.pixels
         if self.cameras.offset.any():
             pixels = pixels + at_once - project(self.rig, camera, self.as_exposed(start, twist), points)[0]
         # how far the images move in the time by which a camera's exposure is unknown
-        smear = self.cameras.delays.sigma * float(np.sqrt(median((velocity**2).sum(1))))
+        smear = self.cameras.delays.sigma * float(np.sqrt(median(squared_speeds(jacobians, twist))))
         return replace(observations, pixels=pixels, sigma=sigma), smear
 
     def as_exposed(self, base_from_surface: Array, twist: Array) -> Array:
