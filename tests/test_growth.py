@@ -33,14 +33,14 @@ from tests.synthetic import frame_sets, patch, pictures
 
 RIG = arc_rig(size=(320, 240), focal=560.0)  # 0.7 mm a pixel, 228 mm wide
 LONG = patch(1, (320.0, 60.0), np.inf, Wound((310.0, 56.0)))
-STAMPS = np.arange(46) / 10
+STAMPS = np.arange(36) / 10
 FIRST = StateSettings().first  # the pose that is given out first
 SMALL = patch(2, (80.0, 60.0), np.inf, Wound((70.0, 54.0)))
 
 
 def passing(stamp: float) -> Array:
     """A long patch passes by: of what is in view at first, nothing is in the end."""
-    return BASE_FROM_REST @ se3.exp([0.02 * np.sin(stamp), 0, 0, 85 - 45 * stamp, 0, 1.5 * np.sin(2 * stamp)])
+    return BASE_FROM_REST @ se3.exp([0.02 * np.sin(stamp), 0, 0, 85 - 58 * stamp, 0, 1.5 * np.sin(2 * stamp)])
 
 
 @cache

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -111,10 +112,13 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path
     }
 
 
+replayed = cache(replay_run)
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_simulated_run_replays_bit_by_bit(recordings: dict[str, tuple[Path, Recorded]], name: str) -> None:
     file, sink = recordings[name]
-    played = replay_run(file)
+    played = replayed(file)
     assert len(played) > 40 and all(each.frame == each.recorded for each in played)
     wire = b"".join(each.frame for each in played)
     assert wire == sink.sent or "kill" in name or "unplug" in name  # where the port is gone nothing passes
@@ -128,14 +132,14 @@ def test_a_simulated_run_replays_bit_by_bit(recordings: dict[str, tuple[Path, Re
 
 
 def test_the_same_in_another_process_with_two_threads(recordings: dict[str, tuple[Path, Recorded]]) -> None:
-    files = [str(file) for file, _ in recordings.values()]
+    files = [recordings[name][0] for name in ("stopped and resumed", "a recall", "a lost camera")]
     code = "import sys; from pathlib import Path; from hardware.live.recorded_run import replay_run\n"
     code += "for file in sys.argv[1:]:\n print(''.join(p.frame.hex() for p in replay_run(Path(file))))"
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "PYTHONHASHSEED": "3"}
     how = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True, "check": True}
     lines = subprocess.run([sys.executable, "-c", code, *files], **how).stdout.split()  # type: ignore[call-overload]
-    for (file, _), line in zip(recordings.values(), lines, strict=True):
-        assert line == "".join(each.recorded.hex() for each in replay_run(file))
+    for file, line in zip(files, lines, strict=True):
+        assert line == "".join(each.recorded.hex() for each in replayed(file))
 
 
 def test_the_command_replays_a_simulated_session(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -98,7 +99,12 @@ class Printing:
 
 
 def seen(now: float) -> SurfacePose:
-    return pose_at(breathing, round(now - 0.02, 2))
+    return _seen(round(now - 0.02, 2))
+
+
+@cache
+def _seen(stamp: float) -> SurfacePose:
+    return pose_at(breathing, stamp)
 
 
 def outside(spans: list[tuple[float, float]], allowed: list[tuple[float, float]]) -> float:
