@@ -27,9 +27,9 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.process import checks
 from perception.frames import FrameSet
-from perception.tracking.step import StepReport
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # who only reads poses needs no tracker, which takes two seconds to load
+    from perception.tracking.step import StepReport
     from perception.tracking.wound_step import WoundEstimate
     from perception.wound.segmentation import Segmenter
 
