@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from math import isnan, nan
 from pathlib import Path
 from types import FrameType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from estimation.errors import InputError
 from estimation.rig import Rig
@@ -37,7 +37,9 @@ from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
 from hardware.process.system import SPAWN, SharedLatest
 from perception.frames import FrameSet, region_since
-from perception.tracking.wound_step import FindRegion
+
+if TYPE_CHECKING:  # who draws no region needs no tracker, which takes two seconds to load
+    from perception.tracking.wound_step import FindRegion
 
 FIRST_PICTURE_TIME = 10.0  # s in which cameras open; a recording of so many seconds counts from its first picture
 READY_POLL = 0.05  # s between looks at a recorder that starts

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from logging import INFO, WARNING
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,7 +41,9 @@ from hardware.process.progress import ProgressReport, no_progress
 from hardware.recording.recorder import NOT_KEPT, Recorder
 from hardware.recording.session_reader import open_session, read_truth_rows
 from perception.frames import Frame, FrameSet, Roi
-from perception.tracking.step import StepReport
+
+if TYPE_CHECKING:  # who converts needs no tracker, which takes two seconds to load
+    from perception.tracking.step import StepReport
 
 
 def import_folder(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,9 @@ from hardware.operator.shared_state import (
 from perception.frames import FrameSet, OutlinedPicture, Roi
 from perception.lens import undistort
 from perception.mapping.features import polygon_mask
-from perception.tracking.wound_step import WoundSight
+
+if TYPE_CHECKING:
+    from perception.tracking.wound_step import WoundSight
 from perception.wound.segmentation import WoundMask, dice, hull_of, largest_part, outline_of
 
 MAX_LINES = 2500  # of all: 3 cameras draw them five times a second
