@@ -276,9 +276,8 @@ class _EntryWriter:
         self._lane = TraceLane(RECORDER_LANE, self._clock, self._write) if settings.trace else None
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
-        self._early: list[Entry] = []
         self._used, self._tracked = UsedPoses(()), -np.inf  # and the stamp, s, of the last pose by the tracking process
-        self._failed, self._reported = "", 0.0
+        self._early, self._failed, self._reported = list[Entry](), "", 0.0
         self.report()  # pictures may come
 
     def run(self, senders: Sequence[RecorderReceiver]) -> None:
