@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import wait
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path as File
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,7 +20,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceHeights
+from estimation.surface_map import SurfaceHeights, SurfaceMap
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.profile import ArmProfile
 from hardware.motion.step import MotionStep
@@ -36,6 +39,9 @@ from hardware.simulator.scene.shape import Wound, body
 from hardware.simulator.truth import divide_path
 from perception.frames import Frame, FrameSet
 from perception.lens import Lenses
+from perception.mapping.features import grey
+from perception.mapping.first_map import FirstMap
+from perception.mapping.scan_map import relief_points
 from perception.mapping.surface_heights import (
     SurfaceView,
     _GroundView,
@@ -401,16 +407,64 @@ def test_a_live_run_gathers_judges_beside_the_tracking_and_says_so_once() -> Non
     scene = Scene(body("chest", None, 1), Appearance(wetness=0.0), seed=1)
     scene.gel = Gel(gloss=0.05)
     path = layers(1, 3)
-    bare, places, now = views(scene, rig, rng), landmarks(scene), 100.0
+    bare, places = views(scene, rig, rng), landmarks(scene)
     for k, (a, b) in enumerate(path.surface_from_nozzle[:, :2, 3].reshape(3, 2, 2)):
         way = np.linspace(a, b, 81)
         area = np.full(80, WIDTH * HEIGHT * (k != 1))  # the middle one is clogged
         scene.ink.flow(GelPieces(way[:-1], way[1:], 0.1 * area, np.maximum(area, 0.1)), 0.0)
     scene.ink.flow(none_left(), 30.0)
     printed = views(scene, rig, rng)
-    held, done = Hold(0.0, 0.1, LOOKS), list[Look]()
-    begun = PrintProgress(PrintPhase.PRINTING, 1, 6, 0.0, 30.0, 0.0, "")
-    aside = replace(begun, phase=PrintPhase.RETREATING, fraction=5.0, wanted=LOOK)
+    looks, (look,) = looked_live(rig, path, bare, printed, places)
+    assert looks.count == 1 and looks.text == f"looked at: {look.text}" and look.seconds > 1
+    ((begin, end),) = look.laid.clogs
+    middle = look.laid.stations.begin[look.laid.stations.bead == 1]
+    assert begin == pytest.approx(middle[0], abs=1.3) and end - begin > 5
+
+
+@pytest.mark.parametrize("size", [(320, 180), (96, 54)])
+def test_cameras_of_too_few_pixels_tell_nothing_and_end_nothing(size: tuple[int, int]) -> None:
+    rig = arc_rig(focal=0.86 * size[0], size=size)  # 1.6 mm a pixel: coarser than the beads, and soon than the path
+    scene = Scene(body("chest", None, 1), Appearance(wetness=0.0), seed=1)
+    seen = views(scene, rig, np.random.default_rng(4))
+    looks, done = looked_live(rig, layers(1, 2), seen, seen, landmarks(scene))
+    assert looks.count == 1 and "goes on as planned" not in looks.text, looks.text
+    assert all(not look.laid.clogs and np.isnan(look.laid.share).all() for look in done)
+
+
+@pytest.mark.parametrize(("size", "found"), [((640, 360), True), ((320, 180), True), ((96, 54), False)])
+def test_relief_is_what_pictures_resolve(size: tuple[int, int], found: bool) -> None:
+    rig, scene = (
+        arc_rig(focal=0.86 * size[0], size=size),
+        Scene(body("chest", None, 1), Appearance(wetness=0.0), seed=1),
+    )
+    seen = views(scene, rig, np.random.default_rng(4))[0]
+    places = scene.shape.points(np.random.default_rng(3).uniform(-10, 10, (60, 2)))
+    surface = SurfaceMap(places, np.zeros_like(places), np.zeros((0, 0)))
+    first = cast(FirstMap, SimpleNamespace(map=surface, base_from_surface=seen.base_from_surface))
+    points = relief_points(Lenses(rig), {c: grey(image) for c, image in seen.images.items()}, first, {})
+    assert points.shape[1:] == (3,) and bool(len(points)) == found
+    inner = se3.transform_points(se3.inverse(seen.base_from_surface), points)
+    assert np.abs(inner[:, 2] - scene.shape.heights_at(inner[:, :2])).max(initial=0) < 2.0  # mm, a pixel at 320
+
+
+def test_a_look_that_fails_says_so_and_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise ValueError("no such surface")
+
+    monkeypatch.setattr("hardware.offline.looks.dense_heights", failing)
+    rig, scene = arc_rig(focal=275.0, size=(320, 180)), Scene(body("chest", None, 1), Appearance(), seed=1)
+    seen = views(scene, rig, np.random.default_rng(4))
+    looks, done = looked_live(rig, layers(1, 2), seen, seen, landmarks(scene))
+    assert not done and looks.count == 1 and "goes on as planned (ValueError: no such surface)" in looks.text
+
+
+def looked_live(
+    rig: Rig, path: Path, bare: Sequence[SurfaceView], printed: Sequence[SurfaceView], places: Array
+) -> tuple[LiveLooks, list[Look]]:
+    """The looks of a live run at views of the bare surface and of what was printed; places: its landmarks."""
+    held, done, now = Hold(0.0, 0.1, LOOKS), list[Look](), 100.0
+    begun = PrintProgress(PrintPhase.PRINTING, 1, len(path), 0.0, 30.0, 0.0, "")
+    aside = replace(begun, phase=PrintPhase.RETREATING, fraction=len(path) - 1.0, wanted=LOOK)
     with ExitStack() as stack:
         looks = LiveLooks(rig, path, stack)
 
@@ -422,20 +476,16 @@ def test_a_live_run_gathers_judges_beside_the_tracking_and_says_so_once() -> Non
             look = looks(progress, held, frames, pose, places, lies)
             done.extend([] if look is None else [look])
 
-        for view in bare * 2:
+        for view in [*bare, *bare]:
             seen(view, None, None)
-        for turn, progress in enumerate((begun, aside)):
-            for view in (bare, printed * 4)[turn]:
+        for shown, progress in ((bare, begun), ([*printed] * 4, aside)):
+            for view in shown:
                 seen(view, progress, np.eye(4))
             assert looks.busy is not None
             wait([looks.busy])
         for _ in range(3):
             seen(printed[0], aside, np.eye(4))
-    (look,) = done
-    assert looks.count == 1 and looks.text == f"looked at: {look.text}" and look.seconds > 1
-    ((begin, end),) = look.laid.clogs
-    middle = look.laid.stations.begin[look.laid.stations.bead == 1]
-    assert begin == pytest.approx(middle[0], abs=1.3) and end - begin > 5
+    return looks, done
 
 
 @pytest.mark.parametrize(("wetness", "gloss", "wound"), [(0.0, 0.05, None), (1.0, 0.95, Wound())], ids=["matt", "wet"])

@@ -69,7 +69,7 @@ def _summed(point: Index, values: Array, count: int) -> Array:
     """Sums (count, ...) of values (M, ...) by the point (M,) of each."""
     size = int(np.prod(values.shape[1:]))
     each = (point[:, None] * size + np.arange(size)).ravel()  # half of what np.add.at takes
-    return np.bincount(each, values.ravel(), count * size).reshape(count, *values.shape[1:])
+    return np.asarray(np.bincount(each, values.ravel(), count * size).reshape(count, *values.shape[1:]))
 
 
 def epipolar_distance(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> Array:

@@ -182,6 +182,7 @@ class LiveLooks:
     count: done so far. text: of the last one. busy: what is judged now.
 
     The bare surface is measured in views from just before the print begins, when the arm stands at its home.
+    A look that fails says so, and the print goes on as planned.
     """
 
     def __init__(
@@ -243,11 +244,12 @@ class LiveLooks:
 
     def _finished(self, now: float) -> Look | None:
         assert self.busy is not None and self._looks is not None
-        job, self.busy = self.busy, None
-        job.result()
+        failed, self.busy = self.busy.exception(), None
         if not self._counts:
             return None
-        self.count, self.text, look = self.count + 1, NOTHING_JUDGED, self._looks.last
+        why = f"looked at: nothing could be judged, and the path goes on as planned ({type(failed).__name__}: {failed})"
+        self.text = NOTHING_JUDGED if failed is None else why
+        self.count, look = self.count + 1, self._looks.last
         if look is None:
             return None
         if self._adapt is not None and (shares := self._looks.adapted()) is not None:

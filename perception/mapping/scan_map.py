@@ -77,9 +77,12 @@ def match_near(
 ) -> DenseMatch | None:
     """Where the surface near `nodes` (H, W, 3), base frame, really is; None where no two cameras see any of it.
 
+    None, too, of nodes that are too few for the flow, as pictures of few pixels make them of a small surface.
     Each node's ray in the reference camera is intersected with those of the other cameras at the places that match.
     every: step in rows and columns between the nodes given, (H', W', 3).
     """
+    if min(nodes.shape[:2]) <= FLOW_PATCH_NODES:
+        return None
     towards = lattice_normals(nodes)
     first = lattice_image(lenses, reference, images[reference], nodes, towards)
     flow = _flow()
@@ -206,7 +209,7 @@ def relief_points(
         nodes = np.dstack([flat, resized.astype(float)])
         match = match_near(lenses, images, transformed_nodes(first.base_from_surface, nodes), reference)
         if match is None:
-            return np.zeros((0, 3))
+            continue
         relief, sure = match.points, match.sure
         inner = transformed_nodes(se3.inverse(first.base_from_surface), relief)
         heights = corrected_heights(nodes, inner, sure, width * finest)

@@ -174,6 +174,9 @@ def sweep_beads(
     widths: that are tried, or the one that is known. station: (H, W) piece of bead that a node belongs to, -1 for none.
     joined: (S - 1,) whether the next piece is of the same bead.
     """
+    if not np.isfinite(before.heights).any():
+        unknown = np.full(len(joined) + 1, np.nan)
+        return BeadShares(unknown, unknown, unknown, widths[len(widths) // 2])
     rows, columns = (_reach(np.flatnonzero((station >= 0).any(axis=axis)), before.step) for axis in (1, 0))
     box = (slice(*rows), slice(*columns))
     station, count = station[box], len(joined) + 1
