@@ -27,7 +27,7 @@ from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, install
 from tests.light_live import HOME, TILT, prepare_files
 from tests.live_runs import CLOCK, PATH, SCENARIO, Running, messages
 from tests.moving import breathing
-from tests.octoprint_bench import OctoPrintServer
+from tests.octoprint_bench import ROOT, OctoPrintServer
 from tests.test_arm_laws import straight
 from tests.test_live_run import confirmed
 
@@ -37,6 +37,7 @@ ADDRESS = f"franka://{HOST}"
 PICTURES = SCENARIO.replace("seconds = 2.7", "seconds = 4.3").replace("fps = 20.0", "fps = 15.0")
 PICTURES = PICTURES.replace("amplitude_mm = 2.0", "amplitude_mm = 4.0").replace("rate_hz = 0.4", "rate_hz = 0.25")
 HEIGHT = 2.0  # mm up and 2 mm down: breaths of 4 mm
+PLUNGER_MM2 = 78.5  # of data/dispensers/arm_axis.toml
 STANDSTILL = 0.05  # mm from where it comes to rest
 
 
@@ -142,25 +143,32 @@ def test_from_pictures_the_true_flange_says_how_well_a_franka_prints(tmp_path: P
 def test_from_pictures_octoprint_s_printer_says_how_well_it_prints(tmp_path: Path) -> None:
     address = f"gcode://{tmp_path / 'printer'}"
     server = OctoPrintServer(tmp_path, arm_over(ArmProfile(), address).arm.home)
+    head, *rows = PATH.split()
+    metered = "\n".join([f"{head},volume_mm3", *(f"{row},0.4" for row in rows)]) + "\n"
+    given = "--dispensers", str(ROOT / "data/dispensers/arm_axis.toml")
     try:
-        print_from_pictures(tmp_path, address, lambda profile: server.places())
+        print_from_pictures(tmp_path, address, lambda profile: server.places(), metered, *given)
     finally:
         server.end(signal.SIGKILL)
+    pushed = float(np.ptp(np.loadtxt(server.log)[:, 4])) * PLUNGER_MM2
+    assert pushed == pytest.approx(0.4 * sum(row.endswith(",1") for row in rows), rel=0.01)
 
 
-def print_from_pictures(folder: Path, address: str, truth: Callable[[ArmProfile], tuple[Array, Array]]) -> None:
+def print_from_pictures(
+    folder: Path, address: str, truth: Callable[[ArmProfile], tuple[Array, Array]], path: str = PATH, *given: str
+) -> None:
     """Print a scenario, all tracking included, and compare the nozzle with its place on the true surface.
 
-    truth: ends the arm; stamps (N,), s, and axes (N, 6), where it truly was.
+    given: options of the command. truth: ends the arm; stamps (N,), s, and axes (N, 6), where it truly was.
     """
     scenario, record = folder / "scenario.toml", folder / "run.mcap"
     scenario.write_text(PICTURES, encoding="utf-8")
-    (folder / "path.csv").write_text(PATH, encoding="utf-8")
+    (folder / "path.csv").write_text(path, encoding="utf-8")
     rendered = prerender(scenario, folder / "cache" / "stillbed").folder
     profile = arm_over(read_arm(rendered / "arm.toml"), address)
     write_arm(folder / "arm.toml", profile, "where a simulated run puts it")
     what = "--simulated", str(scenario), "--arm", address, "--yes", "--no-page", "--record", str(record)
-    run = Running(*what, cache=folder / "cache")
+    run = Running(*what, *given, cache=folder / "cache")
     try:
         run.wait_for(r"\nprint\n")
         run.wait_for("done|finished|stopped|failed")
