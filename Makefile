@@ -85,8 +85,11 @@ docs: $(STAMP)
 	@rm -rf out/api && PYTHONPATH=$(DOCS) OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.api_links out/api
 
 # The operator's page is tested in Chromium; where there is none those tests are skipped, and say so.
+ANY_CHROMIUM := command -v chromium-headless-shell || command -v chromium || command -v chromium-browser || command -v google-chrome
+
 browser:
-	@$(call apt,chromium,command -v chromium || command -v chromium-browser || command -v google-chrome)
+	@$(call apt,chromium-headless-shell fonts-liberation,$(ANY_CHROMIUM))
+	@$(call apt,chromium,$(ANY_CHROMIUM))
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
@@ -106,7 +109,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 # $(call apt,PACKAGES,CHECK): where CHECK fails, install PACKAGES if we may, else say the one line to run, and go on.
 define apt
-if ! $(2) >/dev/null 2>&1; then \
+if ! { $(2); } >/dev/null 2>&1; then \
 	if [ "$$(id -u)" = 0 ]; then sudo=; else sudo="sudo -n"; fi; \
 	if command -v apt-get >/dev/null && { [ -z "$$sudo" ] || $$sudo true 2>/dev/null; }; then \
 		echo "installing $(1)"; \

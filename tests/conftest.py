@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -35,10 +36,16 @@ def browser() -> Iterator[Browser]:
     from tests.browser import Browser, executable
 
     if (program := executable()) is None:
-        pytest.skip("no Chromium: apt-get install chromium")
+        pytest.skip("no Chromium: make browser")
     made = Browser(program)
     yield made
     made.close()
+
+
+def pytest_collection_finish() -> None:
+    """What was imported and collected stays to the end: the garbage collector need not walk it in every test."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)  # before those that are not asked for are left out
