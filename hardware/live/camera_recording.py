@@ -150,7 +150,8 @@ class CameraRecording:
         self._order, self._clock, self._stream = order, WallClock(), stream
         self._signal = 0
         self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
-        self._begun, self._first, self._last = self._clock.now(), nan, nan
+        self._begun = self._ready = self._clock.now()  # and since when pictures are taken
+        self._first = self._last = nan
         self._sets = self._passed = 0
         self._counts = Counter[int]()  # of pictures, by camera
         self._lost: dict[str, None] = {}  # names of cameras that were without pictures for a while, in that order
@@ -206,7 +207,7 @@ class CameraRecording:
         while self._reports.get() is None and not self._ended():
             self._clock.wait_until(self._clock.now() + READY_POLL)
             progress(0, 0)
-            self._begun = self._clock.now()
+            self._ready = self._clock.now()
         self._source.take(0.0)  # what came meanwhile
 
     def _open_page(self, stack: ExitStack, rig: Rig) -> None:
@@ -234,7 +235,7 @@ class CameraRecording:
         if not self._processes.alive(RECORDER):
             self.failed = True
             return f"the recorder {self._processes.ending(RECORDER)}; what was written before is kept"
-        since = self._begun + FIRST_PICTURE_TIME if isnan(self._arrived) else self._arrived
+        since = self._ready + FIRST_PICTURE_TIME if isnan(self._arrived) else self._arrived
         if self._order.seconds is not None and now - since >= self._order.seconds:
             return "the time is over"
         return self.words
