@@ -423,7 +423,7 @@ def test_a_live_run_gathers_judges_beside_the_tracking_and_says_so_once() -> Non
 
 @pytest.mark.parametrize("size", [(320, 180), (96, 54)])
 def test_cameras_of_too_few_pixels_tell_nothing_and_end_nothing(size: tuple[int, int]) -> None:
-    rig = arc_rig(focal=0.86 * size[0], size=size)  # 1.6 mm a pixel: coarser than the beads, and soon than the path
+    rig = arc_rig(focal=0.86 * size[0], size=size)  # 1.7 and 5.6 mm a pixel: coarser than a bead
     scene = Scene(body("chest", None, 1), Appearance(wetness=0.0), seed=1)
     seen = views(scene, rig, np.random.default_rng(4))
     looks, done = looked_live(rig, layers(1, 2), seen, seen, landmarks(scene))

@@ -150,7 +150,8 @@ class CameraRecording:
         self._order, self._clock, self._stream = order, WallClock(), stream
         self._signal = 0
         self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
-        self._begun = self._ready = self._clock.now()  # and since when pictures are taken
+        self._begun = self._clock.now()
+        self._ready = self._begun  # s, when the recorder had loaded, and pictures were taken
         self._first = self._last = nan
         self._sets = self._passed = 0
         self._counts = Counter[int]()  # of pictures, by camera
