@@ -17,6 +17,7 @@ from estimation.se3 import Array
 MIN_FEED = 1.0  # mm/s, or degrees/s: where the arm is off by rounding or a lost frame, it must not take for ever
 TICK_FRACTION = 0.98  # of a tick for a move; in the rest the arm works off what queued up in an unnoticed stall
 MAX_FLOW = 1000.0  # mm^3/s: a bead of 5 mm^2 on the fastest path; bioprinting lays 0.1 to 10
+LOOKS = "stands aside for a look"  # the reason of a hold
 MIN_TRAVEL = 1e-3  # mm: a shorter move only turns; the arm gets its axes as binary32, good to 6e-5 mm at 1 m
 
 

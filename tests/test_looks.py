@@ -49,7 +49,7 @@ from perception.mapping.surface_heights import (
     first_heights,
     matte,
 )
-from planning.command import Hold, Move
+from planning.command import LOOKS, Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.laid_beads import (
     MAX_FLOW,
@@ -66,7 +66,7 @@ from planning.laid_beads import (
 )
 from planning.material import AS_PLANNED, FlowShares
 from planning.motion.guard import Guard
-from planning.motion.planner import LOOKS, Planner
+from planning.motion.planner import Planner
 from planning.path import LOOK, Path, PrintPhase, PrintProgress
 from tests import worlds
 from tests.moving import path_through, pose_at, still

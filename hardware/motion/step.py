@@ -22,7 +22,7 @@ from hardware.arm.profile import ArmProfile, measured_lag
 from hardware.motion.loop import MaterialControl
 from hardware.process.clock import Clock
 from planning.clearance import TissueGuard
-from planning.command import Command, Hold, Move
+from planning.command import LOOKS, Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.material import FlowShares, Outlets, with_offsets
 from planning.motion.guard import Guard
@@ -44,10 +44,9 @@ class MotionStep:
 
         tissue: that the tool is kept out of, where a scan tells of it.
         """
-        from planning.motion.planner import LOOKS, Planner  # half a second, spent by who plans alone
+        from planning.motion.planner import Planner  # half a second, spent by who plans alone
 
         self.profile = ArmProfile() if profile is None else profile
-        self.looks = LOOKS  # the reason of a hold beside what is printed
         settings = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
         path = with_offsets(path, outlets or {})
@@ -294,7 +293,7 @@ class PrintMotion:
         if abs(lag - self._step.lag) > LAG_STEP:
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if waits and isinstance(self.last, Hold) and self.last.reason != self._step.looks:
+        if waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
             self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
         self._place.value = self._step.progress.fraction
         return self.last

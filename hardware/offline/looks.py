@@ -40,7 +40,7 @@ from perception.mapping.surface_heights import (
     sweep_beads,
     view_of,
 )
-from planning.command import Command, Hold
+from planning.command import LOOKS, Command, Hold
 from planning.laid_beads import (
     SURE,
     BeadPieces,
@@ -55,7 +55,6 @@ from planning.laid_beads import (
     stations_of,
 )
 from planning.material import AS_PLANNED, FlowShares
-from planning.motion.planner import LOOKS
 from planning.path import LOOK, Path, PrintProgress, way_lengths
 
 VIEWS = 4  # frame sets of a look: each at another place of the breath, so that pixels fall elsewhere

@@ -22,6 +22,7 @@ from estimation.se3 import Array
 from planning.command import (
     AXIS_MARGIN,
     JOINT_MARGIN,
+    LOOKS,
     Command,
     Hold,
     HoldReason,
@@ -52,8 +53,7 @@ from planning.path import LOOK, Path, PrintPhase, PrintProgress, check_path, che
 
 RENEW_BEFORE_END = 0.5  # s left of a horizon when the next is timed: the surface is predicted for half a second
 PATH_END_TOLERANCE = 1e-3  # mm of a path that count as none: along 20 nm, as a stop once left, no timing exists
-PAUSED = "paused"
-RESTS, LOOKS = "rests for wait_s", "stands aside for a look"
+PAUSED, RESTS = "paused", "rests for wait_s"
 STALL_TICKS = 3.0  # ticks without a call after which the arm has come to rest by itself
 MAX_SENT_MOVES = 64  # a second of them, more than an arm is sent before they are called back
 POSE_LIMIT_FRACTION = 0.98  # of the guard's limits for a pose: the planner brakes before the guard would refuse
