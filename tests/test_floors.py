@@ -68,7 +68,7 @@ OWNERS = {  # library: the files that may import it
     "gtsam": ("estimation/*.py",),
     "matplotlib": ("perception/training/*.py",),
     "mcap": ("hardware/recording/mcap_*.py", "hardware/offline/trajectory_files.py"),
-    "foxglove": ("hardware/live/recorder_process.py",),
+    "foxglove": ("hardware/operator/process.py",),
     "franky": ("hardware/arm/franka.py",),
     "numba": ("estimation/runtime.py",),
     "onnx": ("perception/training/*.py",),

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 
 from estimation.errors import InputError
 from hardware.live.prepared import RunFiles
-from hardware.live.recorder_process import FOXGLOVE_BACKLOG, FoxgloveServer
 from hardware.live.settings import LiveSettings, check_settings
+from hardware.operator.process import FOXGLOVE_BACKLOG, FoxgloveServer
 from hardware.process.clock import WallClock, utc_now
 from hardware.process.system import file_hash
 from hardware.recording import ros_messages

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 import os
-import pickle
 import signal
 import subprocess
 import sys
 import threading
 import time
+import weakref
+from copy import deepcopy
 from ctypes import c_double
 from dataclasses import replace
 from multiprocessing import Pipe
@@ -40,7 +41,7 @@ from hardware.live.prepared import (
     read_placement,
     write_placement,
 )
-from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender, record
+from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender, packed, record, unpacked
 from hardware.live.records import (
     FIRST_BIN_WIDTH,
     TIMELINE_BINS,
@@ -66,13 +67,13 @@ from hardware.process.faults import faults_from_texts
 from hardware.process.progress import cached
 from hardware.process.system import MOST_RINGS, SPAWN, Bell, SharedLatest
 from hardware.recording.loop_record import recorded_begin
-from hardware.recording.session_reader import read_poses
-from perception.frames import Frame, FrameSet
+from hardware.recording.session_reader import open_session, read_poses
+from perception.frames import Frame, FrameSet, Image
 from planning.material import Outlet, SwitchDelay
 from planning.path import fingerprint
 from tests.moving import breathing, pose_at, raster
 from tests.scans import body, height_field
-from tests.session_files import rig
+from tests.session_files import image, rig
 from tests.slowly import slowly
 
 THERE = available_cores()
@@ -189,10 +190,12 @@ def test_frames_that_were_written_over_meanwhile_are_not_taken() -> None:
     assert ring.take(word) is None
 
 
-def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is_counted() -> None:
+@pytest.mark.parametrize("raw", [False, True])
+def test_a_recorder_that_takes_nothing_holds_up_nobody_and_what_finds_no_room_is_counted(raw: bool) -> None:
     ours, theirs = Pipe(duplex=False)
     box = RecorderSender(theirs)
     picture = SetEntry({0: 0.0}, {0: ("jpeg", bytes(4_000_000))})
+    picture = unencoded(0.0, np.zeros((1250, 3200), np.uint8)) if raw else picture
     for _ in range(20):
         box.put(picture)
     assert 5 <= box.dropped <= 11
@@ -233,8 +236,84 @@ def test_poses_that_died_with_the_tracking_process_are_recorded_once_the_motion_
 def _taken(inbox: RecorderReceiver) -> list[Entry]:
     taken = list[Entry]()
     while not inbox.ended:
-        taken += inbox.take()
+        taken += map(deepcopy, inbox.take())  # pixels hold until the next entry
     return taken
+
+
+def unencoded(stamp: float, *images: Image) -> SetEntry:
+    taken = tuple(Frame(camera, stamp, image) for camera, image in enumerate(images))
+    return SetEntry(dict.fromkeys(range(len(images)), stamp), {}, taken)
+
+
+def test_pixels_go_through_the_pipe_as_they_lie_and_are_read_where_it_left_them() -> None:
+    pictures = [image(0, 1), image(1, 1)[..., 0].copy()]
+    head, *parts = packed(unencoded(1.0, *pictures))
+    assert [np.shares_memory(part, picture) for part, picture in zip(parts, pictures, strict=False)] == [True, True]
+    left = memoryview(bytearray(b"".join([head[ENTRY_HEAD.size :], *parts])))
+    entry = unpacked(left, ENTRY_HEAD.unpack_from(head)[1])
+    assert isinstance(entry, SetEntry)
+    for frame, picture in zip(entry.frames, pictures, strict=True):
+        assert np.shares_memory(frame.image, left) and np.array_equal(frame.image, picture)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.lists(st.tuples(st.integers(1, 900), st.integers(1, 1200)), max_size=3), max_size=6))
+def test_pictures_of_any_size_arrive_bit_by_bit_and_in_order(
+    sizes: list[list[tuple[int, int]]],
+) -> None:
+    rng = np.random.default_rng(0)
+    every = [[rng.integers(0, 256, (*size, 3), np.uint8) for size in each] for each in sizes]
+    ours, theirs = Pipe(duplex=False)
+    box, found = RecorderSender(theirs), list[Entry]()
+    reader = threading.Thread(target=lambda: found.extend(_taken(RecorderReceiver(ours))))
+    reader.start()
+    for number, images in enumerate(every):
+        box.put(unencoded(float(number), *images))
+        box.put(EventEntry(float(number), "x" * number, 2, "test"))
+    box.close()
+    reader.join(10)
+    assert [len(e.text) for e in found if isinstance(e, EventEntry)] == list(range(len(every)))
+    taken = [[frame.image for frame in e.frames] for e in found if isinstance(e, SetEntry)]
+    assert [len(images) for images in taken] == [len(images) for images in every]
+    for one, other in zip(itertools.chain(*taken), itertools.chain(*every), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_raw_pixels_are_recorded_exactly_also_those_that_came_before_the_rig(tmp_path: Path) -> None:
+    ours, theirs = Pipe(duplex=False)
+    kept = LiveSettings(record=tmp_path / "run.mcap", arm="virtual", trace=False, jpeg_quality=0)
+    recorder = SPAWN.Process(target=record, args=(kept, [ours], SharedLatest[RecorderReport]()))
+    recorder.start()
+    ours.close()
+    box = RecorderSender(theirs)
+    for number in range(400):  # 11 MB: more than the receiver's memory holds
+        if number == 200:
+            box.put(rig())
+        box.put(unencoded(1.0 + number / 30, *(image(camera, number) for camera in range(3))))
+    box.close(30)
+    recorder.join(30)
+    assert recorder.exitcode == 0 and box.dropped == 0
+    sets = list(open_session(tmp_path / "run.mcap").frame_sets())
+    assert len(sets) == 400
+    for number, frames in enumerate(sets):
+        assert all(np.array_equal(frame.image, image(frame.camera, number)) for frame in frames.frames)
+
+
+def test_a_sender_lets_go_of_the_pictures_that_a_killed_recorder_has_not_taken(tmp_path: Path) -> None:
+    ours, theirs = Pipe(duplex=False)
+    kept = LiveSettings(record=tmp_path / "run.mcap", arm="virtual", trace=False)
+    recorder = SPAWN.Process(target=record, args=(kept, [ours], SharedLatest[RecorderReport]()))
+    recorder.start()
+    ours.close()
+    recorder.kill()
+    recorder.join(30)
+    box, pictures = RecorderSender(theirs), [np.zeros((1000, 1000, 3), np.uint8) for _ in range(10)]
+    held = [weakref.ref(picture) for picture in pictures]
+    while pictures:
+        box.put(unencoded(1.0, pictures.pop()))
+    box.close()
+    assert box.dropped >= 9 and [picture() for picture in held] == [None] * 10
+    box.check()
 
 
 @settings(max_examples=20)
@@ -254,9 +333,9 @@ def test_what_is_put_is_taken_in_order_however_large(sizes: list[int]) -> None:
 
 @given(st.lists(st.integers(0, 300), max_size=5), st.lists(st.integers(1, 200), min_size=1), st.integers(0, 2000))
 def test_what_a_killed_sender_cut_short_is_left_out(sizes: list[int], pieces: list[int], cut: int) -> None:
-    entries = [pickle.dumps(EventEntry(float(k), "x" * size, 2, "test")) for k, size in enumerate(sizes)]
-    data = b"".join(ENTRY_HEAD.pack(len(entry)) + entry for entry in entries)[:cut]
-    whole = int(np.searchsorted(np.cumsum([ENTRY_HEAD.size + len(entry) for entry in entries]), len(data), "right"))
+    entries = [b"".join(packed(EventEntry(float(k), "x" * size, 2, "test"))) for k, size in enumerate(sizes)]
+    data = b"".join(entries)[:cut]
+    whole = int(np.searchsorted(np.cumsum([len(entry) for entry in entries]), len(data), "right"))
     ours, theirs = Pipe(duplex=False)
     inbox, found, begin = RecorderReceiver(ours), list[Entry](), 0
     for size in itertools.cycle(pieces):

@@ -1,7 +1,8 @@
 """The recorder of a live run: each process's queue of entries to it, and the process that writes them to the file.
 
-A sender never waits: it queues a bounded number of bytes and counts the entries for which there was no room. All
-processes of a run import this module, so the modules that write files are imported in the recorder's process alone.
+A sender never waits: it queues a bounded number of bytes and counts the entries for which there was no room. Pixels are
+copied twice on their way, into the pipe and out of it. All processes of a run import this module, so the modules that
+write files are imported in the recorder's process alone.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from functools import partial
 from multiprocessing.connection import Connection
 from selectors import EVENT_READ, BaseSelector, DefaultSelector
@@ -39,7 +41,7 @@ from hardware.live.records import (
     UsedPoses,
     WireEntry,
 )
-from hardware.live.settings import LOOPBACK, LiveSettings, used_files
+from hardware.live.settings import LiveSettings, used_files
 from hardware.live.trace import MIN_WRITE_S, RECORDER_LANE, TraceBatch, TraceLane
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
@@ -49,9 +51,10 @@ from perception.frames import OutlinedPicture, Roi
 from planning.laid_beads import Look
 
 if TYPE_CHECKING:
-    from hardware.recording.recorder import PublishedMessage, Recorder
+    from hardware.recording.recorder import Recorder
 
-ENTRY_HEAD = struct.Struct("=Q")  # bytes of the pickled entry that follows
+ENTRY_HEAD = struct.Struct("=QQ")  # bytes that follow: a size for each array, the arrays, the entry; number of arrays
+ARRAY_SIZE = struct.Struct("=Q")  # bytes of an array that stands beside its entry
 PIPE_BYTES = 2**20  # bytes that a pipe holds: 0.1 s of three cameras' pictures, and as much as anyone may ask for
 CROWDED_SHARE = 0.9  # of that, from which whoever sends may be waiting
 QUEUE_BYTES = 48 * 2**20  # bytes that may wait in a sender: 3 s of pictures as three cameras encode them
@@ -60,9 +63,6 @@ FLUSH_AFTER = 0.2  # s without anything new after which what is there goes to th
 GATHER_TIME = 0.08  # s in which entries gather: woken for each, this process took twice as long for all of them
 FREE_PAGES_BYTES = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
 RECORDER_NICENESS = 10  # below all that moves the arm
-FOXGLOVE_BACKLOG = 60  # messages that wait for a slow client, 0.2 s of them; then the oldest is dropped
-REPEAT_PERIOD = 2.0  # s after which what seldom comes is served again, for clients that came since
-SELDOM = ("/tf_static", "/path", "/scan", "/landmarks", "/camera_info")  # ends of such topics
 
 
 class RecorderSender:
@@ -76,22 +76,22 @@ class RecorderSender:
     def __init__(self, connection: Connection) -> None:
         self.dropped, self.failed = 0, ""
         self._connection = connection
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[list[memoryview]] = deque()
         self._size, self._closed, self._gone = 0, False, False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._send, daemon=True)
         self._thread.start()
 
     def put(self, entry: Entry) -> None:
-        """Queue an entry."""
-        data = pickle.dumps(entry, pickle.HIGHEST_PROTOCOL)
-        room = QUEUE_BYTES - RESERVED_BYTES if isinstance(entry, SetEntry) else QUEUE_BYTES
+        """Queue an entry. Pixels are not copied: nobody may change a picture from now on."""
+        parts, pictures = packed(entry), isinstance(entry, SetEntry)
+        size = sum(map(len, parts))
         with self._changed:
-            if self._gone or self._size + len(data) > room:
+            if self._gone or self._size + size > QUEUE_BYTES - RESERVED_BYTES * pictures:
                 self.dropped += 1
                 return
-            self._waiting.append(data)
-            self._size += len(data)
+            self._waiting.append(parts)
+            self._size += size
             self._changed.notify()
 
     def close(self, patience: float = 5.0) -> None:
@@ -103,11 +103,12 @@ class RecorderSender:
 
     def _send(self) -> None:
         try:
-            while (data := self._next()) is not None:
-                pipe, head = self._connection.fileno(), ENTRY_HEAD.pack(len(data))
-                left = memoryview(data)[max(os.writev(pipe, [head, data]) - len(head), 0) :]
+            while (left := self._next()) is not None:
                 while left:
-                    left = left[os.write(pipe, left) :]
+                    sent = os.writev(self._connection.fileno(), left)
+                    while left and sent >= len(left[0]):
+                        sent -= len(left.pop(0))
+                    left[:1] = [part[sent:] for part in left[:1]]
         except (OSError, ValueError):  # nobody is there any more
             pass
         except Exception as error:
@@ -124,16 +125,36 @@ class RecorderSender:
         if self.failed:
             raise StillbedError(f"nothing is recorded any more: {self.failed}")
 
-    def _next(self) -> bytes | None:
-        """The next entry, waited for; None once this is closed and empty."""
+    def _next(self) -> list[memoryview] | None:
+        """The next entry's parts, waited for; None once this is closed and empty."""
         with self._changed:
             while not self._waiting:
                 if self._closed:
                     return None
                 self._changed.wait()
-            data = self._waiting.popleft()
-            self._size -= len(data)
-            return data
+            parts = self._waiting.popleft()
+            self._size -= sum(map(len, parts))
+            return parts
+
+
+def packed(entry: Entry) -> list[memoryview]:
+    """The parts in which an entry goes through the pipe: its head, its pictures' pixels themselves, and the rest."""
+    arrays = list[pickle.PickleBuffer]()
+    rest = pickle.dumps(entry, 5, buffer_callback=arrays.append if isinstance(entry, SetEntry) else None)
+    pixels = [array.raw() for array in arrays]
+    sizes = b"".join(ARRAY_SIZE.pack(len(part)) for part in pixels)
+    head = ENTRY_HEAD.pack(len(sizes) + sum(map(len, pixels)) + len(rest), len(pixels)) + sizes
+    return [memoryview(head), *pixels, memoryview(rest)]
+
+
+def unpacked(data: memoryview, arrays: int) -> Entry:
+    """The entry in what followed its head. Its pixels are those in `data`, not copied."""
+    begin, parts = ARRAY_SIZE.size * arrays, list[memoryview]()
+    for (size,) in ARRAY_SIZE.iter_unpack(data[:begin]):
+        parts.append(data[begin : begin + size])
+        begin += size
+    entry: Entry = pickle.loads(data[begin:], buffers=parts)
+    return entry
 
 
 class RecorderReceiver:
@@ -156,7 +177,10 @@ class RecorderReceiver:
         return self._connection.fileno()
 
     def take(self) -> Iterator[Entry]:
-        """The complete entries that have come since the last call; waits where nothing has."""
+        """The complete entries that have come since the last call; waits where nothing has.
+
+        An entry's pixels hold until the next one is taken.
+        """
         with memoryview(self._memory) as memory:
             count = os.readv(self._connection.fileno(), [memory[self._filled :]])
         self.ended, self.crowded = count == 0, count > CROWDED_SHARE * self._room
@@ -164,16 +188,18 @@ class RecorderReceiver:
         begin, needed = 0, ENTRY_HEAD.size
         with memoryview(self._memory) as memory:
             while begin + ENTRY_HEAD.size <= self._filled:
-                needed = ENTRY_HEAD.size + ENTRY_HEAD.unpack_from(memory, begin)[0]
+                size, arrays = ENTRY_HEAD.unpack_from(memory, begin)
+                needed = ENTRY_HEAD.size + size
                 if begin + needed > self._filled:
                     break
-                yield pickle.loads(memory[begin + ENTRY_HEAD.size : begin + needed])
+                yield unpacked(memory[begin + ENTRY_HEAD.size : begin + needed], arrays)
                 begin += needed
                 needed = ENTRY_HEAD.size
-            memory[: self._filled - begin] = memory[begin : self._filled]  # the part of the next entry
+            room = memory if needed <= len(memory) else memoryview(bytearray(len(memory) + needed))
+            if begin or room is not memory:
+                room[: self._filled - begin] = memory[begin : self._filled]  # the part of the next entry
+            self._memory = room.obj
         self._filled -= begin
-        if needed > len(self._memory):
-            self._memory += bytes(needed)
 
     def close(self) -> None:
         """Close the pipe, which the sender notices."""
@@ -204,61 +230,6 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
             writer.report(str(error))
 
 
-class FoxgloveServer:
-    """Serves what is recorded to Foxglove on this machine, as it is written.
-
-    Clients listen; nothing that they send counts. The library's threads have this process's low priority. A client that
-    reads slowly loses messages, nobody else does.
-    """
-
-    def __init__(self, port: int) -> None:
-        import foxglove  # the extra [foxglove]
-
-        self._library, self._context = foxglove, foxglove.Context()
-        try:
-            self._server = foxglove.start_server(
-                name="stillbed",
-                host=LOOPBACK,
-                port=port,
-                capabilities=[],  # what a client wants to publish, set or call is refused
-                context=self._context,
-                message_backlog_size=FOXGLOVE_BACKLOG,
-            )
-        except Exception as error:  # the library's own, of a port that was taken since it was looked at
-            raise StillbedError(f"record.foxglove_port: {port} cannot be used: {error}; another port, or 0") from error
-        self._channels: dict[str, foxglove.Channel] = {}
-        self._seldom: dict[str, PublishedMessage] = {}
-        self._clock, self._repeated = WallClock(), 0.0
-
-    def publish(self, message: PublishedMessage) -> None:
-        """Serve a message; now and then those that seldom come as well."""
-        self._send(message)
-        if message.topic.endswith(SELDOM):
-            self._seldom[message.topic] = message
-        if (now := self._clock.now()) > self._repeated + REPEAT_PERIOD:
-            self._repeated = now
-            for each in self._seldom.values():
-                self._send(each)
-
-    def _send(self, message: PublishedMessage) -> None:
-        from hardware.recording.ros_messages import definition
-
-        if message.topic not in self._channels:
-            schema, encoding = None, "json"
-            if message.name is not None:
-                text = definition(message.name).encode()
-                schema, encoding = self._library.Schema(name=message.name, encoding="ros2msg", data=text), "cdr"
-            channel = self._library.Channel(
-                message.topic, schema=schema, message_encoding=encoding, context=self._context
-            )
-            self._channels[message.topic] = channel
-        self._channels[message.topic].log(message.data, log_time=message.log_time)
-
-    def close(self) -> None:
-        """End the service."""
-        self._server.stop()
-
-
 class _EntryWriter:
     """Writes entries to the file, which is opened once the rig is known; earlier entries wait for that."""
 
@@ -269,8 +240,12 @@ class _EntryWriter:
         self._file, self._reports, quality = settings.record, reports, settings.jpeg_quality or None
         self._clock, self._processor = WallClock(), ProcessorClock()
         began = round((utc_now() - self._clock.now()) * 1e9)
-        self._server = FoxgloveServer(settings.foxglove_port) if settings.foxglove_port else None
-        listener = None if self._server is None else self._server.publish
+        self._server, listener = None, None
+        if settings.foxglove_port:
+            from hardware.operator.process import FoxgloveServer
+
+            self._server = FoxgloveServer(settings.foxglove_port)
+            listener = self._server.publish
         opened = partial(Recorder, self._file, jpeg_quality=quality, overwrite=True, compress=False)
         self._opened = partial(opened, began=began, listener=listener)
         self._lane = TraceLane(RECORDER_LANE, self._clock, self._write) if settings.trace else None
@@ -314,7 +289,7 @@ class _EntryWriter:
             for each in early:
                 _write_entry(self._recorder, each)
         elif self._recorder is None:
-            self._early.append(entry)
+            self._early.append(deepcopy(entry))  # its pixels are the pipe's
         elif isinstance(entry, UsedPoses):
             self._used = entry
         else:

@@ -23,10 +23,9 @@ from typing import Any
 
 from estimation.errors import InputError
 from hardware.files.region_table import ANY_REGION, RegionSettings, region_from_table, region_lines
-from hardware.operator.settings import OperatorSettings
+from hardware.operator.settings import LOOPBACK, OperatorSettings
 from hardware.process import checks
 
-LOOPBACK = "127.0.0.1"  # nobody but this machine
 FROM_CAMERAS = "from the cameras"  # instead of a scan's file: they scan, and it is planned, before the run
 VIRTUAL_ARM = "virtual"  # the arm that needs no device
 MAX_LIFT_MM = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at

@@ -1,4 +1,4 @@
-"""The run's side of its operator's page: the process that serves it, and the thumbnails that are offered to it.
+"""The run's side of what shows it: the process of the operator's page, thumbnails for that, and Foxglove's server.
 
 Offering a frame set costs a comparison or two. Thumbnails are made a few times a second while a window is open, in a
 thread of their own with OpenCV's calls outside of Python's lock; sets that come meanwhile are dropped.
@@ -18,16 +18,20 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimation.errors import InputError
+from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
-from hardware.operator.settings import OperatorSettings, WindowLimits, allowed_hosts, check_settings
+from hardware.operator.settings import LOOPBACK, OperatorSettings, WindowLimits, allowed_hosts, check_settings
 from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
 from hardware.process.clock import WallClock
 from hardware.process.system import NICE_LEVEL, SPAWN, SharedLatest, ask_to_go_first, blocked_sigint, step_back
 from perception.frames import Image
+
+if TYPE_CHECKING:
+    from hardware.recording.recorder import PublishedMessage
 
 RESTART_AFTER = 1.0  # s between two starts of a page that died
 REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
@@ -39,6 +43,10 @@ FINE_CROP_WIDTH, FINE_QUALITY = 1920, 90  # of the same where beads of a millime
 CROP_MARGIN = 1.4  # of that part around outline and tracks: breathing stays inside
 MIN_CROP_POINTS = 8  # points that say where the wound is
 THUMBNAIL_PERIOD = 0.2  # s: breathing looks smooth, and 3 % of a core is not missed
+
+FOXGLOVE_BACKLOG = 60  # messages that wait for a slow client, 0.2 s of them; then the oldest is dropped
+REPEAT_PERIOD = 2.0  # s after which what seldom comes is served again, for clients that came since
+SELDOM = ("/tf_static", "/path", "/scan", "/landmarks", "/camera_info")  # ends of such topics
 
 Crop = tuple[int, int, int, int]  # x, y, width, height px
 
@@ -214,3 +222,58 @@ def crop_around(shot: CameraShot, present: Crop | None) -> Crop | None:
 def _holds(crop: Crop, low: Array, high: Array) -> bool:
     corner, size = np.array(crop[:2]), np.array(crop[2:])
     return bool((low >= corner).all() and (high <= corner + size).all())
+
+
+class FoxgloveServer:
+    """Serves what is recorded to Foxglove on this machine, as it is written.
+
+    Clients listen; nothing that they send counts. The library's threads have this process's low priority. A client that
+    reads slowly loses messages, nobody else does.
+    """
+
+    def __init__(self, port: int) -> None:
+        import foxglove  # the extra [foxglove]
+
+        self._library, self._context = foxglove, foxglove.Context()
+        try:
+            self._server = foxglove.start_server(
+                name="stillbed",
+                host=LOOPBACK,
+                port=port,
+                capabilities=[],  # what a client wants to publish, set or call is refused
+                context=self._context,
+                message_backlog_size=FOXGLOVE_BACKLOG,
+            )
+        except Exception as error:  # the library's own, of a port that was taken since it was looked at
+            raise StillbedError(f"record.foxglove_port: {port} cannot be used: {error}; another port, or 0") from error
+        self._channels: dict[str, foxglove.Channel] = {}
+        self._seldom: dict[str, PublishedMessage] = {}
+        self._clock, self._repeated = WallClock(), 0.0
+
+    def publish(self, message: PublishedMessage) -> None:
+        """Serve a message; now and then those that seldom come as well."""
+        self._send(message)
+        if message.topic.endswith(SELDOM):
+            self._seldom[message.topic] = message
+        if (now := self._clock.now()) > self._repeated + REPEAT_PERIOD:
+            self._repeated = now
+            for each in self._seldom.values():
+                self._send(each)
+
+    def _send(self, message: PublishedMessage) -> None:
+        from hardware.recording.ros_messages import definition
+
+        if message.topic not in self._channels:
+            schema, encoding = None, "json"
+            if message.name is not None:
+                text = definition(message.name).encode()
+                schema, encoding = self._library.Schema(name=message.name, encoding="ros2msg", data=text), "cdr"
+            channel = self._library.Channel(
+                message.topic, schema=schema, message_encoding=encoding, context=self._context
+            )
+            self._channels[message.topic] = channel
+        self._channels[message.topic].log(message.data, log_time=message.log_time)
+
+    def close(self) -> None:
+        """End the service."""
+        self._server.stop()

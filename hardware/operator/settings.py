@@ -14,6 +14,7 @@ from pathlib import Path
 
 from estimation.errors import InputError
 
+LOOPBACK = "127.0.0.1"  # nobody but this machine
 OWN_SITES = ("same-origin", "none")  # Sec-Fetch-Site of a request by the page itself, or by the address bar
 _TOKEN_LETTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_")
 
@@ -22,7 +23,7 @@ _TOKEN_LETTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz
 class OperatorSettings:
     """Where and to whom the page is served."""
 
-    host: str = "127.0.0.1"  # address that is listened on
+    host: str = LOOPBACK  # address that is listened on
     port: int = 0  # 0: any that is free
     token: str = field(default_factory=lambda: secrets.token_urlsafe(16), repr=False)  # in every request
     elsewhere: bool = False  # serve other machines as well, with certificate and key
