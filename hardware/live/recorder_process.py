@@ -195,10 +195,11 @@ class RecorderReceiver:
                 yield unpacked(memory[begin + ENTRY_HEAD.size : begin + needed], arrays)
                 begin += needed
                 needed = ENTRY_HEAD.size
-            room = memory if needed <= len(memory) else memoryview(bytearray(len(memory) + needed))
-            if begin or room is not memory:
-                room[: self._filled - begin] = memory[begin : self._filled]  # the part of the next entry
-            self._memory = room.obj
+            kept = memory[begin : self._filled]  # the part of the next entry
+            if needed > len(memory):
+                self._memory = bytearray(kept) + bytes(needed)
+            elif begin:
+                memory[: len(kept)] = kept
         self._filled -= begin
 
     def close(self) -> None:
