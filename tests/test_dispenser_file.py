@@ -23,7 +23,7 @@ from hardware.files.dispenser_file import (
     arm_with_dispensers,
     check_arm_moves,
     dispensers_from_text,
-    open_dispensers,
+    drivers_of,
     read_dispensers,
     write_delays,
 )
@@ -52,9 +52,9 @@ def text(messages: str = "", **changes: str | None) -> str:
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: file.stem)
 def test_each_example_is_read_and_carries_a_shipped_path(file: Path) -> None:
-    (each,) = read_dispensers(file)
+    (each,) = settings = read_dispensers(file)
     assert each.preset == file.stem
-    dispensers = open_dispensers(file)
+    dispensers = drivers_of(settings, file)
     (driver,) = dispensers
     by_arm = {"arm_pwm": ArmPwmDispenser, "arm_axis": ArmAxisDispenser}
     assert isinstance(driver, by_arm.get(file.stem, LineDispenser))

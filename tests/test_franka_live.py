@@ -18,7 +18,7 @@ from hardware.files.path_file import read_path
 from hardware.live.prepared import RunFiles
 from hardware.live.prerender import nozzle_errors as nozzle_errors_from_pictures
 from hardware.live.prerender import prerender
-from hardware.live.recorded_run import commands_of, replay_run
+from hardware.live.recorded_run import commands_in, read_run, replay_run
 from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.path import PrintPhase
 from tests import octoprint_bench
@@ -92,7 +92,7 @@ class _Breathing:
 
 def nozzle_errors(record: Path, path: Path, profile: ArmProfile, stamps: Array, axes: Array) -> tuple[Array, float]:
     """Error (N,), mm, of each extruding millisecond by the true nozzle, and the duty."""
-    commands = commands_of(record)
+    commands = commands_in(read_run(record, "/tick", "/move"))
     log = TruthLog(read_path(path), profile.arm, Truth(np.eye(4), _Breathing()), profile.tick, profile.lag)
     for command, progress in commands:
         log.write(command, progress)

@@ -156,11 +156,6 @@ def check_arm_moves(settings: Sequence[DispenserSettings], arm: str, where: obje
             raise InputError(where, "dispenser.preset", preset, f"one for {arm}; this one needs a {kinds} as the arm")
 
 
-def open_dispensers(path: str | Path) -> Dispensers:
-    """The drivers of a dispenser file, closed; InputError as `read_dispensers`."""
-    return drivers_of(read_dispensers(path), path)
-
-
 def drivers_of(settings: Sequence[DispenserSettings], where: object = "dispensers") -> Dispensers:
     """The drivers of what is in a file, closed."""
     return Dispensers([dispenser_from_settings(each) for each in settings], where)

@@ -357,11 +357,6 @@ def printed_range(record: File) -> tuple[float, float]:
     return (min(places), max(places)) if places else (float("nan"), float("nan"))
 
 
-def commands_of(record: File) -> list[tuple[Command, PrintProgress]]:
-    """A recorded run's commands in order, with the place on the path."""
-    return commands_in(read_run(record, "/tick", "/move"))
-
-
 def commands_in(run: RecordedRun) -> list[tuple[Command, PrintProgress]]:
     """Commands in order, with the place on the path."""
     ticks = {m["stamp"]: m for m in run.messages["/tick"]}
