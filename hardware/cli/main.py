@@ -32,7 +32,7 @@ from hardware.process.progress import (
     prepare_out,
     write_error_text,
 )
-from hardware.process.system import fill_standard_streams, state_inputs
+from hardware.process.system import fill_standard_streams, state_inputs, stillbed_version
 from perception import named_path
 
 if TYPE_CHECKING:
@@ -252,12 +252,8 @@ class _Version(argparse.Action):
     """Prints the installed version; asks for it only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import PackageNotFoundError, version
-
-        try:
-            print(f"stillbed {version('stillbed')}")
-        except PackageNotFoundError:
-            print("stillbed, not installed")
+        version = stillbed_version()
+        print(f"stillbed {version}" if version else "stillbed, not installed")
         parser.exit()
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -19,6 +18,8 @@ from hardware.process.progress import Progress, ProgressReport, prepare_out
 from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent, step_back
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from estimation.pose import SurfacePose
     from estimation.rig import Rig
     from estimation.scans.scan import Scan
@@ -76,6 +77,8 @@ def step_by(
         with tracker(rig, roi, surface, now, tool, prefilter, model) as step:
             yield step
         return
+    from concurrent.futures import ThreadPoolExecutor
+
     from perception.thesis.camera import Corners, KeyPoints
     from perception.thesis.step import ThesisStep
 
@@ -104,6 +107,8 @@ def tracker(
 
     waits: whether a map that is not ready when it is due is waited for, so that a recording gives the same poses again.
     """
+    from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
     from perception.mapping.masks import Tool

@@ -17,7 +17,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -285,7 +284,6 @@ class SharedLatest(Generic[Value]):
         return _COUNT.size + (count % 2) * (_SLOT_HEAD.size + self._capacity)
 
 
-HASHED_AT_ONCE = 2**20  # bytes
 SHOWN_DIGITS = 12  # of a hash, in a text for people
 
 
@@ -371,8 +369,7 @@ def file_hash(file: Path) -> str:
                 whole.update(f"{part.relative_to(file).as_posix()}\0".encode())
             if part.is_file():
                 with part.open("rb") as stream:
-                    while data := stream.read(HASHED_AT_ONCE):
-                        whole.update(data)
+                    hashlib.file_digest(stream, lambda: whole)
     except OSError:
         return ""
     return whole.hexdigest()
@@ -380,6 +377,8 @@ def file_hash(file: Path) -> str:
 
 def stillbed_version() -> str:
     """The version of the installed package; "" where it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version  # a tenth of what a command line loads for its help
+
     try:
         return version("stillbed")
     except PackageNotFoundError:
