@@ -38,7 +38,7 @@ mutants: $(STAMP)
 	$(BIN)/python -m tests.mutants
 
 bench: $(STAMP)
-	$(BIN)/stillbed bench --all
+	$(BIN)/python -m tests.campaigns --all
 
 outages: $(STAMP)
 	$(BIN)/python -m tests.campaigns outages --count 1000 --seed 1 -o out/outages --force

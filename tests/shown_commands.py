@@ -57,7 +57,7 @@ COMPLETED = {  # an option named in passing, and a command with it
     "stillbed track --arm ARM.toml": TRACKED,
     "stillbed track --prefilter bilateral": TRACKED,
     "stillbed track --wound": TRACKED,
-    "stillbed bench SUBJECT": "stillbed bench planner --updates 20",
+    "stillbed bench SUBJECT": "python -m tests.campaigns planner --updates 20",
     "stillbed calibrate import FILE --format F -o rig.toml": (
         "stillbed calibrate import camchain.yaml --format kalibr -o rig.toml"
     ),
@@ -68,7 +68,8 @@ LOOP = "stillbed bench loop --scenario breathing_deep -o out/new"
 LIVE = "stillbed bench live --minutes 0.1 --stops 0 --scenario data/live/small.toml"
 KILLED = "stillbed bench live --minutes 0 --stops 0 --kills 1 --seed 21 --scenario data/live/small.toml"
 SIMULATED = "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm"
-STILL = "stillbed bench estimator --only 'still, clean' --seeds 1 --seconds 0.5"
+SMOOTHING = "python -m tests.campaigns smoothing"
+STILL = "python -m tests.campaigns estimator --only 'still, clean' --seeds 1 --seconds 0.5"
 FAULTS = "python -m tests.campaigns faults --count 1 -o out/faults"
 CLUSTER = "stillbed smooth sessions/ -o out/all --scheduler local --workers 4"
 PAGE = (
@@ -86,23 +87,26 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench arm-calibration": ("stillbed bench arm-calibration --rendered 0 --runs 1", LONG),
     "stillbed bench beside": ("stillbed bench beside --seconds 1", LONG),
     "stillbed bench beside --seconds 6": ("stillbed bench beside --seconds 1", LONG),
-    "stillbed bench bumps": ("stillbed bench bumps --count 1 --minutes 0.1", LONG),
+    "python -m tests.campaigns bumps": ("python -m tests.campaigns bumps --count 1 --minutes 0.1", LONG),
     "stillbed bench calibration": ("stillbed bench calibration --instants 12 --runs 1", LONG),
-    "stillbed bench cameras": ("stillbed bench cameras --minutes 0.05", LONG),
-    "stillbed bench estimator": (STILL, LONG),
-    "stillbed bench estimator --maps told --seeds 8 --seconds 5 --only 'still*'": (STILL, LONG),
-    "stillbed bench estimator --maps told seen --seeds 2": (STILL, LONG),
-    "stillbed bench estimator --only 'breathing, [cno]*' --maps seen --seeds 2 --seconds 6": (
-        "stillbed bench estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
+    "python -m tests.campaigns cameras": ("python -m tests.campaigns cameras --minutes 0.05", LONG),
+    "python -m tests.campaigns estimator": (STILL, LONG),
+    "python -m tests.campaigns estimator --maps told --seeds 8 --seconds 5 --only 'still*'": (STILL, LONG),
+    "python -m tests.campaigns estimator --maps told seen --seeds 2": (STILL, LONG),
+    "python -m tests.campaigns estimator --only 'breathing, [cno]*' --maps seen --seeds 2 --seconds 6": (
+        "python -m tests.campaigns estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
         LONG,
     ),
-    "stillbed bench estimator --only 'breathing, clean' --maps seen --seeds 6 --seconds 4": (
-        "stillbed bench estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
+    "python -m tests.campaigns estimator --only 'breathing, clean' --maps seen --seeds 6 --seconds 4": (
+        "python -m tests.campaigns estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
         LONG,
     ),
-    "stillbed bench estimator --soak 3 --maps seen": ("stillbed bench estimator --soak 0.001 --maps seen", LONG),
-    "stillbed bench fill CSV ...": ("stillbed bench fill contour.csv --count 2", LONG),
-    "stillbed bench wounds": ("stillbed bench wounds --count 1", LONG),
+    "python -m tests.campaigns estimator --soak 3 --maps seen": (
+        "python -m tests.campaigns estimator --soak 0.001 --maps seen",
+        LONG,
+    ),
+    "python -m tests.campaigns fill CSV ...": ("python -m tests.campaigns fill contour.csv --count 2", LONG),
+    "python -m tests.campaigns wounds": ("python -m tests.campaigns wounds --count 1", LONG),
     "stillbed bench latency": ("stillbed bench latency sessions/monday", LONG),
     "stillbed bench link --minutes 10 --busy 2": ("stillbed bench link --minutes 0.1", LONG),
     "stillbed bench live": (LIVE, STARTED),
@@ -113,34 +117,37 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench loop": (LOOP, LONG),
     "stillbed bench loop -o OUT": (LOOP, LONG),
     "stillbed bench live --minutes 1 --busy 2 --scenario data/live/small.toml": (f"{LIVE} --busy 1", STARTED),
-    "stillbed bench look": ("stillbed bench look --layers 1 --stacks 0", LONG),
-    "stillbed bench map": ("stillbed bench map --seconds 2", LONG),
-    "stillbed bench plan": ("stillbed bench plan --body foot", "on a smaller wound"),
-    "stillbed bench planner": ("stillbed bench planner --updates 20", LONG),
-    "stillbed bench planner --updates 40000 --seed 1": ("stillbed bench planner --updates 40 --seed 1", LONG),
+    "python -m tests.campaigns look": ("python -m tests.campaigns look --layers 1 --stacks 0", LONG),
+    "python -m tests.campaigns map": ("python -m tests.campaigns map --seconds 2", LONG),
+    "python -m tests.campaigns plan": ("python -m tests.campaigns plan --body foot", "on a smaller wound"),
+    "python -m tests.campaigns planner": ("python -m tests.campaigns planner --updates 20", LONG),
+    "python -m tests.campaigns planner --updates 40000 --seed 1": (
+        "python -m tests.campaigns planner --updates 40 --seed 1",
+        LONG,
+    ),
     "stillbed bench prediction --traces DIR": ("stillbed bench prediction --traces traces --warm-up 2", LONG),
-    "stillbed bench registration": ("stillbed bench registration --seeds 1", LONG),
-    "stillbed bench scan": ("stillbed bench scan --bodies forearm --sets 2", LONG),
+    "python -m tests.campaigns registration": ("python -m tests.campaigns registration --seeds 1", LONG),
+    "python -m tests.campaigns scan": ("python -m tests.campaigns scan --bodies forearm --sets 2", LONG),
     "stillbed bench segmentation DATASET": (
         "stillbed bench segmentation dataset --rendered 1 --areas 1",
         "has a small one",
     ),
     "stillbed bench segmentation --areas 40": ("stillbed bench segmentation --areas 1", LONG),
-    "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand "
-    "breathing_calm breathing_deep turns steps_300um camera_lost --rendered 6": (
-        "stillbed bench smoothing --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",
+    f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand breathing_calm "
+    "breathing_deep turns steps_300um camera_lost --rendered 6": (
+        f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",
         LONG,
     ),
-    "stillbed bench smoothing --movements still breathing steps sway --seeds 4 --seconds 4 --sessions 0 "
-    "--minutes 1 3": (
-        "stillbed bench smoothing --movements still --seeds 1 --seconds 1 --sessions 0 --minutes --landmarks "
-        "--adjusted 0 --scenarios",
+    SMOOTHING: (f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios", LONG),
+    f"{SMOOTHING} --movements still breathing steps sway --seeds 4 --seconds 4 --sessions 0 --minutes 1 3": (
+        f"{SMOOTHING} --movements still --seeds 1 --seconds 1 --sessions 0 --minutes --landmarks --adjusted 0 "
+        "--scenarios",
         LONG,
     ),
-    "stillbed bench steps": ("stillbed bench steps --steps 4 --hours 0.005", LONG),
+    "python -m tests.campaigns steps": ("python -m tests.campaigns steps --steps 4 --hours 0.005", LONG),
     "stillbed bench thesis": ("stillbed bench thesis sessions/monday", LONG),
     "stillbed bench thesis [SESSION...]": ("stillbed bench thesis sessions/monday", LONG),
-    "stillbed bench views --seconds 5": ("stillbed bench views --seconds 0.5", LONG),
+    "python -m tests.campaigns views --seconds 5": ("python -m tests.campaigns views --seconds 0.5", LONG),
     "stillbed calibrate arm --virtual --record try -o arm.toml": (VIRTUAL, LONG),
     "stillbed calibrate dispenser dispenser.toml --virtual --record lines": (LINES, "takes long as it stands"),
     "stillbed calibrate cameras SESSION --board board.toml -o rig.toml": (
@@ -221,9 +228,9 @@ LONG_KINDS = "make ", "pip ", "python -m tests.", "stillbed bench "  # these ins
 SHORT = {  # of these kinds, and no longer than it may take as it stands
     "python -m tests.campaigns",
     "stillbed bench --list",
-    "stillbed bench consistency --scenes 1 --seconds 4",
-    "stillbed bench fill --count 0 --picture docs/patterns.svg",
-    "stillbed bench smoothing --movements still sway --seeds 1 --seconds 4",
+    "python -m tests.campaigns consistency --scenes 1 --seconds 4",
+    "python -m tests.campaigns fill --count 0 --picture docs/patterns.svg",
+    "python -m tests.campaigns smoothing --movements still sway --seeds 1 --seconds 4",
 }
 MOVED = "tests/test_arm_console.py moves a virtual arm before cameras that see its needle, which takes a minute"
 RECORDED = "--cameras rig.toml --record"
@@ -245,6 +252,7 @@ NOT_RUN = {  # and why not
     "pip install -c constraints.txt .": "installs what the tests run with, from a network",
     "stillbed bench --all": "tests/test_bench.py runs the whole with small parts; all of them take 20 minutes",
     "stillbed bench --quick": "the same of fewer",
+    "python -m tests.campaigns --all": "the same of more",
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record moved --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record try --yes -o arm.toml": MOVED,
     "stillbed calibrate arm --device PORT --cameras rig.toml --record DIR --yes -o arm.toml": MOVED,

@@ -16,7 +16,6 @@ import pytest
 from estimation.errors import InputError
 from estimation.synthetic.world import synthetic_world
 from hardware.bench import whole
-from hardware.bench.estimator import best_camera, pnp_pose
 from hardware.bench.figures import (
     Figure,
     Target,
@@ -29,10 +28,8 @@ from hardware.bench.figures import (
     this_machine,
     whole_text,
 )
-from hardware.bench.subjects import SUBJECTS, Subject
+from hardware.bench.subjects import BENCH_WHOLE, SUBJECTS, BenchPart, Subject, Subjects, Whole
 from hardware.bench.whole import (
-    BENCH_PARTS,
-    BenchPart,
     MeasuredPart,
     counted,
     measure_all,
@@ -45,6 +42,9 @@ from hardware.bench.whole import (
 from hardware.cli.main import add_bench, main, run_bench, subject_parser
 from hardware.cli.parser import Commands
 from tests import bench_subject
+from tests.campaigns import __main__ as campaigns
+from tests.campaigns.__main__ import CAMPAIGNS, PROGRAM, WHOLE
+from tests.campaigns.estimator import best_camera, pnp_pose
 
 SUBJECT = {"toy": Subject("tests.bench_subject:run", bench_subject.add_options, "one figure of each kind")}
 
@@ -116,27 +116,33 @@ def test_an_unknown_subject_is_told_the_near_one() -> None:
         bench("toi")
 
 
-@pytest.mark.parametrize("name", SUBJECTS)
-def test_every_subject_has_its_options_and_its_run(name: str) -> None:
-    assert subject_parser(name, SUBJECTS[name]).parse_args([]).out is None and callable(SUBJECTS[name].run)
+@pytest.mark.parametrize(("subjects", "name"), [(each, name) for each in (SUBJECTS, CAMPAIGNS) for name in each])
+def test_every_subject_has_its_options_and_its_run(subjects: Subjects, name: str) -> None:
+    assert subject_parser(name, subjects[name]).parse_args([]).out is None and callable(subjects[name].run)
+
+
+def test_who_asks_for_what_developers_measure_is_told_where_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "estimator"]) == 2 and campaigns.main(["estimatr"]) == 2
+    told, other = [line for line in capsys.readouterr().err.splitlines() if "SUBJECT" in line]
+    assert PROGRAM in told and "did you mean 'estimator'" in other and PROGRAM not in other
 
 
 def test_the_estimator_is_measured_beside_its_bound(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "estimator", "--only", "still, clean", "--seeds", "1", "--seconds", "0.5", "--maps", "told"]
-    assert main(command) == 0
+    command = ["estimator", "--only", "still, clean", "--seeds", "1", "--seconds", "0.5", "--maps", "told"]
+    assert campaigns.main(command) == 0
     text = capsys.readouterr().out
     for words in ("still, clean, exact map: error by bound", "NEES/6", "time, exact map: p99", "differ run twice"):
         assert words in text
 
 
-def test_a_pattern_that_meets_no_scene_is_told_the_scenes() -> None:
-    with pytest.raises(InputError, match="breathing, clean"):
-        run_bench(_arguments("estimator", "--only", "dancing"))
+def test_a_pattern_that_meets_no_scene_is_told_the_scenes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert campaigns.main(["estimator", "--only", "dancing"]) == 2
+    assert "breathing, clean" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[str]) -> None:
-    run_bench(_arguments("estimator", "--soak", "0.001", "--maps", "told"))
+    assert campaigns.main(["estimator", "--soak", "0.001", "--maps", "told"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("soak 0.001 h, exact map") for line in lines) == 4
 
@@ -144,7 +150,7 @@ def test_a_soak_compares_its_end_with_its_start(capsys: pytest.CaptureFixture[st
 @pytest.mark.slow
 def test_where_clocks_differ_the_bench_asks_what_is_known_of_them(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["estimator", "--only", "breathing, offsets 16 ms", "--seeds", "1", "--seconds", "0.3", "--maps", "told"]
-    run_bench(_arguments(*command))
+    assert campaigns.main(command) == 0
     assert "offsets 16 ms, exact map: offsets off by" in capsys.readouterr().out
 
 
@@ -190,23 +196,25 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
 
 
 def test_each_part_has_a_folder_of_its_own() -> None:
-    assert len({part.name or part.subject for part in BENCH_PARTS}) == len(BENCH_PARTS)
+    assert len({part.name or part.subject for part in WHOLE.parts}) == len(WHOLE.parts)
+    assert set(BENCH_WHOLE.parts) <= set(WHOLE.parts) and {part.program for part in BENCH_WHOLE.parts} != {PROGRAM}
 
 
-@pytest.mark.parametrize("part", BENCH_PARTS, ids=lambda part: part.name or part.subject)
+@pytest.mark.parametrize("part", WHOLE.parts, ids=lambda part: part.name or part.subject)
 def test_each_part_is_a_subject_with_options_that_it_has(part: BenchPart) -> None:
     for options in (part.options, part.quick or ()):
-        subject_parser(part.subject, SUBJECTS[part.subject]).parse_args(list(options))
+        subjects = CAMPAIGNS if part.program == PROGRAM else SUBJECTS
+        subject_parser(part.subject, subjects[part.subject]).parse_args(list(options))
 
 
 @pytest.mark.slow  # what they are made of is measured, kept and shown below
 def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = (
-        BenchPart("planner", ("--updates", "20"), ("--updates", "20")),
+        BenchPart("planner", ("--updates", "20"), ("--updates", "20"), program=PROGRAM),
         BenchPart("prediction", (), ("--traces", "none"), name="chests"),
         BenchPart("plan"),
     )
-    done = measure_all(tmp_path, True, parts)
+    done = measure_all(tmp_path, True, Whole(PROGRAM, parts))
     assert [one.subject for one in done] == ["planner", "chests"]  # the quick look leaves `plan` out
     assert any(f.what == "uncaught errors" and f.verdict == "met" for f in done[0].figures)
     assert "stillbed bench prediction" in done[1].trouble and "no figures" in summary(done)
@@ -221,7 +229,7 @@ def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys:
 def test_the_page_counts_colours_and_leads_to_the_pictures(tmp_path: Path) -> None:
     parts = {"toy": FIGURES, "<odd>": []}
     assert counted(parts) == (4, 1, 1)
-    page = whole_page(parts, {"<odd>": "why & not"}, {"toy": "toy/toy.html"}, this_machine())
+    page = whole_page(PROGRAM, parts, {"<odd>": "why & not"}, {"toy": "toy/toy.html"}, this_machine())
     assert page.count('<td class="met">') == 3 and page.count('<td class="missed">') == 1
     assert 'href="toy/toy.html"' in page and "&lt;odd&gt;" in page and "why &amp; not" in page
     missed = next(figure.what for figure in FIGURES if figure.verdict == "MISSED")
@@ -232,7 +240,7 @@ def test_the_page_counts_colours_and_leads_to_the_pictures(tmp_path: Path) -> No
 
 def test_a_table_in_markdown_has_a_line_for_each_figure() -> None:
     odd = Figure("a | b", 2.0, "mm", at_most(1.0))
-    lines = whole_markdown({"toy": [*FIGURES, odd]}, this_machine()).splitlines()
+    lines = whole_markdown(PROGRAM, {"toy": [*FIGURES, odd]}, this_machine()).splitlines()
     rows = [line for line in lines if line.startswith("| ")]
     assert len(rows) == len(FIGURES) + 2 and all(row.replace(r"\|", "").count("|") == 7 for row in rows)
     assert "3 of 5 targets are met;" in "\n".join(lines)
@@ -244,16 +252,17 @@ def test_what_was_measured_of_the_same_code_is_kept(tmp_path: Path, monkeypatch:
     (tmp_path / "plan").mkdir()
     save(tmp_path / "plan", "plan", {}, FIGURES[:1], machine)
     (tmp_path / "plan/options.json").write_text(json.dumps(["abc", "--body", "foot"]))
-    (done,) = measure_all(tmp_path, False, [BenchPart("plan", ("--body", "foot"))])
+    (done,) = measure_all(tmp_path, False, Whole(PROGRAM, (BenchPart("plan", ("--body", "foot")),)))
     assert done.figures == (FIGURES[0],) and whole._earlier(tmp_path / "plan", ["--body", "chest"], machine) is None
     assert whole._earlier(tmp_path / "plan", ["--body", "foot"], replace(machine, commit="abd")) is None
 
 
 @pytest.mark.parametrize(("line", "quick"), [(["--all"], False), (["--quick"], True), (["--all", "--quick"], True)])
 def test_either_word_means_all(line: list[str], quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = list[tuple[Path, bool]]()
-    monkeypatch.setattr(whole, "measure_all", lambda out, quick: asked.append((out, quick)) or [])
-    assert main(["bench", *line, "-o", str(tmp_path)]) == 0 and asked == [(tmp_path, quick)]
+    asked = list[tuple[Path, bool, Whole]]()
+    monkeypatch.setattr(whole, "measure_all", lambda out, quick, parts: asked.append((out, quick, parts)) or [])
+    assert main(["bench", *line, "-o", str(tmp_path)]) == campaigns.main([*line, "-o", str(tmp_path)]) == 0
+    assert asked == [(tmp_path, quick, BENCH_WHOLE), (tmp_path, quick, WHOLE)]
 
 
 def table(tmp_path: Path, figures: list[Figure]) -> Path:

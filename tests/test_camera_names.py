@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
-from hardware.bench.detection import CAMERA_OFFSETS, FRAME_PERIOD, CameraJitter, pair_frames, sent_frames
 from hardware.cameras.capture import (
     Control,
     ignored_controls,
@@ -38,6 +37,7 @@ from hardware.cameras.sources import (
 from hardware.cli.live import NO_CAMERA_TEXT, list_text
 from hardware.files.rig_file import read_rig, write_rig
 from perception.frames import Frame
+from tests.campaigns.detection import CAMERA_OFFSETS, FRAME_PERIOD, CameraJitter, pair_frames, sent_frames
 
 BY_ID = "/dev/v4l/by-id/usb-Maker_Eye_A1-video-index0"
 NAMED = Identity(SourceKind.DEVICE, BY_ID)

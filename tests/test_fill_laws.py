@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from estimation.errors import InputError
-from hardware.bench.fill import random_wound
 from planning.fill.bead import (
     PATTERN_KINDS,
     ROUNDING_GRID,
@@ -35,6 +34,7 @@ from planning.fill.bead import (
 )
 from planning.fill.fill import fill, settle_angle, smooth_corners
 from planning.fill.spiral import order_runs
+from tests.campaigns.fill import random_wound
 from tests.slowly import slowly
 
 PACE = PrintPace()

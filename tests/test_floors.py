@@ -56,7 +56,6 @@ OWNERS = {  # library: the files that may import it
     "aiohttp": ("hardware/live/fault_injection.py", "hardware/operator/*.py", "hardware/offline/viewer.py"),
     "cv2": (
         "perception/*.py",
-        "hardware/bench/estimator.py",  # OpenCV's own pose, to compare with
         "hardware/cameras/capture.py",  # VideoCapture: devices, streams, files, and their controls
         "hardware/cameras/inspection.py",  # draws the preview
         "hardware/files/images.py",
@@ -77,15 +76,11 @@ OWNERS = {  # library: the files that may import it
     "orjson": ("hardware/recording/recorder.py",),
     "packaging": ("hardware/cli/doctor.py",),
     "pinocchio": ("planning/urdf.py",),
-    "pycolmap": ("hardware/bench/smoothing.py",),
     "pytest": ("estimation/synthetic/plugin.py",),
     "rosbags": ("hardware/recording/ros_messages.py",),
     "ruckig": ("planning/*.py",),
     "serial": ("hardware/*.py",),
-    "shapely": (
-        *("hardware/bench/fill.py", "hardware/bench/wounds.py", "hardware/plan/page.py"),
-        *("planning/fill/*.py", "planning/layers/*.py"),
-    ),
+    "shapely": ("hardware/plan/page.py", "planning/fill/*.py", "planning/layers/*.py"),
     "time": ("hardware/process/clock.py", "hardware/cameras/aravis_process.py"),  # which imports nothing of ours
     "toppra": ("planning/*.py",),
     "torch": ("perception/training/*.py",),
@@ -349,7 +344,7 @@ def test_dependencies_and_imports_are_the_same_set() -> None:
     """Every dependency is imported by someone, and every library that is imported is declared; in tests as well."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    loaded = ("bench", "cluster", "foxglove", "franka", "train")  # by the product itself
+    loaded = ("cluster", "foxglove", "franka", "train")  # by the product itself
     run = _packages([*project["dependencies"], *(line for extra in loaded for line in extras[extra])])
     imported = set().union(*(module.roots for module in ours().modules.values()))
     assert imported - {*FLOORS, *sys.stdlib_module_names} - ABSENT == run

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.runtime import left_out, median, trim_heap
-from hardware.bench.estimator import resident
+from tests.campaigns.estimator import resident
 
 
 def printed(code: str) -> int:

@@ -14,7 +14,6 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
-from hardware.bench.planner import StreamTally, bench_arm, follow_stream
 from hardware.files.arm_file import read_arm, write_arm
 from planning.command import Hold, Move, Refusal, RefusalCode
 from planning.kinematics import (
@@ -35,6 +34,7 @@ from planning.kinematics import (
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import PrintPhase
+from tests.campaigns.planner import StreamTally, bench_arm, follow_stream
 from tests.moving import REST, breathing, pose_at, raster
 
 SEEDS = st.integers(0, 100_000)

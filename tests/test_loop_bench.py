@@ -11,8 +11,6 @@ import pytest
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.bench import recordings as growth
-from hardware.bench.estimator import SETTLING_SETS, consistency_figures, scene_errors
 from hardware.bench.prediction import (
     FORECAST_INPUT,
     MOTION_INPUTS,
@@ -22,8 +20,11 @@ from hardware.bench.prediction import (
     loop_page,
     steady,
 )
-from hardware.bench.recordings import CostAxis, axes_for, growth_figures, growth_page, latency_figures, slope
+from hardware.bench.recordings import latency_figures
 from perception.tracking.step import STAGES
+from tests.campaigns import growth
+from tests.campaigns.estimator import SETTLING_SETS, consistency_figures, scene_errors
+from tests.campaigns.growth import CostAxis, axes_for, growth_figures, growth_page, slope
 
 TWIST = np.array([0.0, 0.0, 0.1, 5.0, 0.0, -2.0])
 

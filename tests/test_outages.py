@@ -17,8 +17,8 @@ from estimation.pose_solver import SharedFit
 from estimation.se3 import Array
 from estimation.synthetic.follow import Follower, first_map
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
-from hardware.bench.estimator import FRAME_RATE_HZ, make_pictures
 from perception.frames import Image
+from tests.campaigns.estimator import FRAME_RATE_HZ, make_pictures
 from tests.campaigns.outage_run import (
     Outage,
     OutageKind,

@@ -15,12 +15,12 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import Warp
-from hardware.bench.planner import StreamTally, bench_arm, follow_stream
 from planning.command import Command, Hold, MotionLimits, Move
 from planning.kinematics import SimpleArm, axes_from_nozzle, nozzle_from_axes
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path, PrintPhase
+from tests.campaigns.planner import StreamTally, bench_arm, follow_stream
 from tests.moving import REST, Motion, breathing, pose_at, raster, still
 from tests.slowly import slowly
 

@@ -24,7 +24,16 @@ from hardware.bench.prediction import (
     recorded,
     simulated,
 )
-from hardware.bench.smoothing import (
+from hardware.cli.main import subject_parser
+from hardware.files.folder_tables import write_tum
+from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
+from hardware.process.progress import cached
+from perception import shipped_file
+from tests.campaigns import link as link_run
+from tests.campaigns.__main__ import CAMPAIGNS
+from tests.campaigns.__main__ import main as campaigns
+from tests.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
+from tests.campaigns.smoothing import (
     PYCOLMAP_MISSING,
     MovementErrors,
     RenderedErrors,
@@ -36,15 +45,6 @@ from hardware.bench.smoothing import (
     run_smoothing,
     smooth_rendered,
 )
-from hardware.bench.subjects import SUBJECTS
-from hardware.cli.main import subject_parser
-from hardware.files.folder_tables import write_tum
-from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks
-from hardware.process.progress import cached
-from perception import shipped_file
-from tests.campaigns import link as link_run
-from tests.campaigns.__main__ import main as campaigns
-from tests.campaigns.link import LinkCounts, LinkRun, goal_at, soak_figures, windows
 from tests.slowly import slowly
 from tests.synthetic import write_session
 from tests.virtual_arm import HOME
@@ -90,7 +90,7 @@ def test_errors_of_worlds_are_pooled_by_their_squares() -> None:
 
 
 def test_a_small_run_has_a_value_for_every_figure() -> None:
-    subject = SUBJECTS["smoothing"]
+    subject = CAMPAIGNS["smoothing"]
     words = "--movements still --seeds 1 --seconds 1 --count 40 --minutes 0.02 --adjusted 0 --sessions 0"
     words += " --scenarios --landmarks"
     figures = run_smoothing(subject_parser("smoothing", subject).parse_args(words.split()))

@@ -16,8 +16,8 @@ SEARCHES = {"startswith", "endswith", "find", "rfind", "index", "count", "partit
 MATCHES = {"match", "fullmatch", "search"}
 ATTRIBUTES = {"reason", "answer", "said", "allowed"}  # prose, whatever holds it
 EXCEPTIONS = {
-    "hardware/bench/detection.py": "measures whether a person is told which camera was knocked, and how",
-    "hardware/bench/mapping.py": "measures whether a person is told which directions a scan leaves open",
+    "tests/campaigns/detection.py": "measures whether a person is told which camera was knocked, and how",
+    "tests/campaigns/mapping.py": "measures whether a person is told which directions a scan leaves open",
     "hardware/bench/live.py": "reads what a run prints, as its user does",
     "hardware/bench/whole.py": "reads what a run prints, as its user does",
     "hardware/live/view.py": "joins a stage's name to its reason, and decides nothing",

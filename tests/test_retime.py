@@ -14,15 +14,6 @@ from hypothesis import strategies as st
 from estimation.pose import SurfacePose
 from estimation.runtime import left_out
 from hardware.arm.profile import ArmProfile
-from hardware.bench.planner import (
-    STILL,
-    SWUNG,
-    SwingingSurface,
-    random_path,
-    seconds_as_a_whole,
-    seconds_to_print,
-    zigzag_with_hops,
-)
 from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.motion import retime as retime_module
@@ -37,6 +28,15 @@ from planning.motion.retime import (
     run_times,
 )
 from planning.path import Path
+from tests.campaigns.planner import (
+    STILL,
+    SWUNG,
+    SwingingSurface,
+    random_path,
+    seconds_as_a_whole,
+    seconds_to_print,
+    zigzag_with_hops,
+)
 from tests.moving import Motion, path_through, pose_at, raster, still
 
 with left_out("matplotlib", "matplotlib.pyplot"):

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.bench.wounds import LIMBS, CarvedWound, carve, score_wound, tube
 from hardware.cli.main import main
 from hardware.files.mesh_file import read_raw_mesh, write_ply
 from planning.layers.grid import grid_over
@@ -21,6 +20,7 @@ from planning.layers.outline import ScanColour, WoundQuestionError
 from planning.layers.repair import repair_mesh
 from planning.layers.skin import bent_base, depressions, restored_skin, skin_cells
 from planning.layers.wound import find_wound
+from tests.campaigns.wounds import LIMBS, CarvedWound, carve, score_wound, tube
 
 
 def ring_of(height: object, inner: float, outer: float, noise: float, seed: int = 0) -> Array:

@@ -16,8 +16,6 @@ from estimation.scans.registration import register
 from estimation.scans.scan import ScanIndex, face_normals, lattice_triangles, scan_from_triangles
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.bench.mapping import shape_of
-from hardware.bench.scan import scan_figures
 from hardware.cli.plan import scanned_settings
 from hardware.files.mesh_file import read_mesh, read_raw_mesh, write_scan
 from hardware.live.settings import FROM_CAMERAS, LiveSettings, read_settings
@@ -38,6 +36,8 @@ from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from perception.frames import Frame, FrameSet, Image
 from planning.layers.repair import repair_mesh
+from tests.campaigns.mapping import shape_of
+from tests.campaigns.scan import scan_figures
 from tests.outside_cameras import outside, wound_scene
 from tests.test_first_print import PROGRAM, region
 

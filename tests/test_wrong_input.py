@@ -179,7 +179,7 @@ calibrate cameras empty --board b.toml -o OUT --distance-mm a,b,far
 calibrate cameras empty --board b.toml -o OUT --limit-mm nan
 calibrate arm --virtual --record OUT -o OUT.toml --limit-mm nan
 calibrate dispenser d.toml --measured 1,2
-bench growth --dance
+bench latency --dance
 """
 
 

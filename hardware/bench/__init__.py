@@ -1,6 +1,5 @@
 """Measured figures of every part, each beside its target and its reference: `stillbed bench SUBJECT`."""
 
 __all__ = [
-    "calibration", "detection", "estimator", "fault_run", "figures", "fill", "link", "live", "mapping",
-    "pictures", "planner", "prediction", "recordings", "smoothing", "subjects", "whole", "wounds",
+    "calibration", "fault_run", "figures", "link", "live", "pictures", "prediction", "recordings", "subjects", "whole",
 ]  # fmt: skip

@@ -3,11 +3,15 @@
 What stands between the faults and the arm is all of what stands there in a live run but for the processes and the
 pictures: the pairing of frames, the estimator, planner, guard, the arm's link with its model of the queue. An operator
 arms the arm again where it was stopped.
+
+For the subject `loop`, what the planner's lead of a late dispenser is worth: a scenario's print in which the dispenser
+is told over a line in virtual time, and material lies where its true flow left the true nozzle. Once the motion knows
+the dispenser's delays, and once it takes them for none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path as File
 
@@ -17,6 +21,7 @@ from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import ArmState, LinkCode
 from hardware.arm.profile import in_step
+from hardware.bench.figures import Figure, at_most
 from hardware.files.path_file import read_path
 from hardware.live.checklist import silence_text
 from hardware.motion.loop import Tick
@@ -26,14 +31,16 @@ from hardware.process.faults import Fault
 from hardware.simulator.arm.settings import ReplyMode
 from hardware.simulator.camera_pipeline import Exposures
 from hardware.simulator.cameras import Shot
-from hardware.simulator.deposit import NozzleLog, join_logs
+from hardware.simulator.deposit import NozzleLog, join_logs, planned_line
 from hardware.simulator.material import SimulatedDispenser
+from hardware.simulator.nozzle_error import EndsOfBeads, MaterialFigures, material_figures, nozzle_errors
 from hardware.simulator.scenario import Scenario, TrackingSettings, read_scenario
 from hardware.simulator.scenario_tables import bare_scene
 from hardware.simulator.scene.shape import Shape
 from hardware.simulator.simulate import LandmarkTracker
 from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_deformation
 from hardware.simulator.world import SimulatedWorld
+from perception import shipped_file
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport
 from planning.command import MotionLimits, Move
@@ -251,3 +258,51 @@ class _ChangedStep:
 
     def idle(self) -> None:
         self._step.idle()
+
+
+LATE_DISPENSER = "dispenser_late"  # a scenario
+LED, NOT_LED = "delays known", "delays taken for 0"
+MAX_END_ERROR = 0.5  # mm along the path, 95 %
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeadsPrint:
+    """What came of a print."""
+
+    material: MaterialFigures
+    delay: float  # s, from a switch to half the flow
+
+
+def print_beads(seed: int, way: str) -> BeadsPrint:
+    """Print the scenario once; way: LED or NOT_LED."""
+    on = prepare_scenario(shipped_file("scenarios", f"{LATE_DISPENSER}.toml"))
+    dispenser = on.scenario.dispenser
+    assert dispenser is not None
+    run = FaultRun(on, (), seed, replace(dispenser, led=way == LED))()
+    assert run.log is not None
+    line, truth = planned_line(on.path), dispenser.truth
+    errors = nozzle_errors(run.log, line)
+    material = material_figures(run.log, line, errors, on.scenario.bead, run.told_outside)
+    return BeadsPrint(material, truth.on_dead_time + float(np.log(2)) * truth.on_lag)
+
+
+def bead_figures(prints: Mapping[str, BeadsPrint]) -> list[Figure]:
+    """The figures of both prints, by LED and NOT_LED."""
+    led, not_led, figures = prints[LED].material, prints[NOT_LED].material, list[Figure]()
+    for what, ours, without in (("begin", led.begins, not_led.begins), ("end", led.stops, not_led.stops)):
+        other, note = f"{NOT_LED}: {without.size.p95:.2f}", f"of {len(ours.error)}, by speed {_by_speed(ours)}"
+        name = f"{LATE_DISPENSER}: beads {what} off the plan, 95 %"
+        figures.append(Figure(name, ours.size.p95, "mm", at_most(MAX_END_ERROR), other, note))
+        unled = f"{without.median:.2f} mm at the median; by speed {_by_speed(without)}"
+        figures.append(Figure(f"{name}, {NOT_LED}", without.size.p95, "mm", None, "", unled))
+    told = 1000 * max(led.told, not_led.told)
+    figures.append(Figure(f"{LATE_DISPENSER}: told to flow while not printing", told, "ms", at_most(0)))
+    return figures
+
+
+def _by_speed(ends: EndsOfBeads) -> str:
+    """The mean error at each speed, in whole mm/s."""
+    there = np.isfinite(ends.error)
+    speeds, error = np.round(ends.speed[there]), ends.error[there]
+    each = (f"{speed:g} mm/s {error[speeds == speed].mean():+.2f}" for speed in np.unique(speeds))
+    return ", ".join(each)

@@ -11,7 +11,7 @@ squared errors over the last seconds, relative to the best one's.
 motion of a live run and the virtual arm, whose nozzle is compared with its true checkpoint every millisecond. Only the
 pose that the motion is given differs: the first one for ever, the last one at rest, the last one with its velocity, or
 the pose as it is. The first three state no error: only the arm's limits keep them from printing. One more scenario has
-a late dispenser: hardware/bench/planner.py.
+a late dispenser: hardware/bench/fault_run.py.
 """
 
 from __future__ import annotations
@@ -31,9 +31,17 @@ from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.bench import figures
-from hardware.bench.fault_run import FaultRun, prepare_scenario
+from hardware.bench.fault_run import (
+    LATE_DISPENSER,
+    LED,
+    NOT_LED,
+    BeadsPrint,
+    FaultRun,
+    bead_figures,
+    prepare_scenario,
+    print_beads,
+)
 from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
-from hardware.bench.planner import LATE_DISPENSER, LED, NOT_LED, BeadsPrint, bead_figures, print_beads
 from hardware.bench.subjects import BREATHING
 from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock

@@ -1,8 +1,7 @@
-"""Subjects `thesis`, `latency` and `growth`: tracking methods on short rendered recordings, or on recorded sessions.
+"""Subjects `thesis` and `latency`: tracking methods on short rendered recordings, or on recorded sessions.
 
 `thesis`: the thesis's estimator and ours, on the same frame sets in the same run.
 `latency`: from three decoded frames to the pose, flow included, by wall clock and by processor.
-`growth`: what a pose and a path cost, as tracks, cameras, pixels, checkpoints and minutes grow.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,18 +20,15 @@ import numpy as np
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.rig import Rig
 from estimation.se3 import Array
-from estimation.synthetic.follow import follow_steps
-from estimation.synthetic.world import BASE_FROM_REST, arc_rig, synthetic_world
-from hardware.bench.figures import Figure, Target, at_least, at_most, milliseconds, with_progress, write_page
-from hardware.bench.planner import carries
+from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.bench.figures import Figure, Target, at_least, at_most, milliseconds
 from hardware.files.images import decode, encode
 from hardware.files.pose_file import PoseWriter, read_poses
 from hardware.offline.track import MAP_METHOD, step_by, tracker
 from hardware.process.checks import Table
-from hardware.process.clock import CpuClock, ProcessorClock, WallClock
+from hardware.process.clock import ProcessorClock, WallClock
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import Evaluation, evaluate, measured_share, percent, spread
-from hardware.report.page import Plot, document, legend, line_key, section, spanning
 from hardware.simulator.motion_table import motion_from_tables
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.scene.appearance import Appearance, Sensor
@@ -192,10 +187,10 @@ WARM_UP_STEPS = 10  # frame sets after the first map that only fill caches and t
 def run_latency(options: argparse.Namespace) -> list[Figure]:
     """Latencies on each recording."""
     recordings = chosen_recordings(options, options.scene)
-    return [figure for each in recordings for figure in latency_figures(each.name, *_time_steps(each))]
+    return [figure for each in recordings for figure in latency_figures(each.name, *time_steps(each))]
 
 
-def _time_steps(recording: Recording) -> tuple[Array, Array]:
+def time_steps(recording: Recording) -> tuple[Array, Array]:
     """Wall time (N, 1 + len(STAGES)) s, in all and by stage, and processor time (N,), s, of each tracked frame set."""
     now, processor = WallClock().now, ProcessorClock().now
     rows, costs, initialised = [], [], 0
@@ -286,106 +281,3 @@ def pose_bytes(pose: SurfacePose) -> tuple[object, ...]:
     """All of a pose, to the last bit."""
     numbers = [np.ravel(values) for values in (pose.stamp, pose.base_from_surface, pose.covariance, pose.twist)]
     return pose.state, pose.reason, np.concatenate(numbers).tobytes()
-
-
-ANGLES_DEG = (0.0, 36.0, 84.0, -36.0, 60.0, -60.0)  # the thesis's three cameras, and three more on the same arc
-PICTURE_SIZE, PICTURE_FOCAL = (1280, 720), 1100.0
-GROWTH_RECORDING = "chest, breathing"
-MOVED_PATHS = 50
-WORLD_MINUTES = 0.25, 0.5, 1.0, 2.0  # of one world
-
-
-@dataclass(frozen=True, slots=True)
-class CostAxis:
-    """One thing that grows."""
-
-    name: str
-    unit: str  # of its values
-    what: str  # costs, and in what
-    values: tuple[float, ...]
-    cost: Callable[[float], tuple[float, float]]  # (median, 99 %), ms, of one value
-
-
-def run_growth(options: argparse.Namespace) -> list[Figure]:
-    """Costs along every axis, and how steeply they grow."""
-    axes = [axis for axis in axes_for(options.seconds) if axis.name != "pixels" or not options.no_pictures]
-    points = [(axis, value) for axis in axes for value in axis.values]
-    costs: dict[str, list[tuple[float, float]]] = {axis.name: [] for axis in axes}
-    for axis, value in with_progress("growth", "points", points, len(points)):
-        costs[axis.name].append(axis.cost(value))
-    measured = [(axis, np.array(costs[axis.name])) for axis in axes]
-    write_page(options.out, "growth.html", lambda: growth_page(measured), "the curves")
-    return [figure for axis, table in measured for figure in growth_figures(axis, table)]
-
-
-def axes_for(seconds: float) -> tuple[CostAxis, ...]:
-    """All that grows."""
-    pose, path = "a pose from its tracks, processor time", "a path carried to a new pose, processor time"
-    frames = "three decoded frames to the pose, by the clock"
-
-    def tracked(count: int = 100, cameras: int = 3) -> tuple[float, float]:
-        return _two(_spent(seconds, count, cameras)[WARM_UP_STEPS:])
-
-    def moved(checkpoints: float) -> tuple[float, float]:
-        return _two(carries(round(checkpoints), MOVED_PATHS)[0])
-
-    def pictures(megapixels: float) -> tuple[float, float]:
-        scale = (megapixels * 1e6 / (PICTURE_SIZE[0] * PICTURE_SIZE[1])) ** 0.5
-        width, height = (8 * round(scale * n / 8) for n in PICTURE_SIZE)
-        rig = arc_rig(size=(width, height), focal=scale * PICTURE_FOCAL)
-        return _two(_time_steps(made_recording(GROWTH_RECORDING, seconds, rig))[0][:, 0])
-
-    def late(minutes: float) -> tuple[float, float]:
-        end = round(60 * minutes * FRAME_RATE)
-        return _two(_spent(60 * WORLD_MINUTES[-1])[end - round(seconds * FRAME_RATE) : end])
-
-    return (
-        CostAxis("tracks", "landmarks", pose, (25, 50, 100, 200, 400), lambda n: tracked(count=round(n))),
-        CostAxis("cameras", "cameras", pose, (2, 3, 4, 6), lambda n: tracked(cameras=round(n))),
-        CostAxis("minutes", "min behind", pose, WORLD_MINUTES, late),
-        CostAxis("checkpoints", "checkpoints", path, (1e3, 1e4, 5e4, 2e5), moved),
-        CostAxis("pixels", "Mpx a camera", frames, (0.23, 0.52, 0.92, 2.07), pictures),
-    )
-
-
-@lru_cache(maxsize=1)
-def _spent(seconds: float, count: int = 100, cameras: int = 3) -> Array:
-    """s of processor time of each step (N,) in a breathing world."""
-    world = synthetic_world(seconds=seconds, rate=FRAME_RATE, count=count, rig=arc_rig(ANGLES_DEG[:cameras]))
-    return np.array([step.seconds for step in follow_steps(world, "told", CpuClock().now)])
-
-
-def _two(seconds: Array) -> tuple[float, float]:
-    return milliseconds(seconds, 50), milliseconds(seconds, 99)
-
-
-def growth_figures(axis: CostAxis, costs: Array) -> list[Figure]:
-    """A figure for each value and the slope of the medians. costs: (N, 2) ms."""
-    points = [
-        Figure(f"{axis.name}: {value:g} {axis.unit}, median", half, "ms", note=f"99 %: {late:.2f} ms; {axis.what}")
-        for value, (half, late) in zip(axis.values, costs.tolist(), strict=True)
-    ]
-    power, note = slope(axis.values, costs[:, 0]), "0: not at all; 1: in proportion"
-    return [*points, Figure(f"{axis.name}: grows by the power", power, "", note=note)]
-
-
-def slope(values: Sequence[float], costs: Array) -> float:
-    """The exponent of the power law through costs (N,), by least squares over the logarithms."""
-    usable = np.isfinite(costs) & (costs > 0)
-    if usable.sum() < 2:
-        return math.nan
-    return float(np.polyfit(np.log(np.array(values)[usable]), np.log(costs[usable]), 1)[0])
-
-
-def growth_page(measured: Sequence[tuple[CostAxis, Array]]) -> str:
-    """All curves on one page."""
-    parts, keys = [], legend([line_key("estimate", "median"), line_key("truth", "99 %")])
-    for axis, costs in measured:
-        x = np.array(axis.values, float)
-        plot = Plot(1000, 220, spanning([x]), (0.0, 1.1 * float(np.nanmax(costs))), label=f"ms over {axis.unit}")
-        for column, style in ((1, "truth"), (0, "estimate")):
-            plot.line(x, costs[:, column], style)
-            plot.dots(x, costs[:, column], style, 3)
-        parts.append(section(axis.name.capitalize(), f"{axis.what}, ms, over {axis.unit}.", plot.svg() + keys))
-    lead = "Each curve is one thing that grows while all else stays what it usually is."
-    return document("Bench", "How cost grows", lead, parts, "Made by stillbed bench growth.")

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from estimation.errors import InputError, StillbedError
 from hardware.bench.figures import Figure, Machine, Target, read_figures, table_text, this_machine, whole_text
+from hardware.bench.subjects import BENCH, BenchPart, Whole
 from hardware.process.checks import error_text
 from hardware.process.clock import WallClock
 from hardware.process.progress import duration_text
@@ -34,7 +35,9 @@ PART_HEADER = ("figure", "value", "target", "", "reference", "note")
 COLOURS = {"met": ' class="met"', "MISSED": ' class="missed"'}  # by verdict
 
 
-def whole_page(parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, str], machine: Machine) -> str:
+def whole_page(
+    command: str, parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, str], machine: Machine
+) -> str:
     """An HTML page with a card for each part. troubles: why a part has no figures. pages: of parts that drew one."""
     judged, missed, plain = counted(parts)
     counts = [(judged - missed, f"of {judged}", "targets met"), (missed, "", "missed")]
@@ -46,7 +49,7 @@ def whole_page(parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, st
         for name, figures in parts.items()
     ]
     body = [row_of_tiles(tiles), _overview(parts, troubles), *cards]
-    made = f"Made by stillbed bench --all with {versions}."
+    made = f"Made by {command} with {versions}."
     return document("Bench", "All that is measured", measured_on(machine), body, made)
 
 
@@ -105,13 +108,13 @@ def _row(figure: Figure) -> tuple[str, ...]:
     return figure.what, value, target, figure.verdict, figure.reference, figure.note
 
 
-def whole_markdown(parts: Parts, machine: Machine) -> str:
+def whole_markdown(command: str, parts: Parts, machine: Machine) -> str:
     """The same as Markdown: what was measured on what, and a table for each part."""
     judged, missed, plain = counted(parts)
     lines = [
         "# All that is measured",
         "",
-        f"`stillbed bench --all` (`make bench`) on {measured_on(machine)}",
+        f"`{command}` on {measured_on(machine)}",
         f"{judged - missed} of {judged} targets are met; {plain} figures have none.",
     ]
     for name, figures in parts.items():
@@ -126,38 +129,6 @@ def _line(cells: Sequence[str]) -> str:
 
 WORSE_FACTOR = 1.2  # times farther from good than before: less is what these machines vary by
 FIGURES_FILE, PAGE_FILE, TABLE_FILE = "figures.json", "report.html", "table.md"  # of the whole, in its folder
-BENCH_PROCESS = "import sys; from hardware.cli.main import main; sys.exit(main(sys.argv[1:]))"
-
-
-@dataclass(frozen=True, slots=True)
-class BenchPart:
-    """One subject as a part of the whole, and of the quick look."""
-
-    subject: str
-    options: tuple[str, ...] = ()
-    quick: tuple[str, ...] | None = None  # None: left out of the quick look
-    name: str = ""  # in the table and of its folder, where the subject has another part beside it
-
-
-OWN_MAPS = "--maps", "seen", "--only"  # of several seeds: the frame's own error is one draw for a whole world
-QUICK_ESTIMATOR = *OWN_MAPS, "breathing, clean", "--seeds", "2", "--seconds", "4"
-BENCH_PARTS = (
-    BenchPart("estimator", (*OWN_MAPS, "breathing, [cno]*", "--seeds", "6", "--seconds", "4"), QUICK_ESTIMATOR),
-    BenchPart("consistency", ("--scenes", "1")),
-    BenchPart("estimator", ("--maps", "seen", "--soak", "0.05"), name="memory"),
-    BenchPart("prediction", (), ("--seconds", "75")),
-    BenchPart("steps", ("--steps", "500", "--hours", "0.2"), None),
-    BenchPart("latency", ("--seconds", "4")),
-    BenchPart("thesis", ("--seconds", "2")),
-    BenchPart("segmentation", ("--rendered", "30", "--areas", "20"), ("--rendered", "2", "--areas", "1")),
-    BenchPart("plan", (), None),
-    BenchPart("fill", ("--count", "60"), ("--count", "3")),
-    BenchPart("planner", ("--updates", "20000"), ("--updates", "2000")),
-    BenchPart("link", ("--minutes", "1"), ("--minutes", "0.1")),
-    BenchPart("loop", ("--jobs", "2"), ("--jobs", "2", "--scenario", "breathing_deep")),
-    BenchPart("registration", ("--seeds", "1")),
-    BenchPart("growth", ("--seconds", "2")),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,19 +140,19 @@ class MeasuredPart:
     trouble: str = ""  # why there are no figures, "" where there are
 
 
-def measure_all(out: Path, quick: bool, parts: Sequence[BenchPart] = BENCH_PARTS) -> list[MeasuredPart]:
-    """Measure every subject into a folder each of `out`; figures there of the same commit and options are reused.
+def measure_all(out: Path, quick: bool, whole: Whole) -> list[MeasuredPart]:
+    """Measure every part into a folder each of `out`; figures there of the same commit and options are reused.
 
     The table is written after each, so that an interrupted run leaves what it has measured.
     """
     clock, machine, done = WallClock(), this_machine(), list[MeasuredPart]()
-    candidates = [(part, part.quick if quick else part.options) for part in parts]
-    chosen = [(part.subject, part.name or part.subject, options) for part, options in candidates if options is not None]
-    for number, (subject, name, options) in enumerate(chosen, 1):
-        start = clock.now()
-        part = _earlier(out / name, options, machine) or _measured(out / name, subject, options)
+    candidates = [(part, part.quick if quick else part.options) for part in whole.parts]
+    chosen = [(asked, options) for asked, options in candidates if options is not None]
+    for number, (asked, options) in enumerate(chosen, 1):
+        start, folder = clock.now(), out / (asked.name or asked.subject)
+        part = _earlier(folder, options, machine) or _measured(folder, asked, options)
         duration = duration_text(clock.now() - start)
-        print(f"{number} of {len(chosen)}: {subject} {' '.join(options)}, {duration}\n", flush=True)
+        print(f"{number} of {len(chosen)}: {asked.subject} {' '.join(options)}, {duration}\n", flush=True)
         print(part.trouble or table_text(part.figures), end="\n\n", flush=True)
         done.append(part)
         figures = {part.subject: part.figures for part in done}
@@ -189,8 +160,8 @@ def measure_all(out: Path, quick: bool, parts: Sequence[BenchPart] = BENCH_PARTS
         drawn = {part.subject: sorted((out / part.subject).glob("*.html")) for part in done}
         pages = {name: files[0].relative_to(out).as_posix() for name, files in drawn.items() if files}
         (out / FIGURES_FILE).write_text(whole_text(figures, machine), encoding="utf-8")
-        (out / PAGE_FILE).write_text(whole_page(figures, troubles, pages, machine), encoding="utf-8")
-        (out / TABLE_FILE).write_text(whole_markdown(figures, machine), encoding="utf-8")
+        (out / PAGE_FILE).write_text(whole_page(whole.command, figures, troubles, pages, machine), encoding="utf-8")
+        (out / TABLE_FILE).write_text(whole_markdown(whole.command, figures, machine), encoding="utf-8")
     return done
 
 
@@ -204,12 +175,15 @@ def _earlier(folder: Path, options: Sequence[str], machine: Machine) -> Measured
     return MeasuredPart(folder.name, tuple(read_figures(folder / FIGURES_FILE)))
 
 
-def _measured(folder: Path, subject: str, options: Sequence[str]) -> MeasuredPart:
-    command = [sys.executable, "-c", BENCH_PROCESS, "bench", subject, "-o", str(folder), "--force", *options]
+def _measured(folder: Path, part: BenchPart, options: Sequence[str]) -> MeasuredPart:
+    program = ["-m", "hardware.cli.main", "bench"] if part.program == BENCH else part.program.split()[1:]
+    command = [sys.executable, *program, part.subject, "-o", str(folder), "--force", *options]
     (folder / FIGURES_FILE).unlink(missing_ok=True)
     done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # its progress is shown as it goes
     if done.returncode or not (folder / FIGURES_FILE).is_file():
-        return MeasuredPart(folder.name, (), f"no figures: `stillbed bench {subject} {' '.join(options)}` says why")
+        return MeasuredPart(
+            folder.name, (), f"no figures: `{part.program} {part.subject} {' '.join(options)}` says why"
+        )
     (folder / "options.json").write_text(json.dumps([this_machine().commit, *options]), encoding="utf-8")
     return MeasuredPart(folder.name, tuple(read_figures(folder / FIGURES_FILE)))
 
@@ -239,7 +213,7 @@ def read_whole(file: Path) -> dict[tuple[str, str], float]:
         rows = ((name, row["what"], row["value"]) for name, part in subjects.items() for row in part)
         return {(name, what): float(value) for name, what, value in rows if value is not None}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        allowed = "figures.json as `stillbed bench --all` writes it"
+        allowed = f"{FIGURES_FILE} as `{BENCH} --all` writes it"
         raise InputError(file, "table", error_text(error), allowed) from error
 
 
@@ -259,14 +233,14 @@ def _badness(target: Target, value: float) -> float:
     return part / whole if whole else 0.0
 
 
-def run_whole(out: Path, quick: bool, against: Path | None) -> None:
+def run_whole(out: Path, quick: bool, against: Path | None, whole: Whole) -> None:
     """Measure, print, save and compare."""
     if against is not None:
         read_whole(against)  # a wrong file is reported before an hour of measuring
     out.mkdir(parents=True, exist_ok=True)
     machine = this_machine()
     print(f"{machine.cpu}, {machine.cores} cores, commit {machine.commit or 'unknown'}\n", flush=True)
-    done = measure_all(out, quick)
+    done = measure_all(out, quick, whole)
     print(summary(done))
     if against is not None:
         print(regressions(done, against))

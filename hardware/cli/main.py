@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import StillbedError
-from hardware.bench.subjects import SUBJECTS, Subject, Subjects
+from hardware.bench.subjects import BENCH_WHOLE, SUBJECTS, Subject, Subjects, Whole
 from hardware.cli.calibrate import add_calibrate
 from hardware.cli.dispenser import add_dispenser
 from hardware.cli.live import add_arm, add_cameras, add_init, add_live, add_record, add_trace
@@ -44,14 +44,20 @@ WRITTEN_OPTIONS = ("out", "record", "log", "link", "gcode")  # paths of the comm
 
 def add_bench(commands: Commands) -> None:
     """Add the sub-command `bench`; what follows its subject is read once the subject's module is loaded."""
-    add = commands.add(
+    parser = commands.add(
         "bench",
         run_bench,
         "measure a part, and print each figure beside its target",
         "Measure a part of stillbed and print each figure beside its target and its reference.",
-        "stillbed bench estimator -o out/estimator",
+        "stillbed bench latency -o out/latency",
         "stillbed bench --quick",
-    ).add_argument
+    )
+    add_bench_options(parser)
+
+
+def add_bench_options(parser: argparse.ArgumentParser) -> None:
+    """What to measure: a subject and its options, or all."""
+    add = parser.add_argument
     add("--list", action="store_true", help="list the subjects and exit")
     add("--all", action="store_true", help="measure all subjects, each in short; what is there is kept")
     add("--quick", action="store_true", help="the same of fewer subjects, in two minutes")
@@ -61,20 +67,20 @@ def add_bench(commands: Commands) -> None:
     add("rest", nargs=argparse.REMAINDER, metavar="...", help="its options; see SUBJECT --help")
 
 
-def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS) -> None:
+def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS, whole: Whole = BENCH_WHOLE) -> None:
     """List the subjects, or measure one or all, print the table and, where a folder was named, save it there."""
     name = arguments.subject
     if arguments.all or arguments.quick:
         from hardware.bench.whole import run_whole
 
-        run_whole(arguments.out, arguments.quick, arguments.against)
+        run_whole(arguments.out, arguments.quick, arguments.against, whole)
     elif arguments.list or name is None:
         width = max(map(len, subjects), default=0)
         print("\n".join(f"{key:<{width}}  {subject.summary}" for key, subject in subjects.items()))
     elif name not in subjects:
         from hardware.process.checks import one_of_text
 
-        raise wrong_option("SUBJECT", name, one_of_text(name, list(subjects)))
+        raise wrong_option("SUBJECT", name, one_of_text(name, list(subjects)) + whole.elsewhere)
     else:
         options = subject_parser(name, subjects[name]).parse_args(arguments.rest)
         arguments.out = options.out  # told where the run is interrupted

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -273,8 +274,6 @@ def content_of(file: Path) -> bytes:
 
     Files that cannot be read are left out: whoever renders the scenario says so.
     """
-    import tomllib  # which a command line does not need for its help
-
     parts = [file.read_bytes()]
     with suppress(ValueError):
         for name in _texts(tomllib.loads(parts[0].decode("utf-8-sig"))):

@@ -187,7 +187,7 @@ def passing_times(curve: PathCurve, arm: SimpleArm, limits: tuple[Array, Array])
 
     limits: as `retime` takes them. The whole curve under its rules, the middle of it where the arm is at home, but for
     the acceleration that a curve takes at a steady speed outside its corners. Joints count only where they reach.
-    `stillbed bench planner` says how far off it is.
+    `python -m tests.campaigns planner` says how far off it is.
     """
     at_home = nozzle_from_axes(arm, arm.home) @ se3.inverse(curve.poses(np.array([curve.length / 2]))[0])
     pose = SurfacePose(0.0, at_home, np.eye(6), np.zeros(6), TrackState.TRACKING)  # how well it is known does not count

@@ -18,12 +18,12 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
-from hardware.bench.estimator import FRAME_RATE_HZ, ScenePictures
 from hardware.simulator.camera_pipeline import draw_cover
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Image
 from perception.lens import undistort
 from perception.tracking.step import TrackingStep
+from tests.campaigns.estimator import FRAME_RATE_HZ, ScenePictures
 
 Map = NDArray[np.float32]  # (H, W)
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
-from hardware.bench.estimator import make_pictures
 from hardware.bench.figures import Figure, aligned, at_most, columns, with_progress, workers, write_page
 from hardware.report.page import Plot, area_key, document, legend, line_key, ribbon, section
+from tests.campaigns.estimator import make_pictures
 from tests.campaigns.outage_run import OutageKind, WatchedOutage, run_stretch
 
 HARMFUL_ERROR = 0.5  # mm: an error below is of no harm to a print with a nozzle of 0.4 mm

@@ -16,7 +16,6 @@ from estimation import se3
 from estimation.rig import Rig
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench.figures import Figure, Target, at_least, at_most, rms
-from hardware.bench.mapping import NORMAL_MEDIAN, breathing_pose, shape_of
 from hardware.live.surface_scan import ScanSource, scan_surface
 from hardware.offline.looks import WIDTHS, look_at
 from hardware.process.clock import WallClock
@@ -29,6 +28,7 @@ from perception.frames import Frame, FrameSet
 from perception.lens import Lenses
 from perception.mapping.surface_heights import SurfaceView, dense_heights, first_heights
 from planning.laid_beads import BeadPieces, LaidBeads
+from tests.campaigns.mapping import NORMAL_MEDIAN, breathing_pose, shape_of
 
 SCAN_WETNESS = {"dry": 0.0, "wet": 1.0}
 SCAN_SPAN, FUSED_SCAN_RATE = (

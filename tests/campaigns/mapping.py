@@ -23,7 +23,6 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.follow import MIN_FRAME_SETS
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.bench.estimator import nees
 from hardware.bench.figures import Figure, Target, at_least, at_most, relative_nees, rms
 from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.render import render
@@ -34,6 +33,7 @@ from perception.lens import Lenses
 from perception.mapping.features import grey
 from perception.mapping.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
 from perception.tracking.step import TrackingStep
+from tests.campaigns.estimator import nees
 
 SCAN_SPACING = 1.0  # mm between the vertices of a scan, as handheld scanners give them
 SCAN_FROM_SURFACE = se3.make(se3.exp_rotation([0.3, -0.2, 0.6]), [12.0, -7.0, 31.0])  # a scanner has its own frame

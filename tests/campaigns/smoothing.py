@@ -37,7 +37,6 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import synthetic_world
-from hardware.bench.estimator import nees
 from hardware.bench.figures import CONSISTENT_NEES, Figure, at_least, at_most, columns, rms
 from hardware.files.session import Session
 from hardware.live.prerender import prerender
@@ -52,6 +51,7 @@ from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import best_constant, spread
 from perception import shipped_file
 from perception.frames import Frame
+from tests.campaigns.estimator import nees
 
 SESSION_SETTINGS = 5.0, 30.0, 60  # s, Hz, landmarks
 MIN_SPEED_UP = 1.8
@@ -156,7 +156,7 @@ NO_GATE = 1e4  # times the gate: no residual is that large, and all count by the
 NO_MOTION_PRIOR = np.array([1e10] * 3 + [1e15] * 3)  # rad^2/s^5, mm^2/s^5: neighbouring poses are independent
 NO_JITTER = 1e-7, 1e-5  # s, px: exposures and images without a jitter
 COST_TOLERANCE, MAX_STEPS = 1e-8, 50  # of the cost; solver steps
-PYCOLMAP_MISSING = "pycolmap is not installed (the extra [bench]): not compared"
+PYCOLMAP_MISSING = "pycolmap is not installed (the extra [counterparts]): not compared"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,18 +1,14 @@
-"""`stillbed bench planner`: random poses into planner and guard, judged tick by tick by an oracle; cost of a step.
+"""`planner`: random poses into planner and guard, judged tick by tick by an oracle; cost of a step.
 
 Each stream is a print of its own: a random path over a moving surface, whose poses are noisy, late, jumping, invalid or
 missing, with a caller that stalls now and then. A stream is cut in two: a second planner resumes from the first one's
 progress. Time is virtual; the cost of a step is the thread's own processor time.
-
-For the subject `loop`, what the planner's lead of a late dispenser is worth: a scenario's print in which the dispenser
-is told over a line in virtual time, and material lies where its true flow left the true nozzle. Once the motion knows
-the dispenser's delays, and once it takes them for none.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -24,13 +20,10 @@ from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import Warp
 from hardware.arm.profile import ArmProfile
-from hardware.bench.fault_run import AXES_LIMITS, AxesOracle, FaultRun, prepare_scenario
+from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
 from hardware.bench.figures import Figure, at_least, at_most, milliseconds, percentile, with_progress
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import CpuClock
-from hardware.simulator.deposit import planned_line
-from hardware.simulator.nozzle_error import EndsOfBeads, MaterialFigures, material_figures, nozzle_errors
-from perception import shipped_file
 from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle, axis_limits
 from planning.motion.curve import curve_through, gridpoints_on
@@ -345,51 +338,3 @@ def carries(checkpoints: int, count: int) -> tuple[Array, Array]:
         np.arctan2(x[1], x[0], out=machine[5])
         axes[k] = clock.now() - start
     return transform, axes
-
-
-LATE_DISPENSER = "dispenser_late"  # a scenario
-LED, NOT_LED = "delays known", "delays taken for 0"
-MAX_END_ERROR = 0.5  # mm along the path, 95 %
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BeadsPrint:
-    """What came of a print."""
-
-    material: MaterialFigures
-    delay: float  # s, from a switch to half the flow
-
-
-def print_beads(seed: int, way: str) -> BeadsPrint:
-    """Print the scenario once; way: LED or NOT_LED."""
-    on = prepare_scenario(shipped_file("scenarios", f"{LATE_DISPENSER}.toml"))
-    dispenser = on.scenario.dispenser
-    assert dispenser is not None
-    run = FaultRun(on, (), seed, replace(dispenser, led=way == LED))()
-    assert run.log is not None
-    line, truth = planned_line(on.path), dispenser.truth
-    errors = nozzle_errors(run.log, line)
-    material = material_figures(run.log, line, errors, on.scenario.bead, run.told_outside)
-    return BeadsPrint(material, truth.on_dead_time + float(np.log(2)) * truth.on_lag)
-
-
-def bead_figures(prints: Mapping[str, BeadsPrint]) -> list[Figure]:
-    """The figures of both prints, by LED and NOT_LED."""
-    led, not_led, figures = prints[LED].material, prints[NOT_LED].material, list[Figure]()
-    for what, ours, without in (("begin", led.begins, not_led.begins), ("end", led.stops, not_led.stops)):
-        other, note = f"{NOT_LED}: {without.size.p95:.2f}", f"of {len(ours.error)}, by speed {_by_speed(ours)}"
-        name = f"{LATE_DISPENSER}: beads {what} off the plan, 95 %"
-        figures.append(Figure(name, ours.size.p95, "mm", at_most(MAX_END_ERROR), other, note))
-        unled = f"{without.median:.2f} mm at the median; by speed {_by_speed(without)}"
-        figures.append(Figure(f"{name}, {NOT_LED}", without.size.p95, "mm", None, "", unled))
-    told = 1000 * max(led.told, not_led.told)
-    figures.append(Figure(f"{LATE_DISPENSER}: told to flow while not printing", told, "ms", at_most(0)))
-    return figures
-
-
-def _by_speed(ends: EndsOfBeads) -> str:
-    """The mean error at each speed, in whole mm/s."""
-    there = np.isfinite(ends.error)
-    speeds, error = np.round(ends.speed[there]), ends.error[there]
-    each = (f"{speed:g} mm/s {error[speeds == speed].mean():+.2f}" for speed in np.unique(speeds))
-    return ", ".join(each)

@@ -322,7 +322,7 @@ clock = ProcessorClock()
 start = clock.now()
 import planning.fill.bead, planning.layers.plan, planning.layers.repair, planning.layers.slicing, planning.layers.wound
 imports = clock.now() - start
-from hardware.bench.fill import measure_plan
+from tests.campaigns.fill import measure_plan
 measure_plan(imports, *sys.argv[1:])
 """
 
