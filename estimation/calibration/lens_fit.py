@@ -1,4 +1,4 @@
-"""One camera's lens from its own views: homographies (Zhang 2000), refined by Levenberg-Marquardt, with covariance.
+"""One camera's lens from its own views: homographies (Zhang 2000), refined by Levenberg-Marquardt.
 
 Each view has its own pose, so no common clock is needed: the distortion model is chosen before time is estimated.
 """
@@ -172,7 +172,6 @@ class LensFit:
 
     model: str
     lens: Array  # (9,)
-    covariance: Array  # (9, 9) at the pixels' stated sigma; zero for parameters that are not free
     camera_from_board: Array  # (V, 4, 4)
     residuals: Array  # (V, P, 2) px, projection less measurement, or nan
     scale: float  # of the residuals, in stated sigmas
@@ -214,8 +213,7 @@ def fit_lens(
     lens, camera_from_board = first_lens(views) if begin is None else begin
     lens = np.where(np.isin(np.arange(9), free), lens, 0.0)
     state, at = _minimise(views, _LensState(lens, camera_from_board), free, min_gain)
-    covariance, scale = _lens_covariance(at, free), _scale(views, at.residuals, len(free))
-    return LensFit(model, state.lens, covariance, state.poses, at.residuals, scale)
+    return LensFit(model, state.lens, state.poses, at.residuals, _scale(views, at.residuals, len(free)))
 
 
 def fit_poses(
@@ -283,22 +281,12 @@ def _lens_step(state: _LensState, at: _LensEquations, damping: float, free: Inde
     return _LensState(state.lens + change, state.poses @ se3.exp(turn))
 
 
-def _lens_covariance(at: _LensEquations, free: Index) -> Array:
-    matrix = _schur_complement(at, free, 0.0)[0]
-    out = np.zeros((9, 9))
-    try:
-        out[np.ix_(free, free)] = np.linalg.inv((matrix + matrix.T) / 2)
-    except np.linalg.LinAlgError:
-        out[free, free] = np.inf
-    return out
-
-
 def fit_given_lens(views: BoardViews, lens: Array) -> LensFit:
     """One camera's views with a given lens (9,); its model is the simplest that has its non-zero parameters."""
     f = np.full(len(views), float(np.sqrt(lens[0] * lens[1])))
     camera_from_board, residuals = fit_poses(views, lens, poses(homographies(views), f))
     model = next(name for name, free in MODELS.items() if not lens[np.setdiff1d(np.arange(9), free)].any())
-    return LensFit(model, lens, np.zeros((9, 9)), camera_from_board, residuals, _scale(views, residuals, 0))
+    return LensFit(model, lens, camera_from_board, residuals, _scale(views, residuals, 0))
 
 
 def _scale(views: BoardViews, residuals: Array, free: int) -> float:
