@@ -114,6 +114,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench live --minutes 0 --stops 0 --kills 6 --seed 21 --scenario data/live/small.toml": (KILLED, STARTED),
     "stillbed bench live --minutes 1 --stops 6": (LIVE, STARTED),
     "stillbed bench live --minutes 60 --stops 6": (LIVE, STARTED),
+    "stillbed bench live --minutes 60 --stops 1 --scenario data/live/small.toml": (LIVE, STARTED),
     "stillbed bench loop": (LOOP, LONG),
     "stillbed bench loop -o OUT": (LOOP, LONG),
     "stillbed bench live --minutes 1 --busy 2 --scenario data/live/small.toml": (f"{LIVE} --busy 1", STARTED),

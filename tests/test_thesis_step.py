@@ -22,12 +22,12 @@ from hardware.bench import recordings as thesis_scenes
 from hardware.bench.subjects import MADE
 from hardware.cli.main import main
 from hardware.files.pose_file import read_poses
-from hardware.offline.track import TRACKING_METHODS
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Roi
 from perception.thesis.camera import Corners, KeyPoints
 from perception.thesis.step import ThesisStep
+from perception.tracking import TRACKING_METHODS
 from tests.slowly import slowly
 from tests.synthetic import WIDE, Motion, frame_sets, patch, write_session
 from tests.worlds import SMALL, write_scenario

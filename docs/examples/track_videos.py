@@ -6,8 +6,9 @@ A session folder holds rig.toml, frames.csv and a video a camera (docs/conventio
 from __future__ import annotations
 
 from hardware.cli.parser import run_script
-from hardware.offline.track import MAP_METHOD, step_by
+from hardware.offline.track import step_by
 from hardware.recording.session_reader import open_session
+from perception.tracking import MAP_METHOD
 
 
 def main(folder: str) -> None:

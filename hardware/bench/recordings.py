@@ -24,7 +24,7 @@ from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.bench.figures import Figure, Target, at_least, at_most, milliseconds
 from hardware.files.images import decode, encode
 from hardware.files.pose_file import PoseWriter, read_poses
-from hardware.offline.track import MAP_METHOD, step_by, tracker
+from hardware.offline.track import step_by, tracker
 from hardware.process.checks import Table
 from hardware.process.clock import ProcessorClock, WallClock
 from hardware.recording.session_reader import open_session
@@ -37,6 +37,7 @@ from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import Wound, flat, with_wound
 from hardware.simulator.truth import Truth
 from perception.frames import Frame, FrameSet, Roi
+from perception.tracking import MAP_METHOD
 from perception.tracking.step import STAGES
 
 FRAME_RATE = 30.0  # frame sets a second

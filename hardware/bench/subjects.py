@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hardware.offline.track import THESIS_FLOW_METHOD, THESIS_METHOD
+from perception.tracking import THESIS_FLOW_METHOD, THESIS_METHOD
 
 if TYPE_CHECKING:
     from hardware.bench.figures import Figure

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, damage_code, progress_bar, wrong_option
-from hardware.offline.track import MAP_METHOD, TRACKING_METHODS
 from hardware.process.progress import prepare_out
 from perception import named_path
+from perception.tracking import MAP_METHOD, TRACKING_METHODS
 
 
 def add_track(commands: Commands) -> None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 from hardware.process.progress import Progress, ProgressReport, prepare_out
 from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent, step_back
+from perception.tracking import MAP_METHOD, THESIS_METHOD
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -38,12 +39,6 @@ if TYPE_CHECKING:
 
 SETTLING_TIME = 1.0  # s of an earlier run, beyond where its path was placed, that make the map anew
 MAP_PROCESS_NICE = 10  # added to the niceness of the map's process
-MAP_METHOD, THESIS_METHOD, THESIS_FLOW_METHOD = "map", "thesis", "thesis-flow"
-TRACKING_METHODS = {
-    MAP_METHOD: "the pose from all cameras against a map of the surface",
-    THESIS_METHOD: "the thesis's estimator: SIFT and FLANN, median displacement, an axis a camera",
-    THESIS_FLOW_METHOD: "the same with Shi-Tomasi corners and optical flow",
-}
 
 
 class FrameSetStep(Protocol):

@@ -45,7 +45,6 @@ from hardware.arm.profile import BITS_PER_BYTE, MAX_LAG, ArmProfile, placed
 from hardware.arm.protocol import FRAME_LENGTH
 from hardware.files.arm_file import read_arm, tool_from_value
 from hardware.files.rig_file import read_rig
-from hardware.offline.track import MAP_METHOD, THESIS_FLOW_METHOD, THESIS_METHOD
 from hardware.process import checks
 from hardware.process.checks import Table
 from hardware.process.faults import Fault, FaultRunner, check_faults, faults_from_texts
@@ -57,6 +56,7 @@ from hardware.simulator.nozzle_summary import RunLimits, limits_from_table
 from hardware.simulator.scenario_tables import sensor_from_table
 from hardware.simulator.scene.appearance import Sensor
 from hardware.simulator.scene.fields import FRESH_ASPECT, Gel
+from perception.tracking import MAP_METHOD, THESIS_FLOW_METHOD, THESIS_METHOD
 from planning.kinematics import SimpleArm
 from planning.laid_beads import beads_between_looks
 

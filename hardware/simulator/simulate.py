@@ -32,7 +32,7 @@ from hardware.arm.profile import in_step
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import read_path
 from hardware.files.pose_file import read_poses
-from hardware.offline.track import MAP_METHOD, FrameSetStep, step_by
+from hardware.offline.track import FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import Progress, open_in_browser, prepare_out
@@ -53,6 +53,7 @@ from hardware.simulator.scene.shape import Shape
 from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_deformation
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, Roi
+from perception.tracking import MAP_METHOD
 from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
 from planning.laid_beads import with_looks
 from planning.material import is_metered
