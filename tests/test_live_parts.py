@@ -279,6 +279,27 @@ def test_pictures_of_any_size_arrive_bit_by_bit_and_in_order(
         assert np.array_equal(one, other)
 
 
+def test_a_sender_that_a_signal_interrupts_goes_on_where_it_was() -> None:
+    handler = signal.signal(signal.SIGUSR1, lambda number, frame: None)
+    ours, theirs = Pipe(duplex=False)
+    box, found = RecorderSender(theirs), list[Entry]()
+    try:
+        box.put(unencoded(0.0, *(image(0, number) for number in range(100))))
+        for _ in range(3):  # the pipe holds a fraction of it, so the sender waits
+            time.sleep(0.1)
+            signal.pthread_kill(box._thread.ident or 0, signal.SIGUSR1)
+        reader = threading.Thread(target=lambda: found.extend(_taken(RecorderReceiver(ours))))
+        reader.start()
+        box.close()
+        reader.join(10)
+    finally:
+        signal.signal(signal.SIGUSR1, handler)
+    assert [len(entry.frames) for entry in found if isinstance(entry, SetEntry)] == [100]
+    for entry in found:
+        assert isinstance(entry, SetEntry)
+        assert all(np.array_equal(frame.image, image(0, number)) for number, frame in enumerate(entry.frames))
+
+
 def test_raw_pixels_are_recorded_exactly_also_those_that_came_before_the_rig(tmp_path: Path) -> None:
     ours, theirs = Pipe(duplex=False)
     kept = LiveSettings(record=tmp_path / "run.mcap", arm="virtual", trace=False, jpeg_quality=0)

@@ -39,3 +39,9 @@ def test_the_check_can_fail() -> None:
 
 def test_replay_loads_no_images_before_it_has_a_session() -> None:
     assert HEAVY.isdisjoint(loaded("import hardware.offline.replay, sys; print(*sys.modules)"))
+
+
+def test_a_command_line_without_a_command_loads_nothing_that_its_help_does_not_say() -> None:
+    modules = loaded("import hardware.cli.main, sys; print(*sys.modules)")
+    late = {"numpy", "importlib.metadata", "concurrent.futures", "statistics", "tomllib"}
+    assert "hardware.cli.main" in modules and late.isdisjoint(modules)

@@ -20,7 +20,7 @@ from estimation import se3
 from estimation.observations import Observations
 from estimation.pose_solver import PoseFit
 from estimation.runtime import compiled, contiguous
-from estimation.se3 import Array, Index, Mask
+from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceMap, Warp, bells, farthest_points
 
 CONTROL_POINTS = 12
@@ -293,34 +293,6 @@ def displacement_sums(
                 for b in range(3):
                     normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
     return normal, right, square, views
-
-
-@compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
-def landmark_sights(
-    cameras: int,
-    landmarks: int,
-    camera: Index,
-    track: Index,
-    jacobian: Array,
-    residual: Array,
-    agrees: Mask,
-    near: float,
-) -> tuple[Mask, Mask]:
-    """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
-
-    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm from the place, at which a
-    landmark is there though it does not agree.
-    """
-    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
-    for i in range(len(camera)):
-        away, by_point = 0.0, 0.0
-        for k in range(2):
-            away += residual[i, k] * residual[i, k]
-            for b in range(3):
-                by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
-        seen[camera[i], track[i]] = True
-        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
-    return found, seen
 
 
 @compiled("Tuple((f8[:,:,::1], f8[:,:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1])")

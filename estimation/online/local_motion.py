@@ -20,11 +20,11 @@ import numpy as np
 
 from estimation import se3
 from estimation.observations import Observations
-from estimation.online.deformation import displacement_sums, landmark_sights
+from estimation.online.deformation import displacement_sums
 from estimation.online.fit import FrameFit, solve_symmetric3, unusual_displacements
 from estimation.pose_solver import GATE
-from estimation.runtime import contiguous, median
-from estimation.se3 import Array, Mask
+from estimation.runtime import compiled, contiguous, median
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import LocalError, SurfaceMap, bells, farthest_points
 
 BELL_SIGMA_MM = 6.0  # of a bell, at least: about a dozen landmarks of a dense map, and a fold of the skin
@@ -91,10 +91,7 @@ class LocalMotion:
         self._usual, self._learned = np.zeros(0), np.zeros(0)  # per bell: mean chi square per axis, and looks
         self._moving = np.zeros(0, bool)  # per bell
         self._span = REGION_SPAN_MM if region else PICTURE_SPAN_MM
-        self._anchors, self._near = (
-            np.zeros((0, 3)),
-            np.zeros((0, 0)),
-        )  # (S, 3) mm, and (S, N) whose landmarks are whose
+        self._anchors, self._near = np.zeros((0, 3)), np.zeros((0, 0))  # (S, 3) mm, and (S, N) whose landmark is whose
         self._gate = 0.1  # mm, at which the last fit took landmarks for outliers
         self._support = SupportedPlaces(cameras)
 
@@ -374,3 +371,30 @@ def bell_centres(points: Array, centres: Array) -> Array:
         chosen.append(points[int(np.argmax(away))])
         away = np.minimum(away, np.linalg.norm(points - chosen[-1], axis=1))
     return np.array(chosen).reshape(-1, 3)
+
+
+@compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
+def landmark_sights(
+    cameras: int,
+    landmarks: int,
+    camera: Index,
+    track: Index,
+    jacobian: Array,
+    residual: Array,
+    agrees: Mask,
+    near: float,
+) -> tuple[Mask, Mask]:
+    """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
+
+    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,), or near, mm, to where it should be.
+    """
+    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
+    for i in range(len(camera)):
+        away, by_point = 0.0, 0.0
+        for k in range(2):
+            away += residual[i, k] * residual[i, k]
+            for b in range(3):
+                by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
+        seen[camera[i], track[i]] = True
+        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
+    return found, seen

@@ -22,7 +22,6 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -143,6 +142,8 @@ def own_interval(between: Sequence[float]) -> float:
     """
     if not between:
         return math.nan
+    from statistics import median  # which a command line does not need for its help
+
     least = sorted(between)[len(between) // 4]  # a quarter came one after the other, or nothing can be told
     return median(each / max(round(each / least), 1) for each in between) if least > 0 else math.nan
 

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -274,6 +273,8 @@ def content_of(file: Path) -> bytes:
 
     Files that cannot be read are left out: whoever renders the scenario says so.
     """
+    import tomllib  # which a command line does not need for its help
+
     parts = [file.read_bytes()]
     with suppress(ValueError):
         for name in _texts(tomllib.loads(parts[0].decode("utf-8-sig"))):
