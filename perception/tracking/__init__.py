@@ -1,9 +1,9 @@
 """The tracking step: one frame set in, one surface pose out; and tracks found anew once a motion is known."""
 
 __all__ = [
-    *("MAP_METHOD", "THESIS_FLOW_METHOD", "THESIS_METHOD", "TRACKING_METHODS"),
-    *("reobservation", "step", "wound_area", "wound_step"),
-]
+    "MAP_METHOD", "THESIS_FLOW_METHOD", "THESIS_METHOD", "TRACKING_METHODS",
+    "reobservation", "step", "wound_area", "wound_step",
+]  # fmt: skip
 
 MAP_METHOD, THESIS_METHOD, THESIS_FLOW_METHOD = "map", "thesis", "thesis-flow"
 TRACKING_METHODS = {
