@@ -105,6 +105,7 @@ INSTEAD = {  # (what is run in its place, why)
         "python -m tests.campaigns estimator --soak 0.001 --maps seen",
         LONG,
     ),
+    "python -m tests.campaigns fill": ("python -m tests.campaigns fill --count 2", LONG),
     "python -m tests.campaigns fill CSV ...": ("python -m tests.campaigns fill contour.csv --count 2", LONG),
     "python -m tests.campaigns wounds": ("python -m tests.campaigns wounds --count 1", LONG),
     "stillbed bench latency": ("stillbed bench latency sessions/monday", LONG),

@@ -386,7 +386,7 @@ def landmark_sights(
 ) -> tuple[Mask, Mask]:
     """Which landmarks each camera (C, L) has found where the pose puts them, and has found at all.
 
-    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,), or near, mm, to where it should be.
+    camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm off that count as found.
     """
     found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
     for i in range(len(camera)):

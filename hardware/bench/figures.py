@@ -57,7 +57,6 @@ def at_least(value: float) -> Target:
 
 
 CONSISTENT_NEES = Target(0.8, 1.25)  # squared error by the stated covariance, per degree of freedom
-INSIDE_95 = Target(0.93, 0.97)  # share of errors inside their 95 % intervals
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from estimation.rig import Camera, Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import FollowResult, Mapping, follow, follow_steps
 from estimation.synthetic.world import BASE_FROM_REST, World, arc_rig, synthetic_world
-from hardware.bench.figures import CONSISTENT_NEES, INSIDE_95, Figure, Target, at_least, at_most, rms, with_progress
+from hardware.bench.figures import CONSISTENT_NEES, Figure, Target, at_least, at_most, rms, with_progress
 from hardware.process.clock import CpuClock
 from hardware.simulator.scene.appearance import Appearance
 from hardware.simulator.scene.scene import Scene, rois
@@ -55,6 +55,7 @@ class TrackScene:
 
 SYNC_ERROR, ASYNC_ERROR = at_most(0.03), at_most(0.1)  # mm, with and without synchronised exposures
 HALF_OFFSETS = {"offsets": (0.0, HALF_PERIOD, -HALF_PERIOD)}
+INSIDE_95 = Target(0.93, 0.97)  # share of errors inside their 95 % intervals
 CLEAN_MOVEMENTS = "still", "breathing", "irregular", "shaker", "steps", "turns", "sway", "lively"
 TRACK_SCENES = (
     *(TrackScene(f"{movement}, clean", movement, {}, SYNC_ERROR, True) for movement in CLEAN_MOVEMENTS),
