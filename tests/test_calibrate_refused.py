@@ -34,7 +34,7 @@ Change = Callable[[Image], Image]
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return rendered(tmp_path_factory.mktemp("board") / "session", instants=12)
+    return rendered(tmp_path_factory.mktemp("board") / "session", instants=10)
 
 
 @pytest.fixture
@@ -121,13 +121,13 @@ def test_two_cameras_that_are_swapped_are_named(session: Path, refused: Refused)
 
 def test_a_truncated_recording_is_named(session: Path, refused: Refused) -> None:
     sorted((session / "b").glob("*.png"))[-1].unlink()
-    refused("number of frames of camera 'b' = 12, allowed 11")
+    refused("number of frames of camera 'b' = 10, allowed 9")
 
 
 def test_a_board_that_most_pictures_do_not_show_is_not_taken_for_another(session: Path, refused: Refused) -> None:
     for path in sorted((session / "b").glob("*.png"))[4:]:
         cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 60, (480, 640)).astype(np.uint8))
-    refused("camera b: pictures that show the board = 4, allowed .* it has 12 pictures: the others do not show it")
+    refused("camera b: pictures that show the board = 4, allowed .* it has 10 pictures: the others do not show it")
 
 
 def test_too_few_pictures_are_named(tmp_path: Path, session: Path, refused: Refused) -> None:

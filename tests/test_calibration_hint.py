@@ -96,7 +96,7 @@ def test_a_mirrored_camera_is_never_missed_in_silence() -> None:
 
 
 def test_no_pose_is_given_by_mirrored_pictures_alone() -> None:
-    poses = followed(((0, 1, 2), "mirrored"), 12)
+    poses = followed(((0, 1, 2), "mirrored"))
     assert TrackState.TRACKING not in {p.state for p in poses} and poses[-1].state is TrackState.INITIALISING
     assert "all cameras look mirrored" in poses[-1].reason
 

@@ -154,7 +154,7 @@ def test_a_window_that_is_rebuilt_is_told_for_as_long_as_a_fault_is() -> None:
 def test_no_state_but_tracking_is_without_a_reason() -> None:
     estimator, draw = begun(breathing), np.random.default_rng(4)
     seen_states = set()
-    for i, t in enumerate(stamps(10.0)):
+    for i, t in enumerate(stamps(7.0)):
         kind = draw.integers(0, 6) if i // 30 % 2 else 5
         cameras = [(), (0,), (0, 1), (0, 1, 2), (2,), (0, 1, 2)][kind]
         if 150 <= i < 180:

@@ -127,8 +127,8 @@ def test_in_a_pause_the_needle_goes_aside_when_somebody_looks_and_lays_the_rest_
     printed, aside, axes = [], [], CLOSE.home
     for k in range(6000):
         now = START + k * TICK
-        step.paused = 140 <= k < 1400
-        step.aside = asked <= k < 1200
+        step.paused = 140 <= k < 800
+        step.aside = asked <= k < 700
         command = step(pose_at(still, now), now)
         if isinstance(command, Move):
             axes = command.axes

@@ -34,7 +34,7 @@ from tests.worlds import Heard, world_of, write_scenario
 ROOT = Path(__file__).parents[1]
 BREATHING = [{"kind": "breathing", "amplitude_mm": 4.0, "rate_hz": 0.25}]
 ANSWERING = {"arm": {"file": "arm.toml", "replies": "stream"}}
-SECONDS = 3.5
+SECONDS = 3.0
 FAULTS = {  # name: faults of the run, and what its events or holds say of them
     "stopped and resumed": ([], "by the operator"),
     "a recall": (["arm stall 400ms at 1.5s"], "called back"),

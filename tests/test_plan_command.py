@@ -28,7 +28,6 @@ from hardware.plan.order import (
     SETTING_RANGES,
     PlanRequest,
     PlanSettings,
-    example_scan,
     in_mm,
     order_of,
     subject_of,
@@ -89,7 +88,7 @@ def test_a_contour_becomes_a_path_with_everything_beside_it(tmp_path: Path, caps
 
 
 def test_what_was_repaired_is_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    vertices, triangles = example_scan("forearm")
+    vertices, triangles = scan_of()
     write_ply(tmp_path / "scan.ply", vertices, np.vstack([triangles, triangles[:1]]))
     out = tmp_path / "path.csv"
     assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(out), "--bead", "2", "--no-pictures"]) == 0

@@ -171,19 +171,19 @@ def test_the_speed_of_each_checkpoint_is_its_way_there() -> None:
 
 def test_an_outage_is_braked_held_and_resumed_where_it_stopped() -> None:
     def seen() -> Iterable[tuple[float, SurfacePose | None]]:
-        for now, pose in exact(breathing, 22):
-            lost = 18.0 <= now < 19.0
+        for now, pose in exact(breathing, 16):
+            lost = 12.0 <= now < 13.0
             yield now, replace(pose, state=TrackState.LOST, reason="covered by a hand") if lost else pose
 
-    result = run(raster(), seen())
+    result = run(raster(), seen(), arm=CLOSE)
     assert result.reasons == {"surface is LOST: covered by a hand", "path finished"}
     assert over_limit(result.axes, LIMITS) <= 1
     stamps = np.array([c.stamp for c in result.commands])
-    out = (stamps >= 18.0) & (stamps < 19.0)
+    out = (stamps >= 12.0) & (stamps < 13.0)
     assert not extruding(result)[out].any()
     braking = sum(isinstance(c, Move) for c, o in zip(result.commands, out, strict=True) if o)
     assert 0 < braking <= 0.2 / TICK
-    before, after = result.places[stamps < 18.0][-1], result.places[stamps >= 19.0]
+    before, after = result.places[stamps < 12.0][-1], result.places[stamps >= 13.0]
     assert (result.places[out] == before).all()
     assert 0 < before < 40
     assert after[-1] == pytest.approx(40.0)
@@ -194,12 +194,12 @@ def test_an_outage_is_braked_held_and_resumed_where_it_stopped() -> None:
 
 @pytest.mark.parametrize("motion", [breathing, *slowly(still)])
 def test_one_pose_that_is_worth_nothing_costs_a_fifth_of_a_second(motion: Motion) -> None:
-    seen = ((now, None if abs(now - 18.0) < TICK / 2 else pose) for now, pose in exact(motion, 9))
-    result = run(raster(), seen)
+    seen = ((now, None if abs(now - 12.0) < TICK / 2 else pose) for now, pose in exact(motion, 3))
+    result = run(raster(), seen, arm=CLOSE)
     stamps, printing = np.array([c.stamp for c in result.commands]), extruding(result)
-    assert printing[stamps < 18.0 - TICK / 2][-1] and not printing[abs(stamps - 18.0) < TICK / 2].any()
-    assert stamps[printing & (stamps > 18.0)][0] <= 18.2 + TICK / 2
-    off = distance_to(tips(result, motion)[printing & (stamps > 18.0)], raster())
+    assert printing[stamps < 12.0 - TICK / 2][-1] and not printing[abs(stamps - 12.0) < TICK / 2].any()
+    assert stamps[printing & (stamps > 12.0)][0] <= 12.2 + TICK / 2
+    off = distance_to(tips(result, motion)[printing & (stamps > 12.0)], raster())
     assert off.max() < 0.06  # mm, as in a whole print: it is there when it prints
     assert over_limit(result.axes, LIMITS) <= 1
 
@@ -208,39 +208,39 @@ def test_one_pose_that_is_worth_nothing_costs_a_fifth_of_a_second(motion: Motion
 def test_what_a_pose_lacks_is_braked_for_before_the_guard_would_refuse(lacks: str) -> None:
     def seen() -> Iterable[tuple[float, SurfacePose]]:
         last = pose_at(breathing, 10.0)
-        for now, pose in exact(breathing, 9):
-            gone = now - 16.0
+        for now, pose in exact(breathing, 6):
+            gone = now - 13.0
             if not 0 < gone < 1:
                 last = pose
             worse = 0.7 * max(gone, 0.0) if gone < 1 else 0.0  # mm, over a second
             covariance = pose.covariance + worse**2 * np.diag([0, 0, 0, 1, 0, 0])
             yield now, last if lacks == "age" else replace(pose, covariance=covariance)
 
-    result = run(raster(), seen())  # where the guard refuses nothing
+    result = run(raster(), seen(), arm=CLOSE)  # where the guard refuses nothing
     stamps, printing = np.array([c.stamp for c in result.commands]), extruding(result)
-    assert printing[(stamps > 15.5) & (stamps <= 16.0)].all() and printing[stamps > 17.0].any()
-    assert not printing[(stamps > 16.75) & (stamps < 17.0)].any()
+    assert printing[(stamps > 12.5) & (stamps <= 13.0)].all() and printing[stamps > 14.0].any()
+    assert not printing[(stamps > 13.75) & (stamps < 14.0)].any()
     assert any(("old" if lacks == "age" else "is known to") in reason for reason in result.reasons)
 
 
 def test_a_surface_that_jumps_is_found_again_before_printing_goes_on() -> None:
     def jumping(t: float) -> Array:
-        return REST @ se3.exp([0, 0, 0, 0, 0, 0 if t < 18.0 else -4.0])
+        return REST @ se3.exp([0, 0, 0, 0, 0, 0 if t < 12.0 else -4.0])
 
     path = raster()
-    stamps = 10 + TICK * np.arange(900)
-    result = run(path, [(t, replace(pose_at(jumping, t), twist=np.zeros(6))) for t in stamps.tolist()])
+    stamps = 10 + TICK * np.arange(700)
+    result = run(path, [(t, replace(pose_at(jumping, t), twist=np.zeros(6))) for t in stamps.tolist()], arm=CLOSE)
     printing, where = extruding(result), tips(result, jumping)
-    assert printing[stamps < 18.0 - TICK].any()
+    assert printing[stamps < 12.0 - TICK].any()
     assert result.reasons == {"path finished"}
     assert over_limit(result.axes, LIMITS) <= 1
-    foreseen = ~((stamps < 18.0) & (stamps + TICK >= 18.0))  # not the tick during which it jumps
+    foreseen = ~((stamps < 12.0) & (stamps + TICK >= 12.0))  # not the tick during which it jumps
     assert distance_to(where[printing & foreseen], path).max() <= LIMITS.on_path
     printed = result.places[printing]
     assert printed[-1] == pytest.approx(40.0) and (np.diff(printed) >= 0).all()
     assert np.diff(printed, prepend=0).max() < 0.25  # no part of the path was passed without printing
-    back = stamps[printing & (stamps >= 18.0)][0]
-    assert 18.1 < back < 21.5  # up to 10 mm, and down again at 5 mm/s
+    back = stamps[printing & (stamps >= 12.0)][0]
+    assert 12.1 < back < 15.5  # up to 10 mm, and down again at 5 mm/s
 
 
 @settings(max_examples=2)

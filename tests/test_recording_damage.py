@@ -22,6 +22,7 @@ from estimation.errors import InputError, StillbedError
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.cli.main import main
 from hardware.files.arm_file import write_arm
+from hardware.files.mesh_file import write_ply
 from hardware.files.rig_file import write_board
 from hardware.live.prepared import rig_from_session
 from hardware.offline.convert import import_folder
@@ -35,6 +36,7 @@ from tests.board_session import BOARD, rendered
 from tests.recorded import whole_recording, write_frames
 from tests.session_files import image, make_folder, rig, stamps
 from tests.started import ROOT
+from tests.wounds import scan_of
 
 SQUARE = ROOT / "data" / "paths" / "square_10mm.csv"
 
@@ -268,7 +270,8 @@ def test_a_plan_laid_into_a_damaged_recording_and_masks_of_one_say_so(
 ) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[:-100])
-    plan = ["plan", "--example", "forearm", "-o", str(tmp_path / "path.csv"), "--no-pictures", "--bead", "2"]
+    write_ply(tmp_path / "scan.ply", *scan_of())
+    plan = ["plan", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "path.csv"), "--no-pictures", "--bead", "2"]
     assert main([*plan, "--session", str(cut)]) == 1
     told = f"The recording is damaged: {open_session(cut).damage}.\n"
     assert capsys.readouterr().out.endswith(told)
