@@ -431,7 +431,10 @@ def test_cameras_of_too_few_pixels_tell_nothing_and_end_nothing(size: tuple[int,
     assert all(not look.laid.clogs and np.isnan(look.laid.share).all() for look in done)
 
 
-@pytest.mark.parametrize(("size", "found"), [((640, 360), True), ((320, 180), True), ((96, 54), False)])
+@pytest.mark.parametrize(
+    ("size", "found"),
+    [((320, 180), True), ((96, 54), False), pytest.param((640, 360), True, marks=pytest.mark.slow)],
+)
 def test_relief_is_what_pictures_resolve(size: tuple[int, int], found: bool) -> None:
     rig, scene = (
         arc_rig(focal=0.86 * size[0], size=size),

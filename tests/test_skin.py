@@ -21,6 +21,7 @@ from planning.layers.repair import repair_mesh
 from planning.layers.skin import bent_base, depressions, restored_skin, skin_cells
 from planning.layers.wound import find_wound
 from tests.campaigns.wounds import LIMBS, CarvedWound, carve, score_wound, tube
+from tests.slowly import slowly
 
 
 def ring_of(height: object, inner: float, outer: float, noise: float, seed: int = 0) -> Array:
@@ -103,7 +104,7 @@ def thigh(seed: int) -> CarvedWound:
     return carve(tube(*LIMBS["thigh"]), np.random.default_rng([7, seed]))
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *slowly(1)])
 def test_a_carved_wound_is_found_and_its_skin_restored_better_than_by_a_thin_plate(seed: int) -> None:
     wound = thigh(seed)
     score, why = score_wound(wound, None)
