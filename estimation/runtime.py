@@ -25,18 +25,19 @@ TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # glibc's numbers of the
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
-def compiled(signature: str, reordered: bool = False) -> Callable[[Function], Function]:
+def compiled(signature: str, reordered: bool = False, inlined: bool = False) -> Callable[[Function], Function]:
     """Compile a function for the given types; arrays must be contiguous and writable, as new ones are.
 
     reordered: long sums may be taken several terms at a time, which is many times faster. Runs on one machine give the
     same bits; another kind of processor may round otherwise.
+    inlined: its code stands wherever it is called, which is several times faster for a few operations in a loop.
     """
 
     from numba import njit  # half a second, which processes without such loops need not spend
 
     def decorate(function: Function) -> Function:
         fast = REORDERED_SUMS if reordered else False
-        return cast(Function, njit(signature, cache=True, nogil=True, error_model="numpy", fastmath=fast)(function))
+        return cast(Function, njit(signature, cache=True, nogil=True, error_model="numpy", fastmath=fast, forceinline=inlined)(function))
 
     return decorate
 

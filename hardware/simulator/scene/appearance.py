@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from estimation.errors import InputError
@@ -144,51 +143,21 @@ def mirror_slopes(rays: tuple[Field, Field, Field], towards: Array) -> Field:
     return np.asarray(np.dstack(out), np.float32)
 
 
-def surface_light(
-    colour: NDArray[np.float32],
-    relief: NDArray[np.float32],
-    mirrors: Field,
-    passed: Field | None,
-    towards: Array,
-    lamps: tuple[Lamp, Lamp],
-    ambient: float,
-) -> NDArray[np.float32]:
-    """Light (H, W, 4) and opacity: linear BGR times opacity, of a texture's colour and relief at (H, W) places.
+def lamp_table(lamps: tuple[Lamp, Lamp], towards: Array, ambient: float) -> tuple[Field, Field]:
+    """(2, 10) the lamps and (7,) the room, as `ray_kernels.shade` takes them; towards: (2, 3), grid frame.
 
-    mirrors: as `mirror_slopes` gives. passed: (H, W, 2) share of each lamp's light that arrives; None: all of it.
-    towards: (2, 3) the lamps in the grid frame. ambient: irradiance of the room.
+    What a film mirrors is Beckmann's lobe over the square of the slope between surface and mirror, widened by the
+    lamp's own size: one of the wet film and one of dry skin.
     """
-    across, along, gloss, open_sky = cv2.split(relief)
-    *bgr, opacity = cv2.split(colour)
-    mirror = cv2.split(mirrors)
-    shares = None if passed is None else cv2.split(passed)
-    facing = 1 / cv2.sqrt(across * across + along * along + 1)
-    room = open_sky * (0.45 + 0.55 * facing) * np.float32(ambient)
-    wet, dry = gloss * gloss, np.float32(0.3) + gloss
-    lights = [as_field(room * np.float32(AMBIENT_COLOUR[k])) for k in range(3)]
-    glint = 0.06 * wet * room  # the film mirrors the room
-    for k, lamp in enumerate(lamps):
-        if not lamp.strength:
-            continue
-        direction = towards[k].astype(np.float32)
-        cosine = (direction[2] - direction[0] * across - direction[1] * along) * facing
-        arrives = open_sky if shares is None else open_sky * shares[k]
-        for c in range(3):
-            creep = np.float32(SCATTER_WRAP[c])
-            strength = np.float32(lamp.strength * lamp.colour[c] / (1 + SCATTER_WRAP[c]))
-            lights[c] += np.maximum(cosine + creep, 0) * (arrives * strength)
-        du, dv = across - mirror[2 * k], along - mirror[2 * k + 1]
-        square = as_field(du * du + dv * dv)
-        film = _beckmann_lobe(square, WET_ROUGHNESS, WET_REFLECTANCE, lamp) * wet
-        glint += arrives * (film + _beckmann_lobe(square, DRY_ROUGHNESS, DRY_REFLECTANCE, lamp) * dry)
-    glint *= opacity
-    return np.asarray(cv2.merge([*(bgr[c] * lights[c] + glint for c in range(3)), opacity]), np.float32)
-
-
-def _beckmann_lobe(square: Field, rough: float, mirror: float, lamp: Lamp) -> Field:
-    """Beckmann's lobe over the square of the slope between surface and mirror, widened by the lamp's own size."""
-    width = rough**2 + (lamp.spread / 2) ** 2
-    return np.asarray(cv2.exp(square * np.float32(-0.5 / width)) * np.float32(lamp.strength * mirror / (4 * width)))
+    rows = []
+    for lamp, direction in zip(lamps, towards, strict=True):
+        strength = lamp.strength * np.array(lamp.colour) / (1 + np.array(SCATTER_WRAP))
+        row = [*direction, *strength]
+        for rough, mirror in ((WET_ROUGHNESS, WET_REFLECTANCE), (DRY_ROUGHNESS, DRY_REFLECTANCE)):
+            width = rough**2 + (lamp.spread / 2) ** 2
+            row += [-0.5 / width, lamp.strength * mirror / (4 * width)]
+        rows.append(row)
+    return as_field(rows), as_field([*(ambient * c for c in AMBIENT_COLOUR), ambient, *SCATTER_WRAP])
 
 
 CLOTH_TEAL = linear_light([136, 122, 44])
@@ -223,7 +192,10 @@ def weave_texture(shape: Size, texel: float, rng: np.random.Generator) -> tuple[
     return np.asarray(shade, np.float32), np.asarray(0.012 * fibre, np.float32)
 
 
-def opening_distance(x: Field, y: Field, half: tuple[float, float], corner: float = 14.0) -> Field:
+OPENING_CORNER = 14.0  # mm, radius of the opening's corners
+
+
+def opening_distance(x: Field, y: Field, half: tuple[float, float], corner: float = OPENING_CORNER) -> Field:
     """Distance mm outside the rounded opening of half sides `half`, negative inside, at material points x, y."""
     dx, dy = np.abs(x) - (half[0] - corner), np.abs(y) - (half[1] - corner)
     outside = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0)) + np.minimum(np.maximum(dx, dy), 0)

@@ -1,4 +1,4 @@
-"""Camera rays, and where they meet a height field z = Z(x, y)."""
+"""Camera rays, and height fields z = Z(x, y)."""
 
 from __future__ import annotations
 
@@ -11,36 +11,17 @@ from numpy.typing import NDArray
 from estimation.rig import Camera
 from estimation.se3 import Array, inverse
 from hardware.simulator.scene.appearance import Sensor, vignette
-from hardware.simulator.scene.fields import Field, Mask, as_field, gradient, sample
+from hardware.simulator.scene.fields import Field, as_field, gradient
+from hardware.simulator.scene.ray_kernels import CELL_PX, SAMPLES_PER_PIXEL
 from perception.lens import undistort
-
-SEARCH_STEPS = 56  # of the search downwards through all heights
-LOCAL_SEARCH_STEPS = 24  # of a search between near bounds
-NEWTON_ROUNDS = 2  # of Newton's method
-GRAZING_FACING = 0.3  # rays that meet the surface more grazing than this (1: head on) are searched for one by one
-NEWTON_TOLERANCE = 2e-3  # mm that is left over where Newton's method did not come to rest
-GRAZING_REACH = 7  # rays round a grazing one that are searched too: it may hide the surface from them
-BLOCK_WIDTH = 256  # rays
-
-
-class RayLines(NamedTuple):
-    """Rays as lines over the height: at height z mm they stand over node (u + z du, v + z dv). All of one shape."""
-
-    u: Field
-    v: Field
-    du: Field
-    dv: Field
-
-    def nodes(self, z: Field) -> tuple[Field, Field]:
-        """The nodes u, v over which they stand at heights z."""
-        return self.u + z * self.du, self.v + z * self.dv
 
 
 class HeightField(NamedTuple):
-    """A height field (H, W) mm, its slopes a node along u and v, and the heights it keeps within, mm."""
+    """A height field (H, W) mm, and the heights it keeps within, mm."""
 
     height: Field
-    slopes: Field  # (H, W, 2)
+    slopes: Field  # (H, W, 4) a node along u and v, the height again, and nothing: OpenCV is fastest with four
+    smooth_slopes: Field  # (H, W, 4) the same, of means over SMOOTH_NODES
     low: float
     high: float
 
@@ -48,85 +29,13 @@ class HeightField(NamedTuple):
 def height_field(height: Field) -> HeightField:
     """A height field with its slopes."""
     low, high = float(height.min()) - 0.1, float(height.max()) + 0.1
-    return HeightField(height, as_field(np.dstack(gradient(height, 1.0))), low, high)
+    slopes = as_field(np.dstack([*gradient(height, 1.0), height, np.zeros_like(height)]))
+    return HeightField(height, slopes, as_field(cv2.blur(slopes, (SMOOTH_NODES, SMOOTH_NODES))), low, high)
 
 
-def first_hit(relief: HeightField, rays: RayLines, start: Field, odd: Mask, bounds: tuple[Field, Field]) -> Field:
-    """Height z (H, W) mm where each ray first meets the field, which goes on beyond its edge as it is there.
-
-    start: (H, W) mm, near it. odd: (H, W) which rays are searched alone, because the surface there grazes them or hides
-    itself; so are those that turn out to graze it or do not come to rest. Newton's method ends within 1e-4 mm of it.
-    bounds: (h, w) mm below and above which the search need not look, of squares of rays.
-    """
-    z, rest, facing = _newton(relief, rays, start)
-    grazed = facing < GRAZING_FACING
-    if grazed.any():
-        around = np.ones((GRAZING_REACH, GRAZING_REACH), np.uint8)
-        grazed = np.asarray(cv2.dilate(grazed.astype(np.uint8), around), bool)
-    doubt = odd | grazed | ~(np.abs(rest) < NEWTON_TOLERANCE)
-    if doubt.any():
-        doubt &= near_field(relief, rays, start)
-    place = np.nonzero(doubt)
-    if len(place[0]):
-        alone = RayLines(*(as_block(part[place]) for part in rays))
-        times = z.shape[0] // bounds[0].shape[0]
-        low, high = (as_block(b[place[0] // times, place[1] // times]) for b in bounds)
-        searched, _ = search_down(relief, alone, low, high, LOCAL_SEARCH_STEPS)
-        better, left, _ = _newton(relief, alone, searched)
-        z[place] = np.where(np.abs(left) < 10 * NEWTON_TOLERANCE, better, searched).reshape(-1)[: len(place[0])]
-    return z
+SMOOTH_NODES = 9  # nodes over which slopes are smooth
 
 
-def as_block(values: Field) -> Field:
-    """Values (N,) as rows of WIDTH, the last one filled up: OpenCV looks up no more than 32767 rows."""
-    rows = -(-len(values) // BLOCK_WIDTH)
-    return as_field(np.pad(values, (0, rows * BLOCK_WIDTH - len(values)), mode="edge").reshape(rows, BLOCK_WIDTH))
-
-
-def near_field(relief: HeightField, rays: RayLines, z: Field, margin: float = 4.0) -> Mask:
-    """Whether rays stand over the field, or within `margin` nodes of it, at height z."""
-    rows, columns = relief.height.shape
-    u, v = rays.nodes(z)
-    near: Mask = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
-    return near
-
-
-def _newton(relief: HeightField, rays: RayLines, z: Field) -> tuple[Field, Field, Field]:
-    """Heights nearer to the surface than z, what was left over before the last round, mm, and how much rays face it.
-
-    The slope at the start serves all rounds.
-    """
-    slopes = sample(relief.slopes, *rays.nodes(z))
-    facing = 1 - slopes[..., 0] * rays.du - slopes[..., 1] * rays.dv
-    step = 1 / np.maximum(facing, 0.15)
-    for _ in range(NEWTON_ROUNDS):
-        z = as_field(z - (z - sample(relief.height, *rays.nodes(z))) * step)
-    rest = z - sample(relief.height, *rays.nodes(z))
-    return as_field(z - rest * step), rest, facing
-
-
-def search_down(relief: HeightField, rays: RayLines, low: Field, high: Field, steps: int) -> tuple[Field, Field]:
-    """Heights where rays first meet the field, by steps from high to low, and how much it faces them (1: head on)."""
-    step = (high - low) / np.float32(steps - 1)
-    z, above = low, step
-    facing = np.ones(z.shape, np.float32)
-    open_way = np.ones(z.shape, bool)
-    for k in range(steps):
-        level = high - np.float32(k) * step
-        clearance = level - sample(relief.height, *rays.nodes(level))
-        new = (clearance <= 0) & open_way
-        fall = np.maximum(above - clearance, 1e-6)
-        z = as_field(np.where(new, level - step * clearance / fall, z))
-        facing = as_field(np.where(new, fall / step, facing))
-        open_way &= ~new
-        if not open_way.any():
-            break
-        above = clearance
-    return z, facing
-
-
-SAMPLES_PER_PIXEL = 2  # per pixel and axis
-CELL_PX = 8  # px: boxes are whole cells, and what varies slowly is worked out once a cell
 RAY_MARGIN_PX = 3 * CELL_PX  # by which the rays kept reach beyond the box asked for: a moving box is found again
 LENS_NODE_PX = 8  # px between the rays that are traced through the lens; cubic between them, off by less than 1e-5 px
 

@@ -17,6 +17,7 @@ from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.simulator.scene.appearance import Appearance, Sensor, expose
 from hardware.simulator.scene.fields import Field, upsample
+from hardware.simulator.scene.ray_kernels import blend_over
 from hardware.simulator.scene.rays import ImageBox, RenderView, rays_at
 from hardware.simulator.scene.scene import (
     NOZZLE_PARTS,
@@ -170,20 +171,12 @@ def _finished(
 ) -> Image:
     light = cloth.light
     if skin is not None:
-        _blend_over(light, skin.box, skin.light)
+        blend_over(light, skin.light, skin.box.y0, skin.box.x0)
     boxes = part_boxes(now, view)
     if boxes:
         box = whole_box(boxes)
-        _blend_over(light, box, nozzle_picture(now, view, boxes, _behind(box, skin, cloth)))
+        blend_over(light, nozzle_picture(now, view, boxes, _behind(box, skin, cloth)), box.y0, box.x0)
     return expose(light, sensor, view.fall(sensor), now.instant.gain, rng)
-
-
-def _blend_over(light: NDArray[np.float32], box: ImageBox, layer: NDArray[np.float32]) -> None:
-    below = light[box.y0 : box.y1, box.x0 : box.x1]
-    layer = layer[: below.shape[0], : below.shape[1]]
-    b, g, r, opacity = cv2.split(layer)
-    np.multiply(below, cv2.merge([1 - opacity] * 3), out=below)
-    np.add(below, cv2.merge([b, g, r]), out=below)
 
 
 def _behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> NDArray[np.float32]:

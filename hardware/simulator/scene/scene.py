@@ -16,6 +16,7 @@ from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST
+from hardware.simulator.scene import ray_kernels
 from hardware.simulator.scene.appearance import (
     Appearance,
     Drape,
@@ -198,6 +199,9 @@ NOZZLE_PARTS = (
     Frustum(88.0, 96.0, 2.2, 2.2, STEEL, 0.6, True),
 )
 NOZZLE_LENGTH = NOZZLE_PARTS[-1].z1
+NOZZLE_OUTLINE = np.array(  # heights and radii mm; the steps are bridged
+    [(part.z0, part.r0) for part in NOZZLE_PARTS] + [(NOZZLE_LENGTH, NOZZLE_PARTS[-1].r1)], np.float32
+)
 
 XYZ = tuple[Field, Field, Field]  # x, y, z
 
@@ -251,21 +255,10 @@ def passing_light(points: XYZ, nozzle_from_rest: Array, lamp: Lamp) -> Field:
 
     The lamp is a disc: the shadow's edge softens with the distance between the nozzle and what it falls on.
     """
-    x, y, z = points
-    lx, ly, lz = (np.float32(v) for v in nozzle_from_rest[:3, :3] @ lamp.towards)
-    across = max(float(lx * lx + ly * ly), 1e-4)
-    # mm along the ray to where it passes the axis
-    away = as_field(np.maximum(-(x * lx + y * ly) / np.float32(across), 0))
-    height = as_field(np.clip(z + away * lz, 0, NOZZLE_LENGTH))
-    if abs(lz) > 0.2:
-        away = as_field(np.maximum((height - z) / lz, 0))
-    gap = np.hypot(x + away * lx, y + away * ly)
-    gap = np.hypot(gap, z + away * lz - height)
-    soft = np.float32(0.25) + np.float32(lamp.spread) * away
-    ends = np.array([(part.z0, part.r0) for part in NOZZLE_PARTS] + [(NOZZLE_LENGTH, NOZZLE_PARTS[-1].r1)])
-    radius = as_field(np.interp(height, ends[:, 0], ends[:, 1]))  # steps are bridged
-    hidden = np.clip((radius + soft - gap) / (2 * soft), 0, 1) * np.minimum(1, (radius / soft) ** 0.7)
-    return as_field(1 - hidden * hidden * (3 - 2 * hidden))
+    share = np.empty_like(points[2])
+    towards = as_field(nozzle_from_rest[:3, :3] @ lamp.towards)
+    ray_kernels.pass_nozzle(*points, towards, np.float32(lamp.spread), NOZZLE_OUTLINE, share)
+    return share
 
 
 SHADOW_STEP = 0.5  # mm: a needle's shadow is 0.7 mm wide
@@ -283,7 +276,7 @@ class SceneState:
     factors: tuple[float, float]  # by which material lengths x, y are stretched
     lamps: tuple[Lamp, Lamp]
     towards: Array  # (2, 3) the lamps' directions, grid frame
-    shadow: Field | None  # (h, w, 2) share of each lamp's light, nodes SHADOW_STEP apart; None without a nozzle
+    shadow: Field | None  # (h, w, 4) share of each lamp's light, twice, nodes SHADOW_STEP apart; None without a nozzle
 
 
 def scene_state(scene: Scene, instant: WorldState) -> SceneState:
@@ -303,7 +296,8 @@ def scene_state(scene: Scene, instant: WorldState) -> SceneState:
         nozzle_from_base = se3.inverse(instant.base_from_nozzle)
         points = transform_fields(nozzle_from_base @ base_from_grid, x[None], y[:, None], z)
         nozzle_from_rest = nozzle_from_base @ scene.base_from_rest
-        shadow = np.dstack([passing_light(points, nozzle_from_rest, lamp) for lamp in both])
+        passed = [passing_light(points, nozzle_from_rest, lamp) for lamp in both]
+        shadow = np.dstack([*passed, *passed])
     return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, both, towards, shadow)
 
 

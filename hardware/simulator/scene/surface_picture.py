@@ -10,37 +10,35 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.rig import pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.scene.appearance import CLOTH_TEAL, DRAPE_STEP, DRAPE_TEXEL, mirror_slopes, surface_light
-from hardware.simulator.scene.fields import Field, Mask, as_field, block_mean, sample, sample_texture, upsample
-from hardware.simulator.scene.rays import (
-    CELL_PX,
-    GRAZING_FACING,
-    SAMPLES_PER_PIXEL,
-    SEARCH_STEPS,
-    ImageBox,
-    RayLines,
-    Rays,
-    RenderView,
-    as_block,
-    first_hit,
-    near_field,
-    search_down,
+from hardware.simulator.scene import ray_kernels
+from hardware.simulator.scene.appearance import (
+    AT_REST_BEYOND,
+    ATTACHED_WITHIN,
+    CLOTH_TEAL,
+    DRAPE_STEP,
+    DRAPE_TEXEL,
+    OPENING_CORNER,
+    lamp_table,
+    mirror_slopes,
 )
+from hardware.simulator.scene.fields import Field, as_field, block_mean, sample, sample_texture, upsample
+from hardware.simulator.scene.ray_kernels import CELL_PX, CELL_SAMPLES, SAMPLES_PER_PIXEL
+from hardware.simulator.scene.rays import ImageBox, Rays, RenderView
 from hardware.simulator.scene.scene import SHADOW_STEP, SceneState, passing_light, rotate_rays, transform_fields
 
-GRAZING_Z = -0.03  # of a ray's z: those that sink less never meet the shape
-OFF_GRID = -1e5  # a node where nothing is painted
 HEIGHT_MARGIN = np.float32(1.5)  # mm: a wound's rim or wall between two cells reaches no further
 NEIGHBOURS = np.ones((3, 3), np.uint8)
+GRAZING_REACH = np.ones((7, 7), np.uint8)  # rays round a grazing one: it may hide the surface from them
+CELL_ROWS_AT_ONCE = 2  # rows of cells worked on at once: their fields stay in the cache
 COVER_STEP = 4.0  # mm between the points that tell which part of an image the shape covers
-CELL_ROWS_AT_ONCE = 4  # rows of cells worked on at once: their fields stay in the cache
 SMEAR_STEP_PX = 1.5  # px between the instants of one exposure that a pixel holds
 MAX_INSTANTS = 8  # a sample; at more the picture is one smear anyway
-SUBPIXEL_TIMES = np.array([[7, 1], [3, 5]]) / 16  # of the exposure, before and after its middle, by sample of a pixel
+SUBPIXEL_TIMES = as_field([[7, 1], [3, 5]]) / 16  # of the exposure, before and after its middle, by sample of a pixel
 MIN_SMEAR_PX = 0.25  # px: a smear too short to be seen
 
 
@@ -60,86 +58,122 @@ def surface_picture(state: SceneState, view: RenderView) -> SurfacePicture | Non
         return None
     lattice = _lattice(state, view, box)
     light = np.empty((*box.size, 4), np.float32)
-    depth = None if state.shadow is None else np.empty([n * SAMPLES_PER_PIXEL for n in box.size], np.float32)
+    depth = np.empty((0, 0) if state.shadow is None else box.sample_size, np.float32)
     for first in range(0, box.size[0] // CELL_PX, CELL_ROWS_AT_ONCE):
         last = min(first + CELL_ROWS_AT_ONCE, box.size[0] // CELL_PX)
-        rows = slice(first * CELL_PX * SAMPLES_PER_PIXEL, last * CELL_PX * SAMPLES_PER_PIXEL)
-        samples, deep = _strip(state, view, lattice, first, last)
-        light[first * CELL_PX : last * CELL_PX] = block_mean(samples, ((last - first) * CELL_PX, box.size[1]))
-        if depth is not None:
-            depth[rows] = deep
-    return SurfacePicture(box, light, depth)
+        rows = slice(first * CELL_SAMPLES, last * CELL_SAMPLES)
+        _strip(state, view, lattice, first, last, light[first * CELL_PX : last * CELL_PX], depth[rows])
+    return SurfacePicture(box, light, None if state.shadow is None else depth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lattice:
     """What varies slowly, (h, w) at the middles of a box's cells, and the box's rays, (H, W)."""
 
-    grid_from_camera: Array
+    to_nodes: Field
     rays: Rays
     start: Field  # heights mm
-    bounds: tuple[Field, Field]  # heights mm that hold those of the rays around
-    odd: Mask  # where rays must be searched one by one
+    odd: NDArray[np.uint8]  # where rays must be searched one by one
     mirrors: Field  # (h, w, 4) slopes that mirror the lamps
-    speed: Field  # (h, w, 2) mm/s of material points past the rays
+    path: Field  # (h, w, 2) texels by which material points pass the rays during the exposure
     instants: int  # samples before the middle of the exposure, and as many after; 0: in the middle only
 
     def spread(self, cells: Field, first: int, last: int) -> Field:
         """A field of the cells at the samples of the cell rows first to last."""
         low, high = max(first - 1, 0), min(last + 1, len(cells))
-        times = CELL_PX * SAMPLES_PER_PIXEL
-        size = ((high - low) * times, cells.shape[1] * times)
-        return upsample(cells[low:high], size)[(first - low) * times : (last - low) * times]
+        size = ((high - low) * CELL_SAMPLES, cells.shape[1] * CELL_SAMPLES)
+        return upsample(cells[low:high], size)[(first - low) * CELL_SAMPLES : (last - low) * CELL_SAMPLES]
 
 
 def _lattice(state: SceneState, view: RenderView, box: ImageBox) -> _Lattice:
-    grid_from_camera = se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
-    rays = view.rays(box)
-    small = (box.size[0] // CELL_PX, box.size[1] // CELL_PX)
+    to_nodes, rays = _to_nodes(state, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera), view.rays(box)
+    small, relief = (box.size[0] // CELL_PX, box.size[1] // CELL_PX), state.relief
     cells = Rays(*(block_mean(r, small) for r in rays))
-    lines, _ = _ray_lines(state, grid_from_camera, cells)
-    low, high = (np.full(small, v, np.float32) for v in (state.relief.low, state.relief.high))
-    start, facing = search_down(state.relief, lines, low, high, SEARCH_STEPS)
-    lowest, highest = cv2.erode(start, NEIGHBOURS), cv2.dilate(start, NEIGHBOURS)
-    bounds = as_field(lowest) - HEIGHT_MARGIN, as_field(highest) + HEIGHT_MARGIN
-    hard = (facing < GRAZING_FACING) & near_field(state.relief, lines, start, CELL_PX * SAMPLES_PER_PIXEL)
-    odd = np.asarray(cv2.dilate(hard.astype(np.uint8), NEIGHBOURS), bool)
-    directions = rotate_rays(grid_from_camera[:3, :3], *cells)
-    mirrors = mirror_slopes(directions, state.towards)
-    speed = _speed(state, directions, *lines.nodes(start), start)
-    smear = float(np.abs(speed).max()) * state.instant.exposure / (SAMPLES_PER_PIXEL * view.spacing)  # px
+    start, u, v = np.empty((3, *small), np.float32)
+    odd = np.empty(small, np.uint8)
+    bounds = np.float32(relief.low), np.float32(relief.high)
+    ray_kernels.search_cells(to_nodes, *cells, relief.height, *bounds, start, odd, u, v)
+    directions = rotate_rays(to_nodes[:3], *cells)
+    speed, exposure = _speed(state, directions, u, v, start), state.instant.exposure
+    smear = float(np.abs(speed).max()) * exposure / (SAMPLES_PER_PIXEL * view.spacing)  # px
     instants = int(np.clip(np.ceil(smear / SMEAR_STEP_PX / (2 * SUBPIXEL_TIMES.size)), 1, MAX_INSTANTS))
-    instants = instants if smear > MIN_SMEAR_PX else 0
-    return _Lattice(grid_from_camera, rays, start, bounds, odd, mirrors, speed, instants)
+    layers = state.scene.layers
+    path = speed * np.float32(exposure * layers.offsets(layers.level(view.spacing))[0])
+    odd = np.asarray(cv2.dilate(odd, NEIGHBOURS), np.uint8)
+    mirrors = mirror_slopes(directions, state.towards)
+    return _Lattice(to_nodes, rays, start, odd, mirrors, path, instants if smear > MIN_SMEAR_PX else 0)
 
 
-def _strip(state: SceneState, view: RenderView, lattice: _Lattice, first: int, last: int) -> tuple[Field, Field | None]:
-    scene, times = state.scene, CELL_PX * SAMPLES_PER_PIXEL
-    rays = Rays(*(r[first * times : last * times] for r in lattice.rays))
-    lines, sink = _ray_lines(state, lattice.grid_from_camera, rays)
-    odd = np.repeat(np.repeat(lattice.odd[first:last], times, 0), times, 1)
-    bounds = lattice.bounds[0][first:last], lattice.bounds[1][first:last]
-    z = first_hit(state.relief, lines, lattice.spread(lattice.start, first, last), odd, bounds)
-    u, v = lines.nodes(z)  # nodes of material points
-    passed = None
-    if state.shadow is not None:
-        skip = np.float32(max(1, round(SHADOW_STEP / scene.shape.step)))
-        passed = sample(state.shadow, as_field(u / skip), as_field(v / skip))
+def _strip(
+    state: SceneState, view: RenderView, lattice: _Lattice, first: int, last: int, light: Field, depth: Field
+) -> None:
+    """Fill light (H, W, 4) and depth (2H, 2W) of cell rows first to last; depth: of no size when not asked for."""
+    scene = state.scene
+    z, rays = _met(state, lattice, first, last)
     level = scene.layers.level(view.spacing)
     scale, ox, oy = scene.layers.offsets(level)
     to_texels = np.float32(scene.shape.step * scale)
-    tu = u * to_texels + np.float32(ox - scene.shape.size[0] / 2 * scale)
-    tv = v * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
-    speed = lattice.spread(lattice.speed, first, last) if lattice.instants else None
-    colour, relief = _exposed(state, level, tu, tv, speed, lattice.instants)
-    light = colour
+    u = rays[0] * to_texels + np.float32(ox - scene.shape.size[0] / 2 * scale)
+    v = rays[1] * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
+    path = lattice.spread(lattice.path, first, last) if lattice.instants else None
+    colour, relief = _exposed(state, level, u, v, path, lattice.instants)
+    looks = np.float32(max(1, 2 * lattice.instants))
     if scene.look.lit:
         mirrors = lattice.spread(lattice.mirrors, first, last)
-        light = surface_light(colour, relief, mirrors, passed, state.towards, state.lamps, scene.look.ambient)
+        samples = (part.reshape(-1) for part in (colour, relief, mirrors, _passed(state, rays)))
+        ray_kernels.shade(*samples, looks, *lamp_table(state.lamps, state.towards, scene.look.ambient))
+    else:
+        colour /= looks
+    light[:] = block_mean(colour, light.shape[:2])
+    if len(depth):
+        ray_kernels.note_depth(rays, z, lattice.to_nodes[4, 2], colour, depth)
+
+
+def _passed(state: SceneState, rays: Field) -> Field:
+    """Share of each lamp's light, the first two of (H, W, 4), that passes the nozzle to where rays end."""
     if state.shadow is None:
-        return light, None
-    deep = (z - np.float32(lattice.grid_from_camera[2, 3])) * sink
-    return light, as_field(np.where(colour[..., 3] > 0.5, deep, np.inf))
+        return np.ones((*rays.shape[1:], 4), np.float32)
+    skip = np.float32(1 / max(1, round(SHADOW_STEP / state.scene.shape.step)))
+    rows = np.clip([rays[1].min() * skip - 1, rays[1].max() * skip + 2], 0, len(state.shadow)).astype(int)
+    if rows[1] > rows[0] and state.shadow[slice(*rows)].min() == 1:
+        return np.ones((*rays.shape[1:], 4), np.float32)
+    return sample(state.shadow, rays[0] * skip, rays[1] * skip)
+
+
+def _met(state: SceneState, lattice: _Lattice, first: int, last: int) -> tuple[Field, Field]:
+    """Height (H, W) mm at which rays first meet the surface, which goes on beyond its edge as it is there, and rays.
+
+    Newton's method from the cells' heights ends within 1e-4 mm of it; where the surface grazes the rays or hides
+    itself, and where it does not come to rest, they are searched for one by one. rays: (8, H, W), of
+    `ray_kernels.begin_rays`.
+    """
+    relief, places = state.relief, slice(first * CELL_SAMPLES, last * CELL_SAMPLES)
+    x, y = (np.ascontiguousarray(tangents[places]) for tangents in lattice.rays)
+    z = lattice.spread(lattice.start, first, last).copy()
+    rays, doubt = np.empty((8, *z.shape), np.float32), np.empty(z.shape, np.uint8)
+    ray_kernels.begin_rays(lattice.to_nodes, x, y, z, rays)
+    ray_kernels.face_rays(sample(relief.slopes, rays[0], rays[1]), rays, z, doubt)
+    for _ in range(1, ray_kernels.NEWTON_ROUNDS):
+        ray_kernels.step_rays(sample(relief.height, rays[0], rays[1]), rays, z)
+    rest = sample(relief.height, rays[0], rays[1])
+    doubtful = ray_kernels.note_doubt(rest, z, lattice.odd[first:last], doubt)
+    ray_kernels.step_rays(rest, rays, z)
+    if doubtful:
+        doubt |= np.asarray(cv2.dilate((doubt > 1).astype(np.uint8), GRAZING_REACH), np.uint8)
+        above = max(first - 1, 0)
+        around, inner = lattice.start[above : last + 1], slice(first - above, last - above)
+        low, high = (np.ascontiguousarray(f(around, NEIGHBOURS)[inner], np.float32) for f in (cv2.erode, cv2.dilate))
+        how = relief.height, relief.slopes, low - HEIGHT_MARGIN, high + HEIGHT_MARGIN, doubt
+        ray_kernels.search_doubtful(lattice.to_nodes, x, y, *how, z, rays)
+    return z, rays
+
+
+def _to_nodes(state: SceneState, grid_from_camera: Array) -> Field:
+    """(5, 3) how rays become lines over the nodes of material points, as `ray_kernels` takes it."""
+    shape, origin = state.scene.shape, grid_from_camera[:3, 3]
+    per_mm = [1 / (factor * shape.step) for factor in state.factors]
+    lens = [origin[k] * per_mm[k] + shape.size[k] / 2 / shape.step for k in range(2)]
+    return as_field([*grid_from_camera[:3, :3], [*per_mm, 1.0], [*lens, origin[2]]])
 
 
 def surface_box(state: SceneState, view: RenderView) -> ImageBox | None:
@@ -154,25 +188,6 @@ def surface_box(state: SceneState, view: RenderView) -> ImageBox | None:
     return view.clip(pixels.min(0) - 4, pixels.max(0) + 4)
 
 
-def _ray_lines(state: SceneState, grid_from_camera: Array, rays: Rays) -> tuple[RayLines, Field]:
-    """Rays as lines over the nodes of material points, and 1 / their z."""
-    x, y, z = rotate_rays(grid_from_camera[:3, :3], *rays)
-    never = z > GRAZING_Z
-    sink = as_field(1 / np.where(never, np.float32(-1), z))
-    origin = grid_from_camera[:3, 3]
-    shape = state.scene.shape
-    lines = []
-    for k, side in enumerate((x, y)):
-        per_node = np.float32(1 / (state.factors[k] * shape.step))
-        slope = as_field(side * (sink * per_node))
-        first = np.float32(origin[k] * per_node + shape.size[k] / 2 / shape.step)
-        start = as_field(first - np.float32(origin[2]) * slope)
-        if never.any():
-            start[never], slope[never] = OFF_GRID, 0
-        lines.append((start, slope))
-    return RayLines(lines[0][0], lines[1][0], lines[0][1], lines[1][1]), sink
-
-
 def _speed(state: SceneState, directions: tuple[Field, Field, Field], u: Field, v: Field, z: Field) -> Field:
     """Speed (h, w, 2) mm/s at which material points pass rays that meet node u, v at height z, as the surface moves."""
     twist = se3.adjoint(se3.inverse(state.scene.shape.surface_from_grid)) @ state.instant.twist
@@ -180,7 +195,7 @@ def _speed(state: SceneState, directions: tuple[Field, Field, Field], u: Field, 
         return np.zeros((*u.shape, 2), np.float32)
     w, t = twist[:3].astype(np.float32), twist[3:].astype(np.float32)
     shape, factors = state.scene.shape, state.factors
-    slopes = sample(as_field(cv2.blur(state.relief.slopes, (9, 9))), u, v)
+    slopes = sample(state.relief.smooth_slopes, u, v)
     sx, sy = slopes[..., 0] / (shape.step * factors[0]), slopes[..., 1] / (shape.step * factors[1])
     x = (u * shape.step - shape.size[0] / 2) * factors[0]
     y = (v * shape.step - shape.size[1] / 2) * factors[1]
@@ -192,36 +207,33 @@ def _speed(state: SceneState, directions: tuple[Field, Field, Field], u: Field, 
 
 
 def _exposed(
-    state: SceneState, level: int, tu: Field, tv: Field, speed: Field | None, instants: int
+    state: SceneState, level: int, u: Field, v: Field, path: Field | None, instants: int
 ) -> tuple[Field, Field]:
-    """Colour and relief (H, W, 4) at texels tu, tv, each sample at its own part of the exposure; speed: mm/s.
+    """Colour and relief (H, W, 4) at texels u, v, each sample at its own part of the exposure; sums over all looks.
 
     Each sample looks as long before the middle of the exposure as after it, so that a point's picture stays centred.
     """
-    layers, exposure = state.scene.layers, state.instant.exposure
-    sources = layers.colour[level], layers.relief[level]
-    if speed is None:
-        colour, relief = (sample_texture(source, tu, tv) for source in sources)
+    sources = state.scene.layers.colour[level], state.scene.layers.relief[level]
+    if path is None:
+        colour, relief = (sample_texture(source, u, v) for source in sources)
         return colour, relief
-    path = speed * np.float32(exposure * layers.offsets(level)[0])
-    times = np.tile(SUBPIXEL_TIMES.astype(np.float32), (tu.shape[0] // 2, tu.shape[1] // 2))
-    sums = []
+    sums: list[Field] = []
+    moved = np.empty((4, *u.shape), np.float32)
     for k in range(instants):
-        time = times + np.float32(((k + 0.5) / instants - 0.5) / (2 * SUBPIXEL_TIMES.size))
-        du, dv = path[..., 0] * time, path[..., 1] * time
-        for u, v in ((tu - du, tv - dv), (tu + du, tv + dv)):
-            sums.append([sample_texture(source, u, v) for source in sources])
-    colour, relief = (as_field(np.mean(part, axis=0, dtype=np.float32)) for part in zip(*sums, strict=True))
-    return colour, relief
+        ray_kernels.pass_by(u, v, path, SUBPIXEL_TIMES + np.float32(((k + 0.5) / instants - 0.5) / 8), moved)
+        for places in (moved[:2], moved[2:]):
+            looks = [sample_texture(source, *places) for source in sources]
+            sums = [cv2.add(a, b, a) for a, b in zip(sums, looks, strict=True)] if sums else looks
+    return sums[0], sums[1]
 
 
-DRAPE_LATTICE_PX = 8  # px between the rays that are traced
+DRAPE_LATTICE_PX = CELL_PX  # px between the rays that are traced
+DRAPE_ROWS_AT_ONCE = 48  # rows coloured at once: their fields stay in the cache
 DEPTH_STEPS = 20
 SEARCH_LATTICE_PX = 16  # px between the rays that are searched through all depths
 EDGE_DEPTH_STEPS = 8
 DEPTH_MARGIN = np.float32(8.0)  # mm of depth by which the cloth between rays reaches beyond them
 DEPTH_JUMP = 15.0  # mm by which the depth between two rays differs from the mean of theirs where the cloth hides itself
-DRAPE_ROWS_AT_ONCE = 48  # rows coloured at once: their fields stay in the cache
 MAX_DRAPE_HEIGHT = 40.0  # mm above the rest plane: nothing of the cloth is higher
 MIN_DRAPE_HEIGHT = -130.0
 
@@ -234,120 +246,61 @@ class DrapePicture:
     depth: Field  # (h, w) mm along the optical axis, DRAPE_LATTICE_PX apart
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _DrapeRays:
-    """A camera's rays in the moving grid frame and in the grid at rest: origin (3,) and rotation (3, 3) of each."""
-
-    state: SceneState
-    grid_from_camera: Array
-    rest_from_camera: Array
-
-    def material(self, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
-        """Where on the cloth (x, y) and how far above its plane (z), mm, (H, W) each, points at `depth` are.
-
-        The cloth follows the body near the opening and rests far from it; between, it is a mixture of the two.
-        """
-        x, y, z = transform_fields(self.grid_from_camera, rays.x * depth, rays.y * depth, depth)
-        ax, ay, az = transform_fields(self.rest_from_camera, rays.x * depth, rays.y * depth, depth)
-        held = self.state.scene.sheet.held(x, y)
-        flat = np.stack([x / np.float32(self.state.factors[0]), y / np.float32(self.state.factors[1])], -1)
-        z = z - self.state.scene.deformation.lift(flat, self.state.instant.strain).astype(np.float32)
-        x, y = flat[..., 0], flat[..., 1]
-        return ax + held * (x - ax), ay + held * (y - ay), az + held * (z - az)
-
-    def left(self, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
-        """How far above the cloth points at `depth` are, mm, and where on it."""
-        x, y, z = self.material(rays, depth)
-        heights = self.state.scene.sheet.heights
-        u = x / np.float32(DRAPE_STEP) + np.float32((heights.shape[1] - 1) / 2)
-        v = y / np.float32(DRAPE_STEP) + np.float32((heights.shape[0] - 1) / 2)
-        return z - sample(heights, u, v), x, y
-
-
 def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     """The cloth as one camera sees it, the shape taken away."""
-    frames = state.base_from_grid, state.scene.base_from_rest
-    lens_rays = _DrapeRays(state, *(se3.inverse(each) @ view.camera.base_from_camera for each in frames))
-    rays, coarse, m = view.coarse(DRAPE_LATTICE_PX), view.coarse(SEARCH_LATTICE_PX), lens_rays.rest_from_camera
+    rest_from_camera = se3.inverse(state.scene.base_from_rest) @ view.camera.base_from_camera
+    cloth = _cloth(state, view, rest_from_camera), state.scene.sheet.heights
+    rays, coarse, m = view.coarse(DRAPE_LATTICE_PX), view.coarse(SEARCH_LATTICE_PX), rest_from_camera
     sink = np.minimum(m[2, 0] * coarse.x + m[2, 1] * coarse.y + m[2, 2], -0.15)
     near, far = (as_field((height - m[2, 3]) / sink) for height in (MAX_DRAPE_HEIGHT, MIN_DRAPE_HEIGHT))
-    first_depth = _search(lens_rays, coarse, near, far, DEPTH_STEPS)
-    depth, x, y = _refined(lens_rays, rays, upsample(first_depth, (rays.x.shape[0], rays.x.shape[1])))
+    first_depth = np.empty_like(coarse.x)
+    ray_kernels.search_cloth(*cloth, *coarse, near, far, DEPTH_STEPS, first_depth)
+    depth = upsample(first_depth, (rays.x.shape[0], rays.x.shape[1]))
+    at = np.empty((2, *depth.shape), np.float32)
+    ray_kernels.refine_cloth(*cloth, *rays, depth, *at)
     w, h = view.camera.size
-    u, v = (upsample(plane, view.whole.size)[:h, :w] for plane in _texels(state, x, y))
-    key_share = _key_light_share(lens_rays, rays, depth)
-    if key_share is not None:
-        key_share = upsample(key_share, view.whole.size)[:h, :w]
-    _edges(lens_rays, rays, depth, u, v)
-    light, tint = np.empty((h, w, 3), np.float32), CLOTH_TEAL * np.array(state.lamps[0].colour, np.float32)
-    bgr_from_texture, border = np.column_stack([np.eye(3, dtype=np.float32), tint]), cv2.BORDER_REFLECT_101
-    picture = state.scene.sheet.picture
+    planes = *at, _key_light_share(state, view, rays, depth)
+    u, v, share = (np.ascontiguousarray(upsample(plane, view.whole.size)[:h, :w]) for plane in planes)
+    if (edges := _edges(depth)).any():
+        around = np.ones((5, 5), np.uint8)
+        near, far = (as_field(f(depth, around)) for f in (cv2.erode, cv2.dilate))
+        how = near - DEPTH_MARGIN, far + DEPTH_MARGIN, EDGE_DEPTH_STEPS
+        ray_kernels.trace_edges(*cloth, edges, *rays, *how, u, v)
+    light, tint = np.empty((h, w, 3), np.float32), as_field(CLOTH_TEAL * as_field(state.lamps[0].colour))
+    picture, border = state.scene.sheet.picture, cv2.BORDER_REFLECT_101
     for first in range(0, h, DRAPE_ROWS_AT_ONCE):
         rows = slice(first, first + DRAPE_ROWS_AT_ONCE)
         texture = as_field(cv2.remap(picture, u[rows], v[rows], cv2.INTER_LINEAR, borderMode=border))
-        if key_share is not None:
-            texture[..., 3] *= key_share[rows]
-        cv2.transform(texture, bgr_from_texture, light[rows])
+        ray_kernels.light_cloth(texture.reshape(-1), share[rows].reshape(-1), tint, light[rows].reshape(-1))
     return DrapePicture(light, depth)
 
 
-def _texels(state: SceneState, x: Field, y: Field) -> tuple[Field, Field]:
-    rows, columns = state.scene.sheet.picture.shape[:2]
-    scale = np.float32(1 / DRAPE_TEXEL)
-    return x * scale + np.float32((columns - 1) / 2), y * scale + np.float32((rows - 1) / 2)
+def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> Field:
+    """(37,) how the cloth lies before a camera, as `ray_kernels` takes it."""
+    scene, grid_from_camera = state.scene, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
+    bulge = scene.deformation.bulge * state.instant.strain, -1 / (2 * scene.deformation.radius**2)
+    half, rest, held = (0.0, 0.0), -1e6, -1e6 - 1  # without an opening all of it rests
+    if scene.sheet.half is not None:
+        half, rest, held = scene.sheet.half, AT_REST_BEYOND, ATTACHED_WITHIN
+    opening = half[0] - OPENING_CORNER, half[1] - OPENING_CORNER, OPENING_CORNER, rest, 1 / (held - rest)
+    factors = 1 / state.factors[0], 1 / state.factors[1]
+    middle = ((n - 1) / 2 for n in scene.sheet.picture.shape[1::-1])
+    frames = grid_from_camera[:3].ravel(), rest_from_camera[:3].ravel()
+    return as_field([*frames[0], *frames[1], *factors, *bulge, *opening, 1 / DRAPE_STEP, 1 / DRAPE_TEXEL, *middle])
 
 
-def _search(eye: _DrapeRays, rays: Rays, near: Field, far: Field, steps: int) -> Field:
-    """Depth (H, W) mm at which rays first meet the cloth, by equal steps from near to far; far where they never do."""
-    step = (far - near) / np.float32(steps)
-    result, above, open_way = far, np.ones_like(near), np.ones(near.shape, bool)
-    for k in range(steps + 1):
-        depth = near + step * np.float32(k)
-        left, _, _ = eye.left(rays, depth)
-        new = (left <= 0) & open_way
-        result = as_field(np.where(new, depth + step * left / np.maximum(above - left, 1e-6), result))
-        open_way &= ~new
-        above = left
-    return result
-
-
-def _refined(eye: _DrapeRays, rays: Rays, depth: Field) -> tuple[Field, Field, Field]:
-    """Depth and material x, y (H, W) mm after a round of the secant method."""
-    left_last, _, _ = eye.left(rays, depth + np.float32(0.5))
-    left, _, _ = eye.left(rays, depth)
-    fall = 2 * (left_last - left)
-    depth = depth - as_field(np.clip(left / np.where(np.abs(fall) < 0.1, np.float32(-0.5), fall), -15, 15))
-    _, x, y = eye.left(rays, depth)
-    return depth, x, y
-
-
-def _edges(eye: _DrapeRays, rays: Rays, depth: Field, u: Field, v: Field) -> None:
-    """Trace again, one by one, the pixels where the cloth hides itself and the lattice would draw steps.
-
-    u, v: (H, W) columns and rows in the cloth's picture, which are put right.
-    """
+def _edges(depth: Field) -> NDArray[np.uint8]:
+    """The squares of the lattice (h, w) where the cloth hides itself, and what is between them would draw steps."""
     bend = np.array([[1.0, -2.0, 1.0]], np.float32)
     bent = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
-    jump = np.asarray(cv2.dilate((bent > DEPTH_JUMP).astype(np.uint8), np.ones((3, 3), np.uint8)), bool)
-    if not jump.any():
-        return
-    h, w = u.shape
-    place = np.nonzero(np.repeat(np.repeat(jump, DRAPE_LATTICE_PX, 0), DRAPE_LATTICE_PX, 1)[:h, :w])
-    at = [as_block(((p + 0.5) / DRAPE_LATTICE_PX - 0.5).astype(np.float32)) for p in place]
-    alone = Rays(*(sample(r, at[1], at[0]) for r in rays))
-    around = np.ones((5, 5), np.uint8)
-    near, far = (sample(as_field(f(depth, around)), at[1], at[0]) for f in (cv2.erode, cv2.dilate))
-    _, x, y = _refined(eye, alone, _search(eye, alone, near - DEPTH_MARGIN, far + DEPTH_MARGIN, EDGE_DEPTH_STEPS))
-    for into, right in zip((u, v), _texels(eye.state, x, y), strict=True):
-        into[place] = right.reshape(-1)[: len(place[0])]
+    return np.asarray(cv2.dilate((bent > DEPTH_JUMP).astype(np.uint8), NEIGHBOURS), np.uint8)
 
 
-def _key_light_share(eye: _DrapeRays, rays: Rays, depth: Field) -> Field | None:
-    """Share of the key lamp's light that passes the nozzle; None without one."""
-    state = eye.state
+def _key_light_share(state: SceneState, view: RenderView, rays: Rays, depth: Field) -> Field:
+    """Share (h, w) of the key lamp's light that passes the nozzle; all of it without one."""
     if state.instant.base_from_nozzle is None:
-        return None
+        return np.ones_like(depth)
     nozzle_from_base = se3.inverse(state.instant.base_from_nozzle)
-    nozzle_from_camera = nozzle_from_base @ state.base_from_grid @ eye.grid_from_camera
+    nozzle_from_camera = nozzle_from_base @ view.camera.base_from_camera
     points = transform_fields(nozzle_from_camera, rays.x * depth, rays.y * depth, depth)
     return passing_light(points, nozzle_from_base @ state.scene.base_from_rest, state.lamps[0])
