@@ -1,4 +1,4 @@
-"""The loops of rendering, compiled: where rays meet a height field or the cloth, and the light they bring back.
+"""The loops of rendering, compiled: where rays meet a height field, and the light they bring back.
 
 Single precision throughout. Functions return what they find or fill arrays that are given; the interpreter is free
 meanwhile, so that cameras are rendered side by side.
@@ -58,19 +58,21 @@ def _place(at: np.float32, count: int) -> tuple[np.float32, np.float32, np.float
 
 
 @compiled("f4(f4[:,::1], f4, f4)", inlined=True)
-def _height(heights: Field, u: np.float32, v: np.float32) -> np.float32:
+def height_at(heights: Field, u: np.float32, v: np.float32) -> np.float32:
     """The field at column u and row v, bilinear, beyond its edge as it is there."""
     column, left, right = _place(u, heights.shape[1])
     row, upper, lower = _place(v, heights.shape[0])
     i, j = np.uint64(column), np.uint64(row)
     i1, j1 = np.uint64(column + ONE), np.uint64(row + ONE)
     above = left * heights[j, i] + right * heights[j, i1]
-    return upper * above + lower * (left * heights[j1, i] + right * heights[j1, i1])
+    below = left * heights[j1, i] + right * heights[j1, i1]
+    height: np.float32 = upper * above + lower * below
+    return height
 
 
 @compiled("UniTuple(f4, 2)(f4[:,:,::1], f4, f4)", inlined=True)
 def _slopes(field: Field, u: np.float32, v: np.float32) -> tuple[np.float32, np.float32]:
-    """The first two values of a field (H, W, 4), as `_height`."""
+    """The first two values of a field (H, W, 4), as `height_at`."""
     column, left, right = _place(u, field.shape[1])
     row, upper, lower = _place(v, field.shape[0])
     i, j = np.uint64(column), np.uint64(row)
@@ -89,8 +91,8 @@ def _newton(heights: Field, slopes: Field, ray: Line, z: np.float32) -> tuple[np
     facing = ONE - across * du - along * dv
     step = ONE / max(facing, np.float32(0.15))
     for _round in range(NEWTON_ROUNDS):
-        z -= (z - _height(heights, u + z * du, v + z * dv)) * step
-    rest = z - _height(heights, u + z * du, v + z * dv)
+        z -= (z - height_at(heights, u + z * du, v + z * dv)) * step
+    rest = z - height_at(heights, u + z * du, v + z * dv)
     return z - rest * step, rest, facing
 
 
@@ -104,7 +106,7 @@ def _search_down(
     above = step
     for k in range(steps):
         level = high - np.float32(k) * step
-        clearance = level - _height(heights, u + level * du, v + level * dv)
+        clearance = level - height_at(heights, u + level * du, v + level * dv)
         if clearance <= NOTHING:
             fall = max(above - clearance, np.float32(1e-6))
             return level - step * clearance / fall, fall / step
@@ -115,12 +117,8 @@ def _search_down(
 @compiled("b1(f4[:,::1], f4, f4)", inlined=True)
 def _near_field(heights: Field, u: np.float32, v: np.float32) -> bool:
     """Whether a node is on the field or within NEAR_NODES of it."""
-    return (
-        u > -NEAR_NODES
-        and u < np.float32(heights.shape[1]) + NEAR_NODES
-        and v > -NEAR_NODES
-        and v < np.float32(heights.shape[0]) + NEAR_NODES
-    )
+    beyond = max(u - np.float32(heights.shape[1]), v - np.float32(heights.shape[0]), -u, -v)
+    return bool(beyond < NEAR_NODES)
 
 
 @compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4, f4, f4[:,::1], u1[:,::1], f4[:,::1], f4[:,::1])")
@@ -206,7 +204,9 @@ def note_doubt(heights: Field, z: Field, odd: Bytes, doubt: Bytes) -> bool:
     return found
 
 
-@compiled("void(f4[:,::1], f4[:,:], f4[:,:], f4[:,::1], f4[:,:,::1], f4[:,::1], f4[:,::1], u1[:,::1], f4[:,::1], f4[:,:,::1])")
+@compiled(
+    "void(f4[:,::1], f4[:,:], f4[:,:], f4[:,::1], f4[:,:,::1], f4[:,::1], f4[:,::1], u1[:,::1], f4[:,::1], f4[:,:,::1])"
+)
 def search_doubtful(
     m: Field,
     x: Field,
@@ -295,13 +295,17 @@ def shade(
         wet, dry = gloss * gloss, np.float32(0.3) + gloss
         arrive0, arrive1 = sky * passed[4 * k], sky * passed[4 * k + 1]
         cosine0, cosine1 = (z0 - x0 * across - y0 * along) * facing, (z1 - x1 * across - y1 * along) * facing
-        u0, v0, u1, v1 = across - mirrors[4 * k], along - mirrors[4 * k + 1], across - mirrors[4 * k + 2], along - mirrors[4 * k + 3]
+        u0, v0, u1, v1 = (
+            across - mirrors[4 * k],
+            along - mirrors[4 * k + 1],
+            across - mirrors[4 * k + 2],
+            along - mirrors[4 * k + 3],
+        )
         square0, square1 = u0 * u0 + v0 * v0, u1 * u1 + v1 * v1
         film0 = _fading(square0 * wet_e0) * wet_s0 * wet + _fading(square0 * dry_e0) * dry_s0 * dry
         film1 = _fading(square1 * wet_e1) * wet_s1 * wet + _fading(square1 * dry_e1) * dry_s1 * dry
-        glint = (
-            (np.float32(0.06) * wet * open_room * mirrored + arrive0 * film0 + arrive1 * film1) * colours[4 * k + 3] * part
-        )
+        glint = np.float32(0.06) * wet * open_room * mirrored + arrive0 * film0 + arrive1 * film1
+        glint *= colours[4 * k + 3] * part
         light_b = open_room * room_b + max(cosine0 + creep_b, NOTHING) * arrive0 * b0
         light_g = open_room * room_g + max(cosine0 + creep_g, NOTHING) * arrive0 * g0
         light_r = open_room * room_r + max(cosine0 + creep_r, NOTHING) * arrive0 * r0
@@ -326,139 +330,6 @@ def note_depth(rays: Field, z: Field, lens: float, light: Field, depth: Field) -
             depth[row, column] = (z[row, column] - lens) * rays[6, row, column] if opaque else np.float32(np.inf)
 
 
-@compiled("UniTuple(f4, 3)(f4[::1], f4[:,::1], f4, f4, f4)", inlined=True)
-def _above_cloth(
-    cloth: Field, heights: Field, x: np.float32, y: np.float32, depth: np.float32
-) -> tuple[np.float32, np.float32, np.float32]:
-    """How far above the cloth the point at `depth` of a ray (x, y, 1) is, mm, and where on it: x, y mm.
-
-    The cloth follows the body near the opening and rests far from it; between, it is a mixture of the two. cloth: (37,)
-    grid_from_camera and rest_from_camera (3, 4); factors of length x, y; lift mm and exponent a mm^2; half sides of the
-    opening less its corners' radius, and that radius; where the cloth rests, and 1 / (where it is held less that); 1 /
-    the step of its nodes, and 1 / that of its
-    picture, and the middle of that, column and row.
-    """
-    a, b = x * depth, y * depth
-    mx = cloth[0] * a + cloth[1] * b + cloth[2] * depth + cloth[3]
-    my = cloth[4] * a + cloth[5] * b + cloth[6] * depth + cloth[7]
-    mz = cloth[8] * a + cloth[9] * b + cloth[10] * depth + cloth[11]
-    rx = cloth[12] * a + cloth[13] * b + cloth[14] * depth + cloth[15]
-    ry = cloth[16] * a + cloth[17] * b + cloth[18] * depth + cloth[19]
-    rz = cloth[20] * a + cloth[21] * b + cloth[22] * depth + cloth[23]
-    dx, dy = abs(mx) - cloth[28], abs(my) - cloth[29]
-    ex, ey = max(dx, NOTHING), max(dy, NOTHING)
-    outside = np.sqrt(ex * ex + ey * ey) + min(max(dx, dy), NOTHING) - cloth[30]
-    t = min(max((outside - cloth[31]) * cloth[32], NOTHING), ONE)
-    held = t * t * (np.float32(3) - np.float32(2) * t)
-    mx, my = mx * cloth[24], my * cloth[25]
-    if cloth[26] != NOTHING:
-        mz -= cloth[26] * np.exp(cloth[27] * (mx * mx + my * my))
-    mx, my, mz = rx + held * (mx - rx), ry + held * (my - ry), rz + held * (mz - rz)
-    u = mx * cloth[33] + HALF * np.float32(heights.shape[1] - 1)
-    v = my * cloth[33] + HALF * np.float32(heights.shape[0] - 1)
-    return mz - _height(heights, u, v), mx, my
-
-
-@compiled("f4(f4[::1], f4[:,::1], f4, f4, f4, f4, i8)", inlined=True)
-def _first_on_cloth(
-    cloth: Field, heights: Field, x: np.float32, y: np.float32, near: np.float32, far: np.float32, steps: int
-) -> np.float32:
-    """Depth mm at which a ray first meets the cloth, by equal steps from near to far; far where it never does."""
-    step, above = (far - near) / np.float32(steps), ONE
-    for k in range(steps + 1):
-        depth = near + step * np.float32(k)
-        left, _, _ = _above_cloth(cloth, heights, x, y, depth)
-        if left <= NOTHING:
-            return depth + step * left / max(above - left, np.float32(1e-6))
-        above = left
-    return far
-
-
-@compiled("UniTuple(f4, 3)(f4[::1], f4[:,::1], f4, f4, f4)", inlined=True)
-def _on_cloth(
-    cloth: Field, heights: Field, x: np.float32, y: np.float32, depth: np.float32
-) -> tuple[np.float32, np.float32, np.float32]:
-    """The depth of a ray after a round of the secant method, and the cloth's x, y mm there."""
-    last, _, _ = _above_cloth(cloth, heights, x, y, depth + HALF)
-    left, _, _ = _above_cloth(cloth, heights, x, y, depth)
-    fall = np.float32(2) * (last - left)
-    if abs(fall) < np.float32(0.1):
-        fall = -HALF
-    depth -= min(max(left / fall, np.float32(-15)), np.float32(15))
-    _, cloth_x, cloth_y = _above_cloth(cloth, heights, x, y, depth)
-    return depth, cloth_x, cloth_y
-
-
-@compiled("void(f4[::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1])")
-def search_cloth(
-    cloth: Field, heights: Field, x: Field, y: Field, near: Field, far: Field, steps: int, depth: Field
-) -> None:
-    """`_first_on_cloth` of rays (H, W)."""
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            bounds = near[row, column], far[row, column]
-            depth[row, column] = _first_on_cloth(
-                cloth, heights, x[row, column], y[row, column], bounds[0], bounds[1], steps
-            )
-
-
-@compiled("void(f4[::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1])")
-def refine_cloth(cloth: Field, heights: Field, x: Field, y: Field, depth: Field, u: Field, v: Field) -> None:
-    """Depth (H, W) mm of rays, refined in place, and the columns u and rows v of the cloth's picture there."""
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            found = _on_cloth(cloth, heights, x[row, column], y[row, column], depth[row, column])
-            depth[row, column] = found[0]
-            u[row, column] = found[1] * cloth[34] + cloth[35]
-            v[row, column] = found[2] * cloth[34] + cloth[36]
-
-
-@compiled(
-    "void(f4[::1], f4[:,::1], u1[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1], f4[:,::1])",
-)
-def trace_edges(
-    cloth: Field,
-    heights: Field,
-    edges: Bytes,
-    x: Field,
-    y: Field,
-    near: Field,
-    far: Field,
-    steps: int,
-    u: Field,
-    v: Field,
-) -> None:
-    """Trace again, one by one, the pixels of those cells (h, w) in which the cloth hides itself.
-
-    x, y: (h, w) rays; near, far: mm of depth that hold the cloth. u, v: (H, W) columns and rows of the cloth's picture.
-    """
-    for j, i in np.ndindex(edges.shape):
-        if not edges[j, i]:
-            continue
-        for row in range(j * CELL_PX, min((j + 1) * CELL_PX, u.shape[0])):
-            at = (np.float32(row) + HALF) / np.float32(CELL_PX) - HALF
-            for column in range(i * CELL_PX, min((i + 1) * CELL_PX, u.shape[1])):
-                along = (np.float32(column) + HALF) / np.float32(CELL_PX) - HALF
-                rx, ry = _height(x, along, at), _height(y, along, at)
-                low, high = _height(near, along, at), _height(far, along, at)
-                depth = _first_on_cloth(cloth, heights, rx, ry, low, high, steps)
-                _, cloth_x, cloth_y = _on_cloth(cloth, heights, rx, ry, depth)
-                u[row, column] = cloth_x * cloth[34] + cloth[35]
-                v[row, column] = cloth_y * cloth[34] + cloth[36]
-
-
-@compiled("void(f4[::1], f4[::1], f4[::1], f4[::1])")
-def light_cloth(texture: Field, share: Field, tint: Field, light: Field) -> None:
-    """The cloth's linear BGR (3 N,) of what is painted on it (4 N,): its fourth part, times the share (N,) of the key
-    lamp's light and the tint BGR, is added to the others."""
-    blue, green, red = tint[0], tint[1], tint[2]
-    for k in range(len(share)):
-        key = texture[4 * k + 3] * share[k]
-        light[3 * k] = texture[4 * k] + key * blue
-        light[3 * k + 1] = texture[4 * k + 1] + key * green
-        light[3 * k + 2] = texture[4 * k + 2] + key * red
-
-
 @compiled("void(f4[:,:,::1], f4[:,:,::1], i8, i8)")
 def blend_over(light: Field, layer: Field, top: int, left: int) -> None:
     """Lay a layer (h, w, 4), BGR times opacity and opacity, over light (H, W, 3), its corner at row and column."""
@@ -468,34 +339,3 @@ def blend_over(light: Field, layer: Field, top: int, left: int) -> None:
             passed = ONE - above[3]
             for c in range(3):
                 below[c] = below[c] * passed + above[c]
-
-
-@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], f4, f4[:,::1], f4[:,::1])")
-def pass_nozzle(x: Field, y: Field, z: Field, lamp: Field, spread: np.float32, outline: Field, share: Field) -> None:
-    """Share (H, W) of a lamp's light that passes the nozzle at points x, y, z mm of its frame.
-
-    lamp: (3,) towards it, unit. spread: rad. outline: (N, 2) heights, rising, and radii mm of the nozzle, of straight
-    pieces between: its steps are bridged.
-    """
-    lx, ly, lz = lamp[0], lamp[1], lamp[2]
-    across = max(lx * lx + ly * ly, np.float32(1e-4))
-    top = outline[len(outline) - 1, 0]
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            px, py, pz = x[row, column], y[row, column], z[row, column]
-            away = max(-(px * lx + py * ly) / across, NOTHING)  # mm along the ray to where it passes the axis
-            height = min(max(pz + away * lz, NOTHING), top)
-            if abs(lz) > np.float32(0.2):
-                away = max((height - pz) / lz, NOTHING)
-            gx, gy, gz = px + away * lx, py + away * ly, pz + away * lz - height
-            gap = np.sqrt(gx * gx + gy * gy + gz * gz)
-            soft = np.float32(0.25) + spread * away
-            k = 1
-            while k < len(outline) - 1 and outline[k, 0] < height:
-                k += 1
-            part = (height - outline[k - 1, 0]) / max(outline[k, 0] - outline[k - 1, 0], np.float32(1e-6))
-            radius = outline[k - 1, 1] + min(max(part, NOTHING), ONE) * (outline[k, 1] - outline[k - 1, 1])
-            hidden = min(max((radius + soft - gap) / (np.float32(2) * soft), NOTHING), ONE)
-            if hidden > NOTHING:
-                hidden *= min(ONE, (radius / soft) ** np.float32(0.7))
-            share[row, column] = ONE - hidden * hidden * (np.float32(3) - np.float32(2) * hidden)

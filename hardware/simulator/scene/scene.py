@@ -1,13 +1,9 @@
-"""A scene, its state at one instant, and the print head in it.
-
-The print head is a needle, its hub, a cartridge and its holder: frustums about one axis.
-"""
+"""A scene, and its state at one instant."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,7 +12,6 @@ from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST
-from hardware.simulator.scene import ray_kernels
 from hardware.simulator.scene.appearance import (
     Appearance,
     Drape,
@@ -26,7 +21,8 @@ from hardware.simulator.scene.appearance import (
     lamps,
     node_axes,
 )
-from hardware.simulator.scene.fields import Field, Gel, Layers, PrintedBeads, as_field, linear_light
+from hardware.simulator.scene.fields import Field, Gel, Layers, PrintedBeads
+from hardware.simulator.scene.nozzle import passing_light
 from hardware.simulator.scene.rays import HeightField, RenderView, height_field
 from hardware.simulator.scene.shape import Deformation, Shape
 from hardware.simulator.scene.textures import draped_heights, half_opening, paint_layers
@@ -165,100 +161,6 @@ class WorldState:
     strain: float = 0.0  # amount of the scene's deformation, 1 as specified
     base_from_nozzle: Array | None = None  # (4, 4) mm, tip at the origin, z back into the tool
     gain: float = 1.0  # of the exposure, 1 is nominal, in linear light
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frustum:
-    """One part of the print head."""
-
-    z0: float  # mm above the tip
-    z1: float  # mm
-    r0: float  # mm, radius at z0
-    r1: float  # mm
-    colour: Field  # linear BGR
-    gloss: float  # 0..1
-    metal: bool  # mirrors the room in its own colour
-
-
-STEEL, PLASTIC, CARTRIDGE, LUER, RING, CAP = (
-    linear_light(bgr)
-    for bgr in ([176, 178, 180], [190, 198, 198], [136, 176, 204], [62, 92, 196], [104, 106, 110], [150, 112, 62])
-)
-NOZZLE_PARTS = (
-    Frustum(0.0, 2.0, 0.32, 0.42, STEEL, 0.8, True),
-    Frustum(2.0, 12.7, 0.42, 0.42, STEEL, 0.8, True),
-    Frustum(12.7, 13.6, 0.5, 1.5, LUER, 0.5, False),
-    Frustum(13.6, 21.0, 1.5, 2.5, LUER, 0.5, False),
-    Frustum(21.0, 23.0, 3.6, 3.6, LUER, 0.5, False),
-    Frustum(23.0, 27.0, 2.4, 4.6, PLASTIC, 0.6, False),
-    Frustum(27.0, 50.0, 4.6, 4.6, CARTRIDGE, 0.65, False),
-    Frustum(50.0, 58.0, 4.6, 4.6, PLASTIC, 0.6, False),
-    Frustum(58.0, 76.0, 8.0, 8.0, RING, 0.5, True),
-    Frustum(76.0, 78.0, 8.0, 7.0, RING, 0.5, True),
-    Frustum(78.0, 88.0, 5.6, 5.2, CAP, 0.4, False),
-    Frustum(88.0, 96.0, 2.2, 2.2, STEEL, 0.6, True),
-)
-NOZZLE_LENGTH = NOZZLE_PARTS[-1].z1
-NOZZLE_OUTLINE = np.array(  # heights and radii mm; the steps are bridged
-    [(part.z0, part.r0) for part in NOZZLE_PARTS] + [(NOZZLE_LENGTH, NOZZLE_PARTS[-1].r1)], np.float32
-)
-
-XYZ = tuple[Field, Field, Field]  # x, y, z
-
-
-class PartHit(NamedTuple):
-    """What rays see of one part, each of their shape."""
-
-    depth: Field  # in lengths of the ray, inf: nothing
-    x: Field  # of the normal, like y and z
-    y: Field
-    z: Field
-
-
-def part_outline(part: Frustum) -> Array:
-    """Points (N, 3) mm, nozzle frame, whose pictures hold the part's."""
-    rings = ((part.z0, 1.02 * part.r0), (part.z1, 1.02 * part.r1))
-    angles = np.linspace(0, 2 * np.pi, 17)[:-1]
-    return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in angles])
-
-
-def part_hit(part: Frustum, origin: Array, rays: XYZ) -> PartHit:
-    """Where rays from `origin` (3,), nozzle frame, meet a part: its side or one of its flat ends."""
-    ox, oy, oz = (np.float32(v) for v in origin)
-    dx, dy, dz = rays
-    k = np.float32((part.r1 - part.r0) / (part.z1 - part.z0))
-    r = np.float32(part.r0 + k * (oz - part.z0))
-    a = dx * dx + dy * dy - (k * k) * dz * dz
-    b = dx * ox + dy * oy - (k * r) * dz
-    c = ox * ox + oy * oy - r * r
-    with np.errstate(invalid="ignore", divide="ignore"):
-        depth = (-b - np.sqrt(b * b - a * c)) / a
-        z = oz + depth * dz
-        depth = as_field(np.where((depth > 0) & (z >= part.z0) & (z <= part.z1), depth, np.inf))
-        x, y = ox + depth * dx, oy + depth * dy
-        slant = np.float32(np.hypot(1, k))
-        inverse = 1 / (np.hypot(x, y) * slant)
-        side_hit = PartHit(depth, x * inverse, y * inverse, np.full_like(x, -k / slant))
-        side, height, radius = (1, part.z1, part.r1) if oz > part.z1 else (-1, part.z0, part.r0)
-        if part.z0 <= oz <= part.z1:
-            return side_hit
-        end = (np.float32(height) - oz) / dz
-        x, y = ox + end * dx, oy + end * dy
-        hit = (end > 0) & (x * x + y * y <= radius * radius) & (end < depth)
-    zero = np.zeros_like(end)
-    flat_end = end, zero, zero, np.full_like(end, side)
-    return PartHit(*(as_field(np.where(hit, a, b)) for a, b in zip(flat_end, side_hit, strict=True)))
-
-
-def passing_light(points: XYZ, nozzle_from_rest: Array, lamp: Lamp) -> Field:
-    """Share of the lamp's light that passes the nozzle, at points given by x, y, z (H, W) mm, nozzle frame.
-
-    The lamp is a disc: the shadow's edge softens with the distance between the nozzle and what it falls on.
-    """
-    share = np.empty_like(points[2])
-    towards = as_field(nozzle_from_rest[:3, :3] @ lamp.towards)
-    ray_kernels.pass_nozzle(*points, towards, np.float32(lamp.spread), NOZZLE_OUTLINE, share)
-    return share
 
 
 SHADOW_STEP = 0.5  # mm: a needle's shadow is 0.7 mm wide

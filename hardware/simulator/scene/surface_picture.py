@@ -1,7 +1,6 @@
-"""The pictures of the body's surface and of the drape round it, before the nozzle is drawn over them.
+"""The picture of the body's surface, before the nozzle is drawn over it.
 
-Each sample of the surface is traced to its material point and shaded there. The drape is traced on a coarse lattice of
-rays and coloured at every pixel.
+Each sample is traced to its material point and shaded there.
 """
 
 from __future__ import annotations
@@ -17,19 +16,13 @@ from estimation.rig import pixels_from_points
 from estimation.se3 import Array
 from hardware.simulator.scene import ray_kernels
 from hardware.simulator.scene.appearance import (
-    AT_REST_BEYOND,
-    ATTACHED_WITHIN,
-    CLOTH_TEAL,
-    DRAPE_STEP,
-    DRAPE_TEXEL,
-    OPENING_CORNER,
     lamp_table,
     mirror_slopes,
 )
 from hardware.simulator.scene.fields import Field, as_field, block_mean, sample, sample_texture, upsample
 from hardware.simulator.scene.ray_kernels import CELL_PX, CELL_SAMPLES, SAMPLES_PER_PIXEL
 from hardware.simulator.scene.rays import ImageBox, Rays, RenderView
-from hardware.simulator.scene.scene import SHADOW_STEP, SceneState, passing_light, rotate_rays, transform_fields
+from hardware.simulator.scene.scene import SHADOW_STEP, SceneState, rotate_rays
 
 HEIGHT_MARGIN = np.float32(1.5)  # mm: a wound's rim or wall between two cells reaches no further
 NEIGHBOURS = np.ones((3, 3), np.uint8)
@@ -93,7 +86,7 @@ def _lattice(state: SceneState, view: RenderView, box: ImageBox) -> _Lattice:
     odd = np.empty(small, np.uint8)
     bounds = np.float32(relief.low), np.float32(relief.high)
     ray_kernels.search_cells(to_nodes, *cells, relief.height, *bounds, start, odd, u, v)
-    directions = rotate_rays(to_nodes[:3], *cells)
+    directions = rotate_rays(np.asarray(to_nodes[:3], float), *cells)
     speed, exposure = _speed(state, directions, u, v, start), state.instant.exposure
     smear = float(np.abs(speed).max()) * exposure / (SAMPLES_PER_PIXEL * view.spacing)  # px
     instants = int(np.clip(np.ceil(smear / SMEAR_STEP_PX / (2 * SUBPIXEL_TIMES.size)), 1, MAX_INSTANTS))
@@ -117,11 +110,12 @@ def _strip(
     v = rays[1] * to_texels + np.float32(oy - scene.shape.size[1] / 2 * scale)
     path = lattice.spread(lattice.path, first, last) if lattice.instants else None
     colour, relief = _exposed(state, level, u, v, path, lattice.instants)
-    looks = np.float32(max(1, 2 * lattice.instants))
+    looks = max(1, 2 * lattice.instants)
     if scene.look.lit:
         mirrors = lattice.spread(lattice.mirrors, first, last)
-        samples = (part.reshape(-1) for part in (colour, relief, mirrors, _passed(state, rays)))
-        ray_kernels.shade(*samples, looks, *lamp_table(state.lamps, state.towards, scene.look.ambient))
+        mirrored, passed = mirrors.reshape(-1), _passed(state, rays).reshape(-1)
+        lamps = lamp_table(state.lamps, state.towards, scene.look.ambient)
+        ray_kernels.shade(colour.reshape(-1), relief.reshape(-1), mirrored, passed, looks, *lamps)
     else:
         colour /= looks
     light[:] = block_mean(colour, light.shape[:2])
@@ -220,87 +214,9 @@ def _exposed(
     sums: list[Field] = []
     moved = np.empty((4, *u.shape), np.float32)
     for k in range(instants):
-        ray_kernels.pass_by(u, v, path, SUBPIXEL_TIMES + np.float32(((k + 0.5) / instants - 0.5) / 8), moved)
+        times = as_field(SUBPIXEL_TIMES + ((k + 0.5) / instants - 0.5) / (2 * SUBPIXEL_TIMES.size))
+        ray_kernels.pass_by(u, v, path, times, moved)
         for places in (moved[:2], moved[2:]):
             looks = [sample_texture(source, *places) for source in sources]
-            sums = [cv2.add(a, b, a) for a, b in zip(sums, looks, strict=True)] if sums else looks
+            sums = [as_field(cv2.add(a, b, a)) for a, b in zip(sums, looks, strict=True)] if sums else looks
     return sums[0], sums[1]
-
-
-DRAPE_LATTICE_PX = CELL_PX  # px between the rays that are traced
-DRAPE_ROWS_AT_ONCE = 48  # rows coloured at once: their fields stay in the cache
-DEPTH_STEPS = 20
-SEARCH_LATTICE_PX = 16  # px between the rays that are searched through all depths
-EDGE_DEPTH_STEPS = 8
-DEPTH_MARGIN = np.float32(8.0)  # mm of depth by which the cloth between rays reaches beyond them
-DEPTH_JUMP = 15.0  # mm by which the depth between two rays differs from the mean of theirs where the cloth hides itself
-MAX_DRAPE_HEIGHT = 40.0  # mm above the rest plane: nothing of the cloth is higher
-MIN_DRAPE_HEIGHT = -130.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DrapePicture:
-    """The drape over the whole image."""
-
-    light: Field  # (H, W, 3) linear BGR
-    depth: Field  # (h, w) mm along the optical axis, DRAPE_LATTICE_PX apart
-
-
-def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
-    """The cloth as one camera sees it, the shape taken away."""
-    rest_from_camera = se3.inverse(state.scene.base_from_rest) @ view.camera.base_from_camera
-    cloth = _cloth(state, view, rest_from_camera), state.scene.sheet.heights
-    rays, coarse, m = view.coarse(DRAPE_LATTICE_PX), view.coarse(SEARCH_LATTICE_PX), rest_from_camera
-    sink = np.minimum(m[2, 0] * coarse.x + m[2, 1] * coarse.y + m[2, 2], -0.15)
-    near, far = (as_field((height - m[2, 3]) / sink) for height in (MAX_DRAPE_HEIGHT, MIN_DRAPE_HEIGHT))
-    first_depth = np.empty_like(coarse.x)
-    ray_kernels.search_cloth(*cloth, *coarse, near, far, DEPTH_STEPS, first_depth)
-    depth = upsample(first_depth, (rays.x.shape[0], rays.x.shape[1]))
-    at = np.empty((2, *depth.shape), np.float32)
-    ray_kernels.refine_cloth(*cloth, *rays, depth, *at)
-    w, h = view.camera.size
-    planes = *at, _key_light_share(state, view, rays, depth)
-    u, v, share = (np.ascontiguousarray(upsample(plane, view.whole.size)[:h, :w]) for plane in planes)
-    if (edges := _edges(depth)).any():
-        around = np.ones((5, 5), np.uint8)
-        near, far = (as_field(f(depth, around)) for f in (cv2.erode, cv2.dilate))
-        how = near - DEPTH_MARGIN, far + DEPTH_MARGIN, EDGE_DEPTH_STEPS
-        ray_kernels.trace_edges(*cloth, edges, *rays, *how, u, v)
-    light, tint = np.empty((h, w, 3), np.float32), as_field(CLOTH_TEAL * as_field(state.lamps[0].colour))
-    picture, border = state.scene.sheet.picture, cv2.BORDER_REFLECT_101
-    for first in range(0, h, DRAPE_ROWS_AT_ONCE):
-        rows = slice(first, first + DRAPE_ROWS_AT_ONCE)
-        texture = as_field(cv2.remap(picture, u[rows], v[rows], cv2.INTER_LINEAR, borderMode=border))
-        ray_kernels.light_cloth(texture.reshape(-1), share[rows].reshape(-1), tint, light[rows].reshape(-1))
-    return DrapePicture(light, depth)
-
-
-def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> Field:
-    """(37,) how the cloth lies before a camera, as `ray_kernels` takes it."""
-    scene, grid_from_camera = state.scene, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
-    bulge = scene.deformation.bulge * state.instant.strain, -1 / (2 * scene.deformation.radius**2)
-    half, rest, held = (0.0, 0.0), -1e6, -1e6 - 1  # without an opening all of it rests
-    if scene.sheet.half is not None:
-        half, rest, held = scene.sheet.half, AT_REST_BEYOND, ATTACHED_WITHIN
-    opening = half[0] - OPENING_CORNER, half[1] - OPENING_CORNER, OPENING_CORNER, rest, 1 / (held - rest)
-    factors = 1 / state.factors[0], 1 / state.factors[1]
-    middle = ((n - 1) / 2 for n in scene.sheet.picture.shape[1::-1])
-    frames = grid_from_camera[:3].ravel(), rest_from_camera[:3].ravel()
-    return as_field([*frames[0], *frames[1], *factors, *bulge, *opening, 1 / DRAPE_STEP, 1 / DRAPE_TEXEL, *middle])
-
-
-def _edges(depth: Field) -> NDArray[np.uint8]:
-    """The squares of the lattice (h, w) where the cloth hides itself, and what is between them would draw steps."""
-    bend = np.array([[1.0, -2.0, 1.0]], np.float32)
-    bent = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
-    return np.asarray(cv2.dilate((bent > DEPTH_JUMP).astype(np.uint8), NEIGHBOURS), np.uint8)
-
-
-def _key_light_share(state: SceneState, view: RenderView, rays: Rays, depth: Field) -> Field:
-    """Share (h, w) of the key lamp's light that passes the nozzle; all of it without one."""
-    if state.instant.base_from_nozzle is None:
-        return np.ones_like(depth)
-    nozzle_from_base = se3.inverse(state.instant.base_from_nozzle)
-    nozzle_from_camera = nozzle_from_base @ view.camera.base_from_camera
-    points = transform_fields(nozzle_from_camera, rays.x * depth, rays.y * depth, depth)
-    return passing_light(points, nozzle_from_base @ state.scene.base_from_rest, state.lamps[0])
