@@ -7,7 +7,7 @@ import heapq
 import sqlite3
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -18,27 +18,25 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from estimation import se3
 from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose import SurfacePose
-from estimation.rig import Camera, pixels_from_points
-from estimation.se3 import Array
+from estimation.rig import Camera
 from hardware.files.images import decode, encode
 from hardware.offline.track import FrameSetStep
 from hardware.process.clock import Clock, SimClock
-from hardware.process.faults import Fault, FaultPart, WorkRates, fault_rng, faults_striking
+from hardware.process.faults import FaultPart, WorkRates, faults_striking
 from hardware.process.progress import content_of, folder_size, size_text
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras, garble
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.appearance import Sensor
-from hardware.simulator.scene.render import render
+from hardware.simulator.scene.render import cover_wound, render
 from hardware.simulator.scene.scene import Scene, WorldState
-from perception.frames import Frame, FrameSet, Image, Pairing, PrintHead
+from perception.frames import Frame, FrameSet, Pairing, PrintHead
 from perception.tracking.step import StepReport
 
 Action = Callable[[float], None]  # of the instant, s
-ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT = range(4)  # what goes first of what falls on one instant
+ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT, RENDER_EVENT = range(5)  # what goes first at one instant
 
 
 class EventQueue:
@@ -62,39 +60,6 @@ class EventQueue:
             self._clock.wait_until(instant)
             action(instant)
             yield instant
-
-
-WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound
-COVER_SCALE = 1.35  # a cover that lies over all of the wound is larger than it by this
-
-
-def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.random.Generator) -> Image:
-    """A blotchy, skin-toned cover over a box (low, high px); aside: by which part of its width it is drawn away."""
-    low, high = box
-    angle = rng.uniform(0, 2 * np.pi)
-    half = COVER_SCALE * (high - low) / 2
-    shift = np.array([np.cos(angle), np.sin(angle)]) * (half + (high - low) / 2) * min(aside, 1.0)
-    middle = (low + high) / 2 + shift * 1.45  # wholly beside the box at one, whatever the angle
-    if aside >= 1.0:
-        return image
-    h, w = image.shape
-    blotches = rng.normal(150, 28, (14, 18)).astype(np.float32)
-    size = tuple(np.maximum(np.round(2 * half), 8).astype(int).tolist())
-    cover = cv2.resize(blotches, size, interpolation=cv2.INTER_CUBIC) + rng.normal(0, 6, size[::-1])
-    corner = np.round(middle - half).astype(int)
-    x0, y0 = np.clip(corner, 0, (w, h))
-    x1, y1 = np.clip(corner + size, 0, (w, h))
-    covered = image.copy()
-    part = cover[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]  # may be empty
-    covered[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
-    return covered
-
-
-def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
-    """An image (H, W, 3) of a camera with a cover over the wound; base_from_surface: (4, 4) mm then."""
-    pixels, _ = pixels_from_points(camera, se3.transform_points(base_from_surface, WOUND_EXTENT))
-    box = pixels.min(0), pixels.max(0)
-    return np.stack([draw_cover(image[..., k], box, 0.0, fault_rng(fault)) for k in range(image.shape[2])], -1)
 
 
 RENDERER = Path(__file__).parent / "scene"  # its files make what a picture shows
@@ -183,11 +148,15 @@ def picture_key(shot: Shot, instant: WorldState, camera: Camera, scene: Scene) -
 NOISE_STREAM, DAMAGE_STREAM = 5, 6  # streams of random numbers of one picture
 
 
-class PictureRenderer:
-    """Renders and encodes what was exposed.
+Pending = list[tuple[Shot, WorldState]]  # exposed and not yet rendered
+Rendered = list[tuple[Shot, bytes, tuple[str, bytes]]]  # with the picture's key
 
-    Exposed pictures wait until one of them is asked for; then all that wait are rendered, one of each camera at a time,
-    with the printed material as it was at the first of them: what was laid while pictures travel is missing.
+
+class PictureRenderer:
+    """Renders and encodes what was exposed, in the background while time goes on.
+
+    What waits is rendered together, one picture of each camera at a time, with the printed material as it was at the
+    first of them.
     """
 
     def __init__(
@@ -204,29 +173,48 @@ class PictureRenderer:
         """print_beads: brings the scene's printed material up to an instant, s. store: pictures of earlier runs."""
         self._scene, self._true_cameras, self._sensor, self._quality = scene, true_cameras, sensor, jpeg_quality
         self._seed, self._threads, self._print_beads, self._store = seed, threads, print_beads, store
-        self._waiting: list[tuple[Shot, WorldState]] = []  # exposed and not yet rendered
+        self._waiting: Pending = []
         self._done: dict[tuple[int, int], tuple[str, bytes]] = {}
+        self._background = ThreadPoolExecutor(1)
+        self._job: Future[Rendered] | None = None
 
     def expose(self, shot: Shot, instant: WorldState) -> None:
         """Remember the world as this shot meets it."""
         self._waiting.append((shot, instant))
 
+    def start(self) -> None:
+        """Begin to render what waits, once what was begun before is done: no bead is laid while pictures are made."""
+        if not self._waiting:
+            return
+        self._join()
+        self._print_beads(min(instant.stamp for _, instant in self._waiting))
+        missing = [(*pair, self._key(*pair)) for pair in self._waiting]
+        missing = [each for each in missing if not self._found(each[0], each[2])]
+        self._waiting = []
+        if missing:
+            self._job = self._background.submit(self._render_all, missing)
+
     def take(self, shot: Shot) -> tuple[str, bytes]:
         """Format and bytes of a picture that was exposed; each once."""
         key = shot.camera, shot.number
         if key not in self._done:
-            self._print_beads(min(instant.stamp for _, instant in self._waiting))
-            while self._waiting:
-                batch = {pair[0].camera: pair for pair in reversed(self._waiting)}  # the first of each camera
-                self._waiting = [pair for pair in self._waiting if pair is not batch[pair[0].camera]]
-                missing = [pair for pair in batch.values() if not self._found(*pair)]
-                if missing:
-                    self._render(*zip(*missing, strict=True))
+            self._join()
+        if key not in self._done:
+            self.start()
+            self._join()
         return self._done.pop(key)
 
-    def _found(self, shot: Shot, instant: WorldState) -> bool:
+    def _join(self) -> None:
+        """Wait until what was begun is rendered."""
+        job, self._job = self._job, None
+        for shot, key, picture in () if job is None else job.result():
+            self._done[shot.camera, shot.number] = picture
+            if self._store is not None:
+                self._store.put(key, picture)
+
+    def _found(self, shot: Shot, key: bytes) -> bool:
         """Take a picture from the store, if it is there."""
-        picture = None if self._store is None else self._store.get(self._key(shot, instant))
+        picture = None if self._store is None else self._store.get(key)
         if picture is not None:
             self._done[shot.camera, shot.number] = picture
         return picture is not None
@@ -234,7 +222,16 @@ class PictureRenderer:
     def _key(self, shot: Shot, instant: WorldState) -> bytes:
         return picture_key(shot, instant, self._true_cameras(shot), self._scene)
 
-    def _render(self, shots: Sequence[Shot], instants: Sequence[WorldState]) -> None:
+    def _render_all(self, waiting: list[tuple[Shot, WorldState, bytes]]) -> Rendered:
+        done: Rendered = []
+        while waiting:
+            batch = {each[0].camera: each for each in reversed(waiting)}  # the first of each camera
+            waiting = [each for each in waiting if each is not batch[each[0].camera]]
+            shots, instants, keys = zip(*batch.values(), strict=True)
+            done += zip(shots, keys, self._render(shots, instants), strict=True)
+        return done
+
+    def _render(self, shots: Sequence[Shot], instants: Sequence[WorldState]) -> list[tuple[str, bytes]]:
         cameras = [self._true_cameras(shot) for shot in shots]
         rngs = [self._rng(NOISE_STREAM, shot.camera, shot.picture) for shot in shots]
         images = render(self._scene, cameras, instants, self._sensor, rngs, self._threads)
@@ -243,16 +240,20 @@ class PictureRenderer:
                 images[i] = cover_wound(images[i], camera, instant.base_from_surface, shot.covered)
         with ThreadPoolExecutor(self._threads) as pool:
             encoded = list(pool.map(lambda image: encode(image, self._quality), images))
-        for shot, instant, (kind, data) in zip(shots, instants, encoded, strict=True):
-            if shot.fate is Fate.GARBLED:
-                data = garble(data, self._rng(DAMAGE_STREAM, shot.camera, shot.number))
-            self._done[shot.camera, shot.number] = kind, data
-            if self._store is not None:
-                self._store.put(self._key(shot, instant), (kind, data))
+        return [
+            (kind, garble(data, self._rng(DAMAGE_STREAM, shot.camera, shot.number)))
+            if shot.fate is Fate.GARBLED
+            else (kind, data)
+            for shot, (kind, data) in zip(shots, encoded, strict=True)
+        ]
 
     def _rng(self, stream: int, camera: int, number: int) -> np.random.Generator:
         """A picture's own random numbers: they depend on nothing but its camera and number."""
         return np.random.default_rng([self._seed, stream, camera, number])
+
+
+def _begin_rendering(pictures: PictureRenderer, now: float) -> None:
+    pictures.start()
 
 
 Exposures = dict[tuple[int, float], Shot]  # by camera and stamp, s
@@ -327,6 +328,7 @@ class CameraPipeline:
         self._exposures[shot.camera, shot.stamp] = shot
         if self._pictures is not None and self._instant is not None:
             self._pictures.expose(shot, self._instant(shot, now))
+            self._events.at(now, RENDER_EVENT, partial(_begin_rendering, self._pictures))
         self._events.at(shot.arrival, ARRIVAL_EVENT, partial(self._arrive, shot))
 
     def _arrive(self, shot: Shot, now: float) -> None:
@@ -357,17 +359,31 @@ class CameraPipeline:
             self._track(now)
 
     def _track(self, now: float) -> None:
+        """Let the tracker begin; what it finds is worked out when it is due, while the next pictures are rendered."""
         assert self._waiting is not None
         frames, self._waiting, self._busy = self._waiting, None, True
+        processing = self._scenario.tracking.processing
+        if processing is not None:
+            self._events.at(self._rates.done(now, processing), POSE_EVENT, partial(self._find_pose, frames))
+            return
+        pose, observations, spent = self._step_through(frames)
+        delivery = self._rates.done(now, spent)
+        self._events.at(delivery, POSE_EVENT, partial(self._deliver, pose, frames, observations))
+
+    def _find_pose(self, frames: FrameSet, now: float) -> None:
+        pose, observations, _ = self._step_through(frames)
+        self._deliver(pose, frames, observations, now)
+
+    def _step_through(self, frames: FrameSet) -> tuple[SurfacePose, Observations, float]:
+        """What the tracker makes of a frame set, and in how many seconds."""
         start = self._clock.now()
         pose = self._step(frames)
         spent = self._clock.now() - start
         self.tracked += 1
         self._sink.pose(frames, pose, self._step.last, spent)
-        processing = self._scenario.tracking.processing
-        delivery = self._rates.done(now, spent if processing is None else processing)
-        self._events.at(delivery, POSE_EVENT, partial(self._deliver, pose, frames, self._step.last.observations))
+        observations = self._step.last.observations
         self._step.idle()
+        return pose, observations, spent
 
     def _deliver(self, pose: SurfacePose, frames: FrameSet, observations: Observations, now: float) -> None:
         self._busy = False

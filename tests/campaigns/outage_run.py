@@ -18,7 +18,7 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
-from hardware.simulator.camera_pipeline import draw_cover
+from hardware.simulator.scene.render import draw_cover
 from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Image
 from perception.lens import undistort

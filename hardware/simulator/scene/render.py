@@ -15,6 +15,7 @@ from estimation import se3
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
+from hardware.process.faults import Fault, fault_rng
 from hardware.simulator.scene.appearance import Appearance, Sensor, expose
 from hardware.simulator.scene.drape_picture import DRAPE_LATTICE_PX, DrapePicture, drape_picture
 from hardware.simulator.scene.fields import Field, upsample
@@ -89,6 +90,39 @@ def _behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> 
         near = skin.depth[skin.box.samples(both)]
         np.copyto(depth[box.samples(both)], near, where=np.isfinite(near))
     return depth
+
+
+WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound
+COVER_SCALE = 1.35  # a cover that lies over all of the wound is larger than it by this
+
+
+def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.random.Generator) -> Image:
+    """A blotchy, skin-toned cover over a box (low, high px); aside: by which part of its width it is drawn away."""
+    low, high = box
+    angle = rng.uniform(0, 2 * np.pi)
+    half = COVER_SCALE * (high - low) / 2
+    shift = np.array([np.cos(angle), np.sin(angle)]) * (half + (high - low) / 2) * min(aside, 1.0)
+    middle = (low + high) / 2 + shift * 1.45  # wholly beside the box at one, whatever the angle
+    if aside >= 1.0:
+        return image
+    h, w = image.shape
+    blotches = rng.normal(150, 28, (14, 18)).astype(np.float32)
+    size = tuple(np.maximum(np.round(2 * half), 8).astype(int).tolist())
+    cover = cv2.resize(blotches, size, interpolation=cv2.INTER_CUBIC) + rng.normal(0, 6, size[::-1])
+    corner = np.round(middle - half).astype(int)
+    x0, y0 = np.clip(corner, 0, (w, h))
+    x1, y1 = np.clip(corner + size, 0, (w, h))
+    covered = image.copy()
+    part = cover[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]  # may be empty
+    covered[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
+    return covered
+
+
+def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
+    """An image (H, W, 3) of a camera with a cover over the wound; base_from_surface: (4, 4) mm then."""
+    pixels, _ = pixels_from_points(camera, se3.transform_points(base_from_surface, WOUND_EXTENT))
+    box = pixels.min(0), pixels.max(0)
+    return np.stack([draw_cover(image[..., k], box, 0.0, fault_rng(fault)) for k in range(image.shape[2])], -1)
 
 
 VIEW_TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own
