@@ -307,12 +307,18 @@ class CameraPipeline:
         self._pairer = Pairing(len(scenario.rig), scenario.cameras.period)
         self._rates = WorkRates(faults_striking(scenario.faults, FaultPart.TRACKING))
         self._busy = False  # the tracker
+        self._tracked_now: FrameSet | None = None  # its pose is found when it is due
         self._waiting: FrameSet | None = None  # the newest that came meanwhile
 
     def begin(self) -> None:
         """Put the first exposure of each camera into the queue."""
         for camera in range(len(self._scenario.rig)):
             self._next_shot(self._cameras.shots(camera, self._scenario.seconds))
+
+    def finish(self) -> None:
+        """The run is over: find the pose that was due after its end, which nobody waits for any more."""
+        if self._tracked_now is not None:
+            self._step_through(self._tracked_now)
 
     def _next_shot(self, shots: Iterator[Shot]) -> None:
         shot = next(shots, None)
@@ -364,6 +370,7 @@ class CameraPipeline:
         frames, self._waiting, self._busy = self._waiting, None, True
         processing = self._scenario.tracking.processing
         if processing is not None:
+            self._tracked_now = frames
             self._events.at(self._rates.done(now, processing), POSE_EVENT, partial(self._find_pose, frames))
             return
         pose, observations, spent = self._step_through(frames)
@@ -371,6 +378,7 @@ class CameraPipeline:
         self._events.at(delivery, POSE_EVENT, partial(self._deliver, pose, frames, observations))
 
     def _find_pose(self, frames: FrameSet, now: float) -> None:
+        self._tracked_now = None
         pose, observations, _ = self._step_through(frames)
         self._deliver(pose, frames, observations, now)
 

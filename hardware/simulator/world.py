@@ -213,6 +213,7 @@ class SimulatedWorld:
             with suppress(_MotionKilledError):
                 self._loop.run()
             self._advance(self._end)  # of a motion that was killed
+            self.pipeline.finish()
         finally:
             self._emit_rows(self.ended)
 
