@@ -369,8 +369,7 @@ class SimulatedWorld:
         self.order(PauseOrder.MATERIAL_IN)
 
     def _orders(self) -> list[LoopOrder]:
-        now = self._time.now()
-        if now >= self._end:
+        if (now := self._time.now()) >= self._end:
             return [Order.QUIT]
         (given, self._given), last = (self._given, []), self._handover
         tracking = last is not None and last.pose.state is TrackState.TRACKING
