@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -20,6 +22,7 @@ from estimation.se3 import Array
 from estimation.synthetic.movements import ComposedMotion
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.files.images import decode
+from hardware.simulator import camera_pipeline
 from hardware.simulator.camera_pipeline import PictureRenderer
 from hardware.simulator.cameras import Fate, Shot, TrueCameras
 from hardware.simulator.scene.appearance import Appearance, Sensor, unlit_texture
@@ -495,3 +498,30 @@ def test_what_is_printed_is_brought_up_to_the_first_exposure_that_waits() -> Non
     source.take(shot(2, 1))
     source.take(shot(0, 1))
     assert told == [0.1]
+
+
+def test_pictures_made_in_the_background_are_the_same_and_no_bead_is_laid_meanwhile(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    making, laid = threading.Event(), list[bool]()
+
+    def slow_render(*arguments: Any) -> list[Image]:
+        making.set()
+        time.sleep(0.05)
+        images = render(*arguments)
+        making.clear()
+        return images
+
+    expected = shape_taken(pictures(), ALL)
+    monkeypatch.setattr(camera_pipeline, "render", slow_render)
+
+    def note(until: float) -> None:
+        laid.append(making.is_set())
+
+    source = PictureRenderer(scene(), TrueCameras(SHAPE_RIG.cameras), Sensor(), 90, 3, 1, note)
+    for number in range(2):
+        for one in ALL[3 * number : 3 * number + 3]:
+            source.expose(one, shape_instant(one.picture))
+        source.start()
+    assert [source.take(one) for one in ALL] == expected
+    assert laid == [False, False]
