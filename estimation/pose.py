@@ -9,16 +9,13 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import lru_cache
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from estimation import se3
+from estimation.runtime import CubicCurve
 from estimation.se3 import Array
 from estimation.surface_map import LocalError, Warp
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
 
 _normal_quantile = lru_cache(maxsize=32)(NormalDist().inv_cdf)
 
@@ -43,8 +40,8 @@ class Forecast:
 
         The curve starts at the pose itself and has continuous acceleration: an arm follows it.
         """
-        curve, slope = _basis(tuple(self.horizons.tolist()))
-        return curve(ahead) @ self.increments, slope(ahead) @ self.increments
+        share, rate = _basis(tuple(self.horizons.tolist()))(ahead)
+        return share @ self.increments, rate @ self.increments
 
     def covariance(self, start: Array, ahead: float) -> Array:
         """Covariance (6, 6) at `ahead`, 0 to `end` s, with `start` (6, 6) at the pose; linear between horizons."""
@@ -65,19 +62,11 @@ class Forecast:
         return Forecast(steps, se3.log(se3.inverse(se3.exp(here)) @ se3.exp(there)), covariances)
 
 
-def prepare(horizons: Array) -> None:
-    """Build the curve of forecasts over these horizons (H,), s, ahead of the first one: it takes 0.1 to 0.5 s."""
-    _basis(tuple(horizons.tolist()))
-
-
 @lru_cache(maxsize=8)
-def _basis(horizons: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
-    """The curve by each horizon's increment, and its slope."""
-    from scipy.interpolate import CubicSpline  # half a second, which processes that only pass poses on need not spend
-
+def _basis(horizons: tuple[float, ...]) -> CubicCurve:
+    """The curve by each horizon's increment."""
     count = len(horizons)
-    curve = CubicSpline([0.0, *horizons], np.concatenate([np.zeros((1, count)), np.eye(count)]))
-    return curve, curve.derivative()
+    return CubicCurve(np.array([0.0, *horizons]), np.concatenate([np.zeros((1, count)), np.eye(count)]))
 
 
 def body_rate(increment: Array, rate: Array) -> Array:

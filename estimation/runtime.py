@@ -1,4 +1,4 @@
-"""Speed and memory: compiled loops (numba), a fast median, the C library's heap, and what is not loaded.
+"""Speed and memory: compiled loops (numba), a fast median, a cubic spline, the C library's heap, and what is not loaded.
 
 Dozens of short numpy calls a frame cost more than what they compute, so loops over tracks are compiled. Their types are
 stated: a loop is compiled once, when its module is first imported, and cached. Other threads run meanwhile.
@@ -56,6 +56,62 @@ def median(values: Array) -> float:
         return float("nan")
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
+
+
+class CubicCurve:
+    """The cubic spline through values (K, ...) at rising knots (K,), K >= 2, with continuous second derivative.
+
+    As scipy's CubicSpline, of which the motion process would load half a second: "not-a-knot", the first two pieces are
+    one cubic and the last two; or `at_rest`, with rate 0 at both ends. Of fewer than four knots it is the polynomial.
+    """
+
+    def __init__(self, knots: Array, values: Array, at_rest: bool = False) -> None:
+        step = _column(np.diff(knots), values.ndim)
+        slope = np.diff(values, axis=0) / step
+        rates = _knot_rates(step, slope, at_rest)
+        bend = (rates[:-1] + rates[1:] - 2 * slope) / step
+        square, cube = (slope - rates[:-1]) / step - bend, bend / step
+        self._starts, self._inner = knots[:-1], knots[1:-1]
+        self._terms = np.stack([values[:-1], rates[:-1], square, cube, 2 * square, 3 * cube])  # (6, K - 1, ...)
+
+    def __call__(self, at: Array) -> tuple[Array, Array]:
+        """Values (T, ...) and their rates (T, ...) at places (T,); outside, of the first and last piece."""
+        piece = self._inner.searchsorted(at, "right")
+        a, b, c, d, twice_c, thrice_d = self._terms.take(piece, axis=1)
+        s = _column(at - self._starts.take(piece), a.ndim)
+        square = s * s
+        return a + b * s + c * square + d * (square * s), b + twice_c * s + thrice_d * square
+
+
+def _column(values: Array, axes: int) -> Array:
+    """Values (N,) along the first of so many axes."""
+    return values.reshape(-1, *[1] * (axes - 1))
+
+
+def _knot_rates(step: Array, slope: Array, at_rest: bool) -> Array:
+    """The rates (K, ...) at the knots, K - 1 steps apart with these slopes: de Boor, A Practical Guide to Splines, IV."""
+    count = len(step) + 1
+    diagonal, right = np.ones((count, *step.shape[1:])), np.zeros((count, *slope.shape[1:]))
+    below, above = np.zeros_like(step), np.zeros_like(step)
+    right[1:-1] = 3 * (step[1:] * slope[:-1] + step[:-1] * slope[1:])
+    diagonal[1:-1] = 2 * (step[:-1] + step[1:])
+    above[1:], below[:-1] = step[:-1], step[1:]
+    if not at_rest and count < 4:
+        mean = (step[1:] * slope[:-1] + step[:-1] * slope[1:]) / (step[:-1] + step[1:])
+        return np.concatenate([2 * slope[:1] - mean, mean, 2 * slope[-1:] - mean]) if len(mean) else slope[[0, 0]]
+    if not at_rest:
+        first, last = step[0] + step[1], step[-2] + step[-1]
+        diagonal[0], above[0], diagonal[-1], below[-1] = step[1], first, step[-2], last
+        right[0] = ((step[0] + 2 * first) * step[1] * slope[0] + step[0] ** 2 * slope[1]) / first
+        right[-1] = (step[-1] ** 2 * slope[-2] + (2 * last + step[-1]) * step[-2] * slope[-1]) / last
+    for i in range(count - 1):  # no row needs another pivot: the matrix is totally positive
+        share = below[i] / diagonal[i]
+        diagonal[i + 1] -= share * above[i]
+        right[i + 1] -= share * right[i]
+    right[-1] /= diagonal[-1]
+    for i in reversed(range(count - 1)):
+        right[i] = (right[i] - above[i] * right[i + 1]) / diagonal[i]
+    return right
 
 
 class _LeftOut(ModuleType):

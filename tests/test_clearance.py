@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
 from estimation import se3
 from estimation.errors import InputError
@@ -69,6 +70,19 @@ def distance_to(triangles: Array, point: Array) -> float:
         share = np.clip(np.einsum("ti,ti->t", point - start, way) / np.einsum("ti,ti->t", way, way), 0, 1)
         edges = np.minimum(edges, np.linalg.norm(point - start - share[:, None] * way, axis=1))
     return float(np.where(inside, plane, edges).min())
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 6), (1, 5, 6), (4, 1, 2)])
+def test_between_nodes_a_distance_is_linear_and_beside_them_that_of_the_edge(shape: tuple[int, int, int]) -> None:
+    draw = np.random.default_rng(2)
+    distance = draw.normal(size=shape).astype(np.float32)
+    envelope = Envelope(se3.exp(draw.normal(size=6)), np.array([3.0, -2.0, 1.0]), STEP, distance, 0.0)
+    nodes = draw.uniform(-2, 9, (500, 3))
+    nodes[:100] = np.rint(nodes[:100])
+    nodes_from_surface = envelope.nodes_from_surface
+    points = (nodes - nodes_from_surface[:3, 3]) @ np.linalg.inv(nodes_from_surface[:3, :3]).T
+    expected = map_coordinates(distance, nodes.T, np.float64, 1, "nearest", prefilter=False)
+    assert np.abs(envelope.at(points) - expected).max() < 1e-12
 
 
 def tissue(z: Array, reach: float = 12.0) -> Envelope:

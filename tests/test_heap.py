@@ -1,4 +1,4 @@
-"""The heap gives free memory back or keeps it, as was asked; the quick median is the slow one; what is left out."""
+"""The heap gives free memory back or keeps it, as was asked; quick median and spline are the slow ones; what is left out."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 
-from estimation.runtime import left_out, median, trim_heap
+from estimation.runtime import CubicCurve, left_out, median, trim_heap
 from tests.campaigns.estimator import resident
 
 
@@ -82,6 +83,16 @@ def test_what_is_not_a_number_is_not_hidden(place: int) -> None:
     values = np.arange(3.0)
     values[place] = np.nan
     assert np.isnan(median(values))
+
+
+@given(st.lists(st.floats(0.01, 1.0), min_size=1, max_size=12), st.booleans(), st.integers(0, 99))
+def test_the_cubic_curve_is_scipys_spline(steps: list[float], at_rest: bool, seed: int) -> None:
+    knots = np.concatenate([[0.3], 0.3 + np.cumsum(steps)])
+    values = np.random.default_rng(seed).normal(size=(len(knots), 2, 3))
+    at = np.linspace(knots[0] - 0.1, knots[-1] + 0.1, 57)
+    spline = CubicSpline(knots, values, bc_type="clamped" if at_rest else "not-a-knot")
+    for found, expected in zip(CubicCurve(knots, values, at_rest)(at), (spline(at), spline(at, 1)), strict=True):
+        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
 def test_what_is_left_out_stands_empty_for_a_while_and_what_was_there_stays() -> None:

@@ -1,4 +1,4 @@
-"""The motion process: what it loads, seen from a fresh interpreter."""
+"""What processes load, above all the motion's, seen from a fresh interpreter."""
 
 from __future__ import annotations
 
@@ -6,18 +6,33 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
-HEAVY = {"gtsam", "cv2", "onnxruntime", "scipy.ndimage"}
+HEAVY = {"gtsam", "cv2", "onnxruntime", "scipy", "numba"}
+SLOW_PARTS = {"scipy.interpolate", "scipy.optimize", "scipy.signal", "scipy.stats", "matplotlib", "pandas"}  # s each
 RUN = """
 import sys
+import numpy as np
+from dataclasses import replace
+from estimation.pose import Forecast
 from hardware.motion.step import MotionStep
+from perception.frames import SYRINGE
+from planning.clearance import TissueGuard, envelope_over, tool_body
 from planning.command import Move
 from tests.moving import breathing, pose_at, raster
 
-motion = MotionStep(raster())
+body = tool_body(SYRINGE, (), margin=0.0, touch=1.0)
+tissue = TissueGuard(body, envelope_over(np.eye(4), np.array([-40.0, -40]), 1.0, np.full((81, 81), -3.0), 15.0))
+motion = MotionStep(raster(), tissue=tissue)
+begun = set(sys.modules)
+horizons = np.array([0.1, 0.3, 0.5])
+forecast = Forecast(horizons, np.zeros((3, 6)), np.tile(1e-6 * np.eye(6), (3, 1, 1)))
 for k in range(20):
-    last = motion(pose_at(breathing, k * 0.02), k * 0.02)
+    last = motion(replace(pose_at(breathing, k * 0.02), forecast=forecast), k * 0.02)
 assert isinstance(last, Move)
+assert 0.0 < tissue.room(np.eye(4))[0] < 15.0
+assert set(sys.modules) == begun, set(sys.modules) - begun
 print(*sys.modules)
 """
 
@@ -39,6 +54,19 @@ def test_the_check_can_fail() -> None:
 
 def test_replay_loads_no_images_before_it_has_a_session() -> None:
     assert HEAVY.isdisjoint(loaded("import hardware.offline.replay, sys; print(*sys.modules)"))
+
+
+def test_the_motion_process_loads_no_scipy() -> None:
+    modules = loaded("import hardware.live.motion_process, sys; print(*sys.modules)")
+    assert {"toppra", "ruckig", "numpy"} <= modules
+    assert HEAVY.isdisjoint(modules)
+
+
+@pytest.mark.parametrize("module", ["hardware.live.tracking_process", "hardware.simulator.simulate"])
+def test_of_scipy_only_what_is_used_is_loaded(module: str) -> None:
+    modules = loaded(f"import {module}, sys; print(*sys.modules)")
+    assert {"gtsam", "numba", "scipy.spatial"} <= modules
+    assert SLOW_PARTS.isdisjoint(modules)
 
 
 def test_a_command_line_without_a_command_loads_nothing_that_its_help_does_not_say() -> None:

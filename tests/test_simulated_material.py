@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import fftconvolve
 
 from estimation.errors import InputError
 from hardware.arm.driver import UnpluggedError
 from hardware.files.path_file import read_path
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
-from hardware.simulator.deposit import deposit_figures, deposit_map, planned_line, row_volumes
+from hardware.simulator.deposit import convolved, deposit_figures, deposit_map, planned_line, row_volumes
 from hardware.simulator.dispenser import DispenserModel, DispenserPort
 from hardware.simulator.material import IDEAL, SimulatedDispensers, flow_from_told
 from hardware.simulator.nozzle_error import MaterialFigures, material_figures, nozzle_errors
@@ -52,6 +53,13 @@ def printed(
         world = worlds.world_of(scenario, sink := worlds.Heard())
     world.run()
     return world, sink
+
+
+@pytest.mark.parametrize(("rows", "columns", "width"), [(40, 31, 7), (2, 90, 1), (5, 4, 23)])
+def test_a_map_spread_by_a_disc_is_the_convolution(rows: int, columns: int, width: int) -> None:
+    draw = np.random.default_rng(width)
+    values, weights = draw.normal(size=(rows, columns)), draw.normal(size=(width, width))
+    assert np.abs(convolved(values, weights) - fftconvolve(values, weights, "same")).max() < 1e-12
 
 
 def figures(**dispenser: object) -> MaterialFigures:

@@ -20,7 +20,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.forecast.experts import LAGS, TURN_LEVER_MM, Experts, ExpertStack, IntervalCalibration
-from estimation.pose import Forecast, SurfacePose, body_rate, prepare
+from estimation.pose import Forecast, SurfacePose, body_rate
 from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array
 
@@ -249,7 +249,6 @@ class Predictor:
         """points: (N, 3) mm of the surface, for which the intervals shall hold."""
         if points is None:
             points = TURN_LEVER_MM * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-        prepare(HORIZONS)  # before the first frame set: the first forecast comes in the middle of a run
         probes = points[:: -(-len(points) // MAX_PROBES)]
         self._experts = Experts(len(HORIZONS))
         count = self._experts.count

@@ -14,9 +14,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from estimation import se3
+from estimation.runtime import CubicCurve
 from estimation.se3 import Array
 
 WALK_SECONDS = 600  # length of a random walk; after it the walk is played backwards
@@ -151,13 +151,14 @@ class StepWave(Waveform):
 class Walk(Waveform):
     """A smoothed random walk, played backwards after WALK_SECONDS."""
 
-    spline: CubicSpline  # 0 at 0 s, zero slope at both ends
+    curve: CubicCurve  # 0 at 0 s, zero slope at both ends
 
     def _evaluate(self, times: Array) -> tuple[Array, Array]:
         within = np.mod(times, 2 * WALK_SECONDS)
         mirrored = WALK_SECONDS - np.abs(within - WALK_SECONDS)
         sign = np.where(within < WALK_SECONDS, 1.0, -1.0)
-        return np.asarray(self.spline(mirrored)), np.asarray(sign * self.spline(mirrored, 1))
+        values, rates = self.curve(mirrored)
+        return values, sign * rates
 
 
 class MotionPart(Protocol):
@@ -305,7 +306,7 @@ def draw_walk(rng: np.random.Generator) -> Walk:
     """A random walk from 0 with an RMS of 1 after a minute (and of 2 after four), smooth over a second."""
     knots = np.arange(WALK_SECONDS + 1.0)
     values = np.concatenate([[0.0], np.cumsum(rng.standard_normal(WALK_SECONDS)) / np.sqrt(60)])
-    return Walk(CubicSpline(knots, values, bc_type="clamped"))
+    return Walk(CubicCurve(knots, values, at_rest=True))
 
 
 def _bounded(rng: np.random.Generator, count: int) -> Array:

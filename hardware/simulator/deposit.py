@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.spatial import cKDTree
 
 from estimation.se3 import Array
@@ -249,8 +249,17 @@ def _spread(places: Array, material: Array, shape: tuple[int, int], disc: Array)
         for y in (0, 1):
             weight = material * np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1])
             dots += np.bincount((corner[:, 1] + y) * shape[1] + corner[:, 0] + x, weight, len(dots))
-    thickness = fftconvolve(dots.reshape(shape), disc, mode="same")
+    thickness = convolved(dots.reshape(shape), disc)
     return np.asarray(np.where(thickness > 1e-9, thickness, 0.0))  # the transform leaves 1e-16 everywhere
+
+
+def convolved(values: Array, weights: Array) -> Array:
+    """Values (M, N), each spread by weights (K, K), K odd: as scipy.signal's fftconvolve, which loads for a second."""
+    full = [size + len(weights) - 1 for size in values.shape]
+    even = [next_fast_len(size, real=True) for size in full]
+    whole = irfft2(rfft2(values, even) * rfft2(weights, even), even)
+    rows, columns = ((size - kept) // 2 for size, kept in zip(full, values.shape, strict=True))
+    return np.asarray(whole[rows : rows + values.shape[0], columns : columns + values.shape[1]])
 
 
 def _disc(width: float) -> Array:

@@ -11,16 +11,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import butter, filtfilt
 
 from estimation import se3
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.files.folder_tables import read_rows
 from hardware.process import checks
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
 PLACE_COLUMNS = [(stem + "_" + unit, scale) for stem in ("t{}", "{}") for unit, scale in MM_PER_UNIT.items()]
@@ -182,6 +184,8 @@ def played_trace(
     delay): of 0.1 mm noise at 10 Hz an interpolating spline would make speeds of mm/s that no chest had. None takes
     SMOOTH_STEPS of the trace's own steps, 0 nothing.
     """
+    from scipy.interpolate import CubicSpline  # half a second, which runs without a trace need not spend
+
     stamps, duration = trace.stamps, float(trace.stamps[-1])
     step, zero = float(np.median(np.diff(stamps))), np.zeros((len(stamps), 3))
     smooth = SMOOTH_STEPS * step if smooth is None else smooth
@@ -208,6 +212,9 @@ def _rotation_vectors(trace: Trace) -> Array:
 
 def _smoothed(stamps: Array, coordinates: Array, step: float, smooth: float) -> tuple[Array, Array]:
     """Resampled to even steps and low-passed: stamps (M,) and coordinates (M, 6)."""
+    from scipy.interpolate import CubicSpline
+    from scipy.signal import butter, filtfilt  # a second and a half, as above
+
     count = max(8, round(stamps[-1] / step) + 1)
     even = np.linspace(0.0, stamps[-1], count)
     values = CubicSpline(stamps, coordinates)(even)

@@ -31,7 +31,8 @@ from planning.material import material_plan
 from planning.motion.curve import HORIZON_TIME, Gridpoints, PathCurve, curve_through, gridpoints_on
 from planning.path import Path
 
-with left_out("matplotlib", "matplotlib.pyplot"):  # 0.4 s, for plots that nobody asks for
+# a second, for plots, other curves and another solver, for which nobody asks
+with left_out("matplotlib", "matplotlib.pyplot", "scipy.interpolate", "toppra.solverwrapper.ecos_solverwrapper"):
     from toppra import constraint
     from toppra.constants import MAX_TRIES, SMALL, TINY
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
