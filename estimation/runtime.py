@@ -1,4 +1,4 @@
-"""Speed and memory: compiled loops (numba), a fast median, a cubic spline, the C library's heap, and what is not loaded.
+"""Speed and memory: compiled loops (numba), fast median, cubic spline, the C library's heap, and what is not loaded.
 
 Dozens of short numpy calls a frame cost more than what they compute, so loops over tracks are compiled. Their types are
 stated: a loop is compiled once, when its module is first imported, and cached. Other threads run meanwhile.
@@ -89,7 +89,7 @@ def _column(values: Array, axes: int) -> Array:
 
 
 def _knot_rates(step: Array, slope: Array, at_rest: bool) -> Array:
-    """The rates (K, ...) at the knots, K - 1 steps apart with these slopes: de Boor, A Practical Guide to Splines, IV."""
+    """The rates (K, ...) at the knots, K - 1 steps apart with these slopes (de Boor, A Practical Guide to Splines)."""
     count = len(step) + 1
     diagonal, right = np.ones((count, *step.shape[1:])), np.zeros((count, *slope.shape[1:]))
     below, above = np.zeros_like(step), np.zeros_like(step)

@@ -231,7 +231,7 @@ class Envelope:
         """
         scaled, shape = self.nodes_from_surface, np.array(self.distance.shape)[:, None]
         nodes = np.ascontiguousarray(scaled[:3, :3] @ points.T + scaled[:3, 3:])
-        # linear between nodes, as scipy's map_coordinates, which would take half a second to load in the middle of a print
+        # linear between nodes, as scipy's map_coordinates, which would load for half a second in the middle of a print
         np.minimum(np.maximum(nodes, 0.0, out=nodes), shape - 1, out=nodes)
         low = np.minimum(nodes.astype(np.intp), np.maximum(shape - 2, 0))
         nodes -= low
@@ -253,7 +253,7 @@ class Envelope:
 
 
 def _between(values: NDArray[np.float32], first: Index, steps: Index, shares: Array) -> Array:
-    """Values (N,) at `shares` (D, N), 0 to 1, of the way from the nodes `first` (N,) to those `steps` (D,) further on."""
+    """Values (N,) at `shares` (D, N), 0 to 1, of the way from nodes `first` (N,) to those `steps` (D,) further on."""
     if not len(steps):
         return values.take(first).astype(float)
     here, there = (_between(values, first + on, steps[1:], shares[1:]) for on in (0, steps[0]))

@@ -1,4 +1,4 @@
-"""The heap gives free memory back or keeps it, as was asked; quick median and spline are the slow ones; what is left out."""
+"""The heap gives free memory back or keeps it, as was asked; quick median and spline are right; what is left out."""
 
 from __future__ import annotations
 

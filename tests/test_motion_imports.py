@@ -69,7 +69,21 @@ def test_of_scipy_only_what_is_used_is_loaded(module: str) -> None:
     assert SLOW_PARTS.isdisjoint(modules)
 
 
-def test_a_command_line_without_a_command_loads_nothing_that_its_help_does_not_say() -> None:
-    modules = loaded("import hardware.cli.main, sys; print(*sys.modules)")
-    late = {"numpy", "importlib.metadata", "concurrent.futures", "statistics", "tomllib"}
-    assert "hardware.cli.main" in modules and late.isdisjoint(modules)
+NOT_FOR_HELP = {
+    "numpy", "importlib.metadata", "concurrent.futures", "statistics", "tomllib", "multiprocessing", "inspect",
+    "dataclasses", "datetime", "json", "hashlib", "subprocess", "difflib", "socket", "pickle", "ctypes",
+}  # fmt: skip
+
+
+def test_a_command_line_loads_nothing_that_its_help_does_not_say() -> None:
+    modules = loaded("from hardware.cli.main import parser; import sys; parser().format_help(); print(*sys.modules)")
+    assert {"argparse", "hardware.cli.sessions", "hardware.cli.live"} <= modules
+    assert NOT_FOR_HELP.isdisjoint(modules)
+
+
+def test_a_command_loads_the_options_of_no_other() -> None:
+    modules = loaded("from hardware.cli.main import parser; import sys; parser('track'); print(*sys.modules)")
+    assert {name for name in modules if name.startswith("hardware.cli.")} == {
+        "hardware.cli.main", "hardware.cli.parser", "hardware.cli.sessions",
+    }  # fmt: skip
+    assert NOT_FOR_HELP.isdisjoint(modules)

@@ -19,15 +19,16 @@ from hardware.cli.parser import (
     damage_code,
     positive,
     progress_bar,
+    wall_clock,
     wrong_option,
 )
-from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import check_new, left_files_text
 
 if TYPE_CHECKING:
     from hardware.calibration.arm_report import ArmTruth
     from hardware.calibration.arm_run import ArmCalibrationOptions, ArmCalibrationResult
     from hardware.calibration.live import WavingPage
+    from hardware.process.clock import Clock
 
 RIG_FORMATS = {
     "opencv": "a YAML per camera",
@@ -163,7 +164,7 @@ def _board(a: argparse.Namespace) -> int:
 def _cameras(a: argparse.Namespace) -> int:
     from hardware.calibration.run import CalibrationOptions, corners_of, run_calibration, run_live
 
-    clock = WallClock()
+    clock = wall_clock()
     check_new(a.out, a.force)
     path = Path(a.which[0])  # of the one recording that is named, or of a live camera
     recorded = path if len(a.which) == 1 and (path.is_dir() or path.suffix == ".mcap") else None
@@ -315,7 +316,7 @@ def _virtual(a: argparse.Namespace) -> ArmCalibrationResult:
     with progress_bar("moves", "ticks") as moves, progress_bar("pictures", "frame sets") as pictures:
         watched = watched_arm(a.seed)
         if a.terminal:
-            truth = record_on_terminal(watched, WallClock(), a.record, options, moves, pictures)
+            truth = record_on_terminal(watched, wall_clock(), a.record, options, moves, pictures)
         else:
             truth = record_in_virtual_time(watched, a.record, options, moves, pictures)
     return _folder(a, truth)
@@ -332,7 +333,7 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     if not a.yes:
         raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
     check_out(a.out)
-    options, clock, profile = _arm_options(a).moves, WallClock(), arm_profile(a.arm)
+    options, clock, profile = _arm_options(a).moves, wall_clock(), arm_profile(a.arm)
     stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
     rig, sources = read_live_rig(a.cameras)
     check_record(a.record)

@@ -5,19 +5,27 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, Commands, arm_profile, not_negative, positive, progress_bar, wrong_option
-from hardware.process.clock import Clock, WallClock
+from hardware.cli.parser import (
+    FAILED,
+    Commands,
+    arm_profile,
+    not_negative,
+    positive,
+    progress_bar,
+    wall_clock,
+    wrong_option,
+)
 from perception import named_path
 
 if TYPE_CHECKING:
     from hardware.calibration.dispenser_record import LineOptions
     from hardware.dispenser.dispenser import Dispenser, DispenserProfile
     from hardware.files.dispenser_file import DispenserSettings
+    from hardware.process.clock import Clock
 
 VIRTUAL = "virtual"
 MAX_OPEN = 60.0  # s: longer than any test of a nozzle
@@ -70,6 +78,8 @@ def _run_dispenser(a: argparse.Namespace) -> int:
 
 
 def _serve(a: argparse.Namespace) -> int:
+    from dataclasses import replace
+
     from hardware.dispenser.messages import PRESETS
     from hardware.process.checks import one_of_text
     from hardware.simulator.dispenser import DIALECTS, VirtualDispenserSettings, run_virtual_dispenser
@@ -100,7 +110,7 @@ def _connect(a: argparse.Namespace) -> int:
         for option in ("flow", "celsius", "yes"):
             if getattr(a, option):
                 raise wrong_option(f"--{option}", getattr(a, option), "only with --on S")
-        return max(listen(each, a.seconds or 5.0, WallClock()) for each in found)
+        return max(listen(each, a.seconds or 5.0, wall_clock()) for each in found)
     if a.seconds is not None:
         raise wrong_option("--seconds", a.seconds, "only without --on S")
     if len(found) > 1:
@@ -113,7 +123,7 @@ def _connect(a: argparse.Namespace) -> int:
         raise wrong_option(
             "--on", found[0].profile.name, "a dispenser with a line of its own; the arm switches this one"
         )
-    return open_for(dispenser_from_settings(found[0]), a.on, a.flow, a.celsius, WallClock())
+    return open_for(dispenser_from_settings(found[0]), a.on, a.flow, a.celsius, wall_clock())
 
 
 def description(settings: DispenserSettings) -> str:
@@ -287,7 +297,10 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
             raise wrong_option(f"--{name}", "missing", f"given with --{sources[0]}")
     options = LineOptions(a.speeds, a.lines, a.length_mm, a.spacing_mm, a.height_mm, a.area_mm2)
     settings = _named(a)
-    if a.virtual:  # its own name, lest `--from` take its delays for the real one's
+    if a.virtual:
+        from dataclasses import replace
+
+        # its own name, lest `--from` take its delays for the real one's
         settings = replace(settings, profile=replace(settings.profile, name=VIRTUAL))
     if a.measured:
         found = delays_by_hand(a.measured, settings.profile)
@@ -344,7 +357,7 @@ def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptio
     from hardware.cameras.sources import read_live_rig
     from hardware.files.dispenser_file import dispenser_from_settings
 
-    clock, profile = WallClock(), arm_profile(a.arm)
+    clock, profile = wall_clock(), arm_profile(a.arm)
     stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
     where = stands, axes_from_text(a.away, profile.arm.home)
     rig, sources = read_live_rig(a.cameras)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
 from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, positive, wrong_option
-from hardware.process.clock import WallClock
+from hardware.process.progress import json_text
 from perception import named_path
 
 if TYPE_CHECKING:
@@ -293,6 +292,7 @@ def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
     from hardware.arm.console import ArmRequest, axes_from_text, jog_from_text, origin_from_text, run_arm
     from hardware.arm.device import ArmState
     from hardware.arm.profile import LinkSettings, open_arm
+    from hardware.process.clock import WallClock
 
     request = ArmRequest(
         seconds=float("inf") if a.watch else a.seconds,
@@ -340,7 +340,7 @@ def _run_cameras(a: argparse.Namespace) -> int:
         return _watch_cameras(a)
     devices, industrial = list_devices(), list_industrial()
     if a.json:
-        print(json.dumps(_cameras_table(devices, industrial or ()), indent=2))
+        print(json_text(_cameras_table(devices, industrial or ())))
         return 0
     print(list_text(devices, industrial or ()))
     if industrial is None:
@@ -381,6 +381,7 @@ def _watch_cameras(a: argparse.Namespace) -> int:
     from hardware.cameras.inspection import inspect, inspection_sheet, inspection_table, inspection_text
     from hardware.cameras.live import LiveCameras, places_without_rig, sources_named
     from hardware.files.images import encode
+    from hardware.process.clock import WallClock
 
     if not 0 < a.seconds <= 3600:
         raise wrong_option("--seconds", a.seconds, "0 < seconds <= 3600")
@@ -390,7 +391,7 @@ def _watch_cameras(a: argparse.Namespace) -> int:
     clock = WallClock()
     with LiveCameras(places_without_rig(len(a.which)) if rig is None else rig, sources, clock) as live:
         inspection = inspect(live, a.seconds, clock)
-    print(json.dumps(inspection_table(inspection), indent=2) if a.json else inspection_text(inspection))
+    print(json_text(inspection_table(inspection)) if a.json else inspection_text(inspection))
     if a.out is not None:
         jpeg = None if a.out.suffix.lower() == ".png" else SHEET_JPEG_QUALITY
         a.out.write_bytes(encode(inspection_sheet(inspection), jpeg)[1])

@@ -1,41 +1,47 @@
-"""The command line `stillbed`: all commands, and `simulate`, `bench` and `doctor` themselves. Imports lazily."""
+"""The command line `stillbed`: all commands, and `simulate`, `bench` and `doctor` themselves.
+
+Imports lazily, the other commands too: nobody waits for the options of a command that he does not call.
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimation.errors import StillbedError
-from hardware.bench.subjects import BENCH_WHOLE, SUBJECTS, Subject, Subjects, Whole
-from hardware.cli.calibrate import add_calibrate
-from hardware.cli.dispenser import add_dispenser
-from hardware.cli.live import add_arm, add_cameras, add_init, add_live, add_record, add_trace
-from hardware.cli.parser import FAILED, INTERRUPTED, WRONG_INPUT, Commands, Parser, add_fault, error_text, wrong_option
-from hardware.cli.plan import add_plan, add_reach, add_scan, add_segment, add_train
-from hardware.cli.sessions import add_compare, add_export, add_import, add_replay, add_smooth, add_track, add_view
-from hardware.process.clock import WallClock
+from hardware.cli.parser import (
+    FAILED,
+    INTERRUPTED,
+    WRONG_INPUT,
+    Commands,
+    Parser,
+    add_fault,
+    error_text,
+    wall_clock,
+    wrong_option,
+)
 from hardware.process.progress import (
     BAD,
     FirstWord,
     cache_folder,
+    fill_standard_streams,
+    json_text,
     left_files_text,
     painted,
     prepare_out,
     write_error_text,
 )
-from hardware.process.system import fill_standard_streams, state_inputs, stillbed_version
-from perception import named_path
 
 if TYPE_CHECKING:
+    from hardware.bench.subjects import Subject, Subjects, Whole
     from hardware.operator.view import CheckVerdict
 
 BENCH_OUT = Path("out/bench")
@@ -67,8 +73,14 @@ def add_bench_options(parser: argparse.ArgumentParser) -> None:
     add("rest", nargs=argparse.REMAINDER, metavar="...", help="its options; see SUBJECT --help")
 
 
-def run_bench(arguments: argparse.Namespace, subjects: Subjects = SUBJECTS, whole: Whole = BENCH_WHOLE) -> None:
-    """List the subjects, or measure one or all, print the table and, where a folder was named, save it there."""
+def run_bench(arguments: argparse.Namespace, subjects: Subjects | None = None, whole: Whole | None = None) -> None:
+    """List the subjects, or measure one or all, print the table and, where a folder was named, save it there.
+
+    subjects, whole: by default those of `stillbed bench`.
+    """
+    from hardware.bench.subjects import BENCH_WHOLE, SUBJECTS
+
+    subjects, whole = SUBJECTS if subjects is None else subjects, BENCH_WHOLE if whole is None else whole
     name = arguments.subject
     if arguments.all or arguments.quick:
         from hardware.bench.whole import run_whole
@@ -125,6 +137,8 @@ def add_doctor(commands: Commands) -> None:
 
 
 def _run_doctor(a: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
     from hardware.cli.doctor import device_checks, extras_check, library_checks, machine_checks
     from hardware.live.checklist import checks_table
     from hardware.operator.view import CheckVerdict
@@ -132,12 +146,12 @@ def _run_doctor(a: argparse.Namespace) -> int:
     if not a.folder.is_dir():
         raise wrong_option("--folder", a.folder, "a folder that exists")
     libraries = [*library_checks(), extras_check()]
-    machine = machine_checks(a.folder, WallClock())
+    machine = machine_checks(a.folder, wall_clock())
     broken = any(check.verdict is CheckVerdict.FAIL for check in libraries)
     parts = {"machine": machine, "libraries": libraries, "devices": [] if broken else device_checks()}
     verdicts = [check.verdict for part in parts.values() for check in part]
     if a.json:
-        print(json.dumps({name: [asdict(check) for check in part] for name, part in parts.items()}, indent=2))
+        print(json_text({name: [asdict(check) for check in part] for name, part in parts.items()}))
     else:
         print("\n\n".join(f"{name}\n{checks_table(tuple(part), sys.stdout)}" for name, part in parts.items() if part))
         print(f"\n{_verdict_text(verdicts, broken)}")
@@ -191,12 +205,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     0, 1 where a simulation misses its limits, 2 for wrong input (one line on stderr), 130 after Ctrl-C.
     """
     fill_standard_streams()
-    commands = parser()
+    words = sys.argv[1:] if argv is None else argv
+    commands = parser(words[0] if words else "")
     if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word may be
         import argcomplete
 
         argcomplete.autocomplete(commands)
-    arguments = commands.parse_args(argv)
+    arguments = commands.parse_args(words)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
     with nullcontext() if argv is not None else FirstWord(arguments.command):  # only where the process is the command's
         return _run(arguments)
@@ -204,6 +219,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Run the command that was read; its exit code."""
+    from hardware.process.system import state_inputs
+
     state_inputs(input_files(arguments))
     code: int | None = None
     out: Path | None = getattr(arguments, "out", None)
@@ -236,34 +253,21 @@ def input_files(arguments: argparse.Namespace) -> list[Path]:
     return [each for each in named if isinstance(each, Path) and each != Path() and each.exists()]
 
 
-def parser() -> Parser:
-    """The whole command line."""
-    top = Parser(
-        prog="stillbed",
-        description="Make a moving wound look like a still print bed.",
-        epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. More: stillbed COMMAND --help",
-    )
-    top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    commands = Commands(top, "COMMAND")
-    for add in (
-        _add_simulate, add_track, add_smooth, add_compare, add_view, add_segment, add_scan, add_plan, add_live,
-        add_record, add_trace, add_init, add_replay, add_calibrate, add_reach, add_arm, add_dispenser, add_cameras,
-        add_import, add_export, add_train, add_bench, add_doctor, add_cache,
-    ):  # fmt: skip
-        add(commands)
-    return top
-
-
 class _Version(argparse.Action):
     """Prints the installed version; asks for it only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from hardware.process.system import stillbed_version
+
         version = stillbed_version()
         print(f"stillbed {version}" if version else "stillbed, not installed")
         parser.exit()
 
 
-def _add_simulate(commands: Commands) -> None:
+def add_simulate(commands: Commands) -> None:
+    """Add the sub-command `simulate`."""
+    from perception import named_path
+
     add = commands.add(
         "simulate",
         _simulate,
@@ -296,6 +300,58 @@ def _simulate(a: argparse.Namespace) -> int:
     outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
     return 0 if outcome.met else FAILED
+
+
+def _elsewhere(place: str) -> Callable[[Commands], None]:
+    """What adds a command, by the module of this folder and the name there; loaded once it is called."""
+
+    def add(commands: Commands) -> None:
+        module, name = place.split(":")
+        getattr(import_module(f"hardware.cli.{module}"), name)(commands)
+
+    return add
+
+
+COMMANDS = {  # what adds each
+    "simulate": add_simulate,
+    "track": _elsewhere("sessions:add_track"),
+    "smooth": _elsewhere("sessions:add_smooth"),
+    "compare": _elsewhere("sessions:add_compare"),
+    "view": _elsewhere("sessions:add_view"),
+    "segment": _elsewhere("plan:add_segment"),
+    "scan": _elsewhere("plan:add_scan"),
+    "plan": _elsewhere("plan:add_plan"),
+    "live": _elsewhere("live:add_live"),
+    "record": _elsewhere("live:add_record"),
+    "trace": _elsewhere("live:add_trace"),
+    "init": _elsewhere("live:add_init"),
+    "replay": _elsewhere("sessions:add_replay"),
+    "calibrate": _elsewhere("calibrate:add_calibrate"),
+    "reach": _elsewhere("plan:add_reach"),
+    "arm": _elsewhere("live:add_arm"),
+    "dispenser": _elsewhere("dispenser:add_dispenser"),
+    "cameras": _elsewhere("live:add_cameras"),
+    "import": _elsewhere("sessions:add_import"),
+    "export": _elsewhere("sessions:add_export"),
+    "train": _elsewhere("plan:add_train"),
+    "bench": add_bench,
+    "doctor": add_doctor,
+    "cache": add_cache,
+}
+
+
+def parser(command: str = "") -> Parser:
+    """The whole command line; with a command's name, that command's alone."""
+    top = Parser(
+        prog="stillbed",
+        description="Make a moving wound look like a still print bed.",
+        epilog="A SESSION is a folder with rig.toml and frames.csv, or an .mcap file. More: stillbed COMMAND --help",
+    )
+    top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    commands = Commands(top, "COMMAND")
+    for add in (COMMANDS[command],) if command in COMMANDS else COMMANDS.values():
+        add(commands)
+    return top
 
 
 if __name__ == "__main__":

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
-import inspect
 import math
 import re
 import sys
@@ -13,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from estimation.errors import InputError, StillbedError
-from hardware.process.clock import WallClock
 from hardware.process.progress import BAD, Progress, painted
 
 if TYPE_CHECKING:
     from hardware.arm.profile import ArmProfile
+    from hardware.process.clock import WallClock
 
 Run = Callable[[argparse.Namespace], int | None]  # a command: its exit code, None for 0
 FAULT_TEXT = 'what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md'
@@ -55,6 +53,8 @@ class Parser(argparse.ArgumentParser):
 
 def near_text(word: str, known: Sequence[str]) -> str:
     """What was meant by a word, if one that is known is near; else ""."""
+    import difflib  # as inspect and the clock below: a tenth of what a command line loads for its help
+
     near = difflib.get_close_matches(word.partition("=")[0], known, 1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -103,9 +103,16 @@ def damage_code(damage: str) -> int:
     return FAILED if damage else 0
 
 
+def wall_clock() -> WallClock:
+    """The machine's clock."""
+    from hardware.process.clock import WallClock
+
+    return WallClock()
+
+
 def progress_bar(what: str, unit: str) -> Progress:
     """Progress by the machine's clock, on stderr."""
-    return Progress(what, unit, WallClock().now)
+    return Progress(what, unit, wall_clock().now)
 
 
 def arm_profile(path: Path | None) -> ArmProfile:
@@ -169,6 +176,8 @@ def _run(main: Callable[..., None], text: str, words: Sequence[str]) -> int:
 
 def _read(main: Callable[..., None], words: Sequence[str]) -> list[Any]:
     """The words, those that stand for a number as numbers; TypeError or ValueError where they are none of main's."""
+    import inspect
+
     signature = inspect.signature(main)
     signature.bind(*words)
     if any(word.startswith("--") for word in words):

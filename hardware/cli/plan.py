@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,6 +148,8 @@ def _add_way(command: argparse.ArgumentParser) -> None:
 
 
 def _run_plan(a: argparse.Namespace) -> int:
+    from dataclasses import fields
+
     from hardware.plan.order import PlanRequest, PlanSettings
     from hardware.plan.run import run_plan
 
@@ -366,6 +367,8 @@ def scanned_settings(settings: LiveSettings, where: object, force: bool) -> Live
     Both stand beside the recording. Without a path it is planned with `plan`'s defaults, and at a terminal the operator
     says whether those layers are to be printed. InputError, StillbedError where that is not said.
     """
+    from dataclasses import replace
+
     from hardware.live.settings import FROM_CAMERAS, check_settings
     from hardware.live.surface_scan import ScanOrder, run_scan
     from hardware.plan.order import PlanRequest

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
-import shutil
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -206,6 +203,25 @@ class TimeLeft:
         return left / mean, (left / min(mean + off, 1.0), left / slow if slow > MIN_RATE else math.inf)
 
 
+def json_text(values: object) -> str:
+    """As JSON, for other programs."""
+    import json
+
+    return json.dumps(values, indent=2)
+
+
+STANDARD_STREAMS = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
+
+
+def fill_standard_streams() -> None:
+    """Put the null device where a stream was closed, so that nothing opened later takes its number, here or below."""
+    for name, mode in STANDARD_STREAMS:
+        if getattr(sys, name) is None:
+            file = os.open(os.devnull, os.O_RDONLY if mode == "r" else os.O_WRONLY)
+            os.set_inheritable(file, True)
+            setattr(sys, name, os.fdopen(file, mode, encoding="utf-8"))
+
+
 MAX_NAMED_FILES = 20  # files of an interrupted command that are named; more are counted
 
 
@@ -312,6 +328,8 @@ def cached(file: Path, cache: Path, seconds: float | None = None) -> Prerendered
 
     seconds: of its beginning, None for all of it.
     """
+    import hashlib  # which a command line does not need for its help, nor shutil and subprocess below
+
     text = content_of(file) + CACHE_VERSION.encode() + (b"" if seconds is None else f"{seconds:g} s".encode())
     return PrerenderedSession(cache / f"{file.stem}-{hashlib.sha256(text).hexdigest()[:12]}")
 
@@ -331,6 +349,8 @@ def size_text(size: int) -> str:
 
 def clear_unfinished(cache: Path) -> None:
     """Remove from a cache what a process that is gone has left unfinished."""
+    import shutil
+
     for half in cache.glob(f"*{UNFINISHED}*"):
         number = half.name.rpartition(UNFINISHED)[2]
         if not (number.isdigit() and Path(f"/proc/{number}").exists()):
@@ -339,6 +359,8 @@ def clear_unfinished(cache: Path) -> None:
 
 def clear_cache(cache: Path) -> tuple[int, int]:
     """Remove all rendered scenes from a cache; how many there were, and their bytes."""
+    import shutil
+
     scenes = [folder for folder in cache.glob("*") if (folder / "scenario").is_file()]
     size = sum(map(folder_size, scenes))
     for folder in scenes:
@@ -349,6 +371,9 @@ def clear_cache(cache: Path) -> tuple[int, int]:
 
 def open_in_browser(address: str) -> bool:
     """Open an address with what the system opens addresses with; whether there is such a thing. Waits for nothing."""
+    import shutil
+    import subprocess
+
     opener = shutil.which("xdg-open") or shutil.which("open")
     if opener is None:
         return False

@@ -11,7 +11,6 @@ import platform
 import signal
 import struct
 import subprocess
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -105,18 +104,6 @@ def blocked_sigint() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-STANDARD_STREAMS = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
-
-
-def fill_standard_streams() -> None:
-    """Put the null device where a stream was closed, so that nothing opened later takes its number, here or below."""
-    for name, mode in STANDARD_STREAMS:
-        if getattr(sys, name) is None:
-            file = os.open(os.devnull, os.O_RDONLY if mode == "r" else os.O_WRONLY)
-            os.set_inheritable(file, True)
-            setattr(sys, name, os.fdopen(file, mode, encoding="utf-8"))
 
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
