@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import http.client
 import io
 import os
 import stat
@@ -24,6 +23,7 @@ import termios
 import threading
 from collections.abc import Callable
 from contextlib import closing, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -297,6 +297,7 @@ def _adapters() -> list[tuple[str, Identity]]:
 
 
 METHODS = ("GET", "POST", "PUT")
+HTTP_PORT = 80
 MAX_BODY = 4096  # bytes of an answer that are read
 
 
@@ -311,7 +312,7 @@ class HttpOpener:
     def __init__(self, url: str, timeout: float) -> None:
         try:
             parts = urlsplit(url)
-            self._host, self._number = parts.hostname or "", parts.port or http.client.HTTP_PORT
+            self._host, self._number = parts.hostname or "", parts.port or HTTP_PORT
         except ValueError:
             self._host, parts = "", urlsplit("")
         if not self._host or parts.path not in ("", "/") or parts.query:
@@ -330,6 +331,7 @@ class HttpPort:
     """One request at a time, by a thread that ends with `close`."""
 
     def __init__(self, host: str, number: int, timeout: float) -> None:
+        import_module("http.client")  # here and not with the first request; ports of other kinds need none of it
         self._host, self._number, self._timeout = host, number, timeout
         self._change = threading.Condition()
         self._request, self._answers, self._error, self._open = b"", b"", "", True
@@ -381,6 +383,8 @@ class HttpPort:
 
     def _ask(self, text: str) -> tuple[bytes, str]:
         """The body of the answer, and why there is none."""
+        import http.client
+
         method, _, rest = text.partition(" ")
         path, _, body = rest.partition(" ")
         line = http.client.HTTPConnection(self._host, self._number, timeout=self._timeout)

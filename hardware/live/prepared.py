@@ -56,7 +56,6 @@ from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import UNFINISHED, cache_error, cache_folder, cached
 from hardware.process.system import SPAWN, blocked_sigint
-from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.messages import rig_from_message
 from planning.laid_beads import path_with_looks
 from planning.material import Outlets, with_offsets
@@ -331,6 +330,8 @@ def rig_from_session(session: File) -> Rig:
         return read_rig(session / RIG_FILE).rig
     if session.suffix == ".toml":
         return read_rig(session).rig
+    from hardware.recording.mcap_file import ChunkMessages, parse, walk
+
     for part in walk(session):
         if isinstance(part, ChunkMessages):
             for stored in part.messages:
