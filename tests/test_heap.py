@@ -95,6 +95,18 @@ def test_the_cubic_curve_is_scipys_spline(steps: list[float], at_rest: bool, see
         assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
+def test_a_part_that_is_left_out_is_empty_in_its_package_too() -> None:
+    code = """
+import sys, numpy
+from estimation.runtime import left_out
+with left_out("numpy.f2py"):
+    assert numpy.f2py.whatever is None
+assert "numpy.f2py" not in sys.modules and "f2py" not in vars(numpy)
+print(callable(numpy.f2py.get_include) + 0)
+"""
+    assert printed(code) == 1
+
+
 def test_what_is_left_out_stands_empty_for_a_while_and_what_was_there_stays() -> None:
     before = sys.modules["numpy"]
     with left_out("no_such_package", "no_such_package.part", "numpy"):

@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 HEAVY = {"gtsam", "cv2", "onnxruntime", "scipy", "numba"}
 SLOW_PARTS = {"scipy.interpolate", "scipy.optimize", "scipy.signal", "scipy.stats", "matplotlib", "pandas"}  # s each
+SLOW_PARTS |= {"numpy.f2py", "numpy.testing"}
 RUN = """
 import sys
 import numpy as np
@@ -62,9 +63,12 @@ def test_the_motion_process_loads_no_scipy() -> None:
     assert HEAVY.isdisjoint(modules)
 
 
-@pytest.mark.parametrize("module", ["hardware.live.tracking_process", "hardware.simulator.simulate"])
+@pytest.mark.parametrize(
+    "module", ["hardware.live.tracking_process", "hardware.simulator.simulate", "estimation.mapping.refiner"]
+)
 def test_of_scipy_only_what_is_used_is_loaded(module: str) -> None:
-    modules = loaded(f"import {module}, sys; print(*sys.modules)")
+    code = f"import sys; from estimation.runtime import load_scipy; load_scipy(); import {module}; print(*sys.modules)"
+    modules = loaded(code)
     assert {"gtsam", "numba", "scipy.spatial"} <= modules
     assert SLOW_PARTS.isdisjoint(modules)
 

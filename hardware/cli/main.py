@@ -289,10 +289,12 @@ def add_simulate(commands: Commands) -> None:
 
 
 def _simulate(a: argparse.Namespace) -> int:
+    from estimation.runtime import load_scipy
     from hardware.process.checks import read_toml
     from hardware.process.faults import faults_from_texts
 
     read_toml(a.scenario)  # what cannot be one is told before the simulator is loaded
+    load_scipy()
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)

@@ -130,9 +130,12 @@ def tracker(
 
 def _start_map_process() -> None:
     """Set up the map's process: the parent ends it, also after Ctrl-C, and frames have priority over the map."""
+    from estimation.runtime import load_scipy
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     step_back(MAP_PROCESS_NICE)
     exit_with_parent()
+    load_scipy()
 
 
 DRAW_TEXT = "draw on the page where the surface is"
