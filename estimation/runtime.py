@@ -39,7 +39,8 @@ def compiled(signature: str, reordered: bool = False, inlined: bool = False) -> 
 
     def decorate(function: Function) -> Function:
         fast = REORDERED_SUMS if reordered else False
-        return cast(Function, njit(signature, cache=True, nogil=True, error_model="numpy", fastmath=fast, forceinline=inlined)(function))
+        jit = njit(signature, cache=True, nogil=True, error_model="numpy", fastmath=fast, forceinline=inlined)
+        return cast(Function, jit(function))
 
     return decorate
 

@@ -82,7 +82,7 @@ What stillbed needs, why just that, and what it costs. Made by `python -m tests.
 (the reasons), `constraints.txt` (the pins) and the installed packages; `make test` fails where this page is not what
 these files say. Size: what a package itself takes, unpacked. Alone: by how much the install would be smaller without
 it, as what comes along for nothing else would go too. Import: time of the processor in a new process, on the machine
-that wrote the page; it says what is worth loading late (toppra: without plots and curves, as here, a seventh). `make audit`
+that wrote the page; it says what is worth loading late (toppra: without plots and curves a seventh). `make audit`
 asks for known vulnerabilities of the pins.
 """
 HEAD = "| package | pin | why | kept by | licence | size, MB | alone, MB | import, ms |\n" + 8 * "|---" + "|\n"
