@@ -21,12 +21,15 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))  # mutants 
 
 pytest_plugins = ["estimation.synthetic.plugin"]  # by name, so that a checkout that is not installed has it too
 
-LONGEST = (  # files that take longest, begun first: of two workers neither then waits long for the other's last file
-    *("test_live_run", "test_estimator_suite", "test_tracking", "test_wrong_input", "test_record", "test_local_error"),
-    *("test_bench", "test_wound_area", "test_calibrate_refused", "test_deceit", "test_track", "test_live_parts"),
-    *("test_segment_command", "test_examples", "test_cli", "test_growth", "test_outages", "test_world"),
-    *("test_recordings", "test_floors", "test_operator_stages", "test_calibrate_dispenser", "test_first_print"),
-    *("test_camera_calibration", "test_foxglove", "test_fuzz", "test_smooth_command", "test_simulated_material"),
+LONGEST = (  # files that take longest, and long ones late in the alphabet: begun first, so that no worker waits long
+    *("test_live_run", "test_looks", "test_estimator_suite", "test_calibrate_refused", "test_tracking"),
+    *("test_wound_area", "test_world", "test_loop_replay", "test_plan_tool", "test_operator_stages"),
+    *("test_record", "test_skin", "test_simulate", "test_local_error", "test_track", "test_growth"),
+    *("test_estimator", "test_recording_damage", "test_arm_laws", "test_plan_layers"),
+    *("test_wrong_input", "test_planner", "test_fill_laws", "test_operator_page", "test_deceit"),
+    *("test_smooth_many", "test_clearance", "test_outages", "test_calibration_hint", "test_colours"),
+    *("test_plan_command", "test_rig_formats", "test_calibrate_dispenser", "test_registration"),
+    *("test_training_data", "test_verification", "test_thesis_step", "test_view", "test_warp"),
 )
 
 
