@@ -108,7 +108,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(call apt,python3-venv,$(PYTHON) -c 'import ensurepip')
 	@echo "installing into .venv what stillbed needs: some minutes, once"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]' # each module when it is first loaded: a tenth is
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]' # bytecode comes with the first import
 	@$(call apt,libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0,$(BIN)/python -c 'import open3d')
 	@touch $@
 
