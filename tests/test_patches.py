@@ -7,6 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from estimation import se3
@@ -16,7 +18,7 @@ from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from perception.frames import Image
 from perception.lens import BILATERAL_PREFILTER, NO_PREFILTER, PREFILTERS, Lenses
 from perception.mapping import features
-from perception.mapping.alignment_kernels import CONVERGED_STEP
+from perception.mapping.alignment_kernels import CONVERGED_STEP, median_of
 from perception.mapping.features import grey, match, sift
 from perception.mapping.matcher import optical_flow
 from perception.mapping.patches import (
@@ -333,3 +335,16 @@ def test_the_bilateral_filter_keeps_an_edge_and_takes_the_noise() -> None:
     assert filtered[:, 164:].mean() - filtered[:, :156].mean() > 120
     same = texture(0)
     assert PREFILTERS[NO_PREFILTER](same) is same
+
+
+@given(st.lists(st.tuples(st.floats(-5, 5) | st.just(np.nan), st.booleans()), min_size=1, max_size=40))
+def test_the_median_for_loops_is_numpys_and_ends_whatever_it_is_given(
+    drawn: list[tuple[float, bool]],
+) -> None:
+    values, chosen = np.array([v for v, _ in drawn]), np.array([c for _, c in drawn])
+    chosen[0] = True
+    kept, before = values[chosen], values.copy()
+    found = median_of(values, chosen)
+    np.testing.assert_array_equal(values, before)
+    if not np.isnan(kept).any():
+        assert found == np.partition(kept, len(kept) // 2)[len(kept) // 2]

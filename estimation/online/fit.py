@@ -297,18 +297,18 @@ def unusual_displacements(
     The right sides (L, 3) without what is usual, the square (L,) of the residuals about that, and how much of it (L,)
     a displacement explains.
     """
-    usual = solve_symmetric3(usual_normal, usual_right)
-    plain, about = right.copy(), square.copy()
+    usual, ridged = solve_symmetric3(usual_normal, usual_right), normal.copy()
+    plain, about, explained = right.copy(), square.copy(), np.zeros(len(right))
     for i in range(len(right)):
         for a in range(3):
             for b in range(3):
                 plain[i, a] -= normal[i, a, b] * usual[i, b]
             about[i] -= (right[i, a] + plain[i, a]) * usual[i, a]
-    ridged = normal.copy()
-    for a in range(3):
-        ridged[:, a, a] += DISPLACEMENT_FLOOR
+            ridged[i, a, a] += DISPLACEMENT_FLOOR
     moved = solve_symmetric3(ridged, plain)
-    return plain, about, (moved * plain).sum(1)
+    for i in range(len(right)):
+        explained[i] = moved[i, 0] * plain[i, 0] + moved[i, 1] * plain[i, 1] + moved[i, 2] * plain[i, 2]
+    return plain, about, explained
 
 
 PICTURE_DOF = 4  # of a camera's picture: shift right and down, px; roll, rad; scale

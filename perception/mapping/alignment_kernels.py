@@ -1,7 +1,7 @@
 """The loops of patch alignment, compiled: grey levels under a grid, and the descent that shifts it until it fits.
 
 Grey levels are interpolated in floating point: OpenCV's `remap` rounds places to 1/32 px and its answer to whole grey
-levels, which the sum over a patch does not quite average out. The interpreter is free meanwhile.
+levels, which the sum over a patch does not quite average out. The interpreter is free meanwhile. And a median.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.runtime import compiled
-from estimation.se3 import Array
+from estimation.se3 import Array, Mask
 from perception.frames import Image
 
 Float32 = NDArray[np.float32]
@@ -148,3 +148,33 @@ def descend(
             if length < CONVERGED_STEP:
                 break
     return outcome
+
+
+@compiled("f8(f8[::1], b1[::1])")
+def median_of(values: Array, chosen: Mask) -> float:
+    """The upper median of those of values (N,) that are chosen (N,), one at least, by Hoare's selection.
+
+    numpy's sort and partition take seconds to compile.
+    """
+    kept, count = np.empty(len(values)), 0
+    for i in range(len(values)):
+        if chosen[i]:
+            kept[count] = values[i]
+            count += 1
+    low, high, middle = 0, count - 1, count // 2
+    while low < high:
+        pivot, i, j = kept[middle], low, high
+        while i <= j:
+            while kept[i] < pivot:
+                i += 1
+            while pivot < kept[j]:
+                j -= 1
+            if i <= j:
+                kept[i], kept[j] = kept[j], kept[i]
+                i += 1
+                j -= 1
+        if j < middle:
+            low = i
+        if middle < i:
+            high = j
+    return float(kept[middle])

@@ -27,7 +27,7 @@ from estimation.surface_map import SurfaceMap, Warp, bells
 from perception.frames import SYRINGE, Image, PrintHead, check_profile
 from perception.lens import Lenses, bend_one
 from perception.mapping.aliases import TangentPlane
-from perception.mapping.alignment_kernels import PATCH_RADIUS
+from perception.mapping.alignment_kernels import PATCH_RADIUS, median_of
 from perception.mapping.features import ImageMask
 
 BEAD_REACH_MM = 1.0  # mm from the bead's middle: half of a wide bead, as it spreads
@@ -274,11 +274,10 @@ def add_equations(
     pull: first of the camera's own three columns. free: (P,) places that count. now, before: (2, P) logarithms, of this
     picture and the first. dark: (2, P) how fast they change with light. slopes: (2, P, 3), noise: (2,), of the first.
     """
-    count = np.count_nonzero(free)
     for k in range(2):
         away = now[k] - before[k]
-        away -= np.partition(away[free], count // 2)[count // 2]
-        noise[k] += (1.4826 * np.partition(np.abs(away[free]), count // 2)[count // 2] - noise[k]) / NOISE_MEMORY_SETS
+        away -= median_of(away, free)
+        noise[k] += (1.4826 * median_of(np.abs(away), free) - noise[k]) / NOISE_MEMORY_SETS
         variance = max(noise[k], MIN_NOISE) ** 2
         for p in range(len(away)):
             if not free[p]:
