@@ -229,12 +229,6 @@ class Drape:
     picture: Texture  # (H, W, 4) linear BGR without the key lamp; what that adds to a white cloth
     half: tuple[float, float] | None  # half sides mm of the opening; None: no opening, it does not move
 
-    def held(self, x: Field, y: Field) -> Field:
-        """How much of the body's motion the cloth takes over at x, y mm: 1 near the opening, 0 far away."""
-        if self.half is None:
-            return np.zeros_like(x)
-        return smoothstep(opening_distance(x, y, self.half), AT_REST_BEYOND, ATTACHED_WITHIN)
-
 
 def node_axes(span: tuple[float, float], step: float) -> tuple[Field, Field]:
     """x, y (H, W) mm of nodes `step` apart about the origin, over `span`."""

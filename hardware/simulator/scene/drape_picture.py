@@ -6,6 +6,7 @@ The loops over rays are compiled.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -50,7 +51,8 @@ class DrapePicture:
 def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     """The cloth as one camera sees it, the shape taken away."""
     rest_from_camera = se3.inverse(state.scene.base_from_rest) @ view.camera.base_from_camera
-    cloth = _cloth(state, view, rest_from_camera), state.scene.sheet.heights
+    cloth, picture = _cloth(state, view, rest_from_camera), state.scene.sheet.picture
+    texels = as_field([1 / DRAPE_TEXEL, *((n - 1) / 2 for n in picture.shape[1::-1])])
     rays, coarse, m = view.coarse(DRAPE_LATTICE_PX), view.coarse(SEARCH_LATTICE_PX), rest_from_camera
     sink = np.minimum(m[2, 0] * coarse.x + m[2, 1] * coarse.y + m[2, 2], -0.15)
     near, far = (as_field((height - m[2, 3]) / sink) for height in (MAX_DRAPE_HEIGHT, MIN_DRAPE_HEIGHT))
@@ -58,7 +60,7 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     _search_cloth(*cloth, *coarse, near, far, DEPTH_STEPS, first_depth)
     depth = upsample(first_depth, (rays.x.shape[0], rays.x.shape[1]))
     at = np.empty((2, *depth.shape), np.float32)
-    _refine_cloth(*cloth, *rays, depth, *at)
+    _refine_cloth(*cloth, *rays, depth, texels, *at)
     w, h = view.camera.size
     planes = *at, _key_light_share(state, view, rays, depth)
     u, v, share = (np.ascontiguousarray(upsample(plane, view.whole.size)[:h, :w]) for plane in planes)
@@ -66,9 +68,9 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
         around = np.ones((5, 5), np.uint8)
         near, far = (as_field(f(depth, around)) for f in (cv2.erode, cv2.dilate))
         bounds = as_field(near - DEPTH_MARGIN), as_field(far + DEPTH_MARGIN)
-        _trace_edges(*cloth, edges, *rays, *bounds, EDGE_DEPTH_STEPS, u, v)
+        _trace_edges(*cloth, edges, *rays, *bounds, EDGE_DEPTH_STEPS, texels, u, v)
     light, tint = np.empty((h, w, 3), np.float32), as_field(CLOTH_TEAL * as_field(state.lamps[0].colour))
-    picture, border = state.scene.sheet.picture, cv2.BORDER_REFLECT_101
+    border = cv2.BORDER_REFLECT_101
     for first in range(0, h, DRAPE_ROWS_AT_ONCE):
         rows = slice(first, first + DRAPE_ROWS_AT_ONCE)
         texture = as_field(cv2.remap(picture, u[rows], v[rows], cv2.INTER_LINEAR, borderMode=border))
@@ -76,18 +78,31 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     return DrapePicture(light, depth)
 
 
-def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> Field:
-    """(37,) how the cloth lies before a camera, as the loops take it."""
-    scene, grid_from_camera = state.scene, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
-    bulge = scene.deformation.bulge * state.instant.strain, -1 / (2 * scene.deformation.radius**2)
+class _Cloth(NamedTuple):
+    """How the cloth lies before a camera, as the loops take it.
+
+    It follows the body near the opening and rests far from it; between, it is a mixture of the two.
+    """
+
+    moving: Field  # (3, 4) grid_from_camera, mm
+    resting: Field  # (3, 4) the same of the grid at rest
+    bend: Field  # (4,) by which x and y are stretched back; mm by which the middle is lifted, and its exponent a mm^2
+    opening: (
+        Field  # (5,) mm: half sides less the corners' radius, that radius, where it rests; 1 / (held there less that)
+    )
+    heights: Field  # (H, W) mm, nodes DRAPE_STEP apart
+
+
+def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> _Cloth:
+    scene, moving = state.scene, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
+    lift = scene.deformation.bulge * state.instant.strain, -1 / (2 * scene.deformation.radius**2)
     half, rest, held = (0.0, 0.0), -1e6, -1e6 - 1  # without an opening all of it rests
     if scene.sheet.half is not None:
         half, rest, held = scene.sheet.half, AT_REST_BEYOND, ATTACHED_WITHIN
     opening = half[0] - OPENING_CORNER, half[1] - OPENING_CORNER, OPENING_CORNER, rest, 1 / (held - rest)
-    factors = 1 / state.factors[0], 1 / state.factors[1]
-    middle = ((n - 1) / 2 for n in scene.sheet.picture.shape[1::-1])
-    frames = grid_from_camera[:3].ravel(), rest_from_camera[:3].ravel()
-    return as_field([*frames[0], *frames[1], *factors, *bulge, *opening, 1 / DRAPE_STEP, 1 / DRAPE_TEXEL, *middle])
+    bend = 1 / state.factors[0], 1 / state.factors[1], *lift
+    frames = as_field(moving[:3]), as_field(rest_from_camera[:3])
+    return _Cloth(*frames, as_field(bend), as_field(opening), scene.sheet.heights)
 
 
 def _edges(depth: Field) -> NDArray[np.uint8]:
@@ -107,98 +122,143 @@ def _key_light_share(state: SceneState, view: RenderView, rays: Rays, depth: Fie
     return passing_light(points, nozzle_from_base @ state.scene.base_from_rest, state.lamps[0])
 
 
-@compiled("UniTuple(f4, 3)(f4[::1], f4[:,::1], f4, f4, f4)", inlined=True)
-def _above_cloth(
-    cloth: Field, heights: Field, x: np.float32, y: np.float32, depth: np.float32
-) -> tuple[np.float32, np.float32, np.float32]:
-    """How far above the cloth the point at `depth` of a ray (x, y, 1) is, mm, and where on it: x, y mm.
+CLOTH = "f4[:,::1], f4[:,::1], f4[::1], f4[::1], f4[:,::1]"  # the types of a _Cloth
+Place = tuple[np.float32, np.float32, np.float32]
 
-    The cloth follows the body near the opening and rests far from it; between, it is a mixture of the two. cloth: (37,)
-    grid_from_camera and rest_from_camera (3, 4); factors of length x, y; lift mm and exponent a mm^2; half sides of the
-    opening less its corners' radius, and that radius; where the cloth rests, and 1 / (where it is held less that); 1 /
-    the step of its nodes, and 1 / that of its
-    picture, and the middle of that, column and row.
-    """
+
+@compiled(f"UniTuple(f4, 3)({CLOTH}, f4, f4, f4)", inlined=True)
+def _above_cloth(
+    moving: Field,
+    resting: Field,
+    bend: Field,
+    opening: Field,
+    heights: Field,
+    x: np.float32,
+    y: np.float32,
+    depth: np.float32,
+) -> Place:
+    """How far above the cloth the point at `depth` of a ray (x, y, 1) is, mm, and where on it: x, y mm."""
     a, b = x * depth, y * depth
-    mx = cloth[0] * a + cloth[1] * b + cloth[2] * depth + cloth[3]
-    my = cloth[4] * a + cloth[5] * b + cloth[6] * depth + cloth[7]
-    mz = cloth[8] * a + cloth[9] * b + cloth[10] * depth + cloth[11]
-    rx = cloth[12] * a + cloth[13] * b + cloth[14] * depth + cloth[15]
-    ry = cloth[16] * a + cloth[17] * b + cloth[18] * depth + cloth[19]
-    rz = cloth[20] * a + cloth[21] * b + cloth[22] * depth + cloth[23]
-    dx, dy = abs(mx) - cloth[28], abs(my) - cloth[29]
+    mx = moving[0, 0] * a + moving[0, 1] * b + moving[0, 2] * depth + moving[0, 3]
+    my = moving[1, 0] * a + moving[1, 1] * b + moving[1, 2] * depth + moving[1, 3]
+    mz = moving[2, 0] * a + moving[2, 1] * b + moving[2, 2] * depth + moving[2, 3]
+    rx = resting[0, 0] * a + resting[0, 1] * b + resting[0, 2] * depth + resting[0, 3]
+    ry = resting[1, 0] * a + resting[1, 1] * b + resting[1, 2] * depth + resting[1, 3]
+    rz = resting[2, 0] * a + resting[2, 1] * b + resting[2, 2] * depth + resting[2, 3]
+    dx, dy = abs(mx) - opening[0], abs(my) - opening[1]
     ex, ey = max(dx, NOTHING), max(dy, NOTHING)
-    outside = np.sqrt(ex * ex + ey * ey) + min(max(dx, dy), NOTHING) - cloth[30]
-    t = min(max((outside - cloth[31]) * cloth[32], NOTHING), ONE)
+    outside = np.sqrt(ex * ex + ey * ey) + min(max(dx, dy), NOTHING) - opening[2]  # as `opening_distance`
+    t = min(max((outside - opening[3]) * opening[4], NOTHING), ONE)
     held = t * t * (np.float32(3) - np.float32(2) * t)
-    mx, my = mx * cloth[24], my * cloth[25]
-    if cloth[26] != NOTHING:
-        mz -= cloth[26] * np.exp(cloth[27] * (mx * mx + my * my))
+    mx, my = mx * bend[0], my * bend[1]
+    if bend[2] != NOTHING:
+        mz -= bend[2] * np.exp(bend[3] * (mx * mx + my * my))
     mx, my, mz = rx + held * (mx - rx), ry + held * (my - ry), rz + held * (mz - rz)
-    u = mx * cloth[33] + HALF * np.float32(heights.shape[1] - 1)
-    v = my * cloth[33] + HALF * np.float32(heights.shape[0] - 1)
+    per_mm = np.float32(1 / DRAPE_STEP)
+    u = mx * per_mm + HALF * np.float32(heights.shape[1] - 1)
+    v = my * per_mm + HALF * np.float32(heights.shape[0] - 1)
     return mz - height_at(heights, u, v), mx, my
 
 
-@compiled("f4(f4[::1], f4[:,::1], f4, f4, f4, f4, i8)", inlined=True)
+@compiled(f"f4({CLOTH}, f4, f4, f4, f4, i8)", inlined=True)
 def _first_on_cloth(
-    cloth: Field, heights: Field, x: np.float32, y: np.float32, near: np.float32, far: np.float32, steps: int
+    moving: Field,
+    resting: Field,
+    bend: Field,
+    opening: Field,
+    heights: Field,
+    x: np.float32,
+    y: np.float32,
+    near: np.float32,
+    far: np.float32,
+    steps: int,
 ) -> np.float32:
     """Depth mm at which a ray first meets the cloth, by equal steps from near to far; far where it never does."""
     step, above = (far - near) / np.float32(steps), ONE
     for k in range(steps + 1):
         depth = near + step * np.float32(k)
-        left, _, _ = _above_cloth(cloth, heights, x, y, depth)
+        left, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
         if left <= NOTHING:
             return depth + step * left / max(above - left, np.float32(1e-6))
         above = left
     return far
 
 
-@compiled("UniTuple(f4, 3)(f4[::1], f4[:,::1], f4, f4, f4)", inlined=True)
+@compiled(f"UniTuple(f4, 3)({CLOTH}, f4, f4, f4)", inlined=True)
 def _on_cloth(
-    cloth: Field, heights: Field, x: np.float32, y: np.float32, depth: np.float32
-) -> tuple[np.float32, np.float32, np.float32]:
+    moving: Field,
+    resting: Field,
+    bend: Field,
+    opening: Field,
+    heights: Field,
+    x: np.float32,
+    y: np.float32,
+    depth: np.float32,
+) -> Place:
     """The depth of a ray after a round of the secant method, and the cloth's x, y mm there."""
-    last, _, _ = _above_cloth(cloth, heights, x, y, depth + HALF)
-    left, _, _ = _above_cloth(cloth, heights, x, y, depth)
+    last, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth + HALF)
+    left, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
     fall = np.float32(2) * (last - left)
     if abs(fall) < np.float32(0.1):
         fall = -HALF
     depth -= min(max(left / fall, np.float32(-15)), np.float32(15))
-    _, cloth_x, cloth_y = _above_cloth(cloth, heights, x, y, depth)
+    _, cloth_x, cloth_y = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
     return depth, cloth_x, cloth_y
 
 
-@compiled("void(f4[::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1])")
+@compiled(f"void({CLOTH}, f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1])")
 def _search_cloth(
-    cloth: Field, heights: Field, x: Field, y: Field, near: Field, far: Field, steps: int, depth: Field
+    moving: Field,
+    resting: Field,
+    bend: Field,
+    opening: Field,
+    heights: Field,
+    x: Field,
+    y: Field,
+    near: Field,
+    far: Field,
+    steps: int,
+    depth: Field,
 ) -> None:
     """`_first_on_cloth` of rays (H, W)."""
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
-            bounds = near[row, column], far[row, column]
-            depth[row, column] = _first_on_cloth(
-                cloth, heights, x[row, column], y[row, column], bounds[0], bounds[1], steps
-            )
+            rx, ry, low, high = x[row, column], y[row, column], near[row, column], far[row, column]
+            depth[row, column] = _first_on_cloth(moving, resting, bend, opening, heights, rx, ry, low, high, steps)
 
 
-@compiled("void(f4[::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1])")
-def _refine_cloth(cloth: Field, heights: Field, x: Field, y: Field, depth: Field, u: Field, v: Field) -> None:
-    """Depth (H, W) mm of rays, refined in place, and the columns u and rows v of the cloth's picture there."""
+@compiled(f"void({CLOTH}, f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[:,::1])")
+def _refine_cloth(
+    moving: Field,
+    resting: Field,
+    bend: Field,
+    opening: Field,
+    heights: Field,
+    x: Field,
+    y: Field,
+    depth: Field,
+    texels: Field,
+    u: Field,
+    v: Field,
+) -> None:
+    """Depth (H, W) mm of rays, refined in place, and the columns u and rows v of the cloth's picture there.
+
+    texels: (3,) texels a mm, and the column and row in the middle.
+    """
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
-            found = _on_cloth(cloth, heights, x[row, column], y[row, column], depth[row, column])
-            depth[row, column] = found[0]
-            u[row, column] = found[1] * cloth[34] + cloth[35]
-            v[row, column] = found[2] * cloth[34] + cloth[36]
+            rx, ry, at = x[row, column], y[row, column], depth[row, column]
+            found, cloth_x, cloth_y = _on_cloth(moving, resting, bend, opening, heights, rx, ry, at)
+            depth[row, column] = found
+            u[row, column], v[row, column] = cloth_x * texels[0] + texels[1], cloth_y * texels[0] + texels[2]
 
 
-@compiled(
-    "void(f4[::1], f4[:,::1], u1[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1], f4[:,::1])",
-)
+@compiled(f"void({CLOTH}, u1[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[::1], f4[:,::1], f4[:,::1])")
 def _trace_edges(
-    cloth: Field,
+    moving: Field,
+    resting: Field,
+    bend: Field,
+    opening: Field,
     heights: Field,
     edges: Bytes,
     x: Field,
@@ -206,12 +266,13 @@ def _trace_edges(
     near: Field,
     far: Field,
     steps: int,
+    texels: Field,
     u: Field,
     v: Field,
 ) -> None:
     """Trace again, one by one, the pixels of those cells (h, w) in which the cloth hides itself.
 
-    x, y: (h, w) rays; near, far: mm of depth that hold the cloth. u, v: (H, W) columns and rows of the cloth's picture.
+    x, y: (h, w) rays; near, far: mm of depth that hold the cloth. u, v: (H, W), as `_refine_cloth` gives them.
     """
     for j, i in np.ndindex(edges.shape):
         if not edges[j, i]:
@@ -222,10 +283,9 @@ def _trace_edges(
                 along = (np.float32(column) + HALF) / np.float32(CELL_PX) - HALF
                 rx, ry = height_at(x, along, at), height_at(y, along, at)
                 low, high = height_at(near, along, at), height_at(far, along, at)
-                depth = _first_on_cloth(cloth, heights, rx, ry, low, high, steps)
-                _, cloth_x, cloth_y = _on_cloth(cloth, heights, rx, ry, depth)
-                u[row, column] = cloth_x * cloth[34] + cloth[35]
-                v[row, column] = cloth_y * cloth[34] + cloth[36]
+                depth = _first_on_cloth(moving, resting, bend, opening, heights, rx, ry, low, high, steps)
+                _, cloth_x, cloth_y = _on_cloth(moving, resting, bend, opening, heights, rx, ry, depth)
+                u[row, column], v[row, column] = cloth_x * texels[0] + texels[1], cloth_y * texels[0] + texels[2]
 
 
 @compiled("void(f4[::1], f4[::1], f4[::1], f4[::1])")
