@@ -98,7 +98,6 @@ class LiveRun:
             self._open_page(stack)
             address = "" if self._page is None else self._page.address
             self._injector = FaultInjector(prepared.faults, channels.processes, files.record, channels.start, address)
-            importlib.import_module("scipy.interpolate")  # the prediction needs it; now nobody waits for this process
             for note in prepared.notes:
                 self._console.say(note)
             if prepared.settings.real_time:
