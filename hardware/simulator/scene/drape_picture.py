@@ -81,15 +81,14 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
 class _Cloth(NamedTuple):
     """How the cloth lies before a camera, as the loops take it.
 
-    It follows the body near the opening and rests far from it; between, it is a mixture of the two.
+    It follows the body near the opening and rests far from it; between, it is a mixture of the two. opening: its half
+    sides less its corners' radius, that radius, how far outside it the cloth rests, and 1 / (how far it is held - that).
     """
 
     moving: Field  # (3, 4) grid_from_camera, mm
     resting: Field  # (3, 4) the same of the grid at rest
     bend: Field  # (4,) by which x and y are stretched back; mm by which the middle is lifted, and its exponent a mm^2
-    opening: (
-        Field  # (5,) mm: half sides less the corners' radius, that radius, where it rests; 1 / (held there less that)
-    )
+    opening: Field  # (5,) mm and 1 / mm
     heights: Field  # (H, W) mm, nodes DRAPE_STEP apart
 
 
