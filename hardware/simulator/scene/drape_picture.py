@@ -82,7 +82,7 @@ class _Cloth(NamedTuple):
     """How the cloth lies before a camera, as the loops take it.
 
     It follows the body near the opening and rests far from it; between, it is a mixture of the two. opening: its half
-    sides less its corners' radius, that radius, how far outside it the cloth rests, and 1 / (how far it is held - that).
+    sides less its corners' radius, that radius, how far outside it the cloth rests, 1 / (how far it is held - that).
     """
 
     moving: Field  # (3, 4) grid_from_camera, mm
