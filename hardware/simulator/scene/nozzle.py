@@ -71,14 +71,16 @@ def part_outline(part: Frustum) -> Array:
     return np.array([[r * np.cos(a), r * np.sin(a), z] for z, r in rings for a in angles])
 
 
+PART_OUTLINES = np.stack([part_outline(part) for part in NOZZLE_PARTS])  # (P, N, 3) mm
+
+
 def part_boxes(base_from_nozzle: Array | None, view: RenderView) -> list[PartBox]:
     """The parts in view and the part of the image that each can touch; base_from_nozzle: (4, 4) mm."""
     if base_from_nozzle is None:
         return []
-    outlines = np.stack([part_outline(part) for part in NOZZLE_PARTS])
-    points = se3.transform_points(base_from_nozzle, outlines.reshape(-1, 3))
+    points = se3.transform_points(base_from_nozzle, PART_OUTLINES.reshape(-1, 3))
     pixels, depth = pixels_from_points(view.camera, points)
-    pixels, depth = pixels.reshape(*outlines.shape[:2], 2), depth.reshape(outlines.shape[:2])
+    pixels, depth = pixels.reshape(*PART_OUTLINES.shape[:2], 2), depth.reshape(PART_OUTLINES.shape[:2])
     boxes = (
         view.clip(p.min(0) - 2, p.max(0) + 3) if d.min() > MIN_PART_DEPTH else None
         for p, d in zip(pixels, depth, strict=True)

@@ -70,6 +70,7 @@ class _Lattice:
     mirrors: Field  # (h, w, 4) slopes that mirror the lamps
     path: Field  # (h, w, 2) texels by which material points pass the rays during the exposure
     instants: int  # samples before the middle of the exposure, and as many after; 0: in the middle only
+    lamps: tuple[Field, Field]  # as `lamp_table` gives them
 
     def spread(self, cells: Field, first: int, last: int) -> Field:
         """A field of the cells at the samples of the cell rows first to last."""
@@ -94,7 +95,8 @@ def _lattice(state: SceneState, view: RenderView, box: ImageBox) -> _Lattice:
     path = speed * np.float32(exposure * layers.offsets(layers.level(view.spacing))[0])
     odd = np.asarray(cv2.dilate(odd, NEIGHBOURS), np.uint8)
     mirrors = mirror_slopes(directions, state.towards)
-    return _Lattice(to_nodes, rays, start, odd, mirrors, path, instants if smear > MIN_SMEAR_PX else 0)
+    lamps = lamp_table(state.lamps, state.towards, state.scene.look.ambient)
+    return _Lattice(to_nodes, rays, start, odd, mirrors, path, instants if smear > MIN_SMEAR_PX else 0, lamps)
 
 
 def _strip(
@@ -114,8 +116,7 @@ def _strip(
     if scene.look.lit:
         mirrors = lattice.spread(lattice.mirrors, first, last)
         mirrored, passed = mirrors.reshape(-1), _passed(state, rays).reshape(-1)
-        lamps = lamp_table(state.lamps, state.towards, scene.look.ambient)
-        ray_kernels.shade(colour.reshape(-1), relief.reshape(-1), mirrored, passed, looks, *lamps)
+        ray_kernels.shade(colour.reshape(-1), relief.reshape(-1), mirrored, passed, looks, *lattice.lamps)
     else:
         colour /= looks
     light[:] = block_mean(colour, light.shape[:2])
