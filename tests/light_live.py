@@ -14,6 +14,7 @@ AGE = 0.03  # s of a pose when it comes
 TILT = 0.005  # rad by which the surface turns as it breathes
 HOME = 65.0  # mm of Z: the surface lies at 50
 SIZE = (16, 12)  # px
+BURST_AFTER, BURST_SETS = 30, 100  # frame sets before a burst, and of a megabyte each in it
 RIG = """[[camera]]
 name = "{name}"
 source = "usb:{name}"
@@ -41,10 +42,13 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
     write_arm(folder / "arm.toml", replace(profile, arm=replace(profile.arm, home=home)), "near the surface")
 
 
-def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 1.0, deaf: bool = False) -> None:
+def track_nothing(
+    prepared: Any, channels: Any, last: str = "", height: float = 1.0, deaf: bool = False, burst: bool = False
+) -> None:
     """The body of a tracking process that knows where the surface is, which breathes by `height` mm up and down.
 
     last: phase of the print that it sees no more of, "" to see all of it. deaf: whether it ends by SIGKILL alone.
+    burst: whether it once gives the recorder more pictures at a time than wait for it.
     """
     import signal
     from dataclasses import replace
@@ -80,9 +84,12 @@ def track_nothing(prepared: Any, channels: Any, last: str = "", height: float = 
         pose = pose_at(lambda t: breathing(t, height=height, tilt=TILT), stamp)
         channels.poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
         seen = {"used": (50, 50), "looks": channels.looks.value, "surface": ground, "since": begin}
+        seen["unrecorded"] = outbox.dropped
         channels.reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, **seen))
         outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
         outbox.put(PoseEntry(pose, no_observations(stamp)))
+        for k in range(BURST_SETS if burst and sets == BURST_AFTER else 0):
+            outbox.put(SetEntry({0: stamp + 1e-4 * (k + 1)}, {0: ("png", picture + bytes(2**20))}))
         moved = channels.motion.get()
         if moved is not None and moved.progress is not None and moved.progress.phase.value == last:
             channels.reports.put(replace(channels.reports.get(), ended="session is over"))
@@ -141,9 +148,10 @@ def main(folder: Path, record: Path, *flags: str) -> int:
 
         run.recorded_begin = unkept
     heights = [float(flag.partition("=")[2]) for flag in flags if flag.startswith("--height=")]
-    last, deaf = "leaving" if "--until-printed" in flags else "", "--deaf" in flags
+    last = "leaving" if "--until-printed" in flags else ""
+    more = {"deaf": "--deaf" in flags, "burst": "--burst" in flags}
     with Console() as console:
-        tracker = partial(track_nothing, last=last, height=sum(heights) or 1.0, deaf=deaf)
+        tracker = partial(track_nothing, last=last, height=sum(heights) or 1.0, **more)
         outcome = LiveRun(prepared, console, tracker)()
         console.say(outcome.words)
     return outcome.code

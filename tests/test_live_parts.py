@@ -651,6 +651,16 @@ def test_whatever_ends_the_thread_that_sends_to_the_recorder_is_told() -> None:
     assert sender.dropped == 2
 
 
+def test_what_a_recorder_has_not_taken_when_its_sender_is_closed_is_counted() -> None:
+    ours, theirs = Pipe(duplex=False)
+    receiver, sender = RecorderReceiver(ours), RecorderSender(theirs)
+    for size in (1, 1, *[3_000_000] * 4):  # more than a pipe holds
+        sender.put(EventEntry(0.0, "x" * size, 2, "y"))
+    sender.close(0.2)
+    assert sender.dropped == 4 and len(list(receiver.take())) == 2
+    receiver.close()
+
+
 def test_a_sender_whose_recorder_has_ended_is_no_failure_of_its_own() -> None:
     ours, theirs = Pipe(duplex=False)
     sender = RecorderSender(theirs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -256,12 +257,17 @@ def test_an_arm_that_is_unplugged_is_waited_for_and_goes_on_from_home(start: Sta
 def test_what_goes_wrong_on_purpose_is_said_held_through_and_stops_the_arm(start: Start, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     hang, full = "tracking hang at 1s for 1s", "disk full at 4s"
-    run = start(record, "--yes", f"--fault={hang}", f"--fault={full}")
+    run = start(record, "--yes", "--burst", f"--fault={hang}", f"--fault={full}")
+    run.wait_for("the recording has gaps: the disk or the processor was too slow for [0-9]+ entr")
     run.wait_for("on purpose: tracking hang")
     hung = CLOCK.now()
     run.wait_for("on purpose: disk full")
     struck = CLOCK.now()
     assert run.end() == 1 and "recording stopped" in run.said and "go on with: stillbed live --resume" in run.said
+    gaps = run.said.rpartition("the recording has gaps: ")[2].partition("\n")[0]
+    lost = json.loads(RunFiles(record).summary.read_text())["unrecorded"]
+    assert 20 < lost < 5000 and f" {lost} entries" in gaps and gaps in RunFiles(record).report.read_text()
+    assert any("has gaps" in event.text for event in events(record))
     holds = [m for m in messages(record, "/hold") if hung < float(str(m["stamp"])) < hung + 1.2]
     assert any("pose is" in str(m["reason"]) for m in holds)
     missed = [event for event in events(record) if "the tracking process has said nothing" in event.text]

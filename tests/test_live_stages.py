@@ -715,6 +715,18 @@ def views_of(run: Staged, start: float = 0.0) -> ViewBuilder:
     return ViewBuilder(Prepared(LiveSettings(), File("s"), rig(), False, None, task, None, None, files, ()))
 
 
+def test_what_any_process_could_not_record_stays_on_the_page_and_is_said_at_the_end() -> None:
+    run, statistics = Staged().to_print(), RunStatistics()
+    build = views_of(run)
+    tracking, motion = replace(run.seen.tracking, unrecorded=3), replace(run.seen.motion, unrecorded=4)
+    alone = RunReports(own_unrecorded=5)
+    for seen, count in ((run.seen, 0), (RunReports(tracking, motion, None, 5), 12), (alone, 5)):
+        notes = build(run.now, run.conductor, seen, statistics).notes
+        assert len(notes) == (count > 0) and all(f" for {count} entries" in note for note in notes)
+        words = RunOutcome(build.prepared, run.conductor, statistics, seen, 0, 4.0).words
+        assert ("has gaps" in words) == (count > 0)
+
+
 def test_the_view_says_how_far_the_surface_moves_under_a_nozzle_that_was_stopped() -> None:
     run, statistics = Staged().to_print(), RunStatistics()
     build = views_of(run)

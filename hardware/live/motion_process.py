@@ -9,6 +9,7 @@ import importlib
 import math
 import signal
 from collections import deque
+from dataclasses import replace
 from logging import WARNING
 from types import FrameType
 
@@ -207,3 +208,5 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
         for entry in reporter.times.entries(clock.now()):
             sender.put(entry)
         sender.close()
+        if (last := channels.reports.get()) is not None:
+            channels.reports.put(replace(last, unrecorded=sender.dropped))

@@ -256,7 +256,7 @@ class RunOutcome:
                 if not self.recorded:
                     nothing = "nothing was recorded yet: begin it again as before"
                 lines.append(f"go on with: {self.again}" if self.again else nothing)
-        return "\n".join([*lines, f"report: {files.report}"])
+        return "\n".join([*lines, *self.reports.gaps, f"report: {files.report}"])
 
     def write(self) -> RunOutcome:
         """Write summary.json and report.html; the outcome of which that is said."""
@@ -306,7 +306,7 @@ class RunOutcome:
                 "frame_sets": 0 if tracking is None else tracking.sets,
                 "frame_sets_dropped": 0 if tracking is None else tracking.dropped,
                 "ticks_skipped": 0 if motion is None else motion.skipped,
-                "unrecorded": sum(report.unrecorded for report in (tracking, motion) if report is not None),
+                "unrecorded": reports.unrecorded,
                 "recorded_bytes": 0 if recorder is None else recorder.written,
                 "recorder_share_of_core": None if recorder is None else recorder.share,
             }
@@ -359,7 +359,7 @@ class RunOutcome:
             section("States", "Of the tracked surface.", figures_table(("state", "frame sets"), states)),
             section("Check", "As it was last.", checks),
         ]
-        lead = f"{self.machine.ended}. {'. '.join(self.prepared.notes)}"
+        lead = f"{self.machine.ended}. {'. '.join((*self.prepared.notes, *self.reports.gaps))}"
         return document("live run", self.prepared.files.record.stem, lead, body, "stillbed")
 
     def _track_section(self) -> list[str]:

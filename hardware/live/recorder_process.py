@@ -68,7 +68,7 @@ RECORDER_NICENESS = 10  # below all that moves the arm
 class RecorderSender:
     """One process's queue to the recorder.
 
-    dropped: entries without room, or after the recorder has ended.
+    dropped: entries without room, after the recorder has ended, or not sent when this was closed.
     failed: what ended the thread that sends, other than the recorder's end; "" while all is well. Who owns the sender
         looks at it, and ends the run.
     """
@@ -95,11 +95,15 @@ class RecorderSender:
             self._changed.notify()
 
     def close(self, patience: float = 5.0) -> None:
-        """Send what waits, for `patience` s at most, and close the pipe."""
+        """Send what waits, for `patience` s at most, and close the pipe. What still waits then is lost, and counted."""
         with self._changed:
             self._closed = True
             self._changed.notify()
         self._thread.join(patience)
+        with self._changed:
+            self._gone = True
+            self.dropped += len(self._waiting) + self._thread.is_alive()
+            self._waiting.clear()
 
     def _send(self) -> None:
         try:

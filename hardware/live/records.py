@@ -125,6 +125,20 @@ class RunReports:
     tracking: TrackingReport | None = None
     motion: LiveMotionReport | None = None
     recorder: RecorderReport | None = None
+    own_unrecorded: int = 0  # entries of the process that supervises, for which the recorder had no room
+
+    @property
+    def unrecorded(self) -> int:
+        """Entries of all processes for which the recorder had no room: pictures first, then poses, ticks, messages."""
+        reports = self.tracking, self.motion
+        return self.own_unrecorded + sum(report.unrecorded for report in reports if report is not None)
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """What is missing in the recording, in words; nothing where it is whole."""
+        count = self.unrecorded
+        what = "1 entry" if count == 1 else f"{count} entries"
+        return (f"the recording has gaps: the disk or the processor was too slow for {what}",) if count else ()
 
 
 # -- what is recorded

@@ -72,6 +72,7 @@ class LiveRun:
         self._signal = 0  # that asks the run to end
         self._stops_ordered: list[float] = []  # s, of stops whose frame is not on the wire yet
         self._stops = self._key_requests = 0  # on the wire so far; requests of the terminal, counted downwards
+        self._gaps = 0  # entries not recorded, when that was last said
         self._turn = 0  # of the state machine, when its stage was last announced
         self._announced = -1e9  # s
         self._silence_logged = self._arm_halted = False
@@ -129,7 +130,7 @@ class LiveRun:
         requests = self._requests_by_key(ready) + self._channels.link.take()
         reports, channels, now = self._reports, self._channels, self._clock.now()
         reports.tracking, reports.motion = channels.tracking.get(), channels.motion.get()
-        reports.recorder = channels.recorder.get()
+        reports.recorder, reports.own_unrecorded = channels.recorder.get(), channels.sender.dropped
         self._time_stops()
         machine = self._machine
         for text in self._injector.update(now):
@@ -319,6 +320,9 @@ class LiveRun:
         if machine.silence and not self._silence_logged:
             self._channels.sender.put(EventEntry(now, machine.silence, WARNING, "run"))
         self._silence_logged = bool(machine.silence)
+        if self._reports.unrecorded > 2 * self._gaps:  # not each time: it would fill the log
+            self._gaps = self._reports.unrecorded
+            self._log(*self._reports.gaps, WARNING)
         if machine.turn != self._turn:
             self._turn, self._view_put = machine.turn, -1e9  # the page is told at once
             if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.value):
@@ -374,7 +378,7 @@ class LiveRun:
             self._switch_off_material()
         reports.tracking = channels.tracking.get() or reports.tracking
         reports.motion = channels.motion.get() or reports.motion
-        reports.recorder = channels.recorder.get()
+        reports.recorder, reports.own_unrecorded = channels.recorder.get(), channels.sender.dropped
 
 
 @contextmanager

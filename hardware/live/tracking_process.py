@@ -103,6 +103,8 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
         pass
     finally:
         sender.close()
+        if (last := channels.reports.get()) is not None:
+            channels.reports.put(replace(last, unrecorded=sender.dropped))
 
 
 class _Terminated(BaseException):

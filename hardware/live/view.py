@@ -188,7 +188,7 @@ class ViewBuilder:
             cameras=() if tracking is None else self._cameras(tracking, now),
             answer=machine.answer,
             placement=self._placement(machine, tracking),
-            notes=self.prepared.notes,
+            notes=(*self.prepared.notes, *reports.gaps),
             log=tuple(self._log),
             result=result,
             draws=draws,
