@@ -322,7 +322,7 @@ class LiveRun:
         self._silence_logged = bool(machine.silence)
         if self._reports.unrecorded > 2 * self._gaps:  # not each time: it would fill the log
             self._gaps = self._reports.unrecorded
-            self._log(*self._reports.gaps, WARNING)
+            self._log(self._reports.gaps[0], WARNING)
         if machine.turn != self._turn:
             self._turn, self._view_put = machine.turn, -1e9  # the page is told at once
             if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.value):
