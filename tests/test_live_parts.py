@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import weakref
+from contextlib import suppress
 from copy import deepcopy
 from ctypes import c_double
 from dataclasses import replace
@@ -318,6 +319,37 @@ def test_raw_pixels_are_recorded_exactly_also_those_that_came_before_the_rig(tmp
     assert len(sets) == 400
     for number, frames in enumerate(sets):
         assert all(np.array_equal(frame.image, image(frame.camera, number)) for frame in frames.frames)
+
+
+@pytest.mark.parametrize("real_time", [True, False])
+def test_a_recorder_that_is_behind_goes_before_ordinary_work_until_it_is_not(tmp_path: Path, real_time: bool) -> None:
+    ours, theirs = Pipe(duplex=False)
+    chosen = LiveSettings(record=tmp_path / "run.mcap", arm="virtual", trace=False, real_time=real_time)
+    recorder = SPAWN.Process(target=record, args=(chosen, [ours], reports := SharedLatest[RecorderReport]()))
+    recorder.start()
+    ours.close()
+    sender, clock = RecorderSender(theirs), WallClock()
+    sender.put(rig())
+    for number in range(39):
+        sender.put(SetEntry({0: 1.0 + number}, {0: ("png", bytes(1_000_000))}))
+    policies, until = list[int](), clock.now() + 60
+    while ((report := reports.get()) is None or report.written < 39e6) and clock.now() < until:
+        policies.append(os.sched_getscheduler(recorder.pid))
+    clock.wait_until(clock.now() + 0.5)
+    policies.append(os.sched_getscheduler(recorder.pid))
+    sender.close(30)
+    recorder.join(30)
+    assert recorder.exitcode == 0 and sender.dropped == 0
+    assert (os.SCHED_FIFO in policies) == (real_time and real_time_granted()) and policies[-1] == os.SCHED_OTHER
+
+
+def real_time_granted() -> bool:
+    """Whether the system grants real-time priority here."""
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        return True
+    return False
 
 
 def test_a_sender_lets_go_of_the_pictures_that_a_killed_recorder_has_not_taken(tmp_path: Path) -> None:

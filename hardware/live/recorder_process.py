@@ -45,7 +45,7 @@ from hardware.live.settings import LiveSettings, used_files
 from hardware.live.trace import MIN_WRITE_S, RECORDER_LANE, TraceBatch, TraceLane
 from hardware.motion.loop import DispenserRecord, RecordedTick
 from hardware.process.clock import ProcessorClock, WallClock, utc_now
-from hardware.process.system import SharedLatest, set_up_process, state_inputs
+from hardware.process.system import SharedLatest, catch_up, set_up_process, state_inputs
 from hardware.recording.loop_record import LoopRecord
 from perception.frames import OutlinedPicture, Roi
 from planning.laid_beads import Look
@@ -62,7 +62,7 @@ RESERVED_BYTES = 8 * 2**20  # of them kept free of pictures, so that these never
 FLUSH_AFTER = 0.2  # s without anything new after which what is there goes to the disk
 GATHER_TIME = 0.08  # s in which entries gather: woken for each, this process took twice as long for all of them
 FREE_PAGES_BYTES = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
-RECORDER_NICENESS = 10  # below all that moves the arm
+RECORDER_NICENESS = 10  # below all that moves the arm, unless senders wait
 
 
 class RecorderSender:
@@ -258,6 +258,7 @@ class _EntryWriter:
         self._recorder: Recorder | None = None
         self._used, self._tracked = UsedPoses(()), -np.inf  # and the stamp, s, of the last pose by the tracking process
         self._early, self._failed, self._reported = list[Entry](), "", 0.0
+        self._urgent = settings.real_time  # where senders wait
         self.report()  # pictures may come
 
     def run(self, senders: Sequence[RecorderReceiver]) -> None:
@@ -272,7 +273,9 @@ class _EntryWriter:
                 elif not crowded:
                     self._clock.wait_until(self._clock.now() + GATHER_TIME)
                 begun = self._clock.now()
-                crowded = any([self._take(key.fileobj, selector) for key, _ in selector.select(0)])
+                before, crowded = crowded, any([self._take(key.fileobj, selector) for key, _ in selector.select(0)])
+                if crowded != before and self._urgent:
+                    catch_up(crowded)
                 if self._lane is not None and (now := self._clock.now()) > begun + MIN_WRITE_S:
                     self._lane.add(now, (("a batch is written", begun, now),))
                 if self._clock.now() > self._reported + FLUSH_AFTER:

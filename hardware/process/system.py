@@ -108,7 +108,8 @@ def blocked_sigint() -> Iterator[None]:
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
 TRACKING_PRIORITY = 5  # of those: the arm's motion goes before the tracking that it waits for
-ANSWER_PRIORITY = 1  # of those: whoever answers an operator goes after both
+ANSWER_PRIORITY = 2  # of those: whoever answers an operator goes after both
+CATCH_UP_PRIORITY = 1  # of those: whoever is behind with what would be lost goes last
 NICE_LEVEL = -10  # before all that asked for nothing
 NO_PRIORITY = "nothing: an ordinary process"  # what is granted where no priority is
 
@@ -155,6 +156,13 @@ def step_back(nice: int = 0) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     if nice:
         os.nice(nice)
+
+
+def catch_up(behind: bool) -> None:
+    """This thread goes before ordinary work while it is behind with its own, where the system grants that."""
+    with suppress(AttributeError, OSError):
+        policy, priority = (os.SCHED_FIFO, CATCH_UP_PRIORITY) if behind else (os.SCHED_OTHER, 0)
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
 
 
 def set_up_process(name: str, cores: Sequence[int] = (), nice: int = 0, outlives: bool = False) -> None:
