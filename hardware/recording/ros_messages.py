@@ -274,6 +274,7 @@ class ViewerChannels:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._path, self._places = np.empty((0, 3)), np.empty(0)  # mm, surface frame; and how far along each is
+        self._middle = np.zeros(3)  # mm, of the path
         self._outlines: list[Array] = []  # (K, 3) mm each, surface frame, as drawn over pictures
         self._drawn_path = np.empty((0, 3))  # the path likewise
         self._tracks: Observations | None = None
@@ -301,6 +302,7 @@ class ViewerChannels:
     def path(self, points: Array, places: Array, instant: int) -> Iterator[RosMessage]:
         """The path from now on: points (N, 3), mm, surface frame, and how far along it each is (N,), rising."""
         self._path, self._places, self._drawn_path = points, places, _thinned(points)
+        self._middle = points.mean(axis=0) if len(points) else np.zeros(3)
         yield from self._cloud(0.0, instant)
 
     def surface(self, landmarks: Array, outlines: Sequence[Array], instant: int) -> Iterator[RosMessage]:
@@ -353,18 +355,17 @@ class ViewerChannels:
         yield RosMessage("/tf", TRANSFORMS, transforms(BASE_FRAME, {SURFACE_FRAME: lies}, instant))
         moved = odometry(lies, pose.covariance, pose.twist, pose.twist_covariance, instant)
         yield RosMessage("/surface", ODOMETRY, moved)
-        middle = self._path.mean(axis=0) if len(self._path) else np.zeros(3)
         if self._truth is not None and self._truth[0] == pose.stamp:
             if self._true_from_own is None and pose.state is TrackState.TRACKING:
                 self._true_from_own = se3.inverse(self._truth[1]) @ lies
             if self._true_from_own is not None:
-                true = se3.transform_points(self._truth[1] @ self._true_from_own, middle[None])
-                off = se3.transform_points(lies, middle[None]) - true
+                true = se3.transform_points(self._truth[1] @ self._true_from_own, self._middle[None])
+                off = se3.transform_points(lies, self._middle[None]) - true
                 yield self.error("tracking", float(np.linalg.norm(off)))
         if pose.stamp - self._drawn >= OVERLAY_PERIOD:
             self._drawn = pose.stamp
             if np.isfinite(pose.covariance).all():
-                yield self.error("claimed", float(pose.error_at(middle[None])[0]))
+                yield self.error("claimed", float(pose.error_at(self._middle[None])[0]))
             yield from self._overlays(pose, instant)
 
     def _overlays(self, pose: SurfacePose, instant: int) -> Iterator[RosMessage]:
