@@ -50,7 +50,7 @@ fuzz: $(STAMP)
 	$(BIN)/python -m tests.campaigns fuzz --count 1000000 --jobs 2 --log out/fuzz.csv -o out/fuzz --force
 
 deceit: $(STAMP)
-	$(BIN)/python -m tests.campaigns.deceit --count 200 --seed 1 --jobs 2 --sheets -o out/deceit
+	$(BIN)/python -m tests.campaigns deceit --count 200 --seed 1 --jobs 2 -o out/deceit --force
 
 hazards: $(STAMP)
 	$(BIN)/python -m tests.hazard_table --run

@@ -248,7 +248,6 @@ MADE = (  # by these tests/workspace.py makes what the others name
 TRAINED = "tests/test_training.py trains, where torch is installed"
 NOT_RUN = {  # and why not
     "pip install 'stillbed[franka]'": "installs from a network",
-    "python -m tests.campaigns.three_cameras": "needs Aravis's cameras; `make counterparts` runs the tests with them",
     "python -m tests.dependency_table": "tests/test_shipped.py asks whether what it would write is there",
     "stillbed arm franka://172.16.0.2": "needs a robot; tests/test_arm_laws.py meets a simulated one",
     "stillbed arm gcode:///dev/ttyACM0 --arm data/arms/gantry.toml": "needs a machine; see tests/test_gcode.py",

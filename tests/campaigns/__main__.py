@@ -65,6 +65,16 @@ CAMPAIGNS: Subjects = dict(
             number("--seed", 300, None, "of the first scene (default: 300)"),
             number("--seconds", 5.0, "S", "of each scene; default 5"),
         ),
+        _campaign(
+            "deceit", "deceit.campaign", "sessions made to fool the tracker: silently wrong, and back again after"
+        )(
+            number("--count", 200, "N", "sessions, of all kinds in turn; default 200"),
+            number("--seed", 1, None, "of all that is drawn; default 1"),
+            number("--jobs", 1, None, "processes that share the sessions; default 1"),
+            option("--kind", action="append", metavar="NAME", help="only this kind; may be given again"),
+            option("--index", type=int, action="append", metavar="N", help="only this session; may be given again"),
+            option("--size", type=int, nargs=2, default=(640, 480), metavar="PX", help="of pictures; default 640 480"),
+        ),
         _campaign("estimator", "estimator", "the estimator on synthetic tracks: accuracy, honesty, time")(
             option("--only", default="*", metavar="PATTERN", help="scenes by name, e.g. 'breathing, c*'"),
             option("--maps", nargs="+", choices=MAPS, default=MAPS, help="whose map"),
@@ -166,10 +176,6 @@ CAMPAIGNS: Subjects = dict(
             number("--hours", 1.0, None, "at rest (default: %(default)s)"),
             number("--noise", 0.1, None, "px of a track in a frame (default: %(default)s)"),
             SEED,
-        ),
-        _campaign("tracks", "mapping", "scatter and creep of tracks before a surface that stands still")(
-            number("--minutes", 10.0, "M", "that are stood for; default 10"),
-            number("--pictures", 240, "N", "evenly over them; default 240"),
         ),
         _campaign("views", "views", "skin that deforms, grazing views with glare, a cube's edges")(
             number("--seconds", 8.0, "S", "of each sequence; default 8")

@@ -1,8 +1,7 @@
-"""Subjects `map`, `registration` and `tracks`: landmarks, a scan and tracks, and the truth.
+"""Subjects `map` and `registration`: landmarks and a scan, and the truth.
 
 `map`: distances of landmarks from the true surface, beside the reported covariance; and the map's growth.
 `registration`: a scan registered to the first pictures, its error over the wound, and its verdict.
-`tracks`: scatter and drift of tracks while camera and surface stand still.
 """
 
 from __future__ import annotations
@@ -28,10 +27,8 @@ from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
-from perception.frames import Frame, FrameSet, Image
-from perception.lens import Lenses
-from perception.mapping.features import grey
-from perception.mapping.patches import RELIEF_PX, Pyramid, align, cut_templates, project_squares
+from perception.frames import Frame, FrameSet
+from perception.mapping.patches import RELIEF_PX
 from perception.tracking.step import TrackingStep
 from tests.campaigns.estimator import nees
 
@@ -271,53 +268,3 @@ def _error(result: TrackedShape) -> tuple[Array, NDArray[np.bool_]]:
     change = se3.inverse(estimated[0]) @ true[0]
     error = np.linalg.norm((se3.inverse(true) @ (estimated @ change))[:, :3, 3], axis=1)
     return error, np.array([pose.state.measured for pose in poses])
-
-
-MINUTE_S, LIGHT_DRIFT = 60.0, 0.15  # s; of the light, from the first picture to the last
-
-
-def run_tracks(options: argparse.Namespace) -> list[Figure]:
-    """Tracks on a forearm and a chest, one camera, every picture with its own noise and a light that drifts."""
-    stamps = np.linspace(0.0, options.minutes * MINUTE_S, max(4, options.pictures))
-    return [f for name in ("forearm", "chest") for f in _track_figures(name, stamps, *_track_pictures(name, stamps))]
-
-
-def _track_pictures(name: str, stamps: Array) -> tuple[Array, Array]:
-    """Pixels (T, N, 2) of a body's tracks, nan where lost, and their sigmas (T, N) px."""
-    rig = arc_rig(size=(1280, 720), focal=1100.0)
-    lenses, shape = Lenses(rig), shape_of(name, 1)
-    scene, rng = Scene(shape, Appearance(), seed=1), np.random.default_rng(5)
-    place = shape.grid(4.0, 0.8)
-    points, normals = shape.points(place), shape.normals(place)
-
-    def picture(stamp: float) -> Image:
-        state = WorldState(stamp, 0.0, BASE_FROM_REST, np.zeros(6), gain=1 + LIGHT_DRIFT * stamp / stamps[-1])
-        return grey(render(scene, rig.cameras[1:2], [state], Sensor(), [rng])[0])
-
-    templates = cut_templates(lenses, Pyramid(picture(0.0)), 1, BASE_FROM_REST, points, normals)
-    where = project_squares(lenses, 1, BASE_FROM_REST, points, normals, templates.axes)
-    pixels, sigmas = np.full((len(stamps), len(points), 2), np.nan), np.full((len(stamps), len(points)), np.nan)
-    for i, stamp in enumerate(stamps.tolist()):
-        aligned = align(templates, Pyramid(picture(stamp)), where, where.centre, coarse=False)
-        rows = aligned.found
-        pixels[i, rows], sigmas[i, rows] = aligned.pixels[rows], aligned.sigma[rows]
-    return pixels, sigmas
-
-
-def _track_figures(name: str, stamps: Array, pixels: Array, sigmas: Array) -> list[Figure]:
-    steady = np.isfinite(pixels).all((0, 2))
-    tracks, sigma = pixels[:, steady], sigmas[:, steady]
-    scatter = np.sqrt(((tracks - tracks.mean(0)) ** 2).mean((0, 2)))  # of each track, an axis
-    parts = stamps <= MINUTE_S, stamps >= stamps[-1] - MINUTE_S
-    early, late = (tracks[part].mean(0) for part in parts)
-    chance = float(np.sqrt((scatter**2).mean() * (1 / parts[0].sum() + 1 / parts[1].sum())))
-    share = 100 * float(steady.sum()) / max(1, int(np.isfinite(pixels[0, :, 0]).sum()))
-    over = f"{len(stamps)} pictures over {stamps[-1] / MINUTE_S:g} min, light +{LIGHT_DRIFT:.0%}"
-    note, shared = f"{int(steady.sum())} tracks, {over}", "the claim holds what all pictures share, too"
-    ratio, drift = float(np.median(scatter / sigma.mean(0))), f"{name}: creep, last minute against first"
-    return [
-        Figure(f"{name}: scatter of a track", rms(scatter), "px RMS", at_most(0.1), "", note),
-        Figure(f"{name}: scatter of what is claimed", ratio, "", None, "", shared),
-        Figure(drift, rms(late - early), "px RMS", at_most(0.05), "", f"chance: {chance:.4f}"),
-        Figure(f"{name}: tracks kept to the end", share, "%", at_least(95)),
-    ]

@@ -7,7 +7,6 @@ of 100 cases. The first pose given as TRACKING places the path, so errors are re
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -19,7 +18,8 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.offline.track import FrameSetStep, _network_segmenter
-from perception.frames import FrameSet, Image
+from hardware.process.clock import WallClock
+from perception.frames import FrameSet
 from perception.tracking.step import TrackingStep
 from perception.tracking.wound_step import RegionSearch, RegionTrackingStep
 from planning.command import MotionLimits
@@ -60,7 +60,6 @@ class Verdict:
     first: int  # number of the first set that is TRACKING; the sessions' length where there is none
     again: int  # sets after the trick's end until one is TRACKING and right; -1: none is; -2: no such end
     told: int  # sets from a rise of 2 mm until the claim covers it or nothing is printed; -1: never; -2: no rise
-    pictures: dict[int, list[Image]]  # of the sets asked for
 
     @property
     def wrong(self) -> int:
@@ -155,33 +154,25 @@ def frame_sets(session: Session) -> Iterator[FrameSet]:
         yield renderer.frame_set(number, stamp)
 
 
-def run(session: Session, keep: tuple[int, ...] = ()) -> Verdict:
-    """Track and judge a session. keep: numbers of the sets whose pictures are kept."""
-    step, judge, sets, pictures = tracker(session), Judge(session), [], {}
-    for number, frames in enumerate(frame_sets(session)):
+def run(session: Session) -> Verdict:
+    """Track and judge a session."""
+    step, judge, sets = tracker(session), Judge(session), list[SetVerdict]()
+    for frames in frame_sets(session):
         sets.append(judge(step(frames)))
         step.idle()
-        if number in keep:
-            pictures[number] = [frame.image for frame in frames.frames]
-    return _verdict(session, sets, pictures)
+    return _verdict(session, sets)
 
 
-def shown_sets(session: Session) -> tuple[int, ...]:
-    """Numbers of the sets on a contact sheet: before the trick, within it, at the end."""
-    last = len(session.stamps) - 1
-    return max(session.trick - 1, 0), min(session.trick + max(4, (last - session.trick) // 4), last - 1), last
-
-
-def run_one(seed: int, size: tuple[int, int], sheets: bool, index: int) -> tuple[Verdict, float]:
-    """One session of a campaign, and the seconds that it took. sheets: whether pictures of it are kept."""
+def run_one(seed: int, size: tuple[int, int], index: int) -> tuple[Verdict, float]:
+    """One session of a campaign, and the seconds that it took."""
     cv2.setNumThreads(1)  # sessions run beside each other
-    start = time.perf_counter()
-    session = make_session(seed, index, size)
-    verdict = run(session, shown_sets(session) if sheets else ())
-    return verdict, time.perf_counter() - start
+    clock = WallClock()
+    start = clock.now()
+    verdict = run(make_session(seed, index, size))
+    return verdict, clock.now() - start
 
 
-def _verdict(session: Session, sets: list[SetVerdict], pictures: dict[int, list[Image]]) -> Verdict:
+def _verdict(session: Session, sets: list[SetVerdict]) -> Verdict:
     first = next((i for i, s in enumerate(sets) if s.state == "TRACKING"), len(sets))
     settled = int(np.searchsorted(session.stamps, session.settled))
     fine = [i for i, s in enumerate(sets) if i >= max(first, settled) and s.state == "TRACKING" and not s.wrong]
@@ -191,4 +182,4 @@ def _verdict(session: Session, sets: list[SetVerdict], pictures: dict[int, list[
     if risen and first < risen[0]:
         told = next((i - risen[0] for i in risen if sets[i].covered), -1)
     known = session.kind, session.index, session.seed, session.what, session.decidable == "", session.honest
-    return Verdict(*known, tuple(sets), first, again, told, pictures)
+    return Verdict(*known, tuple(sets), first, again, told)

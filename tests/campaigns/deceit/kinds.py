@@ -92,7 +92,7 @@ def board_covered(draw: Draw) -> Session:
     made = in_plane(_board(draw, border, marks, fps, SETS + 16), (start + end) / 2, x * SQUARE, y * SQUARE)
     made = changed(made, sheets=(cloth(draw.rng, start, end),))
     what = f"{SQUARE * math.hypot(x, y):.1f} mm while covered, {_words(border, marks)}"
-    return told_as(made, what, settled=end + PASSING_S, trick=TRICK - 8, decidable="" if border or marks else PURE)
+    return told_as(made, what, settled=end + PASSING_S, decidable="" if border or marks else PURE)
 
 
 def board_sway(draw: Draw) -> Session:
@@ -101,7 +101,7 @@ def board_sway(draw: Draw) -> Session:
     fps, start, amplitude = 4.0, start_of(4.0, 20), draw.uniform(28, 42)
     made = _board(draw, border, marks, fps, 50, sway(draw.rng, amplitude, draw.uniform(0.35, 0.6), start))
     what = f"{amplitude:.0f} mm at {fps:g} fps, {_words(border, marks)}"
-    return told_as(made, what, trick=20, settled=start, decidable="" if border or marks else PURE)
+    return told_as(made, what, settled=start, decidable="" if border or marks else PURE)
 
 
 def _words(border: bool, marks: bool) -> str:
@@ -161,7 +161,7 @@ def squares_covered(draw: Draw) -> Session:
     start, end = start_of(fps), start_of(fps, TRICK + COVERED_SETS)
     made = in_plane(_squares(draw, fps, SETS + 16), (start + end) / 2, far, 0.0)
     made = changed(made, sheets=(cloth(draw.rng, start, end),))
-    return told_as(made, f"{far:g} mm while covered", settled=end + PASSING_S, trick=TRICK - 8)
+    return told_as(made, f"{far:g} mm while covered", settled=end + PASSING_S)
 
 
 def chequerboard_hops(draw: Draw) -> Session:
@@ -179,7 +179,7 @@ def chequerboard_hops(draw: Draw) -> Session:
     made = flat(
         draw, texture, looks.BOARD_SCALE, steps(stamps, np.array(hops)), fps=fps, sets=count, reach=95.0, breath=0.0
     )
-    return told_as(made, f"7 x 5 squares of {square:g} mm at {fps:g} fps", trick=start, settled=stamps[0])
+    return told_as(made, f"7 x 5 squares of {square:g} mm at {fps:g} fps", settled=stamps[0])
 
 
 def printed_beads(draw: Draw) -> Session:
@@ -290,7 +290,7 @@ def two_patients(draw: Draw) -> Session:
     other = looks.with_wound(rng, looks.skin(rng), rng.uniform(13, 19))
     made = changed(made, skin=lambda t: first if t < middle else other)
     made = changed(made, sheets=(cloth(draw.rng, start, end),))
-    return told_as(made, "another skin while covered", settled=end, trick=TRICK - 8, gone=middle)
+    return told_as(made, "another skin while covered", settled=end, gone=middle)
 
 
 # -- light
@@ -389,7 +389,7 @@ def mirrored(draw: Draw) -> Session:
     made = seen_by(made, views)
     made = replace(made, roi=drawn_region(made, 38.0))
     what = ", ".join(f"{c} {v.get('flip', 'swapped')}" for c, v in views.items())
-    return told_as(made, what, trick=0)
+    return told_as(made, what)
 
 
 def shimmer(draw: Draw) -> Session:
@@ -426,9 +426,7 @@ def glove(draw: Draw) -> Session:
     colour = draw.pick((0.62, 0.42, 0.2), (0.7, 0.72, 0.75), (0.2, 0.14, 0.1))
     height = draw.uniform(50, 90)
     hand = passing(looks.glove(draw.rng, colour), 3.0, start, start + lasts, height, way=-420.0)
-    return told_as(
-        changed(made, sheets=(hand,)), f"{lasts:g} s", settled=start + lasts + PASSING_S, trick=TRICK - 8, honest=True
-    )
+    return told_as(changed(made, sheets=(hand,)), f"{lasts:g} s", settled=start + lasts + PASSING_S, honest=True)
 
 
 def flicker(draw: Draw) -> Session:

@@ -50,7 +50,6 @@ class Session:
     points: Array  # (M, 3) mm, of the tissue at rest: where poses are judged
     decidable: str = ""  # why no three cameras can decide it; "": they can
     honest: bool = False  # hard, but to be followed
-    trick: int = TRICK  # number of the first set of the trick
     settled: float = -1.0  # s, from which the pictures are good again, so that the pose may be; below 0: always
     gone: float = math.inf  # s, from which on the mapped tissue is no longer there
 
