@@ -31,7 +31,7 @@ from tests.campaigns.faults import (
     append_log,
     draw_faults,
     fault_figures,
-    fault_page,
+    fault_table,
     judge_fault,
     one_run,
     read_log,
@@ -137,7 +137,7 @@ def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, m
     append_log(log := tmp_path / "faults.csv", rows)
     again = read_log(log, 1)
     assert [str(row.verdict.fault) for row in again] == [str(row.verdict.fault) for row in rows]
-    assert not read_log(log, 2) and "camera" in fault_page([row.verdict for row in again])
+    assert not read_log(log, 2) and "camera" in fault_table([row.verdict for row in again])
     assert {figure.what: figure.value for figure in fault_figures(again)}["silent failures"] == 0
     log.write_text("a,b\n")
     with pytest.raises(InputError, match="header"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from hardware.bench.recordings import latency_figures
 from perception.tracking.step import STAGES
 from tests.campaigns import growth
 from tests.campaigns.estimator import SETTLING_SETS, consistency_figures, scene_errors
-from tests.campaigns.growth import CostAxis, axes_for, growth_figures, growth_page, slope
+from tests.campaigns.growth import CostAxis, axes_for, growth_figures, slope
 
 TWIST = np.array([0.0, 0.0, 0.1, 5.0, 0.0, -2.0])
 
@@ -147,19 +146,17 @@ def test_the_slope_is_the_power_of_the_law(power: float) -> None:
     assert np.isnan(slope(values, np.full(4, np.nan)))
 
 
-def test_each_point_is_told_and_drawn() -> None:
+def test_each_point_is_told() -> None:
     axis = CostAxis("tracks", "landmarks", "a pose", (10, 20, 40), lambda n: (n, 2 * n))
     costs = np.array([axis.cost(n) for n in axis.values])
     told = growth_figures(axis, costs)
     assert [f.value for f in told[:3]] == [10, 20, 40] and told[3].value == pytest.approx(1.0)
-    assert growth_page([(axis, costs)]).count("<circle") >= 6
 
 
-def test_a_short_run_measures_every_axis_but_the_rendered_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_run_measures_every_axis_but_the_rendered_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "WORLD_MINUTES", (0.02, 0.03))
     short = tuple(CostAxis(a.name, a.unit, a.what, a.values[:2], a.cost) for a in axes_for(0.8))
     monkeypatch.setattr(growth, "axes_for", lambda seconds: short)
-    found = growth.run_growth(argparse.Namespace(seconds=0.8, no_pictures=True, out=tmp_path))
+    found = growth.run_growth(argparse.Namespace(seconds=0.8, no_pictures=True))
     assert len(found) == 4 * 3 and all(f.value > 0 for f in found if "median" in f.what)
     assert not any(f.what.startswith("pixels") for f in found)
-    assert "Minutes" in (tmp_path / "growth.html").read_text()

@@ -27,9 +27,9 @@ from hardware.bench.fault_run import FaultRun, FaultRunRecord, prepare_scenario
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress, workers
 from hardware.process.clock import ProcessorClock
 from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner, fault_from_text
-from hardware.report.page import Plot, document, figures_table, section
 from hardware.simulator.deposit import NozzleLog
 from perception import shipped_file
+from tests.campaigns.verdicts import kind_table
 
 RowFlags = NDArray[np.bool_]
 
@@ -179,20 +179,15 @@ def fault_table(verdicts: Sequence[FaultVerdict]) -> str:
 
     said, known: `exposure` and `detected` of the verdicts. late: how many recovered after more than `MAX_RECOVERY`.
     """
-    return figures.aligned([KIND_HEADER, *_rows_by_kind(verdicts)], range(1, len(KIND_HEADER)))
+    return kind_table(KIND_HEADER, [(f"{v.fault.part} {v.fault.kind}", v) for v in verdicts], _row, KINDS)
 
 
-def _rows_by_kind(verdicts: Sequence[FaultVerdict]) -> list[tuple[str, ...]]:
-    groups = {name: [v for v in verdicts if _kind(v) == name] for name in KINDS} | {"all": verdicts}
-    return [_row(name, group) for name, group in groups.items() if group]
-
-
-def _row(name: str, verdicts: Sequence[FaultVerdict]) -> tuple[str, ...]:
+def _row(verdicts: Sequence[FaultVerdict]) -> tuple[str, ...]:
     exposure, detected, back = _times_of(verdicts)
     silent, restless, operator = (str(sum(getattr(v, n) for v in verdicts)) for n in ("silent", "restless", "operator"))
     share, worst = f"{100 * len(detected) / len(verdicts):.0f}", f"{max(v.worst for v in verdicts):.2f}"
     late = str(int((back > MAX_RECOVERY + 1e-9).sum()))
-    counts = (name, str(len(verdicts)), silent, share)
+    counts = (str(len(verdicts)), silent, share)
     times = (*_times(exposure, 99), *_times(detected, 99), worst, restless, *_times(back, 100))
     return (*counts, *times, late, operator)
 
@@ -209,42 +204,6 @@ def _times(seconds: Array, share: float) -> tuple[str, str]:
 
 def _share(seconds: Array, share: float) -> float:
     return 1000 * float(np.percentile(seconds, share, method="higher")) if len(seconds) else math.nan
-
-
-DOT_JITTER = 0.3  # of a kind's row, so that dots do not hide each other
-
-
-def fault_page(verdicts: Sequence[FaultVerdict]) -> str:
-    """The table, and a dot for each fault: said after, error while extruding, back after."""
-    lead = f"{sum(v.silent for v in verdicts)} of {len(verdicts)} faults did harm in silence."
-    present = [name for name in KINDS if name in set(map(_kind, verdicts))]
-    numbers = "; ".join(f"{i + 1} {name}" for i, name in enumerate(present))
-    table = figures_table(KIND_HEADER, _rows_by_kind(verdicts), last_total=True)
-    explanation = (
-        "Times in ms, median first. said %: share that was told; said ms: until the exposure of the pose that said so, "
-        "of what pictures do not show until somebody did; known: until somebody did; worst: the largest error while "
-        "extruding; back: until moves went out again; late: those that took more than 200 ms."
-    )
-    body = [section("What came of each kind", explanation, table)]
-    for title, field, unit, level in (
-        ("Said after", "exposure", "s", MAX_DETECTION),
-        ("Largest error while extruding", "worst", "mm", MAX_ERROR_MM),
-        ("Going on again after its end", "recovered", "s", MAX_RECOVERY),
-    ):
-        (values,) = columns(verdicts, field)
-        top = max(float(values[np.isfinite(values)].max(initial=0.0)), level) * 1.15
-        plot = Plot(900, 230, (0.5, len(present) + 0.5), (0.0, top), label=f"{title.lower()}, {unit}")
-        place = np.array([1.0 + present.index(_kind(v)) for v in verdicts])  # kinds side by side
-        place += np.random.default_rng(0).uniform(-DOT_JITTER, DOT_JITTER, len(place))
-        plot.dots(place, np.where(np.isposinf(values), top, values), "estimate")  # what never came is at the top
-        plot.level(level, f"{level:g}", "limit")
-        body.append(section(title, f"A dot for each fault, by kind: {numbers}.", plot.svg()))
-    footer = "A print in virtual time; the operator arms it again where it stops."
-    return document("bench", "faults", lead, body, footer)
-
-
-def _kind(verdict: FaultVerdict) -> str:
-    return f"{verdict.fault.part} {verdict.fault.kind}"
 
 
 SCENARIOS = ("breathing_calm", "breathing_deep", "breathing_irregular", "hand", "shaking_table_0_1_hz", "still")
@@ -293,9 +252,7 @@ def run_faults(options: argparse.Namespace) -> list[Figure]:
             rows += of_run
             if options.log is not None and of_run:
                 append_log(options.log, of_run)
-    verdicts = [row.verdict for row in rows]
-    print(fault_table(verdicts) + "\n")
-    figures.write_page(options.out, "faults.html", lambda: fault_page(verdicts), "picture")
+    print(fault_table([row.verdict for row in rows]) + "\n")
     return [*fault_figures(rows), Figure("runs that ended in a traceback", broken, "", at_most(0))]
 
 

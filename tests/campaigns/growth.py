@@ -13,10 +13,9 @@ import numpy as np
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow_steps
 from estimation.synthetic.world import arc_rig, synthetic_world
-from hardware.bench.figures import Figure, milliseconds, with_progress, write_page
+from hardware.bench.figures import Figure, milliseconds, with_progress
 from hardware.bench.recordings import FRAME_RATE, WARM_UP_STEPS, made_recording, time_steps
 from hardware.process.clock import CpuClock
-from hardware.report.page import Plot, document, legend, line_key, section, spanning
 from tests.campaigns.planner import carries
 
 ANGLES_DEG = (0.0, 36.0, 84.0, -36.0, 60.0, -60.0)  # the thesis's three cameras, and three more on the same arc
@@ -44,9 +43,7 @@ def run_growth(options: argparse.Namespace) -> list[Figure]:
     costs: dict[str, list[tuple[float, float]]] = {axis.name: [] for axis in axes}
     for axis, value in with_progress("growth", "points", points, len(points)):
         costs[axis.name].append(axis.cost(value))
-    measured = [(axis, np.array(costs[axis.name])) for axis in axes]
-    write_page(options.out, "growth.html", lambda: growth_page(measured), "the curves")
-    return [figure for axis, table in measured for figure in growth_figures(axis, table)]
+    return [figure for axis in axes for figure in growth_figures(axis, np.array(costs[axis.name]))]
 
 
 def axes_for(seconds: float) -> tuple[CostAxis, ...]:
@@ -106,17 +103,3 @@ def slope(values: Sequence[float], costs: Array) -> float:
     if usable.sum() < 2:
         return math.nan
     return float(np.polyfit(np.log(np.array(values)[usable]), np.log(costs[usable]), 1)[0])
-
-
-def growth_page(measured: Sequence[tuple[CostAxis, Array]]) -> str:
-    """All curves on one page."""
-    parts, keys = [], legend([line_key("estimate", "median"), line_key("truth", "99 %")])
-    for axis, costs in measured:
-        x = np.array(axis.values, float)
-        plot = Plot(1000, 220, spanning([x]), (0.0, 1.1 * float(np.nanmax(costs))), label=f"ms over {axis.unit}")
-        for column, style in ((1, "truth"), (0, "estimate")):
-            plot.line(x, costs[:, column], style)
-            plot.dots(x, costs[:, column], style, 3)
-        parts.append(section(axis.name.capitalize(), f"{axis.what}, ms, over {axis.unit}.", plot.svg() + keys))
-    lead = "Each curve is one thing that grows while all else stays what it usually is."
-    return document("Bench", "How cost grows", lead, parts, "Made by python -m tests.campaigns growth.")

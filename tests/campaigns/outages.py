@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from estimation.pose import TrackState
 from estimation.se3 import Array
-from hardware.bench.figures import Figure, aligned, at_most, columns, with_progress, workers, write_page
+from hardware.bench.figures import Figure, at_most, columns, with_progress, workers, write_page
 from hardware.report.page import Plot, area_key, document, legend, line_key, ribbon, section
 from tests.campaigns.estimator import make_pictures
 from tests.campaigns.outage_run import OutageKind, WatchedOutage, run_stretch
+from tests.campaigns.verdicts import kind_table
 
 HARMFUL_ERROR = 0.5  # mm: an error below is of no harm to a print with a nozzle of 0.4 mm
 RADIUS_FACTOR = 3.0  # times the 95 % radius: of normal errors not one in a million lies beyond
@@ -158,15 +159,13 @@ OUTAGE_HEADER = (
 
 def outage_table(judged: Sequence[tuple[OutageKind, OutageVerdict]]) -> str:
     """A line for each kind and one for all; times are median and largest, `worst` the largest error while measured."""
-    groups = {kind.value: [v for k, v in judged if k is kind] for kind in OutageKind} | {"all": [v for _, v in judged]}
-    rows = [_row(name, group) for name, group in groups.items() if group or name == "all"]
-    return aligned([OUTAGE_HEADER, *rows], range(1, len(OUTAGE_HEADER)))
+    return kind_table(OUTAGE_HEADER, [(kind.value, v) for kind, v in judged], _row, [kind.value for kind in OutageKind])
 
 
-def _row(name: str, verdicts: Sequence[OutageVerdict]) -> tuple[str, ...]:
+def _row(verdicts: Sequence[OutageVerdict]) -> tuple[str, ...]:
     flagged, back, after, worst = columns(verdicts, "flagged", "back", "after", "worst")
     silent, beyond = (str(sum(getattr(v, field) for v in verdicts)) for field in ("silent", "beyond"))
-    counts = (name, str(len(verdicts)), silent, beyond, str(int(np.isinf(flagged).sum())))
+    counts = (str(len(verdicts)), silent, beyond, str(int(np.isinf(flagged).sum())))
     errors = (f"{np.median(after):.3f}", f"{after.max():.3f}", f"{worst.max():.2f}")
     return (*counts, *_times(flagged), *_times(back), *errors)
 
