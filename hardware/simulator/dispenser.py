@@ -23,10 +23,9 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.driver import UnpluggedError
-from hardware.process.checks import error_text
 from hardware.process.clock import Clock, WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
-from hardware.simulator.arm.ports import device_link, open_pty, stop_on_signals
+from hardware.simulator.arm.ports import open_log, served_pty
 
 DISPENSER_POLL = 0.001  # s between looks at the line
 DISPENSER_LOG_STEP = 0.001  # s
@@ -267,19 +266,9 @@ def run_virtual_dispenser(
     """
     clock, stop = clock or WallClock(), stop or threading.Event()
     model = DispenserModel(settings, clock.now())
-    ours, theirs, device = open_pty()
-    file = None
-    try:
-        file = _log_file(log)
-        os.set_blocking(ours, False)
-        with device_link(link, device), stop_on_signals(stop):
-            say(device)
-            _serve(ours, model, clock, stop, file)
-    finally:
-        for each in (theirs, ours):
-            os.close(each)
-        if file is not None:
-            file.close()
+    header = "stamp_s,flow_mm3_s,switched\n"
+    with open_log(log, header) as file, served_pty(link, stop, say) as port:
+        _serve(port, model, clock, stop, file)
     say(summary_of(model))
     return model
 
@@ -309,17 +298,6 @@ def _serve(port: int, model: DispenserModel, clock: Clock, stop: threading.Event
             logged = _log(file, model, logged, now)
     if file is not None:
         _log(file, model, logged, model.now)
-
-
-def _log_file(log: Path | None) -> TextIO | None:
-    if log is None:
-        return None
-    try:
-        file = log.open("x", encoding="utf-8")
-    except OSError as error:
-        raise InputError(log, "log", error_text(error), "a new file in a folder that can be written to") from error
-    file.write("stamp_s,flow_mm3_s,switched\n")
-    return file
 
 
 def _log(file: TextIO, model: DispenserModel, start: float, end: float) -> float:

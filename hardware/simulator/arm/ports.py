@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TextIO
 
 import numpy as np
 import serial
@@ -237,39 +237,55 @@ def run_virtual_arm(
     profile = ArmProfile() if profile is None else profile
     clock, stop = clock or WallClock(), stop or threading.Event()
     arm, start = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud), clock.now()
-    with _motion_log(log, arm, start):
-        ours, theirs, device = open_pty()
+    with open_log(log, "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg\n") as file:
         try:
-            os.set_blocking(ours, False)
-            with device_link(link, device), stop_on_signals(stop):
-                say(device)
-                _serve(ours, arm, start, profile.baud / BITS_PER_BYTE, clock, stop)
+            with served_pty(link, stop, say) as port:
+                _serve(port, arm, start, profile.baud / BITS_PER_BYTE, clock, stop)
         finally:
-            os.close(theirs)
-            os.close(ours)
+            if file is not None:
+                _log_motion(file, arm, start)
     say(run_summary(arm))
     return arm
 
 
 @contextmanager
-def _motion_log(log: Path | None, arm: VirtualArm, begun: float) -> Iterator[None]:
+def served_pty(link: Path | None, stop: threading.Event, say: Callable[[str], None]) -> Iterator[int]:
+    """A new pty, whose device is said and linked, until the block ends: the device's side, which does not block.
+
+    Ctrl-C and SIGTERM set `stop`. InputError where `link` would overwrite something.
+    """
+    ours, theirs, device = open_pty()
+    try:
+        os.set_blocking(ours, False)
+        with device_link(link, device), stop_on_signals(stop):
+            say(device)
+            yield ours
+    finally:
+        os.close(theirs)
+        os.close(ours)
+
+
+@contextmanager
+def open_log(log: Path | None, header: str) -> Iterator[TextIO | None]:
+    """A new log with its header, None where none is asked for; InputError where it would overwrite something."""
     if log is None:
-        yield
+        yield None
         return
     try:
         file = log.open("x", encoding="utf-8")
     except OSError as error:
         raise InputError(log, "log", error_text(error), "a new file in a folder that can be written to") from error
     with file:
-        try:
-            yield
-        finally:
-            size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
-            file.write("stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg\n")
-            for start in range(0, size, _ROWS_AT_ONCE):
-                stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
-                axes = arm.axes_at(stamps) * [1, 1, 1, *np.rad2deg([1.0, 1, 1])]
-                np.savetxt(file, np.column_stack([stamps + begun, axes]), "%.6f", delimiter=",")
+        file.write(header)
+        yield file
+
+
+def _log_motion(file: TextIO, arm: VirtualArm, begun: float) -> None:
+    size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
+    for start in range(0, size, _ROWS_AT_ONCE):
+        stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
+        axes = arm.axes_at(stamps) * [1, 1, 1, *np.rad2deg([1.0, 1, 1])]
+        np.savetxt(file, np.column_stack([stamps + begun, axes]), "%.6f", delimiter=",")
 
 
 def run_summary(arm: VirtualArm) -> str:
