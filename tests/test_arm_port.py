@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from hardware.arm.profile import ArmProfile
 from hardware.arm.protocol import reply_stream
 from hardware.process.clock import WallClock
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import POLL_PERIOD, PtyLink, _arrivals, run_virtual_arm
+from hardware.simulator.arm.ports import POLL_PERIOD, _arrivals, run_virtual_arm
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.virtual_arm import IDEAL, move
 
@@ -139,17 +139,6 @@ def test_a_signal_ends_it_in_order(tmp_path: Path, number: signal.Signals) -> No
         log.read_text().splitlines()[1].partition(",")[2]
         == "202.500000,225.000000,113.000000,0.000000,0.000000,0.000000"
     )
-
-
-def test_bytes_go_through_a_pty_unchanged_and_at_once() -> None:
-    rng = np.random.default_rng(0)
-    with closing(PtyLink()) as link:
-        assert link.name.startswith("/dev/")
-        for size in 1, 48, 256, 20_000:
-            data = rng.bytes(size)
-            assert link.transfer(data) == data
-        every = bytes(range(256)) * 2
-        assert link.transfer(every) == every and link.transfer(b"") == b""
 
 
 @given(st.binary(max_size=200), st.floats(0.0, 5.0), st.floats(0.0, 2.0))

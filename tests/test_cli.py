@@ -83,7 +83,7 @@ def test_the_exit_code_says_whether_a_runs_limits_were_met(tmp_path: Path, capsy
     missed = write_scenario(tmp_path, IDEAL, seconds=2.5, limits={**limits, "max_mm": 0.001}, name="missed.toml")
     assert main(["simulate", str(met), "-o", str(tmp_path / "met")]) == 0
     assert "met     p95_mm" in capsys.readouterr().out
-    assert main(["simulate", str(missed), "-o", str(tmp_path / "missed"), "--pty", "--threads", "1"]) == 1
+    assert main(["simulate", str(missed), "-o", str(tmp_path / "missed"), "--threads", "1"]) == 1
     assert "MISSED  max_mm" in capsys.readouterr().out
 
 

@@ -255,12 +255,6 @@ def test_a_limit_that_is_missed_is_told(quick: Path) -> None:
     assert "met     duty" in outcome.text
 
 
-def test_the_pty_carries_the_same_bytes(quick: Path) -> None:
-    run_simulation(quick / "scenario.toml", quick / "pty", SimulationOptions(pty=True))
-    for name in ("frames.bin", "nozzle.csv", "commands.csv"):
-        assert (quick / "pty" / name).read_bytes() == (quick / "out" / name).read_bytes()
-
-
 def test_a_trace_is_simulated_instead_of_the_scenarios_own_motion(quick: Path) -> None:
     trace = quick / "moved.tum"
     trace.write_text("".join(f"{t / 10} 0 {2 * np.sin(t / 10)} 0 0 0 0 1\n" for t in range(60)))

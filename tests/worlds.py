@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from logging import WARNING
 from pathlib import Path
@@ -158,7 +158,6 @@ def patch(deformation: Deformation = UNDEFORMED) -> Scene:
 def world_of(
     scenario: Scenario,
     sink: Heard,
-    line: Callable[[bytes], bytes] = bytes,
     deformation: Deformation = UNDEFORMED,
     keeper: LoopKeeper | None = None,
 ) -> SimulatedWorld:
@@ -176,7 +175,7 @@ def world_of(
         rigs = scenario.rig, scenario.known_rig
         step = LandmarkTracker(*rigs, truth, scene.shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
     path = read_path(scenario.path)
-    return SimulatedWorld(scenario, scene, path, truth, step, exposures, sink, SimClock(), line=line, keeper=keeper)
+    return SimulatedWorld(scenario, scene, path, truth, step, exposures, sink, SimClock(), keeper=keeper)
 
 
 def heard(file: Path) -> Heard:

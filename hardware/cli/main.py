@@ -284,7 +284,6 @@ def add_simulate(commands: Commands) -> None:
     add_fault(add)
     add("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
     add("--open", action="store_true", help="open the page that shows the run in a browser")
-    add("--pty", action="store_true", help="send the arm's bytes through a pseudo-terminal")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
 
@@ -298,7 +297,7 @@ def _simulate(a: argparse.Namespace) -> int:
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
     faults = faults_from_texts("command line", "--fault", a.fault)
-    options = SimulationOptions(a.trace, faults, a.threads, a.pty, a.force, a.open, cache_folder())
+    options = SimulationOptions(a.trace, faults, a.threads, a.force, a.open, cache_folder())
     outcome = run_simulation(a.scenario, a.out, options)
     print(outcome.text)
     return 0 if outcome.met else FAILED

@@ -39,7 +39,6 @@ from hardware.process.progress import Progress, open_in_browser, prepare_out
 from hardware.process.system import provenance
 from hardware.report.evaluation import Evaluation, evaluate, write_summary
 from hardware.report.report import write_report
-from hardware.simulator.arm.ports import PtyLink
 from hardware.simulator.camera_pipeline import Exposures, PictureStore
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras
 from hardware.simulator.deposit import join_logs, planned_line
@@ -179,7 +178,6 @@ class SimulationOptions:
     trace: Path | None = None  # a recorded motion instead of the scenario's own
     faults: tuple[Fault, ...] = ()  # besides the scenario's own
     threads: int = 2  # that render
-    pty: bool = False  # send the arm's bytes through a pseudo-terminal
     force: bool = False  # write into a folder that is not empty
     open: bool = False  # open the page that shows it in a browser
     cache: Path | None = None  # where pictures of earlier runs are found, and those of this one kept
@@ -234,13 +232,12 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
             step = stack.enter_context(_tracking(scenario, truth, scene.shape, wound_rois, scan, exposures))
             if isinstance(step, TrackingStep):
                 folder.follow(step)
-            line = stack.enter_context(closing(PtyLink())).transfer if options.pty else bytes
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             folder.watch.begin()
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
             if options.open:
                 open_in_browser(folder.watch.page.resolve().as_uri())
-            loop = step, exposures, folder, WallClock(), options.threads, line
+            loop = step, exposures, folder, WallClock(), options.threads
             kept = options.cache if scenario.tracking.pictures else None
             store = None if kept is None else stack.enter_context(closing(PictureStore(file, kept)))
             if (keeper := folder.keeper) is not None:

@@ -160,13 +160,12 @@ class SimulatedWorld:
         sink: WorldSink,
         clock: Clock,
         threads: int = 2,
-        line: Callable[[bytes], bytes] = bytes,
         store: PictureStore | None = None,
         keeper: LoopKeeper | None = None,
     ) -> None:
         """scene: the scenario's, None without pictures; beads are drawn into it. path: in the true surface frame.
         exposures: filled with each picture's shot, for a step that may know. clock: of tracking. keeper: of the loop.
-        line: carries bytes from the motion to the arm, e.g. over a pty. store: pictures of earlier runs.
+        store: pictures of earlier runs.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
         if scene is not None:
@@ -175,7 +174,7 @@ class SimulatedWorld:
         self._events = EventQueue(self._time)
         profile, faults, self._commanded = scenario.profile, scenario.faults, CommandedPose(scenario.profile)
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, faults, scenario.baud)
-        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time), line=line)
+        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time))
         self._truth_log = TruthLog(path, scenario.true_arm, truth, profile.tick, profile.lag)
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:

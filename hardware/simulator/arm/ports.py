@@ -16,12 +16,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Protocol, TextIO
 
 import numpy as np
-import serial
 
 from estimation.errors import InputError
 from hardware.arm.driver import UnpluggedError
@@ -89,7 +87,6 @@ class VirtualPort:
         taken = len(data)
         if device.listener is not None:
             device.listener.from_host(data)
-        data = device.line(data)
         if faults.noise_out and rng.random() < faults.noise_out:
             place = rng.integers(taken + 1)
             data = data[:place] + rng.bytes(1) + data[place:]
@@ -137,13 +134,12 @@ class VirtualDevice:
         faults: PortFaults | None = None,
         seed: int = 0,
         listener: LineListener | None = None,
-        line: Callable[[bytes], bytes] = bytes,
     ) -> None:
-        """listener: is told all that passes. line: carries bytes to the arm, e.g. over a pty."""
+        """listener: is told all that passes."""
         self.arm, self.clock, self.baud = arm, clock, baud
         self.faults = PortFaults() if faults is None else faults
         self.rng = np.random.default_rng(seed)
-        self.listener, self.line = listener, line
+        self.listener = listener
         self._port: VirtualPort | None = None  # the last one opened
 
     def __call__(self) -> VirtualPort:
@@ -171,10 +167,6 @@ class VirtualDevice:
             self.listener.to_arm(data)
 
 
-_CHUNK_BYTES = 1024  # bytes; a pty buffers about 4000
-_READ_TIMEOUT = 5.0  # s; bytes that are not back by then never come
-
-
 def open_pty() -> tuple[int, int, str]:
     """A pty that changes no byte: descriptors of the arm's side and of the host's, and the host's device name.
 
@@ -183,32 +175,6 @@ def open_pty() -> tuple[int, int, str]:
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
     return ours, theirs, os.ttyname(theirs)
-
-
-class PtyLink:
-    """A pty with a serial client at one end, all in one process. name: of its device."""
-
-    def __init__(self) -> None:
-        self._ours, self._theirs, self.name = open_pty()
-        self._client = serial.Serial(self.name, baudrate=115_200)
-
-    def transfer(self, data: bytes) -> bytes:
-        """Write `data` to the device as a client does, and give back what comes out at the arm's side."""
-        arrived = bytearray()
-        for start in range(0, len(data), _CHUNK_BYTES):
-            self._client.write(data[start : start + _CHUNK_BYTES])
-            due = min(start + _CHUNK_BYTES, len(data))
-            while len(arrived) < due:
-                if not wait([self._ours], _READ_TIMEOUT):
-                    raise TimeoutError(f"{self.name} gave {len(arrived)} of {len(data)} bytes back")
-                arrived += os.read(self._ours, due - len(arrived))
-        return bytes(arrived)
-
-    def close(self) -> None:
-        """Close both ends; the device goes."""
-        self._client.close()
-        for descriptor in (self._theirs, self._ours):
-            os.close(descriptor)
 
 
 _print_line = partial(print, flush=True)
