@@ -132,7 +132,7 @@ def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: py
 @pytest.mark.slow  # single faults are judged above
 def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fault_run, "MAX_RUN_S", 8.0)
-    rows = one_run(SCENARIOS, 1, 1)
+    rows = one_run(1, 1)
     assert rows and all(row.over == 0 and not row.verdict.silent for row in rows)
     append_log(log := tmp_path / "faults.csv", rows)
     again = read_log(log, 1)
@@ -143,7 +143,7 @@ def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, m
     with pytest.raises(InputError, match="header"):
         read_log(log, 1)
     with pytest.raises(InputError, match="--count"):
-        run_faults(Namespace(count=0, jobs=1, log=None, out=None, seed=1, scenarios=None))
+        run_faults(Namespace(count=0, jobs=1, log=None, out=None, seed=1))
 
 
 class Here(Executor):
@@ -161,7 +161,7 @@ class Here(Executor):
 def test_a_run_that_ends_in_a_traceback_is_counted_and_shown_and_the_others_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def falls(folder: Path, seed: int, number: int) -> list[FaultRow]:
+    def falls(seed: int, number: int) -> list[FaultRow]:
         if number == 1:
             raise IndexError("deque index out of range")
         verdict = judge_fault(ran(said=(4.06, 4.6)), FAULT, 7.0)
@@ -170,7 +170,7 @@ def test_a_run_that_ends_in_a_traceback_is_counted_and_shown_and_the_others_go_o
 
     monkeypatch.setattr(faults, "one_run", falls)
     monkeypatch.setattr(faults, "workers", lambda jobs: Here())
-    options = Namespace(count=3 * FAULTS_A_RUN, jobs=1, log=tmp_path / "x.csv", out=None, seed=1, scenarios=None)
+    options = Namespace(count=3 * FAULTS_A_RUN, jobs=1, log=tmp_path / "x.csv", out=None, seed=1)
     found = {figure.what: figure for figure in run_faults(options)}
     assert found["runs that ended in a traceback"].value == 1
     assert found["runs that ended in a traceback"].verdict == "MISSED"

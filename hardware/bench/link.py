@@ -51,7 +51,6 @@ class MotionPlan:
     profile: ArmProfile
     url: str  # of the arm's port, for pyserial
     settings: LinkSettings = field(default_factory=LinkSettings)
-    real_time: bool = True  # ask for that priority
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +91,7 @@ def motion_process(
     """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
     clock, driver = WallClock(), open_arm(plan.url, plan.profile)
     arm, motion = Arm(driver, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
-    priority = ask_for_real_time() if plan.real_time else "nothing asked for"
+    priority = ask_for_real_time()
     events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
 
     loop: MotionLoop | None = None
@@ -152,8 +151,8 @@ class LivePart:
 
 def run_link(options: argparse.Namespace) -> list[Figure]:
     """Three parts of equal length: a calm one, whose jitter counts, one with halts and returns, one with a bad arm."""
-    seconds, seed, busy, real_time = 60 * options.minutes, options.seed, options.busy, not options.ordinary
-    parts = [run_part(seconds / 3, seed + k, busy, real_time, part) for k, part in enumerate(LIVE_PARTS)]
+    seconds, seed, busy = 60 * options.minutes, options.seed, options.busy
+    parts = [run_part(seconds / 3, seed + k, busy, part) for k, part in enumerate(LIVE_PARTS)]
     calm, halted, rough = parts
     name = f"real time {seconds / 60:.3g} min"
     arms = [arm for part in parts for arm in part.arms]
@@ -189,7 +188,7 @@ def _queued(arms: list[ArmReport]) -> float:
     return 1000 * max((arm.deepest for arm in arms), default=NOT_MEASURED)
 
 
-def run_part(seconds: float, seed: int, busy: int, real_time: bool, part: str) -> LivePart:
+def run_part(seconds: float, seed: int, busy: int, part: str) -> LivePart:
     """Print on a breathing surface for so long."""
     context, clock = multiprocessing.get_context("spawn"), WallClock()
     poses, reports = SharedLatest[SurfacePose](), SharedLatest[MotionReport]()
@@ -197,7 +196,7 @@ def run_part(seconds: float, seed: int, busy: int, real_time: bool, part: str) -
     with tempfile.TemporaryDirectory() as folder, burning(busy):
         link = Path(folder) / "arm"
         arm = _VirtualArm(link, seed, part == ROUGH_PART)
-        plan = MotionPlan(_toolpath(), ArmProfile(), str(link), real_time=real_time)
+        plan = MotionPlan(_toolpath(), ArmProfile(), str(link))
         motion = context.Process(target=motion_process, args=(plan, poses, reports, theirs))
         motion.start()
         theirs.close()

@@ -29,7 +29,6 @@ from hardware.bench.figures import TOO_SHORT, Figure, append_rows, at_least, at_
 from hardware.bench.link import burning
 from hardware.bench.recordings import FRAME_RATE, beside_figures, made_recording, packed_sets, unpacked_set
 from hardware.bench.whole import LiveSession
-from hardware.files.dispenser_file import read_dispensers
 from hardware.files.path_file import read_path, write_path
 from hardware.live.prepared import RunFiles
 from hardware.live.prerender import NozzleErrors, nozzle_errors, prerender
@@ -41,8 +40,6 @@ from hardware.process.checks import read_toml
 from hardware.process.clock import CpuClock, WallClock, measure_evenness
 from hardware.process.progress import cache_folder
 from hardware.recording.session_reader import open_session
-from hardware.simulator.dispenser import VirtualDispenserSettings
-from hardware.simulator.nozzle_error import MaterialFigures
 from perception.frames import Image
 from perception.tracking.wound_step import AsyncSegmentation
 from perception.wound.network import WoundNetwork, shipped_model
@@ -207,11 +204,9 @@ def _repeated(path: Toolpath, seconds: float) -> Toolpath:
 def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
     record, clock = folder / "print.mcap", WallClock()
     arguments, alone = _arguments(options.scenario, record, path), measure_evenness(clock, PROBE_PIECES)
-    settings = LiveSettings(dispensers=options.dispenser)
     if options.pinned:  # each loop has a core of its own
         one, other = available_cores()[:1], available_cores()[1:2]
-        settings = replace(settings, cores_tracking=one, cores_motion=other, cores_recorder=other)
-    if settings != LiveSettings():
+        settings = LiveSettings(cores_tracking=one, cores_motion=other, cores_recorder=other)
         (folder / "session.toml").write_text(settings_text(settings))
         arguments.insert(0, str(folder / "session.toml"))
     run = LiveSession(arguments)
@@ -226,7 +221,7 @@ def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: P
     finally:
         run.close()
     summary: dict[str, Any] = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))
-    error = nozzle_errors(record, RunFiles(record).executed, path, arm, _truth(options.dispenser))
+    error = nozzle_errors(record, RunFiles(record).executed, path, arm)
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
     name += f", {options.busy} busy beside it" if options.busy else ""
@@ -266,7 +261,6 @@ def _errors(name: str, summary: dict[str, Any], error: NozzleErrors) -> list[Fig
         Figure(f"{name}: holds", sum(hold["count"] for hold in summary["holds"]), "", None, "", _held(summary)),
         Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50)),
         Figure(f"{name}: virtual arm held up by the machine, longest", 1000 * error.held_up, "ms"),
-        *_beads(name, error.material),
         Figure(f"{name}: frame sets left out", summary["frame_sets_dropped"], "", None, "", sets),
     ]
 
@@ -276,21 +270,6 @@ def _held(summary: dict[str, Any]) -> str:
     holds = summary["holds"]
     longest = f", the longest: {holds[0]['reason']}" if holds else ""
     return f"{sum(hold['total_s'] for hold in holds):.1f} s{longest}"
-
-
-def _truth(file: Path | None) -> VirtualDispenserSettings | None:
-    """What the first dispenser of a file does, by the file; None without one."""
-    if file is None:
-        return None
-    profile = read_dispensers(file)[0].profile
-    delays = profile.on_dead_time, profile.on_lag, profile.off_dead_time, profile.off_lag
-    return VirtualDispenserSettings("arduino", *delays, flow=profile.flow)
-
-
-def _beads(name: str, material: MaterialFigures | None) -> list[Figure]:
-    """Where beads begin and end, of a run whose recording holds what a dispenser was told."""
-    ends = () if material is None else (("begin", material.begins), ("end", material.stops))
-    return [Figure(f"{name}: beads {what} off the plan, 95 %", each.size.p95, "mm") for what, each in ends]
 
 
 def _load(name: str, summary: dict[str, Any], memory: Sequence[tuple[float, dict[str, float]]]) -> list[Figure]:

@@ -114,7 +114,6 @@ _SUBJECTS = (
         number("--minutes", 1.0, "M", "of real time; default 1"),
         number("--seed", 0, None, "of what is halted when"),
         number("--busy", 1, "N", "processes that saturate a core each; default 1"),
-        option("--ordinary", action="store_true", help="do not ask for real-time priority"),
     ),
     _subject("live", "live", "whole runs in real time: frames to wire, stops, nozzle, kills")(
         number("--minutes", 1.0, "M", "of printing; 0: none; default 1"),
@@ -123,7 +122,6 @@ _SUBJECTS = (
         number("--busy", 0, "N", "processes beside it that saturate a core each; default none"),
         number("--seed", 0, None, "of what is killed when"),
         option("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other"),
-        option("--dispenser", type=Path, metavar="DISPENSER.toml", help="to tell, e.g. a virtual one; default none"),
         option(
             "--scenario", type=Path, default=Path("data/live/calm.toml"), metavar="SCENARIO.toml", help="which world"
         ),

@@ -32,7 +32,6 @@ from hardware.bench.subjects import (
 )
 from hardware.cli.main import add_bench_options, run_bench
 from hardware.cli.parser import Parser
-from planning.fill import PATTERN_KINDS
 
 PROGRAM = "python -m tests.campaigns"
 DESCRIPTION = "Measure what developers ask of stillbed, or run a long campaign; print each figure beside its target."
@@ -80,8 +79,6 @@ CAMPAIGNS: Subjects = dict(
             option("--maps", nargs="+", choices=MAPS, default=MAPS, help="whose map"),
             number("--seeds", 3, "N", "worlds of each scene"),
             option("--seconds", type=float, metavar="S", help="length of each world; 10 s or more without"),
-            number("--count", 100, "N", "landmarks"),
-            number("--noise", 0.25, "PX", "white, where a scene has no own"),
             option("--soak", type=float, metavar="HOURS", help="instead: one long run of breathing"),
         ),
         _campaign("faults", "faults", "prints in which everything goes wrong: said, harmless, back soon?")(
@@ -89,13 +86,9 @@ CAMPAIGNS: Subjects = dict(
             number("--seed", 1, None, "of all that chance decides (default: 1)"),
             number("--jobs", 1, None, "processes that share the runs (default: 1)"),
             option("--log", type=Path, metavar="X.csv", help="what came of each fault; runs in it are not repeated"),
-            option("--scenarios", type=Path, metavar="FOLDER", help="where the scenarios are (default: the shipped)"),
         ),
         _campaign("fill", "fill", "beads laid into contours and random wounds: coverage and time")(
             option("contours", nargs="*", type=Path, metavar="CSV", help="x_mm,y_mm; two own without"),
-            option("--kind", choices=PATTERN_KINDS, default="best", help="pattern; default best"),
-            number("--contour-width", 0.8, "MM", "bead in contours; default 0.8"),
-            number("--width", 0.4, "MM", "bead of the wounds; default 0.4"),
             number("--count", 1000, "N", "random wounds; default 1000"),
             SEED,
             option("--picture", type=Path, metavar="SVG", help="also draw all patterns side by side"),
@@ -121,7 +114,6 @@ CAMPAIGNS: Subjects = dict(
         ),
         _campaign("link", "link", "the arm's line in virtual time with everything going wrong")(
             number("--hours", 1.0, "H", "of virtual time; default 1"),
-            number("--baud", 115_200, "B", "of the line"),
             SEED,
         ),
         _campaign("look", "scan", "layers of gel, as a look between layers measures them; clogs found")(
@@ -141,7 +133,6 @@ CAMPAIGNS: Subjects = dict(
         ),
         _campaign("planner", "planner", "random poses into planner and guard: limits kept, cost of a step")(
             number("--updates", 10_000, "N", "in all; default 10000"),
-            option("--arm", type=Path, metavar="ARM.toml", help="instead of the default arm"),
             number("--seed", 0, None, "of the streams; runs with other seeds may go side by side"),
         ),
         _campaign("registration", "mapping", "a scan laid into the first pictures: error and verdict")(
@@ -174,7 +165,6 @@ CAMPAIGNS: Subjects = dict(
         _campaign("steps", "detection", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely")(
             number("--steps", 2000, None, "of each kind (default: %(default)s)"),
             number("--hours", 1.0, None, "at rest (default: %(default)s)"),
-            number("--noise", 0.1, None, "px of a track in a frame (default: %(default)s)"),
             SEED,
         ),
         _campaign("views", "views", "skin that deforms, grazing views with glare, a cube's edges")(

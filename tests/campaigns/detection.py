@@ -258,7 +258,7 @@ def _calm(seed: int, minutes: float) -> Figure:
     return Figure("false alarms, frame sets", alarms, "", at_most(0), NO_REFERENCE, note)
 
 
-STEP_RATE = 30.0  # Hz
+STEP_RATE, STEP_NOISE_PX = 30.0, 0.1  # Hz; px of a track in a frame
 FRAMES_AN_HOUR = 108_000
 FRAMES_A_STEP = 90  # between steps: 3 s, of which the detector needs one until it takes the surface as at rest again
 CORRELATED_NOISE = 0.5  # share of the white noise: errors that tracks carry from frame to frame
@@ -270,12 +270,12 @@ STEP_SIZES = np.array([np.deg2rad(0.1), 0.3])  # rad, mm
 def run_steps(options: argparse.Namespace) -> list[Figure]:
     """Measure steps, turns and rest."""
     rng = np.random.default_rng(options.seed)
-    world = synthetic_world("still", seconds=0.1, noise=options.noise)
+    world = synthetic_world("still", seconds=0.1, noise=STEP_NOISE_PX)
     pose = world.base_from_surface(np.array(0.0))
     # of the pose from one frame set's tracks, by Fisher's information
     information = pose_information(world.true_rig, pose, world.landmarks.points, next(iter(world)))
     covariance = np.asarray(np.linalg.inv(information))
-    note = f"{options.noise:g} px, white, and {CORRELATED_NOISE:.0%} of it over {CORRELATION_TIME:g} s"
+    note = f"{STEP_NOISE_PX:g} px, white, and {CORRELATED_NOISE:.0%} of it over {CORRELATION_TIME:g} s"
     figures, target = [], at_least(99.9)
     for kind, name in enumerate(("turns of 0.1 degree", "steps of 300 um")):
         delay = _flag_delays(kind, options.steps, covariance, rng)

@@ -226,7 +226,7 @@ def run_estimator(options: argparse.Namespace) -> list[Figure]:
         names = "; ".join(scene.name for scene in TRACK_SCENES)
         raise InputError("command line", "--only", options.only, f"a pattern of {names}")
     for scene in scenes:
-        conditions = {"count": options.count, "surface": scene.surface, "noise": options.noise, **scene.conditions}
+        conditions = {"surface": scene.surface, **scene.conditions}
         usual = 24.0 if "offsets" in scene.conditions else 10.0  # s: offsets have to be known after 20 s
         seconds = usual if options.seconds is None else options.seconds
         worlds = [synthetic_world(scene.movement, seconds, seed=n, **conditions) for n in range(options.seeds)]

@@ -235,12 +235,11 @@ class FaultRow:
 def run_faults(options: argparse.Namespace) -> list[Figure]:
     """Run the campaign, print the table of all kinds, and give the figures of all."""
     figures.require_positive(options, "count", "jobs")
-    folder = options.scenarios or shipped_file("scenarios", f"{SCENARIOS[0]}.toml").parent
     rows = read_log(options.log, options.seed) if options.log is not None and options.log.exists() else []
     done = {row.run for row in rows}
     broken, jobs = 0, [k for k in range(-(-options.count // FAULTS_A_RUN)) if k not in done]
     with workers(options.jobs) as pool:
-        waiting = {pool.submit(one_run, folder, options.seed, number): number for number in jobs}
+        waiting = {pool.submit(one_run, options.seed, number): number for number in jobs}
         for job in with_progress("faults", "runs", as_completed(waiting), len(jobs)):
             try:
                 of_run = job.result()
@@ -256,12 +255,12 @@ def run_faults(options: argparse.Namespace) -> list[Figure]:
     return [*fault_figures(rows), Figure("runs that ended in a traceback", broken, "", at_most(0))]
 
 
-def one_run(folder: Path, seed: int, number: int) -> list[FaultRow]:
+def one_run(seed: int, number: int) -> list[FaultRow]:
     """The faults of one run, those that struck a print."""
     scenario = SCENARIOS[number % len(SCENARIOS)]
     faults, clock = draw_faults(seed, number), ProcessorClock()
     start = clock.now()
-    run = FaultRun(prepared(folder / f"{scenario}.toml"), faults, 1000 * seed + number)()
+    run = FaultRun(prepared(shipped_file("scenarios", f"{scenario}.toml")), faults, 1000 * seed + number)()
     spent = clock.now() - start
     ends = [*(fault.start for fault in faults[1:]), run.ended]
     verdicts = [judge_fault(run, fault, end) for fault, end in zip(faults, ends, strict=True)]

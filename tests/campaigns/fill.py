@@ -27,7 +27,7 @@ from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress
 from hardware.process.clock import CpuClock, ProcessorClock
-from planning.fill import PATTERN_KINDS, PatternKind
+from planning.fill import PATTERN_KINDS
 from planning.fill.bead import (
     Bead,
     FillCoverage,
@@ -201,6 +201,7 @@ def _drawn(beads: Sequence[Bead], left: float, high: float) -> str:
     )
 
 
+CONTOUR_PATTERN, WOUND_PATTERN = Pattern("best", 0.8), Pattern("best", 0.4)  # mm of a bead
 RETRY_ANGLE = 0.7  # rad: by which each tenth wound is turned and filled again, a multiple of no pattern's angle
 THESIS_CONTOUR = 3995.5, 3.0  # px2 and px: the largest contour of thesis 5.3, and its lines' spacing
 REFERENCE_PLANNERS = {  # what other planners reach at PEER_WIDTH and Pace(): covered %, s
@@ -216,11 +217,10 @@ def run_fill(options: argparse.Namespace) -> list[Figure]:
     regions = regions or {name: outline(name) for name in ("oval", "bow")}
     if options.picture is not None:
         options.picture.write_text(picture(), encoding="utf-8")
-    pattern = Pattern(options.kind, options.contour_width)
-    figures = [figure for name, region in regions.items() for figure in _contour_figures(name, region, pattern)]
+    figures = [figure for name, region in regions.items() for figure in _contour_figures(name, region)]
     if options.count:
-        figures += _wound_figures(Pattern(options.kind, options.width), options.count, options.seed)
-    return figures + _times(options.kind)
+        figures += _wound_figures(options.count, options.seed)
+    return figures + _times()
 
 
 def _contour(path: Path) -> Region:
@@ -232,8 +232,8 @@ def _contour(path: Path) -> Region:
     return region_of(points, path)
 
 
-def _contour_figures(name: str, region: Region, pattern: Pattern) -> list[Figure]:
-    beads = fill(region, pattern, PrintPace())
+def _contour_figures(name: str, region: Region) -> list[Figure]:
+    beads = fill(region, CONTOUR_PATTERN, PrintPace())
     coverage, cost = fill_coverage(beads, region), print_cost(beads, PrintPace())
     targets = CONTOUR_TARGETS.get(name)
     covered, seconds = (at_least(targets[0]), at_most(targets[1])) if targets else (None, None)
@@ -244,16 +244,16 @@ def _contour_figures(name: str, region: Region, pattern: Pattern) -> list[Figure
         Figure(f"{name}: over", 100 * coverage.over, "%", at_most(0.05)),
         Figure(f"{name}: double", 100 * coverage.double, "%", at_most(3.0)),
         Figure(f"{name}: time", cost.seconds, "s", seconds, peers, note),
-        Figure(f"{name}: covered by lines of nominal width", 100 * _of_one_width(beads, region, pattern.width), "%"),
+        Figure(f"{name}: covered by lines of nominal width", 100 * _of_one_width(beads, region), "%"),
     ]
 
 
-def _of_one_width(beads: Sequence[Bead], region: Region, width: float) -> float:
-    """The share of a region that beads cover as other planners' are taken: all of one width, mm."""
-    return fill_coverage([even_bead(bead.points, width) for bead in beads], region).covered
+def _of_one_width(beads: Sequence[Bead], region: Region) -> float:
+    """The share of a region that beads cover as other planners' are taken: all of one width."""
+    return fill_coverage([even_bead(bead.points, CONTOUR_PATTERN.width) for bead in beads], region).covered
 
 
-def _wound_figures(pattern: Pattern, count: int, seed: int) -> list[Figure]:
+def _wound_figures(count: int, seed: int) -> list[Figure]:
     coverages: list[FillCoverage] = []
     crashes, turned, worst = 0, 0.0, ""
     cosine, sine = np.cos(RETRY_ANGLE), np.sin(RETRY_ANGLE)
@@ -261,10 +261,10 @@ def _wound_figures(pattern: Pattern, count: int, seed: int) -> list[Figure]:
     for i in with_progress("random wounds", "wounds", range(count), count):
         kind, region = random_wound(np.random.default_rng([seed, i]))
         try:
-            coverage = fill_coverage(fill(region, pattern, PrintPace()), region)
+            coverage = fill_coverage(fill(region, WOUND_PATTERN, PrintPace()), region)
             if i % 10 == 0:
                 again = shapely.transform(region, lambda points: points @ rotation)
-                change = coverage.covered - fill_coverage(fill(again, pattern, PrintPace()), again).covered
+                change = coverage.covered - fill_coverage(fill(again, WOUND_PATTERN, PrintPace()), again).covered
                 turned = max(turned, abs(change))
         except Exception:  # whatever it is, it is counted
             crashes += 1
@@ -273,7 +273,7 @@ def _wound_figures(pattern: Pattern, count: int, seed: int) -> list[Figure]:
             worst = f"worst: number {i}, {kind}"
         coverages.append(coverage)
     covered, double, over = (100 * values for values in columns(coverages, "covered", "double", "over"))
-    note = f"{count} of seed {seed}, bead {pattern.width:g} mm"
+    note = f"{count} of seed {seed}, bead {WOUND_PATTERN.width:g} mm"
     return [
         Figure("wounds: crashes", crashes, "", at_most(0), "", note),
         Figure("wounds: covered, least", float(covered.min()), "%", at_least(99.0), "none published", worst),
@@ -285,14 +285,14 @@ def _wound_figures(pattern: Pattern, count: int, seed: int) -> list[Figure]:
     ]
 
 
-def _times(kind: PatternKind) -> list[Figure]:
+def _times() -> list[Figure]:
     area, spacing = THESIS_CONTOUR
     wound = outline("oval")
     large = shapely.transform(wound, lambda points: points * np.sqrt(area / wound.area))
     low, high = np.array(wound.bounds).reshape(2, 2)
     wide = shapely.transform(wound, lambda points: (points - low) * [60.0, 40.0] / (high - low))
     both = _median_ms(lambda: fill(large, Pattern("zigzag", spacing, angle="shorter"), PrintPace()), 200)
-    whole = _median_ms(lambda: fill(wide, Pattern(kind, 0.4), PrintPace()), 5)
+    whole = _median_ms(lambda: fill(wide, WOUND_PATTERN, PrintPace()), 5)
     return [
         Figure("two orientations of 4,000 px2", both, "ms", at_most(1.0), "thesis 3 ms", "median of 200, CPU"),
         Figure("layer of 60 x 40 mm, bead 0.4 mm", whole, "ms", at_most(130.0), "", "median of 5, CPU; 15 in 2 s"),

@@ -17,7 +17,7 @@ from estimation.se3 import Array
 from hardware.arm import protocol
 from hardware.arm.device import ArmState
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings, at_baud
+from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
 from hardware.arm.s6h4d import S6H4D
 from hardware.bench.figures import Figure, at_most, milliseconds, with_progress
@@ -130,7 +130,7 @@ def goal_at(phase: float) -> Array:
 class LinkRun:
     """One run; its faults and the operator's actions follow from the seed. kind: of the arm's own faults."""
 
-    def __init__(self, seed: int, counts: LinkCounts, baud: int = ArmProfile().baud) -> None:
+    def __init__(self, seed: int, counts: LinkCounts) -> None:
         rng = self._rng = np.random.default_rng(seed)
         self._counts = counts
         replies = ReplyMode.STREAM if seed % 2 else (ReplyMode.OFF, ReplyMode.STRAY)[rng.integers(2)]
@@ -144,7 +144,7 @@ class LinkRun:
             self._ends = deque(b for a, b in stalls if b - a >= DETECTABLE_STALL)
         if manner == LOSSY:
             faults = [Fault(FaultPart.ARM, FaultKind.UNPLUG, a, b - a) for a, b in windows(rng, 150.0, 2.0)]
-        profile = at_baud(ArmProfile(), baud)
+        profile = ArmProfile()
         settings = ArmSettings(replies=replies, seed=seed)
         self._clock = SimClock()
         self._virtual = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
@@ -248,7 +248,7 @@ def run_link(options: argparse.Namespace) -> list[Figure]:
     """The figures of all runs."""
     counts, runs = LinkCounts(), max(1, round(3600 * options.hours / RUN_SECONDS))
     for k in with_progress("link", "runs of 10 min", range(runs), runs):
-        LinkRun(options.seed + k, counts, options.baud).run()
+        LinkRun(options.seed + k, counts).run()
         counts.seconds += RUN_SECONDS
     return soak_figures(counts)
 

@@ -22,7 +22,6 @@ from estimation.surface_map import Warp
 from hardware.arm.profile import ArmProfile
 from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
 from hardware.bench.figures import Figure, at_least, at_most, milliseconds, percentile, with_progress
-from hardware.files.arm_file import read_arm
 from hardware.process.clock import CpuClock
 from planning.command import Hold, Move
 from planning.kinematics import axes_from_nozzle, axis_limits
@@ -182,7 +181,7 @@ class StreamTally:
 
 def run_planner(options: argparse.Namespace) -> list[Figure]:
     """Judge the streams, then time the transform of a long path to another pose."""
-    tally, profile = StreamTally(), bench_arm(None if options.arm is None else read_arm(options.arm))
+    tally, profile = StreamTally(), bench_arm()
     streams = -(-options.updates // STREAM_UPDATES)
     for stream in with_progress("planner", "streams", range(streams), streams):
         try:
