@@ -3,8 +3,6 @@
 A reader may accept an input or refuse it with one of our own errors. Anything else counts as a failure: another
 exception, more than `MAX_SECONDS` of processor time, more than `MAX_MEMORY` of memory, the end of the process. The
 input that caused it is kept. `--log` records how far each reader is and what failed; a run goes on from there.
-
-The video among the valid inputs is made by hand: JPEGs in an AVI container (Microsoft, AVI RIFF File Reference).
 """
 
 from __future__ import annotations
@@ -12,11 +10,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import re
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from estimation import se3
@@ -120,7 +118,6 @@ SCAN_TRIANGLES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
 SKIN_NODES = 6  # a side of the scan that is planned on, so that it has the triangles that repair asks for
 SMALL_SIZE, VIDEO_RATE, FRAME_COUNT = (48, 32), 30, 3  # px, Hz
 CORNERS_KEY = "0123456789abcdef" * 4  # of the recording that the corners belong to
-HAS_INDEX, KEY_FRAME = 0x10, 0x10  # flags of an AVI
 FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}
 XYZ_TEXT = "".join(f"{k % 9} {k // 9} {k % 7 / 10}\n" for k in range(81))
 
@@ -128,28 +125,6 @@ XYZ_TEXT = "".join(f"{k % 9} {k // 9} {k % 7 / 10}\n" for k in range(81))
 def _small_picture(number: int) -> Image:
     """Noise (H, W, 3) that follows from the number."""
     return np.random.default_rng(number).integers(0, 256, (SMALL_SIZE[1], SMALL_SIZE[0], 3), np.uint8)
-
-
-def _mjpeg_avi(pictures: Sequence[bytes]) -> bytes:
-    """The file of pictures of SMALL_SIZE px that are encoded as JPEG, with its index."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return name + struct.pack("<I", len(data)) + data + b"\0" * (len(data) % 2)
-
-    largest, (width, height), count = max(map(len, pictures)), SMALL_SIZE, len(pictures)
-    main = 1_000_000 // VIDEO_RATE, largest * VIDEO_RATE, 0, HAS_INDEX, count, 0, 1, largest, width, height, 0, 0, 0, 0
-    timing = 0, 0, 0, 0, 1, VIDEO_RATE, 0, count, largest, -1, 0, 0, 0, width, height
-    stream = chunk(b"strh", struct.pack("<4s4sIHHIIIIIIiI4H", b"vids", b"MJPG", *timing))
-    bitmap = struct.pack("<IiiHH4sIiiII", 40, width, height, 1, 24, b"MJPG", 3 * width * height, 0, 0, 0, 0)
-    chunks, entries, offset = [], [], 4
-    for picture in pictures:
-        chunks.append(chunk(b"00dc", picture))
-        entries.append(struct.pack("<4sIII", b"00dc", KEY_FRAME, offset, len(picture)))
-        offset += len(chunks[-1])
-    streams = chunk(b"LIST", b"strl" + stream + chunk(b"strf", bitmap))
-    header = chunk(b"LIST", b"hdrl" + chunk(b"avih", struct.pack("<14I", *main)) + streams)
-    body = header + chunk(b"LIST", b"movi" + b"".join(chunks)) + chunk(b"idx1", b"".join(entries))
-    return chunk(b"RIFF", b"AVI " + body)
 
 
 def _write_cameras(folder: Path, kind: str, pattern: str) -> list[str]:
@@ -164,8 +139,11 @@ def _write_cameras(folder: Path, kind: str, pattern: str) -> list[str]:
 
 def _make_videos(folder: Path) -> None:
     for name in _write_cameras(folder, "video", "{}.avi"):
-        pictures = [encode(_small_picture(k), 90)[1] for k in range(FRAME_COUNT)]
-        (folder / f"{name}.avi").write_bytes(_mjpeg_avi(pictures))
+        motion_jpeg = cv2.VideoWriter.fourcc(*"MJPG")
+        writer = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.CAP_OPENCV_MJPEG, motion_jpeg, VIDEO_RATE, SMALL_SIZE)
+        for k in range(FRAME_COUNT):
+            writer.write(_small_picture(k))
+        writer.release()
 
 
 def _make_session(folder: Path) -> None:
