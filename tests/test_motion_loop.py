@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,19 +16,17 @@ from hypothesis import strategies as st
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
 from hardware.arm.device import BLIND_RESENDS, ArmState, LinkCode
-from hardware.arm.profile import ArmProfile, LinkSettings
-from hardware.bench.link import MotionPlan, MotionReport, motion_process
+from hardware.arm.profile import ArmProfile
+from hardware.bench.link import LIVE_PARTS, run_part
 from hardware.motion.loop import CommandedPose, MotionLoop, Order, Tick, TickMotion
 from hardware.motion.step import MotionStep
-from hardware.process.clock import Histogram, SimClock, WallClock
-from hardware.process.system import SharedLatest
+from hardware.process.clock import Histogram, SimClock
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from tests.linked import Linked, linked
 from tests.moving import breathing, pose_at, raster
-from tests.test_arm_port import serving
 from tests.virtual_arm import HOME, arm_fault
 
 ROOT = Path(__file__).parents[1]
@@ -308,31 +305,9 @@ def test_what_priority_was_granted_is_said() -> None:
     assert done.stdout.split(",")[0].split(":")[0].strip() in {"real time", "nice -10", "nothing"}
 
 
-def test_in_a_process_of_its_own_it_prints_over_a_pty_and_ends_when_nobody_is_left(tmp_path: Path) -> None:
-    clock = WallClock()
-    context = multiprocessing.get_context("spawn")
-    poses: SharedLatest[SurfacePose] = SharedLatest()
-    reports: SharedLatest[MotionReport] = SharedLatest()
-    orders, theirs = context.Pipe()
-    with serving(tmp_path / "arm", ArmSettings(replies=ReplyMode.STREAM)) as ended:
-        plan = MotionPlan(raster(speed=10.0), ArmProfile(), str(tmp_path / "arm"), LinkSettings())
-        process = context.Process(target=motion_process, args=(plan, poses, reports, theirs))
-        process.start()
-        theirs.close()
-        orders.send(Order.AT_HOME)
-        orders.send(Order.ARM)
-        until = clock.now() + 20
-        while clock.now() < until:
-            poses.put(pose_at(breathing, clock.now()))
-            report = reports.get()
-            if report is not None and report.tick.status.frames > 60:
-                break
-            clock.wait_until(clock.now() + 0.03)
-        orders.close()
-        process.join(10)
-        clock.wait_until(clock.now() + 0.1)
-    assert report is not None and report.tick.status.state is ArmState.ARMED, report
-    assert process.exitcode == 0
-    assert report.total == 6 and any("armed" in event.text for event in report.events)
-    assert ended[0].frames > 60 and not ended[0].garbage and not ended[0].ignored
-    assert ended[0].in_flight == 0
+def test_in_a_live_runs_processes_it_prints_over_a_pty_is_stopped_and_leaves_the_arm_at_rest() -> None:
+    part = run_part(4.0, 1, 0, LIVE_PARTS[0])
+    (arm,) = part.arms
+    assert arm.frames > 60 and not (arm.garbage or arm.ignored or arm.refused or arm.left)
+    assert part.stops and part.report is not None and part.report.progress is not None and part.rate > 25
+    assert 0 < part.flight <= 0.05 and 0 < arm.deepest <= 0.05

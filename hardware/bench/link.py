@@ -1,119 +1,48 @@
-"""`stillbed bench link`: jitter, stops, and what arrives of a motion process on a pty, while others saturate the cores.
+"""`stillbed bench link`: jitter, stops, and what arrives of a live run's motion process, while others saturate cores.
 
-Three processes as in a live run: a virtual arm that serves a pty, the motion process, and this one, which gives poses
-and orders; and some that only use up processor time. The motion process is halted now and then, as by a busy machine;
-the device goes and comes back; the controller stalls and the wire loses frames.
+The processes are a live run's: motion, recorder, and a virtual arm on a pty. In place of the tracking one that tells
+where a breathing chest is; this one gives the orders; and some only use up processor time. The motion process is halted
+now and then, as by a busy machine; the device goes and comes back; the controller stalls and the wire loses frames.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import os
 import signal
 import tempfile
-from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass, field
-from io import StringIO
-from multiprocessing.connection import Connection
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from hardware.arm.device import ArmEvent, ArmState, LinkCode
-from hardware.arm.link import Arm
-from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, LinkSettings, open_arm
+from estimation.synthetic.world import arc_rig
+from hardware.arm.device import ArmState, LinkCode
+from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
 from hardware.bench.figures import Figure, at_least, at_most, milliseconds
-from hardware.motion.loop import MotionLoop, Order, Tick
-from hardware.motion.step import MotionStep
+from hardware.live.checklist import PrintTask
+from hardware.live.ipc import RunChannels, start_arm, start_processes
+from hardware.live.prepared import Prepared, RunFiles
+from hardware.live.records import LATE_TICK_STAGE, LiveMotionReport, StageTiming, TrackingChannels
+from hardware.live.settings import VIRTUAL_ARM, LiveSettings
+from hardware.motion.loop import Order
+from hardware.motion.step import BeginPrint, PoseHandover
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
-from hardware.process.system import SharedLatest, ask_for_real_time, take_messages
-from hardware.simulator.arm.ports import run_virtual_arm
-from hardware.simulator.arm.settings import ArmSettings, ReplyMode
+from hardware.process.system import set_up_process
+from hardware.simulator.arm.settings import ArmSettings, ReplyMode, write_virtual_arm
 from planning.path import Path as Toolpath
 
-MAX_REPORTED_EVENTS = 50
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionPlan:
-    """What is to be printed, and on which arm."""
-
-    path: Toolpath
-    profile: ArmProfile
-    url: str  # of the arm's port, for pyserial
-    settings: LinkSettings = field(default_factory=LinkSettings)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionReport:
-    """The state of the motion process after a tick."""
-
-    tick: Tick
-    total: int  # checkpoints
-    events: tuple[ArmEvent, ...]  # the last ones
-    late: tuple[float, float, float]  # s, median, 99 % and largest lateness of all ticks so far
-    ticks: int
-    skipped: int  # ticks left out
-    stop: tuple[float, float] | None  # s, when the last one was decided and when it was on the wire
-    priority: str  # as the system granted it
-
-
-class _Orders:
-    """The orders received; QUIT where the other end is closed, or at SIGTERM and SIGINT."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._ended = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._end)
-
-    def __call__(self) -> list[Order]:
-        orders, closed = take_messages(self._connection)
-        self._ended |= closed
-        return [*orders, Order.QUIT] if self._ended else orders
-
-    def _end(self, number: int, frame: FrameType | None) -> None:
-        self._ended = True
-
-
-def motion_process(
-    plan: MotionPlan, poses: SharedLatest[SurfacePose], reports: SharedLatest[MotionReport], orders: Connection
-) -> None:
-    """Print until an order to quit, or until the process that gives orders is gone; then stop the arm."""
-    clock, driver = WallClock(), open_arm(plan.url, plan.profile)
-    arm, motion = Arm(driver, plan.profile, clock.now(), plan.settings), MotionStep(plan.path, plan.profile)
-    priority = ask_for_real_time()
-    events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
-
-    loop: MotionLoop | None = None
-
-    def report(tick: Tick) -> None:
-        assert loop is not None
-        events.extend(arm.events())
-        late, total = loop.lateness, motion.progress.total
-        lateness, stop = (late.percentile(50), late.percentile(99), late.most), arm.stops[-1] if arm.stops else None
-        reports.put(MotionReport(tick, total, tuple(events), lateness, late.count, loop.skipped, stop, priority))
-
-    loop = MotionLoop(motion, arm, clock, poses.get, _Orders(orders), report)
-    try:
-        loop.run()
-    finally:
-        loop = None  # report and loop refer to each other: the planner's solver would live until the process ends
-        arm.close()
-        driver.release()
-
-
 DEVICE_SPAN = 40.0  # s with one device, where it goes and comes back
-POSE_RATE = 30.0  # Hz
+POSE_RATE, ORDER_RATE = 30.0, 30.0  # Hz, and in which the operator looks at the reports
 STOP_PERIOD = 3.0  # s between the operator's stops
 HALT_PERIOD, MAX_HALT = 6.0, 0.6  # s between halts of the motion process, and of the longest
 START_TIMEOUT = 60.0  # s in which a process must have started, on a busy machine
@@ -127,10 +56,10 @@ HALTED_PART, ROUGH_PART = LIVE_PARTS[1:]
 class ArmReport:
     """What a virtual arm counted."""
 
-    frames: int
-    ignored: int
-    refused: int
-    garbage: int  # bytes
+    frames: float
+    ignored: float
+    refused: float
+    garbage: float  # bytes
     deepest: float  # s, the most that was ever queued
     left: float  # s, queued at its end
 
@@ -145,31 +74,31 @@ class LivePart:
     orders: list[float] = field(default_factory=list)  # from the order to the wire
     load: list[float] = field(default_factory=list)
     halts: int = 0
-    report: MotionReport | None = None
+    report: LiveMotionReport | None = None
     rate: float = NOT_MEASURED  # ticks a second
 
 
 def run_link(options: argparse.Namespace) -> list[Figure]:
     """Three parts of equal length: a calm one, whose jitter counts, one with halts and returns, one with a bad arm."""
-    seconds, seed, busy = 60 * options.minutes, options.seed, options.busy
-    parts = [run_part(seconds / 3, seed + k, busy, part) for k, part in enumerate(LIVE_PARTS)]
+    seconds, busy = 60 * options.minutes, options.busy
+    parts = [run_part(seconds / 3, options.seed + k, busy, part) for k, part in enumerate(LIVE_PARTS)]
     calm, halted, rough = parts
     name = f"real time {seconds / 60:.3g} min"
     arms = [arm for part in parts for arm in part.arms]
     obeying = calm.arms + halted.arms
     load, report = np.mean([*calm.load, *halted.load, *rough.load] or [NOT_MEASURED]), calm.report
-    priority, late, skipped = "", (NOT_MEASURED,) * 3, 0
+    priority, late, skipped = "", NOT_LATE, 0
     if report is not None:
-        priority, late, skipped = report.priority, report.late, report.skipped
+        priority, late, skipped = report.priority, _lateness(report), report.skipped
     machine = f"{priority}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
     stops, orders = calm.stops + halted.stops + rough.stops, calm.orders + rough.orders
     note = f"{halted.halts} halts up to 600 ms, {len(halted.arms) - 1} returns of the device"
     decided, moving = f"{name}: stop on the wire after its decision, 99 %", sum(p.arms[-1].left > 0 for p in parts[:2])
     return [
         Figure(f"{name}: ticks a second", calm.rate, "Hz", at_least(49.5), "thesis 30", machine),
-        Figure(f"{name}: tick late, median", 1000 * late[0], "ms"),
-        Figure(f"{name}: tick late, 99 %", 1000 * late[1], "ms", at_most(3), "8 in a process, 72 in a thread"),
-        Figure(f"{name}: tick late, largest", 1000 * late[2], "ms", note=f"{skipped} ticks were skipped"),
+        Figure(f"{name}: tick late, median", 1000 * late.median, "ms"),
+        Figure(f"{name}: tick late, 99 %", 1000 * late.p99, "ms", at_most(3), "8 in a process, 72 in a thread"),
+        Figure(f"{name}: tick late, largest", 1000 * late.largest, "ms", note=f"{skipped} ticks were skipped"),
         Figure(decided, milliseconds(stops, 99), "ms", at_most(10), note=f"{len(stops)} stops"),
         Figure(f"{name}: stop on the wire after the order, 99 %", milliseconds(orders, 99), "ms",
                note="from another process"),
@@ -190,61 +119,62 @@ def _queued(arms: list[ArmReport]) -> float:
 
 def run_part(seconds: float, seed: int, busy: int, part: str) -> LivePart:
     """Print on a breathing surface for so long."""
-    context, clock = multiprocessing.get_context("spawn"), WallClock()
-    poses, reports = SharedLatest[SurfacePose](), SharedLatest[MotionReport]()
-    orders, theirs = context.Pipe()
-    with tempfile.TemporaryDirectory() as folder, burning(busy):
-        link = Path(folder) / "arm"
-        arm = _VirtualArm(link, seed, part == ROUGH_PART)
-        plan = MotionPlan(_toolpath(), ArmProfile(), str(link))
-        motion = context.Process(target=motion_process, args=(plan, poses, reports, theirs))
-        motion.start()
-        theirs.close()
-        operator = _Operator(orders, motion, np.random.default_rng(seed), part == HALTED_PART)
+    clock = WallClock()
+    with tempfile.TemporaryDirectory() as name, burning(busy):
+        folder = Path(name)
+        prepared = _prepared(folder, seed, part)
+        run = start_processes(prepared, folder, tell_poses)
+        operator = _Operator(run, np.random.default_rng(seed), part == HALTED_PART)
         try:
-            poses.put(_pose(clock.now()))
-            _wait(lambda: reports.get() is not None)
+            run.sender.put(prepared.rig)
+            run.order(BeginPrint(prepared.task.path, prepared.task.profile, 0.0, {}, ""))
+            _wait(lambda: run.motion.get() is not None)
             begun = device = clock.now()
             while (now := clock.now()) < begun + seconds:
-                poses.put(_pose(now))
-                operator.act(reports.get(), now)
+                operator.act(run.motion.get(), now)
                 if part == HALTED_PART and now > device + DEVICE_SPAN:
-                    operator.measured.arms.append(arm.end())
-                    arm, device = _VirtualArm(link, seed, False), clock.now()
-                clock.wait_until(now + 1 / POSE_RATE)
-            operator.end(reports.get())
-            operator.measured.arms.append(arm.end())
+                    run.processes.end("arm", 0.0)
+                    operator.measured.arms.append(_arm_report(prepared))
+                    run.arm_lifeline = start_arm(run.processes, prepared, Path(run.url))
+                    device = clock.now()
+                clock.wait_until(now + 1 / ORDER_RATE)
+            operator.end(run.motion.get())
+            operator.measured.arms.append(_arm_report(prepared))
         finally:
-            _kill(motion, arm.process)
+            run.processes.kill_all()
     return operator.measured
 
 
-class _VirtualArm:
-    """A virtual arm that serves a pty in a process of its own."""
-
-    def __init__(self, link: Path, seed: int, bad: bool) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._reports, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(link, seed, bad, theirs))
-        self.process.start()
-        _wait(link.is_symlink)
-
-    def end(self) -> ArmReport:
-        """Have it end; its report."""
-        self.process.terminate()
-        assert self._reports.poll(START_TIMEOUT)
-        report: ArmReport = self._reports.recv()
-        self.process.join()
-        return report
+def _prepared(folder: Path, seed: int, part: str) -> Prepared:
+    """A live run with a virtual arm and no pictures."""
+    virtual, faults = folder / "virtual.toml", _faults(seed) if part == ROUGH_PART else []
+    write_virtual_arm(virtual, ArmSettings(replies=ReplyMode.STREAM, seed=seed), tuple(faults))
+    record, rig, task = folder / "run.mcap", arc_rig(size=(64, 48), focal=60.0), PrintTask(_toolpath(), ArmProfile())
+    settings = LiveSettings(arm=VIRTUAL_ARM, record=record)
+    return Prepared(settings, folder / "rig.toml", rig, False, virtual, task, None, None, RunFiles(record), ())
 
 
-def _serve(link: Path, seed: int, bad: bool, reports: Connection) -> None:
-    ask_for_real_time()  # a real controller shares no core with us
-    settings = ArmSettings(replies=ReplyMode.STREAM, seed=seed)
-    with redirect_stdout(StringIO()):
-        arm = run_virtual_arm(settings, faults=_faults(seed) if bad else (), link=link)
-    garbage = sum(len(data) for _, data in arm.garbage)
-    reports.send(ArmReport(arm.frames, len(arm.ignored), len(arm.refused), garbage, arm.deepest, arm.in_flight))
+def tell_poses(prepared: Prepared, channels: TrackingChannels) -> None:
+    """In place of a tracking process: where a breathing chest is, until the run is gone."""
+    set_up_process("tracking")
+    clock = WallClock()
+    while not channels.lifeline.poll():
+        now = clock.now()
+        channels.poses.put(PoseHandover(_pose(now), now, now))
+        channels.bell.ring()
+        clock.wait_until(now + 1 / POSE_RATE)
+
+
+def _arm_report(prepared: Prepared) -> ArmReport:
+    with np.load(prepared.files.executed) as executed:
+        return ArmReport(*(float(executed[each.name]) for each in fields(ArmReport)))
+
+
+def _lateness(report: LiveMotionReport) -> StageTiming:
+    return next((timing for timing in report.timings if timing.name == LATE_TICK_STAGE), NOT_LATE)
+
+
+NOT_LATE = StageTiming(LATE_TICK_STAGE, 0, math.nan, math.nan, math.nan)
 
 
 def _faults(seed: int) -> list[Fault]:
@@ -252,8 +182,8 @@ def _faults(seed: int) -> list[Fault]:
     rng, now, faults = np.random.default_rng(seed), 5.0, list[Fault]()
     while now < 3600:
         kind = WIRE_FAULTS[rng.integers(len(WIRE_FAULTS))]
-        length = 0.0 if kind is FaultKind.DROP else float(rng.uniform(0.05, MAX_HALT))
-        faults.append(Fault(FaultPart.ARM, kind, now, length))
+        length = 0.0 if kind is FaultKind.DROP else round(float(rng.uniform(0.05, MAX_HALT)), 3)
+        faults.append(Fault(FaultPart.ARM, kind, round(now, 3), length))
         now += float(rng.uniform(4, 10))
     return faults
 
@@ -264,15 +194,15 @@ WIRE_FAULTS = (FaultKind.STALL, FaultKind.STALL, FaultKind.DROP, FaultKind.UNPLU
 class _Operator:
     """Arms, stops and arms again, halts the motion process, and collects what it reports."""
 
-    def __init__(self, orders: Connection, motion: BaseProcess, rng: np.random.Generator, halts: bool) -> None:
+    def __init__(self, run: RunChannels, rng: np.random.Generator, halts: bool) -> None:
         self.measured = LivePart()
-        self._orders, self._motion, self._rng, self._halts = orders, motion, rng, halts
+        self._run, self._rng, self._halts = run, rng, halts
         self._stop = self._halt = self._arm = 0.0  # s, when each is due
         self._stop_sent: float | None = None
-        self._first: MotionReport | None = None
+        self._first: LiveMotionReport | None = None
         self._clock = WallClock()
 
-    def act(self, report: MotionReport | None, now: float) -> None:
+    def act(self, report: LiveMotionReport | None, now: float) -> None:
         """Read a report, and do what is due at `now`, s."""
         assert report is not None
         self._first = self._first or report
@@ -285,7 +215,7 @@ class _Operator:
         if status.state is ArmState.ARMED:
             self._disturb(now)
         elif now > self._arm:
-            self._orders.send(Order.HOME if report.tick.answer.code is LinkCode.FAR_FROM_PATH else Order.ARM)
+            self._run.order(Order.HOME if report.tick.answer.code is LinkCode.FAR_FROM_PATH else Order.ARM)
             self._arm = now + 0.5
             self._stop = max(self._stop, now + 1.0)
 
@@ -293,23 +223,25 @@ class _Operator:
         if now > self._stop and self._stop_sent is None:
             self.measured.load.append(os.getloadavg()[0])
             self._stop_sent = self._clock.now()
-            self._orders.send(Order.STOP)
+            self._run.order(Order.STOP)
             self._stop = now + STOP_PERIOD * self._rng.uniform(0.8, 1.2)
-        elif self._halts and now > self._halt and self._motion.pid is not None:
+        elif self._halts and now > self._halt and (pid := self._run.processes.members["motion"].pid) is not None:
             self._halt = now + HALT_PERIOD * self._rng.uniform(0.5, 1.5)
-            os.kill(self._motion.pid, signal.SIGSTOP)
+            os.kill(pid, signal.SIGSTOP)
             self._clock.wait_until(now + self._rng.uniform(0.02, MAX_HALT))
-            os.kill(self._motion.pid, signal.SIGCONT)
+            os.kill(pid, signal.SIGCONT)
             self.measured.halts += 1
 
-    def end(self, report: MotionReport | None) -> None:
-        """Have the motion end, after its last report."""
-        self._orders.send(Order.QUIT)
-        self._motion.join(START_TIMEOUT)
+    def end(self, report: LiveMotionReport | None) -> None:
+        """Have the run end, after the motion's last report."""
+        self._run.order(Order.QUIT)
+        self._run.processes.end("motion")
+        self._run.processes.end("arm", 0.0)  # at once: what it still had queued counts
+        self._run.end()
         self.measured.report = report
         if report is not None and self._first is not None:
             seconds = report.tick.stamp - self._first.tick.stamp
-            self.measured.rate = (report.ticks - self._first.ticks) / seconds
+            self.measured.rate = (_lateness(report).count - _lateness(self._first).count) / seconds
 
 
 @contextmanager

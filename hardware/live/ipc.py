@@ -260,13 +260,6 @@ class ProcessGroup:
             self.kill(name)
 
 
-def run_player(prepared: Prepared, ring: FrameRing, notices: Connection, start: c_double) -> None:
-    """Show a recorded session, as cameras would."""
-    from hardware.live.ipc import play
-
-    play(prepared, ring, notices, start)
-
-
 def run_tracker(prepared: Prepared, channels: TrackingChannels) -> None:
     """Track the surface."""
     from hardware.live.tracking_process import track
@@ -301,7 +294,9 @@ def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
     stamps = np.arange(0.0, arm.now, EXECUTED_STEP)  # (N,) s
     axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))  # (N, 6)
     with prepared.files.executed.open("wb") as file:
-        np.savez(file, stamps=stamps + clock.begun, axes=axes, deepest=arm.deepest, held_up=clock.longest)
+        counts = {"frames": arm.frames, "ignored": len(arm.ignored), "refused": len(arm.refused), "left": arm.in_flight}
+        garbage, moved = sum(len(data) for _, data in arm.garbage), {"stamps": stamps + clock.begun, "axes": axes}
+        np.savez(file, **moved, **counts, garbage=garbage, deepest=arm.deepest, held_up=clock.longest)
 
 
 def _stop_after(lifeline: Connection, stop: threading.Event) -> None:
@@ -362,10 +357,10 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
     processes = ProcessGroup()
     with ExitStack() as stack:
         stack.callback(processes.kill_all)
-        url, arm_lifeline = prepared.settings.arm, SPAWN.Pipe(duplex=False)
+        url, arm_lifeline = prepared.settings.arm, SPAWN.Pipe(duplex=False)[1]
         if url == VIRTUAL_ARM:
             url = str(folder / "arm")
-            _start_arm(processes, prepared, File(url), arm_lifeline[0])
+            arm_lifeline = start_arm(processes, prepared, File(url))
         place, start = RawValue(c_double, math.nan), RawValue(c_double, math.nan)
         ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
         poses, tracking = SharedLatest[PoseHandover](), SharedLatest[TrackingReport]()
@@ -378,23 +373,25 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
         mover = MotionChannels(url, place, poses, motion, shares, *own)
         processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
         if not prepared.live:
-            processes.start("feed", run_player, (prepared, ring, notices[1], start), (notices[1],))
+            processes.start("feed", play, (prepared, ring, notices[1], start), (notices[1],))
         looks, outline, placed = RawValue(c_uint64, 0), SharedLatest[OutlineOrder](), SharedLatest[Array]()
         ends_of_tracking = to_recorder[1][1], looks, outline, placed, shares, lifeline[0]
         track = TrackingChannels(ring, notices[0], poses, bell, tracking, motion, link, *ends_of_tracking)
         processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
         sender = RecorderSender(to_recorder[2][1])
-        own_ends = orders[1], bell, lifeline[1], arm_lifeline[1], sender, link, trouble
+        own_ends = orders[1], bell, lifeline[1], arm_lifeline, sender, link, trouble
         stack.pop_all()
     return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, start, looks, outline, placed)
 
 
-def _start_arm(processes: ProcessGroup, prepared: Prepared, device: File, lifeline: Connection) -> None:
-    """Start a virtual arm, and wait for its device."""
-    processes.start("arm", run_arm, (prepared, device, lifeline), (lifeline,))
+def start_arm(processes: ProcessGroup, prepared: Prepared, device: File) -> Connection:
+    """Start a virtual arm, and wait for its device; returns the lifeline, at whose end it ends."""
+    theirs, lifeline = SPAWN.Pipe(duplex=False)
+    processes.start("arm", run_arm, (prepared, device, theirs), (theirs,))
     clock = WallClock()
     until = clock.now() + ARM_START_TIMEOUT
     while not device.is_symlink():
         if not processes.alive("arm") or clock.now() > until:
             raise StillbedError("the virtual arm did not start")
         clock.wait_until(clock.now() + ARM_POLL_PERIOD)
+    return lifeline
