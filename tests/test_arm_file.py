@@ -135,7 +135,6 @@ FULL = {
     "fifo": 20,
     "dead_time_s": 0.01,
     "servo_lag_s": 0.0,
-    "acceleration_mm_s2": 3000,
     "top_speed_mm_s": 200,
     "top_turn_deg_s": 90,
     "low_mm_deg": [-1, -2, -3, -4, -5, -6],
@@ -150,7 +149,7 @@ def test_a_table_gives_the_settings_in_mm_s_and_rad() -> None:
     assert set(FULL) == set(ARM_KEYS)
     arm = arm_settings_from_table("a.toml", FULL)
     assert (arm.fifo, arm.seed, arm.replies) == (20, 7, ReplyMode.STRAY)
-    assert (arm.dead_time, arm.servo_lag, arm.acceleration, arm.reply_period) == (0.01, 0.0, 3000.0, 0.1)
+    assert (arm.dead_time, arm.servo_lag, arm.reply_period) == (0.01, 0.0, 0.1)
     assert (arm.top_speed, arm.top_turn) == pytest.approx((200, np.pi / 2))
     assert arm.high == pytest.approx([1, 2, 3, *np.deg2rad([4, 5, 180])])
 
@@ -164,7 +163,7 @@ def test_what_a_table_leaves_out_keeps_its_default() -> None:
     ("key", "value"),
     [
         ("fifo", 0), ("fifo", 1.5), ("seed", -1), ("dead_time_s", -0.001), ("servo_lag_s", "20 ms"),
-        ("servo_lag_s", -1e-9), ("acceleration_mm_s2", 0), ("top_speed_mm_s", 0), ("top_turn_deg_s", -1),
+        ("servo_lag_s", -1e-9), ("top_speed_mm_s", 0), ("top_turn_deg_s", -1),
         ("low_mm_deg", [0] * 5), ("low_mm_deg", [1000, -1, -1, -1, -1, -1]), ("high_mm_deg", [1601, 1, 1, 1, 1, 1]),
         ("replies", "on"), ("replies", 3), ("reply_period_s", 0),
     ],

@@ -248,7 +248,7 @@ CASES: list[tuple[str, str, object]] = [  # kind of file, key, and its value
     ("virtual_arm", "arm", 3),
     ("virtual_arm", "arm.seed", -1),
     ("virtual_arm", "arm.top_turn_deg_s", 0),
-    ("virtual_arm", "arm.acceleration_mm_s2", "fast"),
+    ("virtual_arm", "arm.top_speed_mm_s", "fast"),
     ("virtual_arm", "faults", LEFT_OUT),
     ("virtual_arm", "faults", ["camera0 off"]),
 ]

@@ -13,7 +13,6 @@ What thesis and public drivers leave open is decided here, for the worse case of
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
@@ -89,29 +88,24 @@ class Polyline:
         return np.asarray(self.axes[index] + self.slopes[index] * since[:, None])
 
 
-SERVO_STEP = 0.001  # s, of the acceleration limit
-_STEPS_AT_ONCE = 4096  # steps at once
-
-
-class FirstOrderLag:
-    """tau y' = u - y, where u is the line `dead_time` s ago; y is u at the line's first knot."""
+class Servo:
+    """Where the axes really are: tau y' = u - y, where u is the line `dead_time` s ago; y is u at its first knot."""
 
     def __init__(self, line: Polyline, dead_time: float, tau: float) -> None:
         self._line, self._dead_time, self._tau = line, dead_time, tau
         self._behind = np.zeros((64, AXIS_COUNT))  # y - u at each knot
         self._size = 1
 
-    def at(self, instants: Array, now: float) -> tuple[Array, Array]:
-        """Axes and slopes, both (N, 6), at instants (N,) up to `now`, after which the line may still change."""
+    def at(self, instants: Array, now: float) -> Array:
+        """Axes (N, 6) at instants (N,) up to `now`, after which the line may still change."""
         self._settle(now)
         index, since = self._line.before(instants - self._dead_time)
-        slopes, started = self._line.slopes[index], instants - self._dead_time >= self._line.instants[0]
+        slopes = self._line.slopes[index]
         axes = self._line.axes[index] + slopes * since[:, None]
         if self._tau == 0:
-            return axes, slopes * started[:, None]
+            return np.asarray(axes)
         left = np.exp(-since / self._tau)[:, None]
-        behind = self._behind[index] * left + slopes * self._tau * (left - 1)
-        return axes + behind, (slopes - slopes * left - self._behind[index] / self._tau * left) * started[:, None]
+        return np.asarray(axes + (self._behind[index] * left + slopes * self._tau * (left - 1)))
 
     def _settle(self, now: float) -> None:
         instants, slopes = self._line.instants, self._line.slopes
@@ -125,54 +119,6 @@ class FirstOrderLag:
             steady = slopes[knot - 1] * self._tau
             self._behind[knot] = (self._behind[knot - 1] + steady) * share - steady
         self._size = size
-
-
-class Servo:
-    """Where the axes really are."""
-
-    def __init__(self, line: Polyline, dead_time: float, tau: float, accelerations: Array | None) -> None:
-        """accelerations: (2,) the greatest of X Y Z, mm/s^2, and of A B C, rad/s^2; None for no limit."""
-        self._lag, self._accelerations = FirstOrderLag(line, dead_time, tau), accelerations
-        self._limited = Polyline(float(line.instants[0]), line.axes[0])
-        self._steps = 0
-        self._at, self._speed = line.axes[0].tolist(), [0.0] * AXIS_COUNT
-
-    def at(self, instants: Array, now: float) -> Array:
-        """Axes (N, 6) at instants (N,) up to `now`."""
-        if self._accelerations is None:
-            return self._lag.at(instants, now)[0]
-        while self._steps * SERVO_STEP < now:
-            grid = np.arange(self._steps, self._steps + _STEPS_AT_ONCE, dtype=np.float64) * SERVO_STEP
-            grid = grid[grid < now]
-            self._follow(grid, *self._lag.at(grid, now), *self._accelerations.tolist())
-            self._steps += len(grid)
-        return self._limited.at(instants)
-
-    def _follow(self, grid: Array, axes: Array, slopes: Array, acceleration: float, turn_acceleration: float) -> None:
-        """Take the steps that begin at instants (N,), where the lag asks for these axes and slopes (N, 6)."""
-        for instant, goal, slope in zip(grid.tolist(), axes.tolist(), slopes.tolist(), strict=True):
-            before, at = self._speed, self._at
-            linear = _next_speed(at[:3], before[:3], goal[:3], slope[:3], acceleration)
-            self._speed = linear + _next_speed(at[3:], before[3:], goal[3:], slope[3:], turn_acceleration)
-            if self._speed != before:
-                self._limited.append(instant, np.array(at), np.array(self._speed))
-            self._at = [p + v * SERVO_STEP for p, v in zip(at, self._speed, strict=True)]
-
-
-def _next_speed(
-    at: list[float], speed: list[float], goal: list[float], slope: list[float], acceleration: float
-) -> list[float]:
-    """The speed of the next step: that of the goal, and as much more as can be braked in time; change is limited."""
-    gap = [g - p for g, p in zip(goal, at, strict=True)]
-    distance, step = math.hypot(*gap), acceleration * SERVO_STEP
-    closing = step * (
-        math.sqrt(0.25 + 2 * distance / (step * SERVO_STEP)) - 0.5
-    )  # braked by `step` a step, it ends at 0
-    share = min(1 / SERVO_STEP, closing / distance) if distance else 0.0
-    change = [s + share * g - v for s, g, v in zip(slope, gap, speed, strict=True)]
-    size = math.hypot(*change)
-    scale = min(1.0, step / size) if size else 0.0
-    return [v + scale * c for v, c in zip(speed, change, strict=True)]
 
 
 CONTINUATION_GAP = 1e-5  # s: a move that comes this late after the last one still follows it without a stop
@@ -206,10 +152,7 @@ class VirtualArm:
         self._rates = WorkRates(faults_striking(faults, FaultPart.ARM))
         self._answers = Telemetry(settings, baud, faults)
         self._setpoint = Polyline(0.0, home_axes)
-        accelerations = None
-        if settings.acceleration is not None:
-            accelerations = settings.acceleration * np.array([1.0, settings.top_turn / settings.top_speed])
-        self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag, accelerations)
+        self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag)
         self._target = home_axes.copy()  # machine coordinates, of the last command queued
         self.origin = np.zeros(3)  # of work, mm
         self._fifo: deque[WorkStretches] = deque()  # of the commands in it

@@ -3,7 +3,6 @@
 fifo = 200
 dead_time_s = 0.0
 servo_lag_s = 0.02
-acceleration_mm_s2 = 3000      # left out: no limit
 top_speed_mm_s = 250
 top_turn_deg_s = 180
 low_mm_deg = [-1000, -1000, -500, -180, -180, -180]
@@ -61,15 +60,11 @@ def _six(x_y: float, z: float, angle_deg: float) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmSettings:
-    """One virtual arm. InputError names a setting that makes no sense.
-
-    A B C get the acceleration that takes them to their top speed in the same time as X Y Z.
-    """
+    """One virtual arm. InputError names a setting that makes no sense."""
 
     fifo: int = 200  # commands; thesis 6.2: 9600 bytes
     dead_time: float = 0.0  # s from set-point to servo; nobody has measured it
     servo_lag: float = 0.02  # s, time constant; nobody has measured it; usual for small position servos
-    acceleration: float | None = None  # mm/s^2 along X Y Z, None for no limit; the maker names none
     top_speed: float = 250.0  # mm/s along X Y Z; 15,000 mm/min in public drivers
     top_turn: float = float(np.pi)  # rad/s of each of A B C; unknown; above the planner's 120 degrees/s
     low: Array = field(default_factory=lambda: -_six(1000, 500, 180))  # X Y Z as in a public driver
@@ -81,10 +76,8 @@ class ArmSettings:
     def __post_init__(self) -> None:
         for name, low in (("fifo", 1), ("seed", 0)):
             checks.integer("arm", name, getattr(self, name), low)
-        for name in ("dead_time", "servo_lag", "acceleration", "top_speed", "top_turn", "reply_period"):
+        for name in ("dead_time", "servo_lag", "top_speed", "top_turn", "reply_period"):
             number, zero = getattr(self, name), name in ("dead_time", "servo_lag")
-            if number is None and name == "acceleration":
-                continue
             if not (np.isfinite(number) and (number > 0 or (zero and number == 0))):
                 raise InputError("arm", name, number, "a finite number >= 0" if zero else "a finite number > 0")
         for name in ("low", "high"):
@@ -99,7 +92,6 @@ ARM_KEYS: checks.Keys = {  # in a table [arm]
     "fifo": ("fifo", checks.whole(1)),
     "dead_time_s": ("dead_time", checks.number),
     "servo_lag_s": ("servo_lag", checks.number),
-    "acceleration_mm_s2": ("acceleration", checks.number),
     "top_speed_mm_s": ("top_speed", checks.number),
     "top_turn_deg_s": ("top_turn", checks.times(checks.number, float(np.deg2rad(1.0)))),
     "low_mm_deg": ("low", checks.times(checks.array((6,)), AXIS_UNITS)),
