@@ -121,16 +121,12 @@ FIGURE_COLUMNS = ("what", "value", "unit", "low", "high", "verdict", "reference"
 def save(
     folder: Path, subject: str, options: Mapping[str, object], figures: Sequence[Figure], machine: Machine
 ) -> None:
-    """Write figures.json and figures.csv into an existing folder; a number that does not exist is null, or empty."""
+    """Write figures.json into an existing folder; a number that does not exist is null."""
     from hardware.report.evaluation import finite
 
     plain = {name: value if isinstance(value, (int, float, bool)) else str(value) for name, value in options.items()}
     table = {"subject": subject, "options": plain, "machine": asdict(machine), "figures": [*map(_row, figures)]}
     (folder / "figures.json").write_text(json.dumps(finite(table), indent=2) + "\n", encoding="utf-8")
-    with (folder / "figures.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, FIGURE_COLUMNS)
-        writer.writeheader()
-        writer.writerows(finite(table["figures"]))
 
 
 def _row(figure: Figure) -> dict[str, object]:

@@ -102,7 +102,7 @@ def run_bench(arguments: argparse.Namespace, subjects: Subjects | None = None, w
 def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
     """The options of one subject: where to save, and its own."""
     parser = Parser(prog=f"{subject.program} {name}", description=subject.summary)
-    parser.add_argument("-o", "--out", type=Path, help="folder for figures.json and figures.csv, new or empty")
+    parser.add_argument("-o", "--out", type=Path, help="folder for figures.json, new or empty")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     subject.add_options(parser)
     return parser
