@@ -41,7 +41,7 @@ def scan_from_triangles(vertices: ArrayLike, triangles: ArrayLike) -> Scan:
     faces = faces[np.linalg.norm(crosses, axis=1) > 1e-12 * largest**2]
     used, number = np.unique(faces, return_inverse=True)
     points, faces = points[used], number.reshape(-1, 3)
-    return Scan(points, faces, _vertex_normals(points, faces))
+    return Scan(points, faces, vertex_normals(points, faces))
 
 
 def open_edges(scan: Scan) -> Index:
@@ -73,7 +73,7 @@ def _crosses(points: Array, faces: Index) -> Array:
     return np.cross(b - a, c - a)
 
 
-def _vertex_normals(points: Array, faces: Index) -> Array:
+def vertex_normals(points: Array, faces: Index) -> Array:
     """Unit normals (V, 3); where the triangles around a vertex cancel out, that of one of them."""
     crosses = _crosses(points, faces)
     sums = np.zeros_like(points)

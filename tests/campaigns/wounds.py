@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from estimation import se3
 from estimation.errors import StillbedError
-from estimation.scans.scan import Scan, scan_from_triangles
+from estimation.scans.scan import Scan, scan_from_triangles, vertex_normals
 from estimation.se3 import Array, Index
 from hardware.bench.figures import Figure, Target, at_least, at_most, with_progress
 from hardware.files.mesh_file import read_raw_mesh
@@ -135,7 +135,7 @@ def carve(body: Scan, rng: Rng) -> CarvedWound:
     """A wound somewhere on a body (vertices mm, normals outwards), scanned with noise and holes."""
     size = float(rng.uniform(*WOUND_SIZES))
     vertices, triangles, middle, normal = _patch(body, size / 2 + float(rng.uniform(*SKIN_AROUND)), rng)
-    normals = scan_normals(vertices, triangles)
+    normals = vertex_normals(vertices, triangles)
     chart = _chart(vertices, middle, normal)
     edge = _edge_of(size, float(rng.uniform(0.5, 1.0)), rng)
     inside = _inside(chart, edge)
@@ -159,15 +159,6 @@ def carve(body: Scan, rng: Rng) -> CarvedWound:
     return CarvedWound(
         moved[0], triangles[kept], moved[1], moved[2], skin[1] @ pose[:3, :3].T, volume, size, plate, undercut
     )
-
-
-def scan_normals(vertices: Array, triangles: Index) -> Array:
-    """Unit normals (V, 3) of a mesh whose vertices keep their order."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    crosses, sums = np.cross(b - a, c - a), np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(sums, triangles[:, k], crosses)
-    return np.asarray(sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12))
 
 
 def _patch(body: Scan, radius: float, rng: Rng) -> tuple[Array, Index, Array, Array]:
