@@ -186,7 +186,7 @@ def test_a_clogged_needle_holds_its_share_back_and_a_wrong_pump_gives_another_fl
     clog = fault_from_text("test", "fault", "dispenser clog 75% at 2s for 1s")
     assert str(clog) == "dispenser clog 75% at 2s for 1s".replace("75%", "75%")
     dispensers = SimulatedDispensers(layers(), None, SimClock(), (clog,))
-    dispensers.models[0].obey(1.0, 0.5)
+    dispensers.models[0].receive(b"ON 1\n", 0.5)
     instants, needed = np.array([0.1, 1.0, 2.5, 3.5]), np.full(4, 4.0)
     assert dispensers.flow(instants, needed) == pytest.approx([0.0, 4.0, 1.0, 4.0])
     file = worlds.write_scenario(tmp_path, worlds.IDEAL, {"dispenser": {"given": 1.25}})

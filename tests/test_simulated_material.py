@@ -22,7 +22,7 @@ from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
 from hardware.simulator.deposit import convolved, deposit_figures, deposit_map, planned_line, row_volumes
 from hardware.simulator.dispenser import DispenserModel, DispenserPort
-from hardware.simulator.material import IDEAL, SimulatedDispensers, flow_from_told
+from hardware.simulator.material import IDEAL, SimulatedDispensers
 from hardware.simulator.nozzle_error import MaterialFigures, material_figures, nozzle_errors
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.truth import divide_path
@@ -154,15 +154,6 @@ def test_a_line_loses_what_its_faults_say() -> None:
             call()
     clock.wait_until(4.0)
     assert port() is port
-
-
-def test_what_was_recorded_gives_the_flow_again() -> None:
-    world, _ = printed(tuple((LATE | OOZING).items()))
-    model, times = world.dispensers.models[0], np.arange(0.0, 2.6, 1e-3)
-    again = flow_from_told(model.switches, model.settings)(times, np.zeros(len(times)))
-    assert np.allclose(again, model.flow_at(times))
-    ideal = flow_from_told([(1.0, 2.0), (2.0, 0.0)])(np.array([0.5, 1.5, 2.5]), np.full(3, 7.0))
-    assert ideal.tolist() == [0.0, 7.0, 0.0]
 
 
 def moves(flow: float, after: float = 0.0, stamp: float = 0.0) -> Move:

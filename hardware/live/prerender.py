@@ -44,11 +44,6 @@ from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import inputs_from_texts
 from hardware.simulator.arm.settings import write_virtual_arm
 from hardware.simulator.cameras import Shot
-from hardware.simulator.deposit import NozzleLog, PlannedLine, join_logs, planned_line
-from hardware.simulator.dispenser import VirtualDispenserSettings
-from hardware.simulator.material import flow_from_told
-from hardware.simulator.nozzle_error import MaterialFigures, material_figures
-from hardware.simulator.nozzle_error import nozzle_errors as row_errors
 from hardware.simulator.scenario import Scenario, read_scenario
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.simulate import regions
@@ -156,7 +151,6 @@ class _PictureSink:
     pose = given = tick = wire = head = rows = registered = look = event = _ignore
 
 
-BEAD_WIDTH = 1.0  # mm
 BLOCK_SECONDS = 10.0  # s of rows compared at once
 
 
@@ -168,7 +162,6 @@ class NozzleErrors:
     duty: float  # share of the time due in which material left; NaN where none was due
     deepest: float  # s of motion that the arm ever had queued
     held_up: float  # s that a busy machine kept the virtual arm from its line at most
-    material: MaterialFigures | None = None  # of what a dispenser was told; None of a run without one
 
     def figure(self, share: float) -> float:
         """Error, mm, that `share` percent do not exceed; NaN of none."""
@@ -190,15 +183,12 @@ class _TrueMotion:
         raise NotImplementedError
 
 
-def nozzle_errors(
-    record: Path, executed: Path, path: Path, arm: Path, dispenser: VirtualDispenserSettings | None = None
-) -> NozzleErrors:
+def nozzle_errors(record: Path, executed: Path, path: Path, arm: Path) -> NozzleErrors:
     """executed: what the arm did, as a live run leaves it. path: checkpoints in the true surface frame.
 
     arm: as it truly stands. InputError without ticks.
-    dispenser: what the one that was told truly does; None: it gives each bead what it needs, at once.
     """
-    run = read_run(record, "/tick", "/move", "/truth", "/dispenser", "/loop")
+    run = read_run(record, "/tick", "/move", "/truth", "/loop")
     if not run.messages["/tick"] or len(run.messages["/truth"]) < 2:
         raise InputError(record, "recording", "no ticks or no truth", "a run before pre-rendered pictures")
     true, profile = read_arm(arm), inputs_from_texts(run.texts, record).profile  # tick and lag as the run took them
@@ -207,8 +197,6 @@ def nozzle_errors(
     truth = Truth(np.eye(4), _TrueMotion(rows[rising]))
     checkpoints = read_path(path)
     truth_log = TruthLog(checkpoints, true.arm, truth, profile.tick, profile.lag)
-    told = sorted((float(m["stamp"]), float(m["flow"][0])) for m in run.messages["/dispenser"] if m["flow"])
-    flow, logs = flow_from_told(told, dispenser), list[NozzleLog]()
     commands = commands_in(run)
     for command, progress in commands:
         truth_log.write(command, progress)
@@ -226,19 +214,11 @@ def nozzle_errors(
     printed = PrintPhase.LEAVING, PrintPhase.FINISHED  # nothing is due any more
     finished = min((command.stamp for command, progress in commands if progress.phase in printed), default=np.inf)
     for start in np.arange(first, last, BLOCK_SECONDS):
-        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at, flow)
-        if told:
-            logs.append(log)
+        log = truth_log.rows(row_instants(start, min(start + BLOCK_SECONDS, last)), axes_at)
         known = log.extrude & np.isfinite(log.place)
         off = log.base_from_nozzle[known, :3, 3] - log.base_from_target[known, :3, 3]
         errors.append(np.linalg.norm(off, axis=1))
         extruding += int(log.extrude.sum())
         due += int((np.isfinite(log.place) & (log.place > 0) & (log.stamps < finished)).sum())
     duty = extruding / due if due else float("nan")
-    material = _material(join_logs(logs), planned_line(checkpoints)) if logs else None
-    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up, material)
-
-
-def _material(log: NozzleLog, line: PlannedLine) -> MaterialFigures:
-    """The width of beads is not recorded: it is taken as that of UNIT_AREA, 1 mm."""
-    return material_figures(log, line, row_errors(log, line), BEAD_WIDTH, float("nan"))
+    return NozzleErrors(np.concatenate(errors), duty, deepest, held_up)

@@ -122,12 +122,6 @@ class DispenserModel:
         for line in lines:
             self._take(line.decode("ascii", "replace").strip())
 
-    def obey(self, flow: float, now: float) -> None:
-        """Be told a flow, mm^3/s, at `now`, s; 0: off."""
-        self.advance(now)
-        self._fed = now
-        self._switch(flow, now)
-
     def advance(self, now: float) -> None:
         """Let time pass until `now`, s."""
         assert now >= self.now

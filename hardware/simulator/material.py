@@ -37,7 +37,7 @@ from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
 from hardware.simulator.dispenser import DIALECTS, DispenserModel, DispenserPort, VirtualDispenserSettings
 from hardware.simulator.scene.fields import GelPieces
 from hardware.simulator.scene.scene import Scene
-from hardware.simulator.truth import FlowAt, Truth, TruthLog
+from hardware.simulator.truth import Truth, TruthLog
 from planning.command import Command, Move
 from planning.material import Outlets
 from planning.path import Path
@@ -256,17 +256,6 @@ class SimulatedDispensers:
         """Instants (M,), s, rising, and flows (M,) that it obeyed from each on."""
         stamps, flows = np.array([(-math.inf, 0.0), *model.switches]).T
         return stamps, flows
-
-
-def flow_from_told(told: Sequence[tuple[float, float]], truth: VirtualDispenserSettings | None = None) -> FlowAt:
-    """The true flow of a dispenser that was told flows, mm^3/s, at instants, s, rising; truth: None of an ideal one."""
-    if truth is None:
-        stamps, flows = np.array([(-math.inf, 0.0), *told]).T
-        return lambda instants, needed: needed * (flows[np.searchsorted(stamps, instants, "right") - 1] > 0)
-    model = DispenserModel(replace(truth, watchdog=math.inf), told[0][0] if told else 0.0)
-    for stamp, flow in told:
-        model.obey(flow, stamp)
-    return lambda instants, needed: model.flow_at(instants)
 
 
 BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
