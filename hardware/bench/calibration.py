@@ -17,8 +17,7 @@ from estimation import se3
 from estimation.calibration.arm_fit import ArmFit, ArmUnknowns, fit_arm
 from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, first_pose, predict
 from estimation.calibration.camera_rig import Calibration, calibrate
-from estimation.calibration.lens_model import BoardViews, Implausible, Undetermined, lens_of, matrix_of
-from estimation.mapping.triangulation import triangulate
+from estimation.calibration.lens_model import BoardViews, Implausible, Undetermined, lens_of, matrix_of, project_lens
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from hardware.bench.figures import CONSISTENT_NEES, Figure, at_most, relative_nees, rms
@@ -31,7 +30,6 @@ from hardware.process.progress import Progress, no_progress
 from hardware.simulator.scene.render import BoardView
 from hardware.simulator.watched_arm import watched_arm
 from perception.boards.board import Board, CornerFinder, CornerTable, empty_table, usable_views
-from perception.lens import undistort
 
 BOARD = Board(squares=(8, 11), square=30.0)
 PICTURE_SIZE = (1280, 720)
@@ -172,10 +170,17 @@ def _camera_nees(calibration: Calibration, error: Array) -> float:
 
 def _triangulation_errors(rig: Rig, true: Rig, points: Array) -> Array:
     """Distances (N,), mm, of points from where a rig triangulates them, after the best rigid motion of all."""
-    cameras, count = zip(true.cameras, rig.cameras, strict=True), len(points)
-    pixels = [undistort(mine, pixels_from_points(theirs, points)[0]) for theirs, mine in cameras]
-    point, camera = np.tile(np.arange(count), len(rig)), np.repeat(np.arange(len(rig)), count)
-    estimated, _, _ = triangulate(rig, point, camera, np.concatenate(pixels), count)
+    pixels = [pixels_from_points(camera, points)[0] for camera in true.cameras]
+    estimated = points.copy()
+    for _ in range(8):  # Gauss-Newton
+        normal, gradient = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+        for camera, measured in zip(rig.cameras, pixels, strict=True):
+            camera_from_base = se3.inverse(camera.base_from_camera)
+            projected, _, by_point = project_lens(lens_of(camera), se3.transform_points(camera_from_base, estimated))
+            by_point = by_point @ camera_from_base[:3, :3]
+            normal += np.swapaxes(by_point, 1, 2) @ by_point
+            gradient += np.einsum("npi,np->ni", by_point, projected - measured)
+        estimated = estimated - np.linalg.solve(normal, gradient[..., None])[..., 0]
     moved = se3.transform_points(se3.rigid_from_points(points, estimated), points)
     return np.asarray(np.linalg.norm(estimated - moved, axis=1))
 
