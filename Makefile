@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := test
 
 demo: $(STAMP)
-	@$(BIN)/stillbed simulate data/scenarios/demo.toml -o $(DEMO) --pty --force
+	@$(BIN)/stillbed simulate data/scenarios/demo.toml -o $(DEMO) --force
 
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
