@@ -82,7 +82,7 @@ def settle_angle(region: Region, pattern: Pattern, pace: PrintPace) -> Pattern:
         return pattern
     rim, core = _rim(_inset(region, pattern), pattern, pace)
     candidates = [replace(pattern, angle=angle) for angle in _angles(pattern)]
-    costs = [print_cost(rim + _lines(core, one, pace), pace) for one in candidates]
+    costs = [print_cost(rim + _lines(core, candidate, pace), pace) for candidate in candidates]
     shorter = pattern.angle == "shorter"
     return candidates[int(np.argmin([c.printed + c.travelled if shorter else c.seconds for c in costs]))]
 
@@ -101,16 +101,16 @@ def smooth_corners(bead: Bead, reach: float) -> Bead:
 
 def _cut(lines: Array, corner: NDArray[np.intp], reach: float) -> Array:
     """Lines (N, 3) with two points instead of each corner (C,), equally far from it so that each turns half as much."""
-    here = lines[corner]
-    back, on = lines[corner - 1] - here, lines[corner + 1] - here
-    far_back, far_on = np.hypot(back[:, 0], back[:, 1]), np.hypot(on[:, 0], on[:, 1])
-    cut = np.minimum(reach, 0.4 * np.minimum(far_back, far_on))
+    tips = lines[corner]
+    backward, forward = lines[corner - 1] - tips, lines[corner + 1] - tips
+    backward_length, forward_length = np.hypot(backward[:, 0], backward[:, 1]), np.hypot(forward[:, 0], forward[:, 1])
+    lengths = np.minimum(reach, 0.4 * np.minimum(backward_length, forward_length))
     times = np.ones(len(lines), int)
     times[corner] = 2
     doubled = np.repeat(lines, times, axis=0)
     place = corner + np.arange(len(corner))
-    doubled[place] = here + (cut / np.maximum(far_back, 1e-12))[:, None] * back
-    doubled[place + 1] = here + (cut / np.maximum(far_on, 1e-12))[:, None] * on
+    doubled[place] = tips + (lengths / np.maximum(backward_length, 1e-12))[:, None] * backward
+    doubled[place + 1] = tips + (lengths / np.maximum(forward_length, 1e-12))[:, None] * forward
     return doubled
 
 
@@ -127,18 +127,18 @@ def _rim(region: Region, pattern: Pattern, pace: PrintPace) -> tuple[list[Bead],
     """Beads along the contour, in printing order, and the region that they leave for parallel lines."""
     if region.is_empty or pattern.kind in ("zigzag", "raster"):
         return [], region
-    lost = roughness(region, pattern.spacing)
-    if lost < MIN_ROUGHNESS:  # else the gaps are filled one by one
+    uneven = roughness(region, pattern.spacing)
+    if uneven < MIN_ROUGHNESS:  # else the gaps are filled one by one
         pattern = replace(pattern, overlap=max(pattern.overlap, RING_OVERLAP))
     hybrid, fit, spacing = pattern.kind == "hybrid", bead_fit(pattern), pattern.spacing
     reached = shapely.buffer(region, (spacing - pattern.width) / 2) if pattern.overlap else region
-    levels, core = ring_levels(reached, lost, fit, pattern.rims if hybrid else None)
+    levels, core = ring_levels(reached, uneven, fit, pattern.rims if hybrid else None)
     nests = nest_rings([level.rings for level in levels], spacing)
-    runs = [_nest_run(nest, lost, pattern, pace) for nest in nests]
+    runs = [_nest_run(nest, uneven, pattern, pace) for nest in nests]
     runs += [[_printed_bead(bead, pattern)] for level in levels for bead in level.single]
     if hybrid:
         return order_runs(runs, _corner(region, pattern), pace), shapely.buffer(core, RIM_OVERLAP * spacing)
-    if lost >= MIN_ROUGHNESS:  # gaps between beads are filled where the region is rough or narrow, else it costs time
+    if uneven >= MIN_ROUGHNESS:  # gaps between beads are filled where the region is rough or narrow, else it costs time
         runs = [[_cut_corners(bead, pattern) for bead in run] for run in fill_gaps(runs, region, fit)]
     return order_runs(runs, _corner(region, pattern), pace), EMPTY_REGION
 
@@ -150,7 +150,7 @@ def _corner(region: Region, pattern: Pattern) -> Array:
     return np.array([right if x > 0 else left, high if y > 0 else low])
 
 
-def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: PrintPace) -> BeadRun:
+def _nest_run(nest: list[Bead], uneven: float, pattern: Pattern, pace: PrintPace) -> BeadRun:
     """A nest's lines one by one (contour) or joined (spiral), else whichever is faster and fills as well."""
     start = np.array(pattern.start)
     if pattern.kind != "spiral":
@@ -161,7 +161,7 @@ def _nest_run(nest: list[Bead], lost: float, pattern: Pattern, pace: PrintPace) 
     if pattern.kind == "spiral":
         return joined
     slower = print_cost(joined, pace).seconds >= print_cost(closed, pace).seconds
-    return closed if slower or (lost >= MIN_ROUGHNESS and _worse(joined, closed)) else joined
+    return closed if slower or (uneven >= MIN_ROUGHNESS and _worse(joined, closed)) else joined
 
 
 def _worse(joined: BeadRun, closed: BeadRun) -> bool:
@@ -315,15 +315,15 @@ def _runs(scan: Crossings) -> list[Array]:
             used[entry // 2] = True
             leave = entry ^ 1
             path += [entry, leave]
-            to = after[leave]
-            if line[to] == line[leave] + 1 and not used[to // 2]:
-                path += _between(scan, edge[leave], edge[to], len(line))
+            target = after[leave]
+            if line[target] == line[leave] + 1 and not used[target // 2]:
+                path += _between(scan, edge[leave], edge[target], len(line))
             else:
-                to = before[leave]
-                if line[to] != line[leave] + 1 or used[to // 2]:
+                target = before[leave]
+                if line[target] != line[leave] + 1 or used[target // 2]:
                     break
-                path += _between(scan, edge[to], edge[leave], len(line))[::-1]
-            entry = to
+                path += _between(scan, edge[target], edge[leave], len(line))[::-1]
+            entry = target
         runs.append(points[path])
     return runs
 

@@ -114,21 +114,21 @@ def skin_around(
     points: Array, outline: MultiPolygon, margin: float, kernel: SkinKernel | None = None
 ) -> tuple[RestoredSkin, float]:
     """The skin over an outline, from points (P, 3) of the scan beyond `margin` mm, and their scatter about it."""
-    beside = ~shapely.contains_xy(shapely.buffer(outline, margin), points[:, 0], points[:, 1])
-    if beside.sum() < MIN_CELLS:
-        beside = ~shapely.contains_xy(outline, points[:, 0], points[:, 1])
-    around = points[beside] if beside.sum() >= MIN_CELLS else points
+    outside = ~shapely.contains_xy(shapely.buffer(outline, margin), points[:, 0], points[:, 1])
+    if outside.sum() < MIN_CELLS:
+        outside = ~shapely.contains_xy(outline, points[:, 0], points[:, 1])
+    around = points[outside] if outside.sum() >= MIN_CELLS else points
     cells = skin_cells(bent_base(around), around)
     gap = float(np.sqrt(outline.area / np.pi)) + margin
-    skin, held, scatter = restored_skin(cells, gap, kernel), len(cells.heights), 0.0
+    skin, count, scatter = restored_skin(cells, gap, kernel), len(cells.heights), 0.0
     for _ in range(SKIN_ROUNDS):
-        off = np.abs(cells.heights - skin.at(cells.places))
-        scatter = 1.4826 * float(np.median(off))
-        good = off < max(SKIN_SIGMAS * scatter, MIN_SKIN_BAND)  # no second wound, fold or hair
-        if good.sum() == held or good.sum() < MIN_CELLS:
+        deviations = np.abs(cells.heights - skin.at(cells.places))
+        scatter = 1.4826 * float(np.median(deviations))
+        inlier = deviations < max(SKIN_SIGMAS * scatter, MIN_SKIN_BAND)  # no second wound, fold or hair
+        if inlier.sum() == count or inlier.sum() < MIN_CELLS:
             break
-        kept = SkinCells(cells.base, cells.places[good], cells.heights[good], cells.weights[good])
-        skin, held = restored_skin(kept, gap, skin.kernel), int(good.sum())
+        selected = SkinCells(cells.base, cells.places[inlier], cells.heights[inlier], cells.weights[inlier])
+        skin, count = restored_skin(selected, gap, skin.kernel), int(inlier.sum())
     return skin, scatter
 
 
@@ -139,12 +139,12 @@ def _trusted_margin(points: Array, outline: MultiPolygon, skin: RestoredSkin) ->
     places, heights = skin.base.places(points)
     edges = np.arange(MIN_RIM_MARGIN, RIM_MARGIN, MARGIN_STEP)
     for low in edges[::-1]:
-        outer, inner = (shapely.buffer(outline, low + away) for away in (MARGIN_STEP, 0.0))
+        outer, inner = (shapely.buffer(outline, low + width) for width in (MARGIN_STEP, 0.0))
         strip = shapely.contains_xy(outer, *points[:, :2].T) & ~shapely.contains_xy(inner, *points[:, :2].T)
         if not strip.any():
             continue
-        off = float(np.mean(heights[strip] - skin.at(places[strip])))
-        if abs(off) > MAX_SWELLING + float(np.median(skin.deviation(places[strip]))):
+        offset = float(np.mean(heights[strip] - skin.at(places[strip])))
+        if abs(offset) > MAX_SWELLING + float(np.median(skin.deviation(places[strip]))):
             return RIM_MARGIN
     return MIN_RIM_MARGIN
 
@@ -178,22 +178,22 @@ def outlined(
     points = visible_points(scan, fine)
     if len(points) < MIN_CELLS:
         return None
-    margin, known = MIN_RIM_MARGIN if near else RIM_MARGIN, kernel
+    margin, fixed_kernel = MIN_RIM_MARGIN if near else RIM_MARGIN, kernel
     for turn in range(OUTLINE_ROUNDS):
-        restored, scatter = skin_around(points, outline, margin, known)
+        restored, scatter = skin_around(points, outline, margin, fixed_kernel)
         skin = skin_heights(restored, fine.grid)
         rim = np.column_stack([shapely.get_coordinates(outline), np.zeros(shapely.get_num_coordinates(outline))])
         sigma = float(np.median(restored.deviation(restored.base.places(rim)[0])))
-        level, now = _rim_of(fine, np.where(fine.known, skin - fine.heights, -1.0), outline, sigma)
-        if now.is_empty:
+        level, new_outline = _rim_of(fine, np.where(fine.known, skin - fine.heights, -1.0), outline, sigma)
+        if new_outline.is_empty:
             return None
-        before, outline, known = outline, now, restored.kernel
-        same = shapely.intersection(before, outline).area > SAME_SHARE * shapely.union(before, outline).area
+        last_outline, outline, fixed_kernel = outline, new_outline, restored.kernel
+        same = shapely.intersection(last_outline, outline).area > SAME_SHARE * shapely.union(last_outline, outline).area
         if near is None and (same or turn == OUTLINE_ROUNDS - 2):
             near, same = _trusted_margin(points, outline, restored) < RIM_MARGIN, False
             if not near:
                 break
-            margin, known = MIN_RIM_MARGIN, kernel
+            margin, fixed_kernel = MIN_RIM_MARGIN, kernel
         elif same:
             break
     return OutlinedWound(fine, outline, restored, skin, margin, scatter, level)
@@ -212,18 +212,18 @@ def _rim_of(fine: HeightMap, depth: Array, outline: MultiPolygon, sigma: float) 
     if not core.any():
         return level, MultiPolygon()
     reach = max(MIN_WALL_REACH, deep)
-    deeper = (depth > level) & (distance_transform_edt(~core) * fine.grid.step < reach)
-    own = _largest(deeper, core)
-    rise = np.where(own | (depth <= level), depth - level, -level)
+    below_rim = (depth > level) & (distance_transform_edt(~core) * fine.grid.step < reach)
+    wound = _largest(below_rim, core)
+    rise = np.where(wound | (depth <= level), depth - level, -level)
     wider = positive_region(fine.grid, rise, MIN_PIECE, OUTLINE_TOLERANCE)
     opened = as_multi(shapely.buffer(shapely.buffer(wider, -OPENING_RADIUS), OPENING_RADIUS), MIN_PIECE)
     shape = as_multi(shapely.simplify(opened, OUTLINE_TOLERANCE))
     return level, shape if shape.area >= MIN_AREA / 2 else MultiPolygon()
 
 
-def _largest(chosen: Mask, inside: Mask) -> Mask:
+def _largest(nodes: Mask, inside: Mask) -> Mask:
     """The piece (H, W) of the nodes chosen that has most nodes inside; none where it has none."""
-    pieces, _ = label(chosen)
+    pieces, _ = label(nodes)
     share = np.bincount(pieces[inside], minlength=2)[1:]
     return np.asarray((pieces == int(np.argmax(share)) + 1) & bool(share.any()))
 
@@ -284,47 +284,45 @@ def wound_places(
     scan: Scan, first: HeightMap, colour: ScanColour | None
 ) -> tuple[list[tuple[WoundPlace, OutlinedWound]], Sequence[Depression]]:
     """Places that may be the wound, the best first; and the clearest bulges, the clearest first."""
-    found, bulges = depressions(first.grid, first.heights, first.known, MAX_PLACES)
-    judged = [
+    candidates, bulges = depressions(first.grid, first.heights, first.known, MAX_PLACES)
+    rated = [
         place
-        for each in found
-        if each.clarity > RIVAL_CLARITY * found[0].clarity and each.depth > MIN_DEPTH / 4
-        for place in _judged_depression(scan, first, each, colour, found[0].clarity)
+        for candidate in candidates
+        if candidate.clarity > RIVAL_CLARITY * candidates[0].clarity and candidate.depth > MIN_DEPTH / 4
+        for place in _judged_depression(scan, first, candidate, colour, candidates[0].clarity)
     ]
-    judged.sort(key=lambda pair: -pair[0].score)
-    kept = list[tuple[WoundPlace, OutlinedWound]]()
-    for judgement, place in judged:  # two discs may lead to one outline
+    rated.sort(key=lambda pair: -pair[0].score)
+    distinct = list[tuple[WoundPlace, OutlinedWound]]()
+    for judgement, place in rated:  # two discs may lead to one outline
         middle = judgement.outline.mean(axis=0)
         size = np.sqrt(judgement.area)
-        if all(np.linalg.norm(middle - k.outline.mean(axis=0)) > 0.5 * max(size, np.sqrt(k.area)) for k, _ in kept):
-            kept.append((judgement, place))
-    return kept, bulges
+        if all(np.linalg.norm(middle - k.outline.mean(axis=0)) > 0.5 * max(size, np.sqrt(k.area)) for k, _ in distinct):
+            distinct.append((judgement, place))
+    return distinct, bulges
 
 
 def _judged_depression(
-    scan: Scan, first: HeightMap, hollow: Depression, colour: ScanColour | None, clarity: float
+    scan: Scan, first: HeightMap, depression: Depression, colour: ScanColour | None, clarity: float
 ) -> Sequence[tuple[WoundPlace, OutlinedWound]]:
     """The wound at a depression of the first map, in a plane of its own; none where there is none.
 
     Where the skin at the rim is not as the skin further out lets expect, either the rim is swollen or the body bends
     too much to tell: of both the one counts by which the rim is steeper, and in doubt the nearer skin.
     """
-    z = np.array([-hollow.slope[0], -hollow.slope[1], 1.0])
+    z = np.array([-depression.slope[0], -depression.slope[1], 1.0])
     rotation = first.surface_from_plane[:3, :3]
-    middle = se3.transform_points(first.surface_from_plane, np.array([hollow.middle]))[0]
+    middle = se3.transform_points(first.surface_from_plane, np.array([depression.middle]))[0]
     plane = se3.make(axes_along(rotation @ z / np.linalg.norm(z), np.eye(3)[0]), middle)
-    disc = as_multi(shapely.Point(0.0, 0.0).buffer(1.2 * hollow.radius))
+    disc = as_multi(shapely.Point(0.0, 0.0).buffer(1.2 * depression.radius))
     fine = height_map(scan, plane, SEARCH_STEP, surround_box(disc))
     if fine.known.sum() < MIN_NODES:
         return []
     far = outlined(scan, fine, disc, None, USUAL_KERNEL)
-    ways = [far]
+    candidates = [far]
     if far is None or far.margin == RIM_MARGIN:
-        ways.append(outlined(scan, fine, disc if far is None else far.outline, True, USUAL_KERNEL))
-    judged = [(_judged(place, clarity, colour), place) for place in ways if place is not None]
-    return sorted(judged, key=lambda pair: -pair[0].steepness * (NEAR_BONUS if pair[1].margin < RIM_MARGIN else 1.0))[
-        :1
-    ]
+        candidates.append(outlined(scan, fine, disc if far is None else far.outline, True, USUAL_KERNEL))
+    rated = [(_judged(place, clarity, colour), place) for place in candidates if place is not None]
+    return sorted(rated, key=lambda pair: -pair[0].steepness * (NEAR_BONUS if pair[1].margin < RIM_MARGIN else 1.0))[:1]
 
 
 def _judged(place: OutlinedWound, clarity: float, colour: ScanColour | None) -> WoundPlace:
@@ -333,7 +331,7 @@ def _judged(place: OutlinedWound, clarity: float, colour: ScanColour | None) -> 
     depth = place.depth
     inside = nodes_within(fine.grid, outline)
     deep = float(np.percentile(depth[inside], 95))
-    rims = [_around(outline, away) for away in (-RIM_INSIDE, RIM_OUTSIDE)]
+    rims = [_around(outline, distance) for distance in (-RIM_INSIDE, RIM_OUTSIDE)]
     if len(rims[0]):
         falls = [float(np.median(interpolate(fine.grid, depth, rim))) for rim in rims]
         steepness = min((falls[0] - max(falls[1], 0.0)) / max(deep, 1e-6), 1.0)
@@ -343,24 +341,24 @@ def _judged(place: OutlinedWound, clarity: float, colour: ScanColour | None) -> 
     share = float("nan")
     if colour is not None:
         share = _coloured(colour, points_on(fine, fine.grid.nodes[inside]))
-    whole = 1 - share_cut(fine, outline)  # what the scan's own rim cuts off is hardly the wound that was scanned
+    complete = 1 - share_cut(fine, outline)  # what the scan's own rim cuts off is hardly the wound that was scanned
     likeness = 1.0 if np.isnan(share) else 0.1 + share
-    score = np.sqrt(outline.area) * deep * max(steepness, 0.02) ** 2 * likeness * whole**2
+    score = np.sqrt(outline.area) * deep * max(steepness, 0.02) ** 2 * likeness * complete**2
     return WoundPlace(points, float(outline.area), deep, steepness, clarity, share, float(score))
 
 
-def _around(outline: MultiPolygon, away: float) -> Array:
-    """Points (N, 2) along an outline moved outwards by `away` mm."""
-    return np.asarray(shapely.get_coordinates(shapely.segmentize(shapely.buffer(outline, away), 1.0)))
+def _around(outline: MultiPolygon, distance: float) -> Array:
+    """Points (N, 2) along an outline moved outwards by `distance` mm."""
+    return np.asarray(shapely.get_coordinates(shapely.segmentize(shapely.buffer(outline, distance), 1.0)))
 
 
 def _coloured(colour: ScanColour, points: Array) -> float:
     """Mean share of wound colour at points (N, 3); nan where none is known."""
-    known = np.isfinite(colour.shares)
-    if not known.any():
+    valid = np.isfinite(colour.shares)
+    if not valid.any():
         return float("nan")
-    _, near = cKDTree(colour.points[known]).query(points)
-    return float(colour.shares[known][near].mean())
+    _, near = cKDTree(colour.points[valid]).query(points)
+    return float(colour.shares[valid][near].mean())
 
 
 def chosen_place(

@@ -58,21 +58,21 @@ class BentBase:
         u, height = _unbent(flat[:, 0], z, near)
         return np.column_stack([u, v]), height
 
-    def heights_over(self, flat: Array, z: Array, wanted: Array) -> tuple[Array, Array, Mask]:
-        """Heights (N,) over the plane at places (N, 2) of it whose points are `wanted` (N,) mm over the base.
+    def heights_over(self, flat: Array, z: Array, targets: Array) -> tuple[Array, Array, Mask]:
+        """Heights (N,) over the plane at places (N, 2) of it whose points are `targets` (N,) mm over the base.
 
         z: (N,) to begin with. Also the points' places (N, 2) on the base, and whether there is such a point at all.
         """
-        places, seen = flat, np.ones(len(flat), bool)
+        places, reachable = flat, np.ones(len(flat), bool)
         for _ in range(HEIGHT_ROUNDS):
             places, height = self.places(np.column_stack([flat, z]))
             facing = (self.places(np.column_stack([flat, z + 1e-3]))[1] - height) / 1e-3
-            off = wanted - height
-            z = z + off / np.maximum(facing, MIN_FACING)
-            seen = (facing > MIN_FACING) & (np.abs(off) < 10 * HEIGHT_TOLERANCE)
-            if np.percentile(np.abs(off), 95) < HEIGHT_TOLERANCE:  # the others have turned away
+            error = targets - height
+            z = z + error / np.maximum(facing, MIN_FACING)
+            reachable = (facing > MIN_FACING) & (np.abs(error) < 10 * HEIGHT_TOLERANCE)
+            if np.percentile(np.abs(error), 95) < HEIGHT_TOLERANCE:  # the others have turned away
                 break
-        return z, places, seen
+        return z, places, reachable
 
 
 def _unbent(x: Array, z: Array, radius: float) -> tuple[Array, Array]:
@@ -146,18 +146,18 @@ class RestoredSkin:
     def covariance(self, places: Array) -> Array:
         """Covariance (M, M), mm^2, of the heights at places (M, 2)."""
         near, terms = self._correlation(places), _quadric(places, self.size)
-        lacking = terms - near @ self.solved
-        whole = _matern(cdist(places, places), self.kernel.reach, self.kernel.smooth) - near @ cho_solve(
+        residual_terms = terms - near @ self.solved
+        conditional = _matern(cdist(places, places), self.kernel.reach, self.kernel.smooth) - near @ cho_solve(
             self.factor, near.T
         )
-        return np.asarray(self.kernel.variance * (whole + lacking @ self.bound @ lacking.T))
+        return np.asarray(self.kernel.variance * (conditional + residual_terms @ self.bound @ residual_terms.T))
 
     def deviation(self, places: Array) -> Array:
         """Standard deviation (M,), mm, of the heights at places (M, 2)."""
         near, terms = self._correlation(places), _quadric(places, self.size)
-        lacking = terms - near @ self.solved
-        own = 1 - np.einsum("mn,nm->m", near, cho_solve(self.factor, near.T))
-        squares = own + np.einsum("mi,ij,mj->m", lacking, self.bound, lacking)
+        residual_terms = terms - near @ self.solved
+        conditional = 1 - np.einsum("mn,nm->m", near, cho_solve(self.factor, near.T))
+        squares = conditional + np.einsum("mi,ij,mj->m", residual_terms, self.bound, residual_terms)
         return np.asarray(np.sqrt(self.kernel.variance * np.maximum(squares, 0)))
 
     def over(self, grid: Grid) -> tuple[Array, Array]:
@@ -166,12 +166,12 @@ class RestoredSkin:
         Heights are NaN where the skin has turned away from the plane.
         """
         flat = grid.nodes.reshape(-1, 2)
-        z, wanted, places, seen = np.zeros(len(flat)), np.zeros(len(flat)), flat, np.ones(len(flat), bool)
+        z, targets, places, reachable = np.zeros(len(flat)), np.zeros(len(flat)), flat, np.ones(len(flat), bool)
         for _ in range(SKIN_HEIGHT_ROUNDS):
-            z, places, seen = self.base.heights_over(flat, z, wanted)
-            wanted = self.at(places)
-        z, places, seen = self.base.heights_over(flat, z, wanted)
-        z = np.where(seen, z, np.nan)
+            z, places, reachable = self.base.heights_over(flat, z, targets)
+            targets = self.at(places)
+        z, places, reachable = self.base.heights_over(flat, z, targets)
+        z = np.where(reachable, z, np.nan)
         return places.reshape(*grid.shape, 2), z.reshape(grid.shape)
 
     def _correlation(self, places: Array) -> Array:
@@ -195,11 +195,11 @@ def restored_skin(cells: SkinCells, gap: float, kernel: SkinKernel | None = None
     """
     places, values, weights = cells.places, cells.heights, cells.weights
     size = float(np.ptp(places, axis=0).max())
-    apart, terms = cdist(places, places), _quadric(places, size)
+    distances, terms = cdist(places, places), _quadric(places, size)
     if kernel is None:
-        kernel = _validated(apart, terms, values, weights, _blocks(places, gap))
-    whole = _matern(apart, kernel.reach, kernel.smooth) + np.diag(kernel.noise / weights)
-    factor = cho_factor(whole, lower=True)
+        kernel = _validated(distances, terms, values, weights, _blocks(places, gap))
+    correlation = _matern(distances, kernel.reach, kernel.smooth) + np.diag(kernel.noise / weights)
+    factor = cho_factor(correlation, lower=True)
     solved = cho_solve(factor, terms)
     bound = np.linalg.inv(terms.T @ solved)
     drift = bound @ (solved.T @ values)
@@ -207,19 +207,19 @@ def restored_skin(cells: SkinCells, gap: float, kernel: SkinKernel | None = None
     return RestoredSkin(cells.base, kernel, places, size, factor, drift, mixed, bound, solved)
 
 
-def _validated(apart: Array, terms: Array, values: Array, weights: Array, blocks: list[Index]) -> SkinKernel:
+def _validated(distances: Array, terms: Array, values: Array, weights: Array, blocks: list[Index]) -> SkinKernel:
     """The kernel by which blocks of cells that are left out are predicted best: first its shape, then its noise."""
-    tried = dict[tuple[bool, float, float], tuple[float, float]]()
+    scores = dict[tuple[bool, float, float], tuple[float, float]]()
 
     def best(choices: list[tuple[bool, float, float]]) -> tuple[bool, float, float]:
         for smooth, reach, noise in choices:
-            whole = _matern(apart, reach, smooth) + np.diag(noise / weights)
-            tried[smooth, reach, noise] = _left_out(whole, terms, values, blocks)
-        return min(tried, key=lambda choice: tried[choice][0])
+            correlation = _matern(distances, reach, smooth) + np.diag(noise / weights)
+            scores[smooth, reach, noise] = _left_out(correlation, terms, values, blocks)
+        return min(scores, key=lambda choice: scores[choice][0])
 
     smooth, reach, _ = best([(smooth, reach, MIDDLE_NOISE) for smooth in (True, False) for reach in REACHES])
     chosen = best([(smooth, reach, noise) for noise in NOISE_SHARES])
-    return SkinKernel(*chosen, tried[chosen][1], tried[chosen][0])
+    return SkinKernel(*chosen, scores[chosen][1], scores[chosen][0])
 
 
 def skin_cells(base: BentBase, points: Array) -> SkinCells:
@@ -240,27 +240,27 @@ def skin_cells(base: BentBase, points: Array) -> SkinCells:
 
 def _blocks(cells: Array, radius: float) -> list[Index]:
     """Numbers of the cells within `radius` of middles that are spread over all."""
-    chosen = [int(np.argmin(np.linalg.norm(cells - cells.mean(axis=0), axis=1)))]
-    far = np.linalg.norm(cells - cells[chosen[0]], axis=1)
-    while len(chosen) < min(BLOCKS, len(cells)):
-        chosen.append(int(np.argmax(far)))
-        far = np.minimum(far, np.linalg.norm(cells - cells[chosen[-1]], axis=1))
-    lists = cKDTree(cells).query_ball_point(cells[chosen], min(radius, MAX_BLOCK))
+    middles = [int(np.argmin(np.linalg.norm(cells - cells.mean(axis=0), axis=1)))]
+    distances = np.linalg.norm(cells - cells[middles[0]], axis=1)
+    while len(middles) < min(BLOCKS, len(cells)):
+        middles.append(int(np.argmax(distances)))
+        distances = np.minimum(distances, np.linalg.norm(cells - cells[middles[-1]], axis=1))
+    lists = cKDTree(cells).query_ball_point(cells[middles], min(radius, MAX_BLOCK))
     return [np.array(each) for each in lists if len(each) < len(cells) / 3]
 
 
-def _left_out(whole: Array, terms: Array, values: Array, blocks: list[Index]) -> tuple[float, float]:
+def _left_out(correlation: Array, terms: Array, values: Array, blocks: list[Index]) -> tuple[float, float]:
     """Rms error of the blocks predicted from the rest, and its square over the variance predicted for 1."""
-    inverse = cho_solve(cho_factor(whole, lower=True), np.eye(len(whole)))
+    inverse = cho_solve(cho_factor(correlation, lower=True), np.eye(len(correlation)))
     solved = inverse @ terms
     inverse = inverse - solved @ np.linalg.solve(terms.T @ solved, solved.T)
-    pulled = inverse @ values
+    weights = inverse @ values
     squares, ratios, count = 0.0, 0.0, 0
     for block in blocks:
-        own = inverse[np.ix_(block, block)]
-        off = np.linalg.solve(own, pulled[block])
-        squares += float(off @ off)
-        ratios += float(off @ own @ off)  # whitened by the block's predicted covariance
+        precision = inverse[np.ix_(block, block)]
+        errors = np.linalg.solve(precision, weights[block])
+        squares += float(errors @ errors)
+        ratios += float(errors @ precision @ errors)  # whitened by the block's predicted covariance
         count += len(block)
     return float(np.sqrt(squares / max(count, 1))), ratios / max(count, 1)
 
@@ -285,7 +285,7 @@ class Depression:
 
 
 def depressions(
-    grid: Grid, heights: Array, known: Mask, most: int
+    grid: Grid, heights: Array, known: Mask, count: int
 ) -> tuple[Sequence[Depression], Sequence[Depression]]:
     """The clearest depressions of heights (H, W) where `known` (H, W), none in another's disc, the clearest first.
 
@@ -299,20 +299,20 @@ def depressions(
         return [], []
     level = float(values[valid].mean())  # sums of squares keep their digits
     values = np.where(valid, values - level, 0.0)
-    found = [_at_scale(coarse, values, valid, radius, level) for radius in DISC_RADII]
-    hollows, bulges = (_clearest([each for scale in found for each in scale[k]], most) for k in range(2))
+    by_scale = [_at_scale(coarse, values, valid, radius, level) for radius in DISC_RADII]
+    hollows, bulges = (_clearest([each for scale in by_scale for each in scale[k]], count) for k in range(2))
     return hollows, bulges
 
 
-def _clearest(found: Sequence[Depression], most: int) -> Sequence[Depression]:
-    chosen = list[Depression]()
-    for each in sorted(found, key=lambda d: -d.clarity * np.sqrt(d.radius)):
-        apart = [np.hypot(each.middle[0] - c.middle[0], each.middle[1] - c.middle[1]) for c in chosen]
-        if all(far > max(c.radius, 0.7 * each.radius) for far, c in zip(apart, chosen, strict=True)):
-            chosen.append(each)
-        if len(chosen) == most:
+def _clearest(candidates: Sequence[Depression], count: int) -> Sequence[Depression]:
+    clearest = list[Depression]()
+    for each in sorted(candidates, key=lambda d: -d.clarity * np.sqrt(d.radius)):
+        distances = [np.hypot(each.middle[0] - c.middle[0], each.middle[1] - c.middle[1]) for c in clearest]
+        if all(distance > max(c.radius, 0.7 * each.radius) for distance, c in zip(distances, clearest, strict=True)):
+            clearest.append(each)
+        if len(clearest) == count:
             break
-    return chosen
+    return clearest
 
 
 def _at_scale(
@@ -327,8 +327,8 @@ def _at_scale(
     if 2 * half + 1 > 2 * max(grid.shape):
         return [], []
     x, y = np.meshgrid(*[np.arange(-half, half + 1) * grid.step / reach] * 2)
-    far = np.hypot(x, y) * reach
-    ring, disc = ((far >= radius + RING_GAP) & (far <= reach)).astype(float), (far <= radius).astype(float)
+    radii = np.hypot(x, y) * reach
+    ring, disc = ((radii >= radius + RING_GAP) & (radii <= reach)).astype(float), (radii <= radius).astype(float)
     size = tuple(next_fast_len(n + 2 * half, real=True) for n in grid.shape)
 
     def spectrum(field: Array) -> Array:
@@ -337,25 +337,25 @@ def _at_scale(
     def sums(field: Array, weight: Array) -> Array:  # (H, W) of a field's spectrum times a weight's around each node
         return np.asarray(irfft2(field * weight.conj(), size)[: grid.shape[0], : grid.shape[1]])
 
-    there, height, square = (spectrum(np.pad(f, half)) for f in (valid.astype(float), values, values**2))
+    known, height, square = (spectrum(np.pad(f, half)) for f in (valid.astype(float), values, values**2))
     rings = {(a, b): spectrum(ring * x**a * y**b) for a in range(5) for b in range(5 - a)}
     discs = {powers: spectrum(disc * x ** powers[0] * y ** powers[1]) for powers in QUADRIC}
-    enough = sums(there, rings[0, 0]) > MIN_RING_SHARE * ring.sum()
-    enough &= sums(there, discs[0, 0]) > MIN_DISC_SHARE * disc.sum()
-    rows, columns = np.nonzero(enough)
+    scanned = sums(known, rings[0, 0]) > MIN_RING_SHARE * ring.sum()
+    scanned &= sums(known, discs[0, 0]) > MIN_DISC_SHARE * disc.sum()
+    rows, columns = np.nonzero(scanned)
     if not len(rows):
         return [], []
-    moments = {powers: sums(there, weight)[rows, columns] for powers, weight in rings.items()}
+    moments = {powers: sums(known, weight)[rows, columns] for powers, weight in rings.items()}
     normal = np.stack([np.stack([moments[a + c, b + d] for c, d in QUADRIC], axis=1) for a, b in QUADRIC], axis=1)
     right = np.stack([sums(height, rings[powers])[rows, columns] for powers in QUADRIC], axis=1)
     fit = np.linalg.solve(normal + 1e-9 * np.eye(6), right[..., None])[..., 0]
-    off = sums(square, rings[0, 0])[rows, columns] - np.einsum("ni,ni->n", fit, right)
-    spread = np.sqrt(np.maximum(off, 0) / normal[:, 0, 0])
-    inside = np.stack([sums(there, discs[powers])[rows, columns] for powers in QUADRIC], axis=1)
+    residual = sums(square, rings[0, 0])[rows, columns] - np.einsum("ni,ni->n", fit, right)
+    spread = np.sqrt(np.maximum(residual, 0) / normal[:, 0, 0])
+    inside = np.stack([sums(known, discs[powers])[rows, columns] for powers in QUADRIC], axis=1)
     slope = fit[:, 1:3] / reach
     cosine = 1 / np.sqrt(1 + (slope**2).sum(axis=1))
-    own = sums(height, discs[0, 0])[rows, columns]
-    depth = (np.einsum("ni,ni->n", fit, inside) - own) / inside[:, 0] * cosine
+    disc_sum = sums(height, discs[0, 0])[rows, columns]
+    depth = (np.einsum("ni,ni->n", fit, inside) - disc_sum) / inside[:, 0] * cosine
     clarity = np.full(grid.shape, -np.inf)
     clarity[rows, columns] = depth / (spread * cosine + MIN_UNEVENNESS)
     across = 2 * max(1, round(radius / 2 / grid.step)) + 1

@@ -274,10 +274,10 @@ def gridpoints_on(curve: PathCurve, start: float, end: float, horizons: int = 1)
     """
     places = _places(curve, start, end, horizons)
     first, last = curve.stretch(places[:-1]), curve.stretch(np.nextafter(places[1:], 0.0))
-    before = np.searchsorted(curve.knots + curve.half, places[:-1], "right")  # the first blend not yet passed
-    beyond = np.searchsorted(curve.knots - curve.half, places[1:], "left") - 1  # the last one begun
-    part = slice(int(min(first[0], before[0])), int(max(last[-1], beyond[-1])) + 2)
-    stretches, corners = (first - part.start, last - part.start), (before - part.start, beyond - part.start)
+    first_blend = np.searchsorted(curve.knots + curve.half, places[:-1], "right")  # the first blend not yet passed
+    last_blend = np.searchsorted(curve.knots - curve.half, places[1:], "left") - 1  # the last one begun
+    part = slice(int(min(first[0], first_blend[0])), int(max(last[-1], last_blend[-1])) + 2)
+    stretches, corners = (first - part.start, last - part.start), (first_blend - part.start, last_blend - part.start)
     within = 2 * np.maximum(curve.half[part], MIN_BLEND)
     bend, swing, spin = (np.linalg.norm(of[part], axis=1) for of in (curve.bend, curve.swing, curve.spin))
     of_corners = np.stack([1 / curve.corner[part], bend / within, swing / within], axis=1)
@@ -296,12 +296,12 @@ def _places(curve: PathCurve, start: float, end: float, horizons: int) -> Array:
     inside = slice(int(np.searchsorted(curve.knots, start, "right")), int(np.searchsorted(curve.knots, end, "left")))
     knots, half, slows = curve.knots[inside], curve.half[inside], curve.slows[inside]
     if len(knots) <= horizons * FEW_KNOTS:
-        more = np.concatenate([knots - half, knots + half])
+        extra = np.concatenate([knots - half, knots + half])
     else:
-        more = np.concatenate([(knots - half)[slows], (knots + half)[slows], knots[curve.changes[inside]]])
-    if len(more) > horizons * MAX_MORE_POINTS:
+        extra = np.concatenate([(knots - half)[slows], (knots + half)[slows], knots[curve.changes[inside]]])
+    if len(extra) > horizons * MAX_MORE_POINTS:
         return np.linspace(start, end, horizons * (HORIZON_POINTS + MAX_MORE_POINTS))
-    points = np.sort(np.concatenate([np.linspace(start, end, horizons * HORIZON_POINTS), more]))
+    points = np.sort(np.concatenate([np.linspace(start, end, horizons * HORIZON_POINTS), extra]))
     points = points[(points >= start) & (points <= end)]
     points = points[np.concatenate([[True], np.diff(points) > 1e-6])]
     points[-1] = end
@@ -362,12 +362,12 @@ def straight_curve(surface_from_nozzle: Array, goal: Array) -> PathCurve | None:
 
 
 def _through(poses: list[Array], last_speed: float) -> PathCurve | None:
-    way = np.stack(poses)
-    way = way[np.concatenate([way_lengths(way) >= MIN_SPACING, [True]])]  # (K, 4, 4): of one place, the last
-    if len(way) < 2:
+    distinct = np.stack(poses)
+    distinct = distinct[np.concatenate([way_lengths(distinct) >= MIN_SPACING, [True]])]  # (K, 4, 4): last of a place
+    if len(distinct) < 2:
         return None
-    speed = np.array([APPROACH_SPEED] * (len(way) - 2) + [min(last_speed, APPROACH_SPEED)])
-    return curve_through(way, speed, np.ones(len(speed), bool))
+    speed = np.array([APPROACH_SPEED] * (len(distinct) - 2) + [min(last_speed, APPROACH_SPEED)])
+    return curve_through(distinct, speed, np.ones(len(speed), bool))
 
 
 def place_passed(sent: Sequence[tuple[Array, float]], where: Array) -> float:
@@ -378,9 +378,9 @@ def place_passed(sent: Sequence[tuple[Array, float]], where: Array) -> float:
     ends, places = np.stack([end for end, _ in sent]), np.array([place for _, place in sent])
     if len(ends) == 1:
         return float(places[0])
-    ways = np.diff(ends, axis=0)  # (N - 1, 3)
-    squares = np.maximum((ways**2).sum(1), 1e-12)
-    shares = np.clip(((where - ends[:-1]) * ways).sum(1) / squares, 0.0, 1.0)
-    off = np.linalg.norm(ends[:-1] + shares[:, None] * ways - where, axis=1)
-    last = int(np.flatnonzero(off <= off.min() + 1e-6)[-1])
+    segments = np.diff(ends, axis=0)  # (N - 1, 3)
+    squares = np.maximum((segments**2).sum(1), 1e-12)
+    shares = np.clip(((where - ends[:-1]) * segments).sum(1) / squares, 0.0, 1.0)
+    distances = np.linalg.norm(ends[:-1] + shares[:, None] * segments - where, axis=1)
+    last = int(np.flatnonzero(distances <= distances.min() + 1e-6)[-1])
     return float(places[last] + shares[last] * (places[last + 1] - places[last]))

@@ -168,9 +168,9 @@ class Guard:
         if (since := move.stamp - self._trusted_at) > limits.stop_time:
             text = f"still moving after {since:.3f} s, limit {limits.stop_time:g} s, while {distrust.text}"
             return Breach(RefusalCode.WATCHDOG, since, limits.stop_time, text)
-        if (way := math.hypot(*(move.axes - self._trusted_axes)[:LINEAR_AXES])) > limits.stop_distance:
-            text = f"stops only after {way:.2f} mm, limit {limits.stop_distance:g} mm, while {distrust.text}"
-            return Breach(RefusalCode.STOP_DISTANCE, way, limits.stop_distance, text)
+        if (distance := math.hypot(*(move.axes - self._trusted_axes)[:LINEAR_AXES])) > limits.stop_distance:
+            text = f"stops only after {distance:.2f} mm, limit {limits.stop_distance:g} mm, while {distrust.text}"
+            return Breach(RefusalCode.STOP_DISTANCE, distance, limits.stop_distance, text)
         return None
 
     def _distrust(self, pose: SurfacePose | None, now: float) -> Breach | None:
@@ -221,11 +221,11 @@ def _numbers(pose: SurfacePose) -> tuple[Array | float, ...]:
 
 def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     """Standard deviation, mm, along its worst direction, of a surface point (3,) `ahead` s after the pose."""
-    known, covariance = 0.0, pose.covariance
+    forecast_s, covariance = 0.0, pose.covariance
     if pose.forecast is not None:
-        known = min(ahead, pose.forecast.end)
-        covariance = pose.forecast.covariance(covariance, known)
-    beyond = ahead - known
+        forecast_s = min(ahead, pose.forecast.end)
+        covariance = pose.forecast.covariance(covariance, forecast_s)
+    beyond = ahead - forecast_s
     covariance = covariance + beyond**2 * pose.twist_covariance + np.diag(pose.acceleration_psd) * beyond**3 / 3
     jacobian = np.hstack([-se3.hat(place), np.eye(3)])
     spread = jacobian @ covariance @ jacobian.T
@@ -234,9 +234,9 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     worst = float(np.linalg.eigvalsh(spread)[-1])
     if (local := pose.local) is not None:
         share = 1 - ((local.centres - place) ** 2).sum(1) / (2 * local.reach) ** 2
-        moved = float(((local.variance + ahead * local.growth) * np.maximum(share, 0.0)).max(initial=0.0))
+        local_variance = float(((local.variance + ahead * local.growth) * np.maximum(share, 0.0)).max(initial=0.0))
         nearest = math.sqrt(float(((local.support - place) ** 2).sum(1).min(initial=math.inf)))
-        worst += max(moved, local.unsupported * min(max(nearest / local.span - 1.0, 0.0), 1.0))
+        worst += max(local_variance, local.unsupported * min(max(nearest / local.span - 1.0, 0.0), 1.0))
     return math.sqrt(worst) if worst >= 0 else math.nan
 
 

@@ -170,27 +170,27 @@ class Planner:
         if not pose.finite:
             return HoldReason("the pose is not finite", RefusalCode.POSE_NOT_FINITE)
         if not pose.state.measured:
-            words = f"surface is {pose.state.value}" + (f": {pose.reason}" if pose.reason else "")
-            return HoldReason(words, RefusalCode.TRACK_STATE)
+            text = f"surface is {pose.state.value}" + (f": {pose.reason}" if pose.reason else "")
+            return HoldReason(text, RefusalCode.TRACK_STATE)
         age = now - pose.stamp
         if not 0 <= age <= POSE_LIMIT_FRACTION * limits.pose_age:
-            words = f"pose is {age:.3f} s old, limit {limits.pose_age:g} s"
-            return HoldReason(words, RefusalCode.POSE_AGE, age, limits.pose_age)
+            text = f"pose is {age:.3f} s old, limit {limits.pose_age:g} s"
+            return HoldReason(text, RefusalCode.POSE_AGE, age, limits.pose_age)
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
         low, high = self._zone
         place = np.clip((se3.inverse(pose.base_from_surface) @ base_from_nozzle)[:3, 3], low, high)
         speed = float(np.linalg.norm(pose.twist[3:] + se3.cross(pose.twist[:3], place)))
         if speed > POSE_LIMIT_FRACTION * (limit := limits.surface_speed):
-            words = f"surface moves at {speed:.1f} mm/s, limit {limit:g} mm/s"
-            return HoldReason(words, RefusalCode.SURFACE_SPEED, speed, limit)
+            text = f"surface moves at {speed:.1f} mm/s, limit {limit:g} mm/s"
+            return HoldReason(text, RefusalCode.SURFACE_SPEED, speed, limit)
         if (turn := float(np.linalg.norm(pose.twist[:3]))) > POSE_LIMIT_FRACTION * (limit := limits.surface_turn):
-            words = f"surface turns at {np.rad2deg(turn):.1f} degrees/s, limit {np.rad2deg(limit):g} degrees/s"
-            return HoldReason(words, RefusalCode.SURFACE_TURN, turn, limit)
+            text = f"surface turns at {np.rad2deg(turn):.1f} degrees/s, limit {np.rad2deg(limit):g} degrees/s"
+            return HoldReason(text, RefusalCode.SURFACE_TURN, turn, limit)
         with np.errstate(invalid="ignore"):  # of a matrix that is no covariance: NaN, which is too much
             error = float(pose.error_ahead(then, place[None])[0])
         if not error <= POSE_LIMIT_FRACTION * limits.pose_error:
-            words = f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
-            return HoldReason(words, RefusalCode.POSE_ERROR, error, limits.pose_error)
+            text = f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
+            return HoldReason(text, RefusalCode.POSE_ERROR, error, limits.pose_error)
         return ""
 
     # -- which segment, and where on it
@@ -201,19 +201,19 @@ class Planner:
         if segment is None:
             return self._begin(pose, now)
         self._targets = segment, self._segment_axes(pose, segment, now)
-        off = float(np.linalg.norm(self._follower.position[:3] - self._targets[1][0, :3]))
-        if off > self._limits.on_path and segment.phase is PrintPhase.PRINTING:
+        deviation = float(np.linalg.norm(self._follower.position[:3] - self._targets[1][0, :3]))
+        if deviation > self._limits.on_path and segment.phase is PrintPhase.PRINTING:
             return self._begin(pose, now)
-        left = segment.timing.end - now
-        if left > RENEW_BEFORE_END and now < segment.timing.times[0] + HORIZON_TIME:
+        remaining = segment.timing.end - now
+        if remaining > RENEW_BEFORE_END and now < segment.timing.times[0] + HORIZON_TIME:
             return ""
-        if segment.timing.places[-1] < self._end_of(segment) or left > RENEW_BEFORE_END:
+        if segment.timing.places[-1] < self._end_of(segment) or remaining > RENEW_BEFORE_END:
             return self._renew(pose, segment, now)
         if segment.phase is PrintPhase.ENTERING:  # the next begins LOOKAHEAD from now, as this one comes to rest
-            away = off + segment.curve.length - float(segment.timing.at(np.array([now]))[0])
-            over = left <= LOOKAHEAD and away <= self._limits.on_path
+            distance = deviation + segment.curve.length - float(segment.timing.at(np.array([now]))[0])
+            over = remaining <= LOOKAHEAD and distance <= self._limits.on_path
         else:
-            over = left <= 0
+            over = remaining <= 0
         return self._next(pose, segment.phase, now) if over else ""
 
     def _begin(self, pose: SurfacePose, now: float) -> str:
@@ -240,21 +240,21 @@ class Planner:
 
     def _retreat(self, pose: SurfacePose, now: float) -> Command:
         """In a pause: up from where it began, for a look aside too, then at rest; what was interrupted is resumed."""
-        nozzle, segment, looks = self._nozzle(pose, now), self._segment, self.progress.wanted == LOOK
-        waits = LOOKS if looks else f"material {self._rests.wanted} is to be put in"
-        waits = PAUSED if self.paused and not self.aside else waits
-        if self._pause_pose is None or (looks and not self._stands_aside):
-            self._pause_pose = pose_aside(nozzle, self._zone) if looks else point_above(nozzle)
-            segment, self._retreated, self._stands_aside = None, False, looks
+        nozzle, segment, for_look = self._nozzle(pose, now), self._segment, self.progress.wanted == LOOK
+        waiting = LOOKS if for_look else f"material {self._rests.wanted} is to be put in"
+        waiting = PAUSED if self.paused and not self.aside else waiting
+        if self._pause_pose is None or (for_look and not self._stands_aside):
+            self._pause_pose = pose_aside(nozzle, self._zone) if for_look else point_above(nozzle)
+            segment, self._retreated, self._stands_aside = None, False, for_look
         if segment is not None and segment.phase is PrintPhase.RETREATING and now >= segment.timing.end:
             self._retreated, segment = bool(segment.timing.places[-1] >= segment.curve.length), None
-        leads = aside_curve if self._stands_aside else straight_curve
-        curve = None if self._retreated else leads(nozzle, self._pause_pose)
+        curve_to = aside_curve if self._stands_aside else straight_curve
+        curve = None if self._retreated else curve_to(nozzle, self._pause_pose)
         if curve is None:
-            return self._stop(now, waits)
+            return self._stop(now, waiting)
         begins = segment is None or segment.phase is not PrintPhase.RETREATING
         if begins and (reason := self._start(pose, PrintPhase.RETREATING, curve, 0.0, now + LOOKAHEAD)):
-            return self._stop(now, f"{waits}; {reason}")
+            return self._stop(now, f"{waiting}; {reason}")
         return self._follow(pose, now)
 
     def _next(self, pose: SurfacePose, phase: PrintPhase, now: float) -> str:
@@ -327,15 +327,15 @@ class Planner:
         axes = self._follower.aim(ahead, (after - before) / self._tick, (after - 2 * ahead + before) / half**2)
         if isinstance(axes, str):
             return self._stop(now, axes)
-        extrude, told, reason = False, None, ""
+        extrude, order, reason = False, None, ""
         if segment.phase is PrintPhase.PRINTING and np.linalg.norm(axes[:3] - reference[:3]) <= self._limits.on_path:
             before = self._place
             self._place = max(before, float(segment.timing.at(np.array([now + self._tick]))[0]))
             extrude = bool(self._path.extrude[self._checkpoint()]) and self._place > before
-            told = self.flow(segment.timing, before, self._rests.end, now)
-        if now >= segment.timing.end and (left := self._rests.left(self._place, now)) > 0:
-            reason = f"{RESTS}: {left:.1f} s left"
-        return self._move(now, start, axes, extrude, reason, told)
+            order = self.flow(segment.timing, before, self._rests.end, now)
+        if now >= segment.timing.end and (wait := self._rests.left(self._place, now)) > 0:
+            reason = f"{RESTS}: {wait:.1f} s left"
+        return self._move(now, start, axes, extrude, reason, order)
 
     def _segment_axes(self, pose: SurfacePose, segment: Segment, now: float) -> Array:
         """Machine axes (5, 6) on the segment: now, a tick later, and half a tick before, at and after LOOKAHEAD."""
@@ -359,12 +359,12 @@ class Planner:
         return Hold(now, self._limits.pause, reason)
 
     def _move(
-        self, now: float, start: Array, axes: Array, extrude: bool, reason: str = "", told: FlowOrder | None = None
+        self, now: float, start: Array, axes: Array, extrude: bool, reason: str = "", order: FlowOrder | None = None
     ) -> Move:
-        """told: to the dispenser; None: off at once."""
+        """order: to the dispenser; None: off at once."""
         feed = min(feed_for(start, axes, self._tick), self._limits.feed)
         self._sent.append((axes[:3], self._place))
-        return Move(now, axes, feed, self._checkpoint(), extrude, reason, *(told or self.flow.closed()))
+        return Move(now, axes, feed, self._checkpoint(), extrude, reason, *(order or self.flow.closed()))
 
     def _checkpoint(self) -> int:
         """The checkpoint that the place on the path leads to."""
@@ -375,14 +375,14 @@ class Planner:
 
         Axes keep AXIS_MARGIN from their bounds; an arm that stands nearer already must not go nearer still.
         """
-        here = self._follower.position
-        low = np.minimum(self._limits.low + AXIS_MARGIN, here)
-        high = np.maximum(self._limits.high - AXIS_MARGIN, here)
+        current = self._follower.position
+        low = np.minimum(self._limits.low + AXIS_MARGIN, current)
+        high = np.maximum(self._limits.high - AXIS_MARGIN, current)
         reason = self._outside("XYZABC", axes, low, high)
         if reason or (model := self._arm.jointed) is None:
             return reason
-        joints, own = joints_from_axes(model, axes), joints_from_axes(model, here)
-        low, high = np.fmin(model.low + JOINT_MARGIN, own), np.fmax(model.high - JOINT_MARGIN, own)
+        joints, joints_now = joints_from_axes(model, axes), joints_from_axes(model, current)
+        low, high = np.fmin(model.low + JOINT_MARGIN, joints_now), np.fmax(model.high - JOINT_MARGIN, joints_now)
         return self._outside([f"J{i + 1}" for i in range(6)], joints, low, high)
 
     def _outside(self, names: Sequence[str], values: Array, lows: Array, highs: Array) -> str:
@@ -391,10 +391,10 @@ class Planner:
         if not len(rows):
             return ""
         i = columns[0]
-        axis, got, low, high = names[i], values[rows[0], i], lows[i], highs[i]
+        axis, value, low, high = names[i], values[rows[0], i], lows[i], highs[i]
         where = f"checkpoint {self._checkpoint()} is out of reach"
-        if not np.isfinite(got):
+        if not np.isfinite(value):
             return f"{where}: {self._arm.beyond}"
         unit = "mm" if axis in "XYZ" else "degrees"
-        got, low, high = (got, low, high) if unit == "mm" else np.rad2deg([got, low, high])
-        return f"{where}: {axis} = {got:.1f}, allowed {low:g} to {high:g} {unit}"
+        value, low, high = (value, low, high) if unit == "mm" else np.rad2deg([value, low, high])
+        return f"{where}: {axis} = {value:.1f}, allowed {low:g} to {high:g} {unit}"

@@ -89,9 +89,9 @@ def axis_derivatives(
     surface = _largest_near(np.abs(np.stack(_differences(axes[1], DIFFERENCE_TIME))))
     by_move, by_turn = max_axis_change(arm, axes[0, 1])
     bend = by_move * grid.bend[:, None] + by_turn * grid.swing[:, None]
-    most = by_move + by_turn * grid.spin[:, None]
-    first = np.where(bend > 0, np.copysign(np.maximum(np.abs(first), most), first), first)
-    return AxisDerivatives(axes[0, 1], first, second, bend, 2 * most, *surface)
+    largest = by_move + by_turn * grid.spin[:, None]
+    first = np.where(bend > 0, np.copysign(np.maximum(np.abs(first), largest), first), first)
+    return AxisDerivatives(axes[0, 1], first, second, bend, 2 * largest, *surface)
 
 
 def _largest_near(values: Array) -> Array:
@@ -105,8 +105,8 @@ def _largest_near(values: Array) -> Array:
 
 def _differences(values: Array, step: float) -> tuple[Array, Array]:
     """First and second derivative (M, D) of values (3, M, D) `step` apart."""
-    before, here, after = values
-    return (after - before) / (2 * step), (after - 2 * here + before) / step**2
+    before, middle, after = values
+    return (after - before) / (2 * step), (after - 2 * middle + before) / step**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,18 +150,18 @@ def retime(
     points. A start speed above limits that have shrunk is reduced to them as fast as the grid's `cruise` allows.
     A str says why there is no timing.
     """
-    carried = min(speed, START_SPEED_FRACTION * float(grid.allowed[0]))
+    initial = min(speed, START_SPEED_FRACTION * float(grid.allowed[0]))
     change = grid.cruise / RISE_TIME
-    left = _path_share(limits[1], derivatives.acceleration, PATH_ACCELERATION_SHARE)
-    axes = _axis_speed(derivatives, _path_share(limits[0], derivatives.speed, PATH_SPEED_SHARE), left)
+    available = _path_share(limits[1], derivatives.acceleration, PATH_ACCELERATION_SHARE)
+    axes = _axis_speed(derivatives, _path_share(limits[0], derivatives.speed, PATH_SPEED_SHARE), available)
     # the bounds fall below the start speed no faster than the allowed change of speed
     fall = 2 * BRAKING_FRACTION * float(change.min()) * (grid.places - grid.places[0])
-    braking = np.sqrt(np.maximum(carried**2 - fall, 0.0))
+    braking = np.sqrt(np.maximum(initial**2 - fall, 0.0))
     bounds = np.minimum(grid.allowed, np.maximum(axes, braking / START_SPEED_FRACTION))
     start, end = grid.places[[0, -1]]
     unit = end - start
-    constraints = [_Speed(bounds / unit, change / unit), *_acceleration(derivatives, left, bounds, change, unit)]
-    speeds = _solve(constraints, (grid.places - start) / unit, carried / unit)
+    constraints = [_Speed(bounds / unit, change / unit), *_acceleration(derivatives, available, bounds, change, unit)]
+    speeds = _solve(constraints, (grid.places - start) / unit, initial / unit)
     if speeds is None or not np.isfinite(speeds).all():
         return f"no timing from {start:.2f} to {end:.2f} mm at {speed:.2f} mm/s"
     pace = unit * (speeds[:-1] + speeds[1:])
@@ -199,14 +199,14 @@ def passing_times(curve: PathCurve, arm: SimpleArm, limits: tuple[Array, Array])
         due = float(np.diff(np.interp([begin, end], curve.knots, curve.due))[0])
         grid = gridpoints_on(curve, begin, end, math.ceil(due / HORIZON_TIME))
         derivatives = axis_derivatives(arm, pose, curve, grid, 0.0)
-        left = _path_share(limits[1], derivatives.acceleration, PATH_ACCELERATION_SHARE)
-        speed = _axis_speed(derivatives, _path_share(limits[0], derivatives.speed, PATH_SPEED_SHARE), left)
-        rate = (left / np.maximum(np.abs(derivatives.first), 1e-12)).min(axis=1)
+        available = _path_share(limits[1], derivatives.acceleration, PATH_ACCELERATION_SHARE)
+        speed = _axis_speed(derivatives, _path_share(limits[0], derivatives.speed, PATH_SPEED_SHARE), available)
+        rate = (available / np.maximum(np.abs(derivatives.first), 1e-12)).min(axis=1)
         parts.append(np.stack([grid.places, np.fmin(grid.allowed, speed), np.fmin(grid.cruise / RISE_TIME, rate)]))
         begin = end
-    places, most, rate = np.concatenate(parts, axis=1)
-    way = np.diff(places)
-    squared, gains = (most**2).tolist(), (2 * np.minimum(rate[:-1], rate[1:]) * way).tolist()
+    places, fastest, rate = np.concatenate(parts, axis=1)
+    lengths = np.diff(places)
+    squared, gains = (fastest**2).tolist(), (2 * np.minimum(rate[:-1], rate[1:]) * lengths).tolist()
     squared[0] = squared[-1] = 0.0
     for i, gain in enumerate(gains):
         squared[i + 1] = min(squared[i + 1], squared[i] + gain)
@@ -214,13 +214,13 @@ def passing_times(curve: PathCurve, arm: SimpleArm, limits: tuple[Array, Array])
         squared[i] = min(squared[i], squared[i + 1] + gains[i])
     speeds = np.sqrt(squared)
     pace = np.maximum(speeds[:-1] + speeds[1:], 1e-9)
-    times = np.concatenate([[0.0], np.cumsum(2 * way / pace)])
+    times = np.concatenate([[0.0], np.cumsum(2 * lengths / pace)])
     return np.asarray(np.interp(curve.knots, places, times))
 
 
-def _path_share(limit: Array, used: Array, most: float) -> Array:
-    """What the surface, which takes (M, D) of limits (D,), leaves to the path: (M, D), `most` of the limits at most."""
-    return np.clip(LIMIT_SHARE * limit - used, MIN_PATH_SHARE * limit, most * limit)
+def _path_share(limit: Array, by_surface: Array, share: float) -> Array:
+    """What the surface, which takes (M, D) of limits (D,), leaves to the path: (M, D), at most `share` of each."""
+    return np.clip(LIMIT_SHARE * limit - by_surface, MIN_PATH_SHARE * limit, share * limit)
 
 
 def _axis_speed(derivatives: AxisDerivatives, speed: Array, acceleration: Array) -> Array:
@@ -231,13 +231,13 @@ def _axis_speed(derivatives: AxisDerivatives, speed: Array, acceleration: Array)
 
 
 def _acceleration(
-    derivatives: AxisDerivatives, left: Array, speed: Array, change: Array, unit: float
+    derivatives: AxisDerivatives, limit: Array, speed: Array, change: Array, unit: float
 ) -> list[_Acceleration]:
     """The acceleration constraint on the axes that can reach their bound, lengths in `unit` mm; [] where none can.
 
     An axis that cannot reach it at the greatest speed and change of speed only costs time.
     """
-    first, second = derivatives.first / left, derivatives.second / left
+    first, second = derivatives.first / limit, derivatives.second / limit
     reached = ~((np.abs(first) * change.max() + np.abs(second) * speed[:, None] ** 2).max(axis=0) <= 1)  # NaN is
     return [_Acceleration(first[:, reached] * unit, second[:, reached] * unit**2)] if reached.any() else []
 
@@ -270,8 +270,8 @@ def _solve(constraints: list[constraint.LinearConstraint], places: Array, start:
             squared[i] = max(squared[i] - TINY, 0.999 * squared[i])
         else:
             return None
-        there = squared[i] + 2 * step * rate
-        squared.append(min(greatest[i + 1], max(there - TINY, 0.9999 * there, 0.0)))
+        next_squared = squared[i] + 2 * step * rate
+        squared.append(min(greatest[i + 1], max(next_squared - TINY, 0.9999 * next_squared, 0.0)))
     return np.sqrt(squared)
 
 
