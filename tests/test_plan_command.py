@@ -188,6 +188,21 @@ def test_a_path_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.Captu
     assert len(read_path(out)) > 2
 
 
+def test_nothing_of_an_earlier_plan_stays_beside_a_path(tmp_path: Path) -> None:
+    """A path with the scan of another plan would be kept off tissue that is not there."""
+    scan, out = tmp_path / "scan.ply", tmp_path / "of.monday.csv"
+    write_ply(scan, *scan_of())
+    assert main(["plan", str(scan), "-o", str(out), "--bead", "2"]) == 0
+    ends = {file.name.removeprefix("of.monday") for file in tmp_path.iterdir()} - {"scan.ply"}
+    assert ends == {".csv", ".html", ".json", "_layers", "_layers.csv", "_scan.ply"}  # a dot in a name is no suffix
+    assert len(list((tmp_path / "of.monday_layers").iterdir())) > 1
+    assert main(["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "2", "--no-pictures", "--force"]) == 0
+    assert sorted(tmp_path.glob("of*")) == [
+        tmp_path / f"of.monday{e}" for e in (".csv", ".json", "_layers", "_layers.csv")
+    ]
+    assert not list((tmp_path / "of.monday_layers").iterdir())
+
+
 def test_ctrl_c_is_atomic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "path.csv"
     command = ["plan", str(contour(tmp_path)), "-o", str(out), "--bead", "2"]

@@ -24,7 +24,15 @@ from hardware.files.folder_tables import read_tum
 from hardware.files.rig_file import read_rig
 from hardware.files.session import FrameRef
 from hardware.offline import smooth as run_module
-from hardware.offline.smooth_tracks import Rhythm, breathing_rhythm, pulse_rhythm, reobserve, source_hash, tracks_of
+from hardware.offline.smooth_tracks import (
+    Rhythm,
+    breathing_rhythm,
+    pulse_rhythm,
+    read_tracks,
+    reobserve,
+    source_hash,
+    tracks_of,
+)
 from hardware.process.system import file_hash
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session, read_observations, read_poses, read_smoothed
@@ -110,6 +118,52 @@ def test_what_is_done_is_not_done_again(
     assert (out / "summary.json").stat().st_mtime_ns == before
     asked = [run_module.content_hash("a session's", run_module.SmoothOptions(rate)) for rate in (100.0, 50.0)]
     assert asked[0] != asked[1]
+
+
+def test_what_an_earlier_run_left_is_not_taken_for_this_ones(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, folder = tmp_path / "out", tmp_path / "run"
+    first = ["smooth", str(recording), "-o", str(out), "--no-relink"]
+    assert main(first) == 0 and main(["export", str(recording), "-o", str(folder)]) == 0
+    rows = (out / "smoothed.csv").read_text(encoding="utf-8")
+    with monkeypatch.context() as patched:
+        patched.setattr(run_module, "write_map", interrupted)  # behind smoothed.csv
+        assert main([*first, "--rate", "50"]) == 130
+    assert (out / "smoothed.csv").read_text(encoding="utf-8") != rows
+    assert main(first) == 0 and "done already" not in capsys.readouterr().out
+    assert (out / "smoothed.csv").read_text(encoding="utf-8") == rows
+    (out / "report.html").unlink()
+    assert main(first) == 0 and (out / "report.html").exists()
+
+    monkeypatch.setattr(run_module, "tracks_of", lambda *_: read_tracks(recording))
+    assert (out / "smoothed.mcap").exists()
+    assert main(["smooth", str(folder), "-o", str(out), "--no-relink"]) == 0
+    assert not (out / "smoothed.mcap").exists()  # the poses of another session
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_neither_a_session_nor_another_commands_report_is_overwritten(
+    recording: Path, out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sessions = tmp_path / "sessions"
+    assert main(["export", str(recording), "-o", str(sessions / "monday")]) == 0
+    rig = (sessions / "monday/rig.toml").read_bytes()
+    assert main(["smooth", str(sessions / "monday"), "-o", str(sessions / "monday")]) == 2
+    assert main(["smooth", str(sessions), "-o", str(sessions)]) == 1
+    assert (sessions / "monday/rig.toml").read_bytes() == rig
+    assert "would be overwritten" in (sessions / "sessions.csv").read_text(encoding="utf-8")
+
+    (tmp_path / "summary.json").write_text('{"poses": 60}')  # of `stillbed track`
+    assert main(["smooth", str(recording), "-o", str(tmp_path)]) == 2
+    assert (tmp_path / "summary.json").read_text() == '{"poses": 60}'
+    report = (out / "report.html").read_bytes()
+    assert main(["compare", str(out), "-o", str(out)]) == 2
+    assert (out / "report.html").read_bytes() == report
+    assert capsys.readouterr().err.count("another command's report") == 2
 
 
 @pytest.mark.parametrize("share", [0.9, *slowly(0.5, 0.999)])

@@ -19,6 +19,7 @@ import pytest
 from estimation.errors import InputError
 from hardware.bench.figures import workers
 from hardware.cli.main import main
+from hardware.files.mesh_file import write_ply
 from hardware.files.rig_file import write_board
 from hardware.live.prerender import prerender
 from hardware.live.view import Console
@@ -29,6 +30,7 @@ from tests.recorded import write_frames
 from tests.session_files import rig
 from tests.slowly import slowly
 from tests.started import ROOT
+from tests.wounds import scan_of
 
 WRONG = """
 track missing -o OUT
@@ -37,6 +39,10 @@ track half.mcap -o OUT
 track junk.mcap -o OUT
 track whole.mcap -o OUT --arm typo.toml
 track whole.mcap -o OUT --record half.mcap
+track whole.mcap -o OUT --record whole.mcap --force  # would be overwritten
+track whole.mcap -o OUT --graph whole.mcap --force  # would be overwritten
+trace whole.mcap -o whole.mcap --force  # would be overwritten
+trace whole.mcap --page whole.mcap --force  # would be overwritten
 replay missing --path missing -o OUT
 replay whole.mcap --path bad.csv -o OUT
 replay whole.mcap --path PATH --resume typo.toml -o OUT
@@ -75,6 +81,7 @@ view whole.mcap --poses missing
 segment empty -o OUT
 segment missing -o OUT
 segment empty -o OUT --threads 0
+segment blank.png -o . --force  # would be overwritten
 segment blank.png -o OUT --threads 0
 segment blank.png -o OUT --mm-per-px 0
 segment blank.png -o OUT --method shape --model x.onnx
@@ -102,6 +109,9 @@ plan contour.csv -o OUT.csv --tissue a=1:1 --tissue a=2:1  # once
 plan contour.csv -o OUT.csv --tissue a=rest:1 --tissue b=rest:1  # rest
 plan contour.csv -o OUT.csv --bead 15  # room
 plan contour.csv -o OUT.txt  # .csv
+plan contour.csv -o contour.csv --force  # would be overwritten
+plan wound_scan.ply -o wound.csv  # would be overwritten
+plan contour.csv -o OUT.csv --gcode contour.csv --force  # would be overwritten
 reach bad.csv --arm ARM
 reach PATH --arm unknown.toml
 reach PATH --arm jointless.toml  # kinematics = 'missing'
@@ -109,6 +119,7 @@ live typo.toml
 live unknown.toml
 live --rig missing --path PATH --record OUT
 live --resume whole.mcap
+live --rig whole.mcap --path PATH --arm virtual --record whole.mcap --force  # would be overwritten
 init unknown.toml
 arm /dev/nothing --jog X
 arm /dev/nothing --stands 1,2
@@ -196,6 +207,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "jointless.toml").write_text("baud = 115200\n")
     write_board(made / "board.toml", BOARD)
     cv2.imwrite(str(made / "blank.png"), np.full((60, 60, 3), 90, np.uint8))
+    write_ply(made / "wound_scan.ply", *scan_of())
     (made / "junk.stl").write_bytes(b"\0junk" * 100)
     (made / "junk.mcap").write_bytes(b"junk" * 100)
     with Recorder(made / "whole.mcap", rig()) as recorder:
@@ -218,6 +230,7 @@ def words(text: str) -> list[str]:
 @pytest.mark.parametrize("text", WRONG.strip().splitlines())
 def test_one_line(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(folder)
+    before = {file: file.read_bytes() for file in folder.iterdir() if file.is_file()}
     assert main(words(text)) == 2
     told = capfd.readouterr()
     lines = [line for line in told.err.splitlines() if line.startswith("stillbed")]
@@ -225,6 +238,7 @@ def test_one_line(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capf
     assert lines[0].startswith("stillbed: ") and "allowed" in lines[0] and "Errno" not in lines[0]
     assert text.partition("  # ")[2] in lines[0]
     assert not list(folder.glob("OUT*"))
+    assert all(file.read_bytes() == data for file, data in before.items())
 
 
 @pytest.mark.parametrize("text", MISTYPED.strip().splitlines())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
 from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, positive, wrong_option
-from hardware.process.progress import json_text
+from hardware.process.progress import check_new, json_text
 from perception import named_path
 
 if TYPE_CHECKING:
@@ -124,8 +124,8 @@ def _run_trace(a: argparse.Namespace) -> None:
     from hardware.live.trace import chrome_trace, read_trace, trace_page, trace_text
 
     for flag, file in (("--out", a.out), ("--page", a.page)):
-        if file is not None and file.exists() and not a.force:
-            raise wrong_option(flag, file, "a new file, or --force")
+        if file is not None:
+            check_new(file, a.force, flag, a.record)
     trace = read_trace(a.record)
     print(trace_text(trace))
     if a.out is not None:

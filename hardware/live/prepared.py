@@ -54,7 +54,7 @@ from hardware.live.settings import (
 )
 from hardware.process import checks
 from hardware.process.faults import Fault, FaultPart, FaultRunner, check_faults
-from hardware.process.progress import UNFINISHED, cache_error, cache_folder, cached
+from hardware.process.progress import UNFINISHED, cache_error, cache_folder, cached, check_apart
 from hardware.process.system import SPAWN, blocked_sigint
 from hardware.recording.messages import rig_from_message
 from planning.laid_beads import path_with_looks
@@ -188,6 +188,8 @@ def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fa
     files = RunFiles(settings.record)
     if settings.record.exists() and not force:
         raise InputError(where, "record.file", settings.record, "a new file, or --force: this one exists")
+    if settings.rig is not None:
+        check_apart("--record", settings.record, settings.rig)
     if not settings.record.parent.is_dir():
         raise InputError(where, "record.file", settings.record, "a file in a folder that exists")
     prepared = _prepared(settings, files, None, faults, where)

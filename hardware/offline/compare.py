@@ -367,6 +367,8 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     report = comparison_text(comparison)
     if out is None:
         return report
+    if (out / "summary.json").exists():
+        raise InputError(out, "--out", "with another command's report", "a new folder, or one of stillbed compare")
     prepare_out(out, force=True)
     figures = json.dumps(finite(comparison_figures(comparison) | {"provenance": provenance().table()}), indent=2)
     (out / "compare.json").write_text(figures + "\n", encoding="utf-8")

@@ -17,8 +17,9 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.files.images import Video, decode, encode
 from hardware.files.session import Session
+from hardware.process.checks import read_bytes
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, prepare_out
+from hardware.process.progress import Progress, check_apart, prepare_out
 from hardware.recording.session_reader import open_session
 from perception.frames import Image, mean_stamp
 from perception.tracking.wound_area import WoundArea, wound_area
@@ -89,6 +90,8 @@ def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options
     all others are written.
     """
     files = input_files(inputs)
+    for file in files:
+        check_apart("--out", _mask_file(out, _name(file)), file)
     prepare_out(out, options.force)
     if options.overlay:
         (out / OVERLAY_FOLDER).mkdir(exist_ok=True)
@@ -257,7 +260,7 @@ def read_pictures(files: Sequence[Path], errors: list[InputError], lost: list[st
             if _is_session(file):
                 yield from _recorded(file, lost)
             elif file.suffix.lower() in PICTURE_SUFFIXES:
-                yield NamedPicture(_name(file), decode(file.read_bytes(), file, "picture"))
+                yield NamedPicture(_name(file), decode(read_bytes(file), file, "picture"))
             else:
                 yield from _frames(file, lost)
         except InputError as error:
@@ -304,8 +307,12 @@ def table_row(name: str, result: Segmentation, mm_per_px: float | None, ms: floa
     ]  # fmt: skip
 
 
+def _mask_file(out: Path, name: str) -> Path:
+    return out / f"{name}.png"
+
+
 def _write(out: Path, name: str, image: Image, result: Segmentation, options: SegmentOptions) -> None:
-    (out / f"{name}.png").write_bytes(encode(result.mask.astype(np.uint8) * np.uint8(255))[1])
+    _mask_file(out, name).write_bytes(encode(result.mask.astype(np.uint8) * np.uint8(255))[1])
     if options.overlay:
         (out / OVERLAY_FOLDER / f"{name}.jpg").write_bytes(encode(draw_overlay(image, result), OVERLAY_QUALITY)[1])
 

@@ -30,7 +30,7 @@ from hardware.offline.smooth_report import SmoothEvaluation, evaluate_smoothed, 
 from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reobserve, tracks_of
 from hardware.offline.trajectory_files import write_copy, write_instants, write_map
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, prepare_out
+from hardware.process.progress import Progress, check_apart, prepare_out
 from hardware.process.system import file_hash, provenance
 from hardware.recording.session_reader import open_session
 from hardware.report.evaluation import finite
@@ -51,14 +51,17 @@ class SmoothOptions:
 def smooth_session(path: Path, out: Path, options: SmoothOptions, stream: TextIO | None = None) -> tuple[bool, str]:
     """Smooth one session into the folder `out`; returns whether its results were there already, and the summary's text.
 
-    stream: for progress, by default stderr.
+    stream: for progress, by default stderr. InputError where `out` is the session, or holds another command's report.
     """
+    check_apart("--out", out, path)
     session = open_session(path)
     recorded = file_hash(path)
     contents = content_hash(recorded, options)
-    summary = _summary(out)
-    if "text" in summary and summary.get("contents") == contents:
+    summary, report = _summary(out), out / "report.html"
+    if report.is_file() and "text" in summary and summary.get("contents") == contents:
         return True, f"{path}: done already\n{summary['text']}"
+    if (summary and "contents" not in summary) or (out / "compare.json").exists():
+        raise InputError(out, "--out", "with another command's report", "a new folder, or one of stillbed smooth")
     out.mkdir(parents=True, exist_ok=True)
     tracks = tracks_of(session, out, recorded, stream)
     result = _solve(session, tracks, options, stream)
@@ -69,10 +72,12 @@ def smooth_session(path: Path, out: Path, options: SmoothOptions, stream: TextIO
     if reobserved.looks:
         result = _solve(session, reobserved.tracks, options, stream)
     evaluation = evaluate_smoothed(result, tracks, session.truth)
+    for stale in (report, out / SUMMARY_FILE):  # of other options or pictures: from here on neither tells of the files
+        stale.unlink(missing_ok=True)
     _write(out, session, result, options)
     words = " ".join(filter(None, (damage_text(session.damage), smooth_verdict(result, evaluation)))) + reobserved.text
-    text = f"{words}\nreport: {out / 'report.html'}"
-    (out / "report.html").write_text(smooth_page(session.path.name, words, result, evaluation), encoding="utf-8")
+    text = f"{words}\nreport: {report}"
+    report.write_text(smooth_page(session.path.name, words, result, evaluation), encoding="utf-8")
     summary = {"contents": contents, "text": text, **_figures(result, evaluation, session), **reobserved.figures}
     summary["provenance"] = provenance().table()
     (out / SUMMARY_FILE).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
@@ -118,6 +123,8 @@ def _write(out: Path, session: Session, result: Smoothed, options: SmoothOptions
     write_map(out / "map.ply", result, session)
     if session.path.is_file():
         write_copy(session.path, out / "smoothed.mcap", result)
+    else:
+        (out / "smoothed.mcap").unlink(missing_ok=True)  # of another session: who reads the folder takes it first
 
 
 def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -> dict[str, Any]:

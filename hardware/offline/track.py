@@ -14,7 +14,7 @@ from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
-from hardware.process.progress import Progress, ProgressReport, prepare_out
+from hardware.process.progress import Progress, ProgressReport, check_apart, prepare_out
 from hardware.process.system import SPAWN, blocked_sigint, exit_with_parent, step_back
 from perception.tracking import MAP_METHOD, THESIS_METHOD
 
@@ -247,6 +247,7 @@ def run_track(
         _network_segmenter(model)  # what is wrong with it is told before anything is written
     for option, file in (("--record", record), ("--graph", graph)):
         if file is not None:
+            check_apart(option, file, path)
             _check_file(option, file, force)
     prepare_out(out, force)
     clock = WallClock()

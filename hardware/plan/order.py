@@ -17,7 +17,7 @@ from hardware.files.arm_file import read_arm, tool_body_of
 from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import read_contour
 from hardware.plan.question import clicks_of, scan_colour, write_question
-from hardware.process.progress import ProgressReport, no_progress
+from hardware.process.progress import ProgressReport, check_apart, no_progress
 from planning.clearance import BASE_MARGIN, ToolBody
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
@@ -276,11 +276,39 @@ def measured_amplitude(motion: str) -> float:
 SCAN_STEPS = 3  # a mesh is read, repaired, and its wound found
 
 
-def check_out(out: Path, gcode: Path | None, force: bool) -> None:
-    """Make the folder of the file that is written; InputError where it stands there already and `force` is not set."""
+class PlanFiles:
+    """The files of a plan: PATH.csv, and those beside it that are named after it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.layer_table, self.summary = self._beside("_layers.csv"), self._beside(".json")
+        self.scan, self.example = self._beside("_scan.ply"), self._beside("_example.ply")
+        self.report, self.question = self._beside(".html"), self._beside("_question.html")
+        self.pictures = self._beside("_layers")  # a folder
+        self.companions = (self.layer_table, self.summary, self.scan, self.example, self.report, self.question)
+
+    def _beside(self, ending: str) -> Path:
+        return self.path.with_name(self.path.stem + ending)
+
+    def remove_companions(self) -> None:
+        """Remove what an earlier plan left beside its path, so that none of it is taken for this one's."""
+        for file in (*self.companions, *self.pictures.glob("layer_*.svg")):
+            file.unlink(missing_ok=True)
+
+
+def check_out(request: PlanRequest) -> None:
+    """Make the folder of the file that is written; InputError where it stands there already and no --force is given.
+
+    InputError as well where the scan or the outline would be overwritten.
+    """
+    out, gcode, force = request.out, request.gcode, request.force
     if out.suffix.lower() != ".csv":
         raise InputError(COMMAND_LINE, "--out", out, "a file that ends in .csv")
-    for file in (out, *([gcode] if gcode else [])):
+    written = [out, *([gcode] if gcode else [])]
+    for read in filter(None, (request.scan, request.outline)):
+        for file in (*written, *PlanFiles(out).companions):
+            check_apart("--out", file, read)
+    for file in written:
         if file.is_dir() or (file.exists() and not force):
             got = "a folder" if file.is_dir() else "a file that exists"
             raise InputError(file, "--out", got, "a new one, or --force")
@@ -321,7 +349,7 @@ def subject_of(request: PlanRequest, flat: bool, progress: ProgressReport = no_p
             scan, step, request.scan, outline, request.flip, clicks=clicks, number=request.wound, colour=colour
         )
     except WoundQuestionError as question:
-        page = request.out.with_name(f"{request.out.stem}_question.html")
+        page = PlanFiles(request.out).question
         write_question(page, scan, vertices, raw.colours, question)
         allowed = f"{question.allowed}: pictures of them are in {page}"
         raise InputError(question.where, question.what, question.got, allowed) from None

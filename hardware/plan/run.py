@@ -25,7 +25,7 @@ from hardware.files.arm_file import read_arm
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import gcode_text, write_path
 from hardware.offline.reach import read_jointed_arm, with_feasible
-from hardware.plan.order import Index, PlanRequest, PlanSubject, check_out, order_of, subject_of, tool_of
+from hardware.plan.order import Index, PlanFiles, PlanRequest, PlanSubject, check_out, order_of, subject_of, tool_of
 from hardware.plan.page import (
     ReportText,
     bounds_of,
@@ -92,13 +92,14 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
             allowed = "nothing with a contour: it has no shape to be found by"
             raise InputError("command line", "--session", request.session, allowed)
         damage = open_session(request.session).damage  # what is wrong with it is told before anything is written
-    check_out(request.out, request.gcode, request.force)
+    check_out(request)
     with _progress("scan", "steps (read, repaired, wound found)") as progress:
         subject = subject_of(request, flat, progress)
     with _progress("plan", "layers") as progress:
         plan = make_plan(subject.wound, order, subject.name, progress)
     path, arm = (plan.path, NO_ARM_GIVEN) if request.arm is None else with_feasible(plan.path, request.arm)
     check_path(path)
+    PlanFiles(request.out).remove_companions()
     write_atomically(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
         write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
@@ -112,8 +113,7 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
         written += _pictures(request, plan, subject, layers, total, arm, moments)
     placed = []
     if request.session is not None:
-        scan = request.out.with_name(f"{request.out.stem}_scan.ply")
-        placed = placement_lines(*scan_placement(request.session, scan, plan.wound.rim))
+        placed = placement_lines(*scan_placement(request.session, PlanFiles(request.out).scan, plan.wound.rim))
     return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed]), damage
 
 
@@ -121,10 +121,9 @@ def _tables(
     request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str
 ) -> list[str]:  # fmt: skip
     """Write the coverage of each layer, the summary, the scan as it was repaired, and an example's; their names."""
-    stem = request.out.with_suffix("")
-    table, summary = stem.with_name(stem.name + "_layers.csv"), stem.with_suffix(".json")
-    written = [table.name, summary.name]
-    write_atomically(table, lambda file: _write_layers(file, layers))
+    files = PlanFiles(request.out)
+    written = [files.layer_table.name, files.summary.name]
+    write_atomically(files.layer_table, lambda file: _write_layers(file, layers))
     facts = {
         "checkpoints": len(plan.path), "mode": plan.order.mode, "missing_tissues": plan.stack.missing,
         "wound": asdict(plan.wound.findings), "total": asdict(total),
@@ -132,11 +131,10 @@ def _tables(
         "bumps": bump_facts(plan), "feasible": arm, "tool": tool_facts(plan),
         "surface_from_plane": plan.wound.surface_from_plane.tolist(), "provenance": provenance().table(),
     }  # fmt: skip
-    write_atomically(summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
-    meshes = {"_scan.ply": None if subject.repairs is None else _surface(plan.wound), "_example.ply": subject.example}
-    for ending, mesh in meshes.items():
+    write_atomically(files.summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
+    meshes = {files.scan: None if subject.repairs is None else _surface(plan.wound), files.example: subject.example}
+    for file, mesh in meshes.items():
         if mesh is not None:
-            file = stem.with_name(stem.name + ending)
             write_atomically(file, partial(write_ply, vertices=mesh[0], triangles=mesh[1]))
             written.append(file.name)
     return written
@@ -171,8 +169,7 @@ def _pictures(
     moments: Array,
 ) -> list[str]:  # fmt: skip
     """Write a picture of each layer and the report; their names. moments: times (N,), s, of the checkpoints."""
-    stem = request.out.with_suffix("")
-    folder, report = stem.with_name(stem.name + "_layers"), stem.with_suffix(".html")
+    folder, report = PlanFiles(request.out).pictures, PlanFiles(request.out).report
     folder.mkdir(exist_ok=True)
     bounds = bounds_of(plan.layers)
     pictures: list[str] = []

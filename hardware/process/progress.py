@@ -233,12 +233,20 @@ def prepare_out(out: Path, force: bool) -> None:
     out.mkdir(parents=True, exist_ok=True)
 
 
-def check_new(out: Path, force: bool) -> None:
-    """InputError where `out` is a file, or a folder that holds something, and `force` is not set."""
+def check_new(out: Path, force: bool, option: str = "--out", read: Path | None = None) -> None:
+    """InputError where `out` is a file, or a folder that holds something, and `force` is not set; or what is read."""
+    if read is not None:
+        check_apart(option, out, read)
     if out.is_dir() and any(out.iterdir()) and not force:
-        raise InputError(out, "--out", "a folder that is not empty", "a new or empty one, or --force")
+        raise InputError(out, option, "a folder that is not empty", "a new or empty one, or --force")
     if out.exists() and not out.is_dir() and not force:
-        raise InputError(out, "--out", "a file that exists", "a new one, or --force")
+        raise InputError(out, option, "a file that exists", "a new one, or --force")
+
+
+def check_apart(option: str, written: Path, read: Path) -> None:
+    """InputError where a file or folder of results is the one that is read, which they would overwrite."""
+    if written.exists() and read.exists() and written.samefile(read):
+        raise InputError(written, option, "what is read, and would be overwritten", "another one")
 
 
 def left_files_text(out: Path | None) -> str:
