@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -148,6 +150,50 @@ def test_what_was_kept_is_said(tmp_path: Path) -> None:
     assert "readable" in left_files_text(tmp_path / "x.mcap")
     (tmp_path / "arm.toml").write_text("x")
     assert left_files_text(tmp_path / "arm.toml") == f"kept {tmp_path / 'arm.toml'}"
+
+
+def test_ctrl_c_before_a_command_is_read_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def pressed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hardware.cli.main.parser", pressed)
+    assert main(["cache"]) == 130
+    assert capsys.readouterr().err == "\nstillbed: interrupted; nothing was written\n"
+
+
+def test_ctrl_c_while_a_library_loads_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """gtsam, interrupted while it loads, makes an ImportError of it."""
+
+    def load(cause: BaseException) -> None:
+        raise ImportError("initialization failed") from cause
+
+    monkeypatch.setattr("hardware.files.session.check_exists", lambda path: load(KeyboardInterrupt()))
+    assert main(["track", "x", "-o", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "\nstillbed: interrupted; nothing was written\n"
+    monkeypatch.setattr("hardware.files.session.check_exists", lambda path: load(OSError()))
+    with pytest.raises(ImportError):
+        main(["track", "x", "-o", str(tmp_path / "out")])
+
+
+def test_a_full_disk_is_told_with_what_was_to_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(self: Path, *_: object, **__: object) -> None:
+        self.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_text", full)
+        assert main(["init", str(tmp_path / "mon day")]) == 2
+    assert capsys.readouterr().err.startswith(f"stillbed: {tmp_path / 'mon day'}: no space left on device")
+    assert not (tmp_path / "mon day").exists()
+    assert main(["init", str(tmp_path / "mon day")]) == 0
+    told = capsys.readouterr().out
+    assert shlex.split(told.partition("then: ")[2]) == ["stillbed", "live", str(tmp_path / "mon day/session.toml")]
 
 
 def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:

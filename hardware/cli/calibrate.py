@@ -7,6 +7,7 @@ import sys
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
@@ -278,7 +279,7 @@ def _calibrate_arm(a: argparse.Namespace) -> int:
             raise
         hint = "to begin anew, name another --record or empty this one"
         if (a.record / "frames.csv").exists():
-            hint = f"`stillbed calibrate arm {a.record} -o {a.out}` takes what is there; {hint}"
+            hint = f"`stillbed calibrate arm {quote(str(a.record))} -o {quote(str(a.out))}` takes what is there; {hint}"
         print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {hint}", file=sys.stderr)
         return INTERRUPTED
     print(outcome.text)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
 from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, positive, wrong_option
-from hardware.process.progress import check_new, json_text
+from hardware.process.progress import check_new, json_text, write_atomically
 from perception import named_path
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def add_trace(commands: Commands) -> None:
         "first move on the wire, and what the processes did meanwhile, for all sets and for the slowest hundredth.",
         "stillbed trace run.mcap -o run.json --page run.trace.html",
     ).add_argument
-    add("record", type=Path, metavar="X.mcap", help="the recording of a live run")
+    add("recording", type=Path, metavar="X.mcap", help="of a live run")
     add("-o", "--out", type=Path, metavar="X.json", help="write it for Perfetto (ui.perfetto.dev), chrome://tracing")
     add("--page", type=Path, metavar="X.html", help="write a page: the causes, and the slowest sets as lanes")
     add("--force", action="store_true", help="overwrite these files")
@@ -125,13 +126,13 @@ def _run_trace(a: argparse.Namespace) -> None:
 
     for flag, file in (("--out", a.out), ("--page", a.page)):
         if file is not None:
-            check_new(file, a.force, flag, a.record)
-    trace = read_trace(a.record)
+            check_new(file, a.force, flag, a.recording)
+    trace = read_trace(a.recording)
     print(trace_text(trace))
     if a.out is not None:
         a.out.write_text(chrome_trace(trace), encoding="utf-8")
     if a.page is not None:
-        a.page.write_text(trace_page(trace, a.record.stem), encoding="utf-8")
+        a.page.write_text(trace_page(trace, a.recording.stem), encoding="utf-8")
 
 
 def _run_record(a: argparse.Namespace) -> int:
@@ -164,7 +165,7 @@ def add_init(commands: Commands) -> None:
         "Write FOLDER/session.toml, which says everything that a live run is told, with a comment a key.",
         "stillbed init monday",
     ).add_argument
-    add("folder", type=Path, metavar="FOLDER", help="made if it is not there")
+    add("out", type=Path, metavar="FOLDER", help="made if it is not there")
 
 
 def _run_live(a: argparse.Namespace) -> int:
@@ -215,14 +216,14 @@ def _run_live(a: argparse.Namespace) -> int:
 def _run_init(a: argparse.Namespace) -> None:
     from hardware.live.settings import settings_text
 
-    file = a.folder / "session.toml"
-    if a.folder.exists() and not a.folder.is_dir():
-        raise InputError(a.folder, "FOLDER", "a file", "a folder, new or without a session.toml")
+    file = a.out / "session.toml"
+    if a.out.exists() and not a.out.is_dir():
+        raise InputError(a.out, "FOLDER", "a file", "a folder, new or without a session.toml")
     if file.exists():
         raise InputError(file, "FOLDER", "holds a session.toml already", "a folder without one")
-    a.folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(settings_text(), encoding="utf-8")
-    print(f"edit {file}, then: stillbed live {file}")
+    a.out.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, lambda part: part.write_text(settings_text(), encoding="utf-8"))
+    print(f"edit {file}, then: stillbed live {quote(str(file))}")
 
 
 def add_arm(commands: Commands) -> None:
@@ -302,8 +303,7 @@ def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
         origin=None if a.origin is None else origin_from_text(a.origin),
         confirmed=a.yes,
     )
-    settings = LinkSettings(pause_frame=not a.no_pause_frame)
-    driver = open_arm(a.device, profile)
+    driver, settings = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
     try:
         status = run_arm(driver, profile, request, WallClock(), settings=settings)
     finally:

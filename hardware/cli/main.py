@@ -206,15 +206,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     fill_standard_streams()
     words = sys.argv[1:] if argv is None else argv
-    commands = parser(words[0] if words else "")
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word may be
-        import argcomplete
+    try:
+        commands = parser(words[0] if words else "")
+        if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word may be
+            import argcomplete
 
-        argcomplete.autocomplete(commands)
-    arguments = commands.parse_args(words)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over matrices this small
-    with nullcontext() if argv is not None else FirstWord(arguments.command):  # only where the process is the command's
-        return _run(arguments)
+            argcomplete.autocomplete(commands)
+        arguments = commands.parse_args(words)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over such matrices
+        with nullcontext() if argv is not None else FirstWord(arguments.command):  # where the process is the command's
+            return _run(arguments)
+    except KeyboardInterrupt:  # before the command has begun
+        print("\nstillbed: interrupted; nothing was written", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -223,7 +227,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     state_inputs(input_files(arguments))
     code: int | None = None
-    out: Path | None = getattr(arguments, "out", None)
+    out = written_path(arguments)
     was_there = out is not None and out.exists()
     try:
         if threading.current_thread() is threading.main_thread():  # elsewhere, signals are somebody else's part
@@ -240,10 +244,17 @@ def _run(arguments: argparse.Namespace) -> int:
             with suppress(OSError):
                 out.rmdir()  # made for what was not done; what holds anything stays
         return WRONG_INPUT
-    except KeyboardInterrupt:
-        print(f"\nstillbed: interrupted; {left_files_text(getattr(arguments, 'out', None))}", file=sys.stderr)
+    except (KeyboardInterrupt, ImportError) as error:
+        if isinstance(error, ImportError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise  # gtsam makes this of Ctrl-C while it loads
+        print(f"\nstillbed: interrupted; {left_files_text(written_path(arguments))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def written_path(arguments: argparse.Namespace) -> Path | None:
+    """Where the command writes: its folder or file of results, else its recording; None if it has none."""
+    return next((path for name in WRITTEN_OPTIONS[:2] if (path := getattr(arguments, name, None)) is not None), None)
 
 
 def input_files(arguments: argparse.Namespace) -> list[Path]:

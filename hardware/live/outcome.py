@@ -12,6 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from html import escape
 from math import nan
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -219,7 +220,7 @@ class RunOutcome:
         """The command that goes on; "" where nothing is left, recorded, or to be printed at all."""
         task = self.prepared.task
         left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1 and self.recorded
-        return f"stillbed live --resume {self.prepared.files.record}" if left else ""
+        return f"stillbed live --resume {quote(str(self.prepared.files.record))}" if left else ""
 
     def result(self) -> RunResult:
         """For the operator's page."""

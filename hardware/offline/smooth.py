@@ -23,6 +23,7 @@ import numpy as np
 from estimation.batch.smooth import smooth
 from estimation.batch.smoothed import REFINED_PRIOR, CalibrationPrior, Smoothed
 from estimation.errors import InputError, StillbedError
+from estimation.se3 import Array
 from hardware.files.folder_tables import write_tum
 from hardware.files.rig_file import write_rig
 from hardware.files.session import Session, damage_text
@@ -136,7 +137,7 @@ def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -
         "seconds": float(result.stamps[-1] - result.stamps[0]),
         "landmarks": len(result.map),
         "sigma_mm": evaluation.sigma,
-        "residual_px": dict(zip(names, np.nanmedian(fitted.rms, axis=0).tolist(), strict=True)),
+        "residual_px": {name: _median(rms[np.isfinite(rms)]) for name, rms in zip(names, fitted.rms.T, strict=True)},
         "offset_ms": dict(zip(names, (1000 * result.offsets).tolist(), strict=True)),
         "offset_sigma_ms": dict(zip(names, (1000 * result.offset_sigma).tolist(), strict=True)),
         "jitter_ms": 1000 * fitted.jitter,
@@ -151,6 +152,11 @@ def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -
         "cost": fitted.cost,
         "damage": session.damage,
     }
+
+
+def _median(values: Array) -> float:
+    """NaN where there is none, as of a camera that never saw a landmark."""
+    return float(np.median(values)) if len(values) else float("nan")
 
 
 LOCAL_CLUSTER = "local"
