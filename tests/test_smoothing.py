@@ -16,6 +16,7 @@ from estimation.batch.normal_equations import condense
 from estimation.batch.smoothed import (
     REFINED_PRIOR,
     STATE_DOF,
+    CalibrationPrior,
     Smoothed,
     States,
     jerk_covariance,
@@ -148,6 +149,15 @@ def test_clocks_are_found_with_their_doubt() -> None:
     off = result.offsets - (given - given.mean())
     assert np.abs(off).max() < 5e-4 and np.abs(off / result.offset_sigma).max() < 4
     assert [c.clock_offset for c in result.rig.cameras] == pytest.approx(result.offsets.tolist())
+
+
+def test_a_camera_without_tracks_is_told_no_clock_and_takes_no_part_in_the_mean() -> None:
+    given = np.array([0.016, -0.006, 0.0])
+    world = synthetic_world("lively", seconds=1.0, count=FEW, offsets=tuple(given), seed=2)
+    result = smooth(world.rig, [seen.only(seen.camera != 2) for seen in world])
+    off = result.offsets[:2] - (given[:2] - given[:2].mean())
+    assert np.abs(off).max() < 1e-3 and result.offsets[2] == pytest.approx(0, abs=1e-6)
+    assert result.offset_sigma[2] == pytest.approx(CalibrationPrior().clock, rel=1e-3)
 
 
 def test_late_cameras_and_an_imperfect_calibration_cost_less_than_50_micrometres() -> None:

@@ -136,9 +136,10 @@ def smooth(
     data, points = data.landmarks(usable), points[usable]
     held = 0 if start is None else int(np.abs(data.stamps - start.stamps[0]).argmin())
     cameras, sigma = smoothed.cameras_of(rig), smoothed.correction_sigmas(prior, len(rig))
+    seeing = np.bincount(data.camera, minlength=len(rig)) > 0
     before = Priors(
         calibrated=cameras,
-        calibration=smoothed.prior_information(sigma, len(rig)),
+        calibration=smoothed.prior_information(sigma, seeing),
         points=points.copy(),
         map=np.eye(points.size) / FREE_LANDMARK_MM**2 if known is None else _information(known, data),
         pose=poses[held],

@@ -18,7 +18,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.pose import Trajectory
 from estimation.rig import Rig
-from estimation.se3 import Array, Index
+from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
 COMMON_CLOCK_SIGMA_S = 1e-6  # what all clocks have in common cannot be seen; their mean is the reference
@@ -88,11 +88,16 @@ def correction_sigmas(prior: CalibrationPrior, cameras: int) -> Array:
     return np.array([prior.clock] * cameras + place * cameras + lens * cameras)
 
 
-def prior_information(sigma: Array, cameras: int) -> Array:
-    """(11 C, 11 C) information of that step about the calibration; of what is held, zero."""
+def prior_information(sigma: Array, seeing: Mask) -> Array:
+    """(11 C, 11 C) information of that step about the calibration; of what is held, zero.
+
+    seeing: (C,) cameras with tracks. The clocks of these are told by their mean: a blind one would take what they have
+    in common, which nothing shows, with the other sign.
+    """
     known = np.divide(1.0, sigma**2, out=np.zeros_like(sigma), where=sigma > 0)
-    out = np.diag(known)
-    out[:cameras, :cameras] += np.where(sigma[0] > 0, 1 / (COMMON_CLOCK_SIGMA_S * cameras) ** 2, 0.0)
+    out, cameras = np.diag(known), len(seeing)
+    common = np.where(sigma[0] > 0, 1 / (COMMON_CLOCK_SIGMA_S * max(int(seeing.sum()), 1)) ** 2, 0.0)
+    out[:cameras, :cameras] += common * np.outer(seeing, seeing)
     return out
 
 
@@ -220,7 +225,7 @@ class Smoothed:
     tracks: Index  # (L,) the id that each landmark bears among the observations
     rig: Rig  # the cameras as corrected, clock offsets included
     calibrated: Rig  # as given
-    offsets: Array  # (C,) s, how much later than stamped each camera exposes, beside the mean of all
+    offsets: Array  # (C,) s, how much later than stamped each camera exposes, beside the mean of those with tracks
     offset_covariance: Array  # (C, C) s^2
     fitted: FitStatistics
 

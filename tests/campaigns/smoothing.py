@@ -196,9 +196,10 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
     start = clock.now()
     cameras, rest = smoothed.cameras_of(rig), np.zeros((len(poses), 6))
     sigmas = smoothed.correction_sigmas(smoothed.CalibrationPrior(clock=0.0), len(rig))
+    calibration = smoothed.prior_information(sigmas, np.ones(len(rig), bool))
     known = Priors(
-        cameras, smoothed.prior_information(sigmas, len(rig)), points, np.eye(points.size) / FREE_LANDMARK_MM**2,
-        poses[0], 0, HELD_POSE_SIGMA, np.tile(NO_MOTION_PRIOR, (len(poses) - 1, 1)),
+        cameras, calibration, points, np.eye(points.size) / FREE_LANDMARK_MM**2, poses[0],
+        0, HELD_POSE_SIGMA, np.tile(NO_MOTION_PRIOR, (len(poses) - 1, 1)),
     )  # fmt: skip
     problem = BatchProblem(data, np.zeros(0, np.int64))
     noise = NoiseModel(np.ones(len(rig)), *NO_JITTER, gate=NO_GATE)
