@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import shlex
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import tomllib
 from collections.abc import Iterator
 from io import StringIO
@@ -251,6 +254,19 @@ def test_progress_on_a_terminal_is_one_line_that_changes() -> None:
     assert text.count("\n") == 1 and text.count("\r") == 50
     assert text.endswith("track: 100 of 100 frame sets, 16.0/s\n")
     assert "track: 50 of 100 frame sets, 16.0/s, 3 s left" in text
+
+
+def test_progress_on_a_narrow_terminal_stays_one_line() -> None:
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 24, 60, 0, 0))
+    now = [0.0]
+    with os.fdopen(theirs, "w") as stream, Progress("reach", "steps", lambda: now[0], stream) as progress:
+        progress.note = "joints and speeds of each checkpoint, wherever the surface moves to"
+        now[0] = 1.0
+        progress(1, 4)
+    shown = os.read(ours, 1000).decode().rpartition("\x1b[K")[2]
+    os.close(ours)
+    assert shown.startswith("reach: 1 of 4 steps; joints") and len(shown.rstrip("\r\n")) == 60
 
 
 def test_the_time_left_is_not_reckoned_from_what_went_before_the_first_report() -> None:

@@ -106,6 +106,8 @@ def test_the_report_needs_no_network_and_holds_every_checkpoint(tmp_path: Path) 
     moments = np.frombuffer(base64.b64decode(held["seconds"]), "<f4")  # the slider's last time is that of the tile
     seconds = json.loads(out.with_suffix(".json").read_text())["total"]["seconds"]
     assert len(moments) == len(read_path(out)) and moments[-1] == pytest.approx(seconds, rel=1e-5)
+    for name, value in (("bead", "0.8 mm"), ("turning", "5 °/mm"), ("sideways", "200 mm/s²"), ("angle", "fastest")):
+        assert f"<td>{name}</td><td>{value}</td>" in page
 
 
 def test_axe_finds_nothing_serious_in_a_plan_or_in_what_an_arm_can_reach(browser: Browser, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from hardware.files.images import Video, decode, encode
 from hardware.files.session import Session
 from hardware.process.checks import read_bytes
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, check_apart, prepare_out
+from hardware.process.progress import Progress, check_apart, count_text, prepare_out
 from hardware.recording.session_reader import open_session
 from perception.frames import Image, mean_stamp
 from perception.tracking.wound_area import WoundArea, wound_area
@@ -111,7 +111,7 @@ def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options
             write_row(table_row(picture.name, result, options.mm_per_px, times[-1]))
             areas.measure(picture)
             progress(len(times), max(total, len(times)))
-    _raise_errors(errors, len(times))
+    _raise_errors(errors, len(times), out)
     median, p99 = np.percentile(times, [50, 99])
     took = f"{median:.1f} ms each (median), {p99:.1f} ms (p99)"
     text = f"{wounds} of {len(times)} pictures show a wound; {took}\nmasks and {WOUND_TABLE} are in {out}"
@@ -317,10 +317,15 @@ def _write(out: Path, name: str, image: Image, result: Segmentation, options: Se
         (out / OVERLAY_FOLDER / f"{name}.jpg").write_bytes(encode(draw_overlay(image, result), OVERLAY_QUALITY)[1])
 
 
-def _raise_errors(errors: list[InputError], done: int) -> None:
-    """Raise the first error; it names the other files where some pictures were read. done: number of those."""
-    if len(errors) == 1 or (errors and not done):
+def _raise_errors(errors: list[InputError], done: int, out: Path) -> None:
+    """Raise the first error; where some pictures were read it names the other files, and where those masks are.
+
+    done: number of these.
+    """
+    if errors and not done:
         raise errors[0]
     if errors:
-        others = ", ".join(str(error.where) for error in errors[1:])
-        raise InputError(errors[0].where, errors[0].what, f"{errors[0].got}; also {others}", errors[0].allowed)
+        first, others = errors[0], ", ".join(str(error.where) for error in errors[1:])
+        got = f"{first.got}; also {others}" if others else first.got
+        count = count_text(done, "other picture")
+        raise InputError(first.where, first.what, got, f"{first.allowed}; the masks of {count} are in {out}")

@@ -43,6 +43,13 @@ DEFAULT_TEXTS = {
     "tissues": "hypodermis=rest, dermis=1.6, epidermis=0.4", "layer_height": "as wide as a bead",
     "bump": "half a layer", "bump_clearance": "half a bead",
 }  # fmt: skip
+SETTING_UNITS = {
+    "layer_height": "mm", "angle": "°", "bead": "mm", "overlap_percent": "%", "inset": "mm", "speed": "mm/s",
+    "travel": "mm/s", "temperature": "°C", "spacing": "mm", "chord": "mm", "lift": "mm", "wait": "s",
+    "sideways": "mm/s²", "tilt_deg": "°", "turning_deg_mm": "°/mm", "spin_deg": "°", "bump": "mm",
+    "bump_clearance": "mm", "amplitude_mm": "mm",
+}  # fmt: skip
+UNIT_SUFFIXES = ("_percent", "_deg_mm", "_deg", "_mm")
 SETTING_RANGES = (
     ("bead", 0.01, 20), ("inset", 0, 100), ("rims", 0, 100),
     ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, MAX_SPEED), ("travel", 0.1, MAX_SPEED),
@@ -83,8 +90,13 @@ class PlanSettings:
     amplitude_mm: float = 0.0
 
     def rows(self) -> list[tuple[str, str]]:
-        """Each setting and its value, as text."""
-        return [(f.name.replace("_", " "), self._text(f.name)) for f in fields(self)]
+        """Each setting and its value with its unit, as text."""
+        return [(self._label(f.name), self._text(f.name)) for f in fields(self)]
+
+    @staticmethod
+    def _label(name: str) -> str:
+        suffix = next((suffix for suffix in UNIT_SUFFIXES if name.endswith(suffix)), "")
+        return name.removesuffix(suffix).replace("_", " ")
 
     def _text(self, name: str) -> str:
         value = getattr(self, name)
@@ -94,7 +106,8 @@ class PlanSettings:
             return "yes" if value else "no"
         if isinstance(value, tuple):
             return "; ".join(value)
-        return f"{value:g}" if isinstance(value, float) else str(value)
+        number = f"{value:g}" if isinstance(value, float) else str(value)
+        return number if number in get_args(AngleChoice) else f"{number} {SETTING_UNITS.get(name, '')}".rstrip()
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,7 +113,10 @@ class Progress:
         note = f"; {self.note}" if self.note else ""
         begun, before = self._first
         text = progress_line(self._what, self._unit, done, total, now - begun, before) + note
-        self._stream.write(f"\r\x1b[K{text}" if self._tty else f"{text}\n")
+        width = None
+        with suppress(OSError, ValueError):  # a line that breaks would not be replaced by the next
+            width = os.get_terminal_size(self._stream.fileno()).columns or None
+        self._stream.write(f"\r\x1b[K{text[:width]}" if self._tty else f"{text}\n")
         self._stream.flush()
         self._open = self._tty
 
