@@ -16,6 +16,7 @@ from estimation.observations import no_observations
 from estimation.pose import MotionState, SurfacePose, TrackState, Trajectory
 from hardware.files.folder_tables import read_rows, read_tum, write_rows, write_tum
 from hardware.files.pose_file import PoseTable, PoseWriter, read_poses
+from hardware.offline.trajectory_files import read_pose_series
 from perception.tracking.step import StepReport
 from tests.runs import run
 
@@ -144,6 +145,14 @@ def test_a_wrong_file_is_told_by_line_and_column(tmp_path: Path, old: str, new: 
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(InputError, match=says):
         read_poses(path)
+
+
+def test_a_measured_pose_that_is_no_number_is_told_by_its_line_where_it_is_to_be_judged(tmp_path: Path) -> None:
+    table, _ = run(20)
+    assert len(read_pose_series(str(write(tmp_path, table)))) == 19  # the first is INITIALISING
+    table.base_from_surface[7, 0, 3] = np.nan
+    with pytest.raises(InputError, match=r"poses\.csv: line 9 = .*nan.*finite numbers"):
+        read_pose_series(str(write(tmp_path, table)))
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:

@@ -24,7 +24,13 @@ from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.rig import Rig, distort, ideal_pixels
 from estimation.se3 import Array, quaternion_from_rotation, transform_points
-from hardware.files.folder_tables import checked_rows, read_tum, row_from_words, trajectory_from_rows
+from hardware.files.folder_tables import (
+    checked_rows,
+    read_tum,
+    row_from_words,
+    rows_from_trajectory,
+    trajectory_from_rows,
+)
 from hardware.files.pose_file import COVARIANCE_COLUMNS, TRANSFORM_COLUMNS, TWIST_COLUMNS, UPPER_TRIANGLE
 from hardware.files.pose_file import read_poses as read_pose_table
 from hardware.files.session import Session
@@ -195,6 +201,8 @@ def _of_csv(path: Path) -> PoseSeries:
         if not rows.any():
             raise InputError(path, "poses", "none that was measured", "one or more")
         trajectory = Trajectory(table.stamps[rows], table.base_from_surface[rows], exact=False)
+        lines = (f"line {row + 2}" for row in np.flatnonzero(rows))
+        checked_rows(path, zip(lines, rows_from_trajectory(trajectory).tolist(), strict=True))
         return PoseSeries(str(path), trajectory, table.covariance[rows])
     return _without_covariance(str(path), read_tum(path, exact=False))
 
