@@ -74,6 +74,7 @@ compare nothing.tum empty  # allowed a TUM or CSV file
 compare empty empty  # allowed a TUM or CSV file
 compare whole.mcap:truth whole.mcap:truth
 view empty
+view smoothed  # --poses smoothed
 view missing
 view junk.mcap
 view half.mcap
@@ -199,6 +200,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Everything that can be wrong with a file."""
     made = tmp_path_factory.mktemp("wrong")
     (made / "empty").mkdir()
+    (made / "smoothed").mkdir()
+    (made / "smoothed/smoothed.csv").touch()
     (made / "typo.toml").write_text("a = = 3\n")
     (made / "unknown.toml").write_text("[dance]\nsteps = 1\n")
     (made / "binary.toml").write_bytes(bytes(range(256)))

@@ -102,6 +102,8 @@ def open_playback(path: Path, poses: str | None = None, toolpath: Path | None = 
     """
     if (path / "smoothed.mcap").is_file():
         path = path / "smoothed.mcap"
+    elif (path / "smoothed.csv").is_file():
+        raise InputError(path, "pictures", "none", f"the session that was smoothed, with --poses {path}")
     session = open_session(path)
     stamps = np.array([mean_stamp(refs) for refs in session.sets])
     if not len(stamps):
