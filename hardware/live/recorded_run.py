@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -109,6 +109,7 @@ class PlayedSource:
         self._passed = self._count = self._number = 0  # readings of this record, calls since the last
         self._instant = 0.0
         self._handover: PoseHandover | None = None
+        self._parted = ""  # why it parted first
         self._fill()
         start = self.answer(START)
         if not start:
@@ -138,7 +139,7 @@ class PlayedSource:
         if answer := self.answer("pose"):
             stamp, sent = answer
             if stamp not in self._poses:
-                raise PartedError(f"the pose of {stamp:.3f} s is not in the recording")
+                self._part(f"the pose of {stamp:.3f} s is not in the recording, which has gaps")
             self._handover = PoseHandover(self._poses[stamp], sent, sent)
         return self._handover
 
@@ -191,15 +192,20 @@ class PlayedSource:
                 return
             raise PlayedOutError("all is played")
         if record["number"] != self._number:
-            raise PartedError(f"after {self._instant:.3f} s a part of the recording is missing")
+            self._part(f"after {self._instant:.3f} s a part of the recording is missing")
         self._number += 1
         self._readings.extend(record["readings"])
         self._calls.extend((row[0], row[1], row[2], row[3]) for row in record["calls"])
         self._passed = 0
 
-    def _missed(self, kind: str = "the clock") -> None:
+    def _missed(self, kind: str = "the clock") -> NoReturn:
         asked = self._calls[0][2]
-        raise PartedError(f"after {self._instant:.3f} s the loop asked for {asked!r} then, and now for {kind!r}")
+        self._part(f"after {self._instant:.3f} s the loop asked for {asked!r} then, and now for {kind!r}")
+
+    def _part(self, words: str) -> NoReturn:
+        """PartedError, whose words are those of the first one: the loop may go on after it for a while."""
+        self._parted = self._parted or words
+        raise PartedError(self._parted)
 
 
 class _RefusedError(InputError):
