@@ -237,7 +237,7 @@ MUTANTS = (
     Mutant(
         "armed again, the arm goes on to what was called back",
         "hardware/motion/loop.py",
-        "self._left_off = recalled.stands",
+        "self._last_target = recalled.stands",
         "pass",
         ("test_motion_loop.py::test_an_arm_armed_again_stays_where_it_came_to_rest_when_moves_were_called_back",),
     ),
@@ -307,7 +307,7 @@ MUTANTS = (
     Mutant(
         "an arm is taken for armed by a report from before it was asked to",
         "hardware/live/state_machine.py",
-        "self._armed |= motion.tick.stamp > self._ordered",
+        "self._armed |= motion.tick.stamp > self._order_time",
         "self._armed = True",
         ("test_live_stages.py",),
     ),

@@ -63,15 +63,15 @@ class _WakingClock(WallClock):
 class _OrderReceiver:
     """Takes the orders.
 
-    alone: whether the process that gives the orders is gone. fingerprint: of the path that was begun, "" before.
+    orphaned: whether the process that gives the orders is gone. fingerprint: of the path that was begun, "" before.
     """
 
     def __init__(self, channels: MotionChannels) -> None:
         self._connection, self._requests, self._shares = channels.orders, channels.requests, channels.shares
         self._followed: FlowShares | None = None
         self._last_stop = channels.requests.last_stop
-        self.alone, self.fingerprint = False, ""
-        self._ended = False
+        self.orphaned, self.fingerprint = False, ""
+        self._terminated = False
         signal.signal(signal.SIGTERM, self._end)
 
     def __call__(self) -> list[LoopOrder]:
@@ -87,15 +87,15 @@ class _OrderReceiver:
                 orders.append(shares)
             orders.append(message)
         self.fingerprint = next((o.fingerprint for o in orders if isinstance(o, BeginPrint)), self.fingerprint)
-        self.alone |= closed
-        return [*orders, Order.QUIT] if self.alone or self._ended else orders
+        self.orphaned |= closed
+        return [*orders, Order.QUIT] if self.orphaned or self._terminated else orders
 
     def _end(self, number: int, frame: FrameType | None) -> None:
-        self._ended = True
+        self._terminated = True
 
 
 class _TickReporter:
-    """Times the way from frames to the wire, records what passes the port, and reports each tick."""
+    """Measures the latency from frames to the wire, records the bytes on the port, and reports each tick."""
 
     def __init__(self, channels: MotionChannels, sender: RecorderSender, priority: str, trace: bool) -> None:
         self._poses, self._reports, self._sender = channels.poses, channels.reports, sender
@@ -103,39 +103,40 @@ class _TickReporter:
         self.times = StageHistograms()
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
         self._handover: PoseHandover | None = None  # the newest
-        self._used = deque[SurfacePose](maxlen=LAST_POSES)
-        self._unsent = False  # whether no move made of that pose went out yet
+        self._used_poses = deque[SurfacePose](maxlen=LAST_POSES)
+        self._pose_unsent = False  # whether no move computed from that pose was sent yet
         self._lane = TraceLane(MOTION_LANE, self._clock, sender.put) if trace else None
-        self._seen = math.nan  # s, when the handover was seen here
+        self._receipt_time = math.nan  # s, when the handover was taken here
         self.loop: MotionLoop | None = None
         self.motion: PrintMotion | None = None
 
     def newest_pose(self) -> PoseHandover | None:
-        """The newest pose there is."""
+        """The newest pose."""
         handover = self._poses.get()
         if handover is not self._handover:
-            self._handover, self._unsent, self._seen = handover, True, self._clock.now()
+            self._handover, self._pose_unsent, self._receipt_time = handover, True, self._clock.now()
             if handover is not None:
-                self._used.append(handover.pose)
+                self._used_poses.append(handover.pose)
         return handover
 
-    def bytes_passed(self, data: bytes, sent: bool) -> None:
-        """Record bytes of the port, and time the first move made of a pose."""
+    def record_bytes(self, data: bytes, sent: bool) -> None:
+        """Record bytes of the port, and the latency of the first move computed from a pose."""
         now, frame = self._clock.now(), b"" if self.loop is None else self.loop.arm.command_frame
-        planned = sent and data == frame and frame[INSTRUCTION_BYTE] == MOVE_INSTRUCTION  # the way home has no pose
-        if planned and self._unsent and self._handover is not None:
-            self._unsent = False
+        from_pose = sent and data == frame and frame[INSTRUCTION_BYTE] == MOVE_INSTRUCTION  # the way home has no pose
+        if from_pose and self._pose_unsent and self._handover is not None:
+            self._pose_unsent = False
             self.times.add(FRAMES_TO_WIRE_STAGE, now - self._handover.handed)
             self.times.add(EXPOSURE_TO_WIRE_STAGE, now - self._handover.pose.stamp)
             if self._lane is not None and self.loop is not None:
-                begun, handover = max(self.loop.begun, self._seen), self._handover
-                told = ("handed over", handover.sent, self._seen), ("waits for its tick", self._seen, begun)
-                self._lane.add(handover.pose.stamp, [*told, (ON_WIRE, begun, now)])
+                tick_start, handover = max(self.loop.tick_start, self._receipt_time), self._handover
+                waited = "waits for its tick", self._receipt_time, tick_start
+                spans = ("handed over", handover.sent, self._receipt_time), waited, (ON_WIRE, tick_start, now)
+                self._lane.add(handover.pose.stamp, spans)
         self._sender.put(WireEntry(now, data, sent))
 
     def close(self) -> None:
-        """Hand over the poses that were used last, and the rest of the trace."""
-        self._sender.put(UsedPoses(tuple(self._used)))
+        """Send the last used poses and the rest of the trace to the recorder."""
+        self._sender.put(UsedPoses(tuple(self._used_poses)))
         if self._lane is not None:
             self._lane.close()
 
@@ -145,27 +146,25 @@ class _TickReporter:
         loop, motion = self.loop, self.motion
         assert loop is not None and motion is not None
         self._events.extend(loop.arm.events())
-        progress, late = motion.progress, loop.lateness
+        progress, ticks = motion.progress, loop.lateness
+        pose_stamp = math.nan if self._handover is None else self._handover.pose.stamp
         if progress is not None:
-            stamp = math.nan if self._handover is None else self._handover.pose.stamp
-            asked = motion.asked and motion.last.stamp == tick.stamp
-            frame, recalled = loop.arm.command_frame if asked else b"", tick.recalled
-            rows = None if recalled is None else recalled.rows
-            reached = tick.command, frame, progress.fraction, progress.phase, rows
-            self._sender.put(RecordedTick(tick.stamp, stamp, asked, *reached))
+            planned = motion.planned and motion.last.stamp == tick.stamp
+            frame, place = loop.arm.command_frame if planned else b"", (progress.fraction, progress.phase)
+            rows = None if tick.recalled is None else tick.recalled.rows
+            self._sender.put(RecordedTick(tick.stamp, pose_stamp, planned, tick.command, frame, *place, rows))
         for record in () if loop.material is None else loop.material.records():
             self._sender.put(record)
-        lateness = StageTiming(LATE_TICK_STAGE, late.count, late.percentile(50), late.percentile(99), late.most)
+        lateness = StageTiming(LATE_TICK_STAGE, ticks.count, ticks.percentile(50), ticks.percentile(99), ticks.most)
         events, timings, stops = tuple(self._events), (*self.times.timings(), lateness), loop.arm.stops
-        last_stop = stops[-1] if stops else None
-        counts = loop.skipped, len(stops), last_stop, self._sender.dropped
+        counts = loop.skipped, len(stops), stops[-1] if stops else None, self._sender.dropped
         material = None if loop.material is None else loop.material.status
-        used = math.nan if self._handover is None else self._handover.pose.stamp, motion.arm_lag
-        self._reports.put(LiveMotionReport(tick, progress, material, events, timings, *counts, self._priority, *used))
+        link = self._priority, pose_stamp, motion.arm_lag
+        self._reports.put(LiveMotionReport(tick, progress, material, events, timings, *counts, *link))
 
 
 def material_control(path: Path, dispensers: str, start: float, now: float) -> MaterialControl | None:
-    """The dispensers of a path, by the text of their file, made ready for `start`, in checkpoints; None without one."""
+    """The dispensers of a path, from the text of their file, prepared for `start`, in checkpoints; None without one."""
     if not dispensers:
         return None
     control = MaterialControl(drivers_of(dispensers_from_text(dispensers, "dispenser.toml")), path)
@@ -176,33 +175,33 @@ def material_control(path: Path, dispensers: str, start: float, now: float) -> M
 def move(prepared: Prepared, channels: MotionChannels) -> None:
     """The body of the process: follow orders until QUIT, or until the process that gives them is gone.
 
-    Then the arm is stopped; in the second case the place on the path is kept here.
+    Then the arm is stopped; in the second case the place on the path is written here.
     """
     settings, profile = prepared.settings, prepared.task.profile
     set_up_process("motion", settings.cores_motion, outlives=True)
     priority = ask_for_real_time() if settings.real_time else "nothing asked for"
     clock, sender = WallClock(), RecorderSender(channels.recorder)  # its thread shares the interpreter: as urgent
-    how = LoopSettings(LinkSettings(pause_frame=settings.pause_frame))
+    loop_settings = LoopSettings(LinkSettings(pause_frame=settings.pause_frame))
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
     reporter, orders = _TickReporter(channels, sender, priority, settings.trace), _OrderReceiver(channels)
-    driver = open_arm(channels.url, profile, reporter.bytes_passed)
-    given = _WakingClock(channels.bell), driver, reporter.newest_pose, orders
-    source = RecordingSource(*given, sender.put, profile, material, how)
+    driver = open_arm(channels.url, profile, reporter.record_bytes)
+    waking, pose = _WakingClock(channels.bell), reporter.newest_pose
+    source = RecordingSource(waking, driver, pose, orders, sender.put, profile, material, loop_settings)
     try:
-        printing = PrintLoop(source, profile, how, clock, reporter.report, channels.place)
+        printing = PrintLoop(source, profile, loop_settings, clock, reporter.report, channels.place)
         reporter.motion, reporter.loop = printing.motion, printing.loop
         try:
             printing.run()
         finally:
             reporter.loop = None
             printing.arm.close()
-            for words in [] if material is None else material.close(clock):
-                sender.put(EventEntry(clock.now(), f"could not be switched off: {words}", WARNING, "dispenser"))
+            for failure in [] if material is None else material.close(clock):
+                sender.put(EventEntry(clock.now(), f"could not be switched off: {failure}", WARNING, "dispenser"))
     except StillbedError as error:  # the arm cannot be used, or nothing is recorded any more
         channels.trouble.put(str(error))
     finally:
         driver.release()
-        if orders.alone and orders.fingerprint:
+        if orders.orphaned and orders.fingerprint:
             write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.value)
         reporter.close()
         for entry in reporter.times.entries(clock.now()):

@@ -55,63 +55,63 @@ class RunStatistics:
     states: Counter[str] = field(default_factory=Counter)  # frame sets in each state of the tracker
     holds: dict[str, records.HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
     extruding: float = 0.0  # s in which material left
-    due: float = 0.0  # s in which it should have left
+    printing: float = 0.0  # s in which it should have left
     times: records.StageHistograms = field(default_factory=records.StageHistograms)
     errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # predicted at the nozzle, mm
     largest: float = nan  # mm, claim
     true_errors: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN, ERROR_BINS))  # of a simulated world, mm
-    judged: int = 0  # true errors of which something was claimed
-    held: int = 0  # of those, within it
+    claimed: int = 0  # true errors for which there was a claim
+    covered: int = 0  # of those, within the claim
     claim: float = nan  # mm, of the last tick; NaN where no material left
     last_error: float = nan  # mm, the newest claim
     last_sigma: float = nan  # mm, of the surface alone, as the guard limits it
-    error_stamp: float = nan  # s, when that was
-    ink: float = 0.0  # mm^3 that the dispensers were told
+    error_stamp: float = nan  # s, of both
+    ink: float = 0.0  # mm^3, commanded to the dispensers
     stretches: Array = field(default_factory=lambda: np.full(STRETCHES, np.nan))  # mm, largest error of each
     timeline: records.ErrorTimeline = field(default_factory=records.ErrorTimeline)
     track: records.NozzleTrack = field(default_factory=records.NozzleTrack)  # on the surface, while material left
-    _begun: tuple[ArmProfile, Path] | None = None  # that the nozzle follows, in the tracker's surface frame
+    _followed: tuple[ArmProfile, Path] | None = None  # arm, and path that it follows, in the tracker's surface frame
     _poses: deque[SurfacePose] = field(default_factory=lambda: deque(maxlen=POSES_KEPT))
-    _updated: float = nan
-    _ticked: float = nan
+    _update_time: float = nan
+    _tick_stamp: float = nan
     _sets: int = 0
     _reason: str = ""
 
     def begin(self, path: Path, profile: ArmProfile) -> None:
         """Judge moves by the path (tracker's surface frame) that the nozzle follows from now on."""
-        self._begun = profile, path
+        self._followed = profile, path
 
     def update(self, now: float, stage: RunStage, reports: records.RunReports) -> None:
         """Count the newest reports at `now`, s."""
-        if not np.isnan(self._updated):
-            self.stages[stage.value] = self.stages.get(stage.value, 0.0) + now - self._updated
-        self._updated = now
+        if not np.isnan(self._update_time):
+            self.stages[stage.value] = self.stages.get(stage.value, 0.0) + now - self._update_time
+        self._update_time = now
         if (tracking := reports.tracking) is not None and tracking.pose is not None and tracking.sets != self._sets:
             self._sets = tracking.sets
             self._poses.append(tracking.pose)
             self.states[tracking.pose.state.value] += 1
-        if reports.motion is not None and reports.motion.tick.stamp != self._ticked:
+        if reports.motion is not None and reports.motion.tick.stamp != self._tick_stamp:
             self._tick(reports.motion, stage)
 
     def add_true_error(self, error: float, claim: float = nan) -> None:
-        """Count the true error at the nozzle of a simulated world and what was claimed of it, mm; NaN: not known."""
+        """Count the true error at the nozzle in a simulated world, and its claim, both mm; NaN: unknown."""
         if not np.isnan(error):
             self.true_errors.add(error)
-            self.judged, self.held = self.judged + (not np.isnan(claim)), self.held + (error <= claim)
+            self.claimed, self.covered = self.claimed + (not np.isnan(claim)), self.covered + (error <= claim)
 
     @property
     def coverage(self) -> float:
-        """Share of the true errors that were within what was claimed of them; NaN where none is known."""
-        return self.held / self.judged if self.judged else nan
+        """Share of the true errors that were within their claim; NaN where none is known."""
+        return self.covered / self.claimed if self.claimed else nan
 
     @property
     def predicted(self) -> dict[str, float]:
-        """The error over the run as it was predicted: median and 95 % of all cases, and the largest claim; mm."""
+        """The predicted error over the run, mm: median and 95 % of all cases, and the largest claim."""
         return self.errors.summary | {"max": self.largest}
 
     @property
     def active(self) -> float:
-        """Seconds since the approach in which it went to the wound, printed, was held or waited."""
+        """Seconds in the stages from the approach on: approaching, printing, paused or stopped."""
         return sum(self.stages.get(stage.value, 0.0) for stage in UNDER_WAY)
 
     @property
@@ -123,50 +123,50 @@ class RunStatistics:
     @property
     def duty(self) -> float:
         """Share of the time since printing began in which material left; NaN before."""
-        return self.extruding / self.due if self.due > 0 else nan
+        return self.extruding / self.printing if self.printing > 0 else nan
 
     def _tick(self, motion: records.LiveMotionReport, stage: RunStage) -> None:
-        before, self._ticked, self.claim = self._ticked, motion.tick.stamp, nan
-        step = min(self._ticked - before, MAX_TICK_GAP) if not np.isnan(before) else 0.0
+        previous, self._tick_stamp, self.claim = self._tick_stamp, motion.tick.stamp, nan
+        step = min(self._tick_stamp - previous, MAX_TICK_GAP) if not np.isnan(previous) else 0.0
         command, progress = motion.tick.command, motion.progress
         if progress is None or stage not in UNDER_WAY:
             return
         if reason := _NUMBER_PATTERN.sub("…", command.reason):
-            counted = reason if reason in self.holds or len(self.holds) < MAX_REASONS else OTHER_REASONS
-            hold = self.holds.setdefault(counted, records.HoldTotal())
-            hold.count += counted != self._reason
+            hold_name = reason if reason in self.holds or len(self.holds) < MAX_REASONS else OTHER_REASONS
+            hold = self.holds.setdefault(hold_name, records.HoldTotal())
+            hold.count += hold_name != self._reason
             hold.seconds += step
         self._reason = reason
         if progress.place > 0 and progress.phase not in (PrintPhase.LEAVING, PrintPhase.FINISHED):
-            self.due += step
+            self.printing += step
         if isinstance(command, Move) and command.extrude:
             self.extruding += step
             self.ink += command.flow * step
             self._claim(motion, command, progress.fraction)
-            at = min(int(STRETCHES * progress.fraction / max(progress.total - 1, 1)), STRETCHES - 1)
-            self.stretches[at] = np.fmax(self.stretches[at], self.claim)
+            stretch = min(int(STRETCHES * progress.fraction / max(progress.total - 1, 1)), STRETCHES - 1)
+            self.stretches[stretch] = np.fmax(self.stretches[stretch], self.claim)
         else:
             self.track.lift()
-        self.timeline.add(self._ticked, self.claim, step if reason else 0.0)
+        self.timeline.add(self._tick_stamp, self.claim, step if reason else 0.0)
 
     def _claim(self, motion: records.LiveMotionReport, move: Move, fraction: float) -> None:
-        """Say how far the nozzle will be from its place after this move, by the pose that the move was made of."""
+        """Enter the predicted error after this move, by the pose from which the move was computed."""
         pose = next((pose for pose in reversed(self._poses) if pose.stamp <= motion.pose_stamp), None)
-        if pose is None or self._begun is None:
+        if pose is None or self._followed is None:
             return
-        due = motion.tick.stamp + self._begun[0].tick + motion.lag
-        said = predicted_error(move, due, pose, *self._begun, fraction)
-        self.track.add(said.tip)
-        for radius in said.radii.tolist():
+        arrival = motion.tick.stamp + self._followed[0].tick + motion.lag
+        prediction = predicted_error(move, arrival, pose, *self._followed, fraction)
+        self.track.add(prediction.tip)
+        for radius in prediction.radii.tolist():
             self.errors.add(radius)
-        self.claim = self.last_error = said.within
-        self.largest = float(np.fmax(self.largest, said.within))
-        self.last_sigma, self.error_stamp = said.sigma, move.stamp
+        self.claim = self.last_error = prediction.within
+        self.largest = float(np.fmax(self.largest, prediction.within))
+        self.last_sigma, self.error_stamp = prediction.sigma, move.stamp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunOutcome:
-    """How a run ended."""
+    """The outcome of a run."""
 
     prepared: Prepared
     machine: RunStateMachine
@@ -174,8 +174,8 @@ class RunOutcome:
     reports: records.RunReports
     signal: int  # that ended it, 0 without
     fraction: float  # place on the path, counted in checkpoints, NaN before any
-    pictures: PagePictures | None = None  # the last that a window of the page was shown
-    written: bool = False  # whether the report is
+    pictures: PagePictures | None = None  # the last on the page
+    written: bool = False  # whether the report is written
 
     @property
     def code(self) -> int:
@@ -186,46 +186,46 @@ class RunOutcome:
 
     @property
     def inked(self) -> bool:
-        """Whether any dispenser was there, or a simulated one."""
+        """Whether the run had a dispenser, real or simulated."""
         return bool(self.prepared.task.dispensers) or self.prepared.settings.simulated is not None
 
     @property
     def place(self) -> float:
-        """Where the path is printed up to, in checkpoints, with what the runs before this one printed."""
+        """Place up to which the path is printed, in checkpoints, earlier runs included."""
         return self.fraction if self.fraction == self.fraction else self.prepared.task.start
 
     @property
     def printed(self) -> float:
-        """The same as a share of the path's length, 0 to 1; none of a dry run."""
+        """The same as a share of the path's length, 0 to 1; 0 in a dry run."""
         return self._share(self.place)
 
     @property
     def printed_before(self) -> float:
-        """What of that the runs before this one printed."""
+        """The share of it that earlier runs printed."""
         return self._share(self.prepared.task.start)
 
     def _share(self, place: float) -> float:
-        """Share of the path's length, 0 to 1, up to a place in checkpoints; none of a dry run."""
+        """Share of the path's length, 0 to 1, up to a place in checkpoints; 0 in a dry run."""
         path, dry = self.prepared.task.path, self.prepared.task.lift is not None
         ways = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
         return 0.0 if dry or not ways[-1] > 0 else float(np.interp(place, np.arange(len(path)), ways) / ways[-1])
 
     @property
     def recorded(self) -> bool:
-        """Whether there is a recording: of a run that ended while its processes loaded there is none."""
+        """Whether there is a recording: a run that ended while its processes loaded has none."""
         return self.reports.recorder is not None and self.reports.recorder.written > 0
 
     @property
     def again(self) -> str:
-        """The command that goes on; "" where nothing is left, recorded, or to be printed at all."""
+        """The command that resumes the run; "" where nothing is left to print, nothing was recorded, or it was dry."""
         task = self.prepared.task
-        left = not self.machine.done and task.lift is None and self.place < len(task.path) - 1 and self.recorded
-        return f"stillbed live --resume {quote(str(self.prepared.files.record))}" if left else ""
+        resumable = not self.machine.done and task.lift is None and self.place < len(task.path) - 1 and self.recorded
+        return f"stillbed live --resume {quote(str(self.prepared.files.record))}" if resumable else ""
 
     def result(self) -> RunResult:
         """For the operator's page."""
         task, statistics, files = self.prepared.task, self.statistics, self.prepared.files
-        two = [(p["p95"], p["max"]) for p in (statistics.predicted, statistics.true_errors.summary)]
+        tails = [(p["p95"], p["max"]) for p in (statistics.predicted, statistics.true_errors.summary)]
         return RunResult(
             printed=self.printed,
             fraction=self.place,
@@ -233,8 +233,8 @@ class RunOutcome:
             begun=task.start,
             seconds=statistics.active,
             duty=statistics.duty,
-            error=two[0],
-            true_error=two[1],
+            error=tails[0],
+            true_error=tails[1],
             ink=statistics.ink if self.inked else nan,
             holds=tuple(statistics.holds_by_time[:MAX_SHOWN_HOLDS]),
             stretches=tuple(statistics.stretches.tolist()),
@@ -250,17 +250,17 @@ class RunOutcome:
         lines = [self.machine.ended]
         if not self.machine.done:
             dry = self.prepared.task.lift is not None
-            done = "were passed by, none printed" if dry else "are printed"
-            lines.append(f"{self.place:.2f} of {total} checkpoints {done}; the arm is at rest")
+            state = "were passed by, none printed" if dry else "are printed"
+            lines.append(f"{self.place:.2f} of {total} checkpoints {state}; the arm is at rest")
             if not dry:
-                nothing = "the path is printed; there is nothing to go on with"
+                hint = "the path is printed; there is nothing to go on with"
                 if not self.recorded:
-                    nothing = "nothing was recorded yet: begin it again as before"
-                lines.append(f"go on with: {self.again}" if self.again else nothing)
+                    hint = "nothing was recorded yet: begin it again as before"
+                lines.append(f"go on with: {self.again}" if self.again else hint)
         return "\n".join([*lines, *self.reports.gaps, f"report: {files.report}"])
 
     def write(self) -> RunOutcome:
-        """Write summary.json and report.html; the outcome of which that is said."""
+        """Write summary.json and report.html; returns the outcome with `written` set."""
         summary, files = self.summary(), self.prepared.files
         files.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         files.report.write_text(self._page(summary), encoding="utf-8")
@@ -320,7 +320,7 @@ class RunOutcome:
         from hardware.report.report import bead_map, error_timeline
 
         duty, task, timeline = self.statistics.duty, self.prepared.task, self.statistics.timeline
-        limit, count, covered = task.profile.limits.pose_error, len(timeline.stamps), self.statistics.coverage
+        limit, count, coverage = task.profile.limits.pose_error, len(timeline.stamps), self.statistics.coverage
         tiles = [
             tile(percent(self.printed), "", f"printed, checkpoint {self.place:.1f} of {len(task.path) - 1}"),
             tile(percent(duty) if duty == duty else "–", "", "of the time material left the nozzle"),
@@ -329,8 +329,8 @@ class RunOutcome:
             if (error := summary[f"{name}_error_mm"])["p95"] is not None:
                 values = f"{figure(error['p95'])} / {figure(error['max'])}"
                 tiles.append(tile(values, "mm", f"{name} error, 95 % / largest"))
-        within = tile(percent(covered), "", "of the true errors within what was predicted for 95 %")
-        tiles += [within] if covered == covered else []
+        coverage_tile = tile(percent(coverage), "", "of the true errors within what was predicted for 95 %")
+        tiles += [coverage_tile] if coverage == coverage else []
         tiles += [tile(figure(self.statistics.ink), "mm³", "of ink")] if self.inked else []
         tiles += [tile(percent(self.printed_before), "", "printed by the runs before")] if task.start else []
         rows = [
@@ -344,12 +344,12 @@ class RunOutcome:
         timings = figures_table(("stage", "times", "median", "99 %", "largest"), rows)
         reasons = figures_table(("what", "times", "s"), [*holds, *self._other_times()], last_total=True)
         bins = timeline.error[:count], timeline.held[:count] > timeline.width / 2, timeline.width
-        drawn = error_timeline(*bins, NORMAL_95 * limit)
+        timeline_chart = error_timeline(*bins, NORMAL_95 * limit)
         points = task.path.surface_from_nozzle[:, :3, 3]
         beads = bead_map(points, task.path.extrude, self.statistics.stretches, limit)
         body = [
             row_of_tiles(tiles),
-            section("Error at the nozzle", TIMELINE_CAPTION, drawn),
+            section("Error at the nozzle", TIMELINE_CAPTION, timeline_chart),
             section("Beads", BEADS_CAPTION, beads),
             *self._track_section(),
             *self._look_section(),
@@ -364,18 +364,18 @@ class RunOutcome:
         return document("live run", self.prepared.files.record.stem, lead, body, "stillbed")
 
     def _track_section(self) -> list[str]:
-        """The way of the nozzle over the surface, where it printed and the place of the path is known."""
+        """The nozzle's track over the surface, where it printed and the path is placed."""
         from hardware.report.page import section
         from hardware.report.report import track_map
 
-        track, placed = self.statistics.track.places, self.machine.placed_path
-        if placed is None or not len(track):
+        track, placed_path = self.statistics.track.places, self.machine.placed_path
+        if placed_path is None or not len(track):
             return []
-        points, extrude = placed.path.surface_from_nozzle[:, :3, 3], placed.path.extrude
+        points, extrude = placed_path.path.surface_from_nozzle[:, :3, 3], placed_path.path.extrude
         return [section("Nozzle track", TRACK_CAPTION, track_map(track, points, extrude))]
 
     def _look_section(self) -> list[str]:
-        """What looks found between layers, or when the operator asked for one."""
+        """Results of the looks between layers and of those that the operator requested."""
         if not self.prepared.task.looks or self.machine.placed_path is None:
             return []
         from hardware.offline.looks import looks_section, read_looks
@@ -388,13 +388,13 @@ class RunOutcome:
 
         if self.pictures is None or not self.pictures.pictures:
             return []
-        shown = [(each.camera, each.near or each.jpeg) for each in self.pictures.pictures]
-        return [section("What the cameras saw", "As the page showed it last.", camera_pictures(shown))]
+        pictures = [(picture.camera, picture.near or picture.jpeg) for picture in self.pictures.pictures]
+        return [section("What the cameras saw", "As the page showed it last.", camera_pictures(pictures))]
 
     def _other_times(self) -> list[list[str]]:
         """Rows of the time that is no hold, and of the sum."""
-        statistics, held = self.statistics, sum(row.seconds for row in self.statistics.holds_by_time)
-        rest = max(statistics.active - held - statistics.extruding, 0.0)
-        times = {"material left": statistics.extruding, "on the way without material": rest}
-        times["since the approach"] = held + statistics.extruding + rest
+        statistics, hold_time = self.statistics, sum(row.seconds for row in self.statistics.holds_by_time)
+        travel = max(statistics.active - hold_time - statistics.extruding, 0.0)
+        times = {"material left": statistics.extruding, "on the way without material": travel}
+        times["since the approach"] = hold_time + statistics.extruding + travel
         return [[name, "", f"{seconds:.2f}"] for name, seconds in times.items()]

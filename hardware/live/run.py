@@ -67,19 +67,19 @@ class LiveRun:
         self._prepared, self._console, self._clock = prepared, console, WallClock()
         self._tracker = tracker
         self._machine, self._statistics, self._reports = RunStateMachine(prepared.task), RunStatistics(), RunReports()
-        self._view_builder, self._view_put = ViewBuilder(prepared), -1e9
+        self._view_builder, self._view_time = ViewBuilder(prepared), -1e9
         self._page: OperatorPage | None = None
         self._signal = 0  # that asks the run to end
-        self._stops_ordered: list[float] = []  # s, of stops whose frame is not on the wire yet
+        self._stop_order_times: list[float] = []  # s, of stops whose frame is not on the wire yet
         self._stops = self._key_requests = 0  # on the wire so far; requests of the terminal, counted downwards
-        self._gaps = 0  # entries not recorded, when that was last said
+        self._gaps = 0  # entries not recorded, when last logged
         self._turn = 0  # of the state machine, when its stage was last announced
         self._announced = -1e9  # s
         self._silence_logged = self._arm_halted = False
-        self._placement_written: tuple[PlacedPath, bool] | None = None  # what run.surface.toml says, whether confirmed
-        self._shown: tuple[object, ...] = None, 0, None, None  # path, landmarks, scan, and what a look found
-        self._lies = ""  # the placement, as run.surface.toml has it
-        self._asked: RunStage | None = None  # the stage whose keys were told
+        self._written_placement: tuple[PlacedPath, bool] | None = None  # in run.surface.toml; whether confirmed
+        self._scene_parts: tuple[object, ...] = None, 0, None, None  # path, landmarks, scan, result of a look
+        self._placement_text = ""  # text of run.surface.toml
+        self._prompted_stage: RunStage | None = None  # the stage whose keys were printed
         self._profile: ArmProfile | None = None  # of the arm since the path was begun
 
     def __call__(self) -> RunOutcome:
@@ -92,8 +92,8 @@ class LiveRun:
             channels = self._channels = start_processes(prepared, File(folder), self._tracker)
             stack.callback(channels.processes.kill_all)
             files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
-            for used in (("session.toml", settings_text(prepared.settings)), (LOOP_ARM_ATTACHMENT, text)):
-                channels.sender.put(UsedEntry(*used))
+            for entry in (("session.toml", settings_text(prepared.settings)), (LOOP_ARM_ATTACHMENT, text)):
+                channels.sender.put(UsedEntry(*entry))
             progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)
             stack.callback(self._close_progress, progress_writer)
             self._open_page(stack)
@@ -111,7 +111,7 @@ class LiveRun:
             outcome = self._outcome().write()
             if self._page is not None:
                 self._put_view(self._clock.now(), outcome.result())
-                if self._profile is not None:  # else it says nothing that anybody would wait for
+                if self._profile is not None:  # else nothing was printed, and nobody waits for the report
                     self._page.hand_out_report()
         return outcome
 
@@ -167,8 +167,8 @@ class LiveRun:
                 continue  # the state machine knows whether pictures are still needed
             if name in (MOTION, TRACKING, RECORDER):
                 recorder = self._channels.recorder.get()
-                why = f": {recorder.failed}" if name == RECORDER and recorder is not None and recorder.failed else ""
-                return machine.end(f"the {name} process {processes.ending(name)}{why}", now)
+                detail = f": {recorder.failed}" if name == RECORDER and recorder is not None and recorder.failed else ""
+                return machine.end(f"the {name} process {processes.ending(name)}{detail}", now)
         if self._channels.sender.failed:
             return machine.end(f"this process records nothing any more: {self._channels.sender.failed}", now)
         if progress_writer.failed:
@@ -201,29 +201,29 @@ class LiveRun:
         """Switch the dispensers off in place of the motion process; those with a watchdog did it themselves."""
         if not (text := self._prepared.task.dispensers):
             return
-        for words in switch_off(drivers_of(dispensers_from_text(text, "dispenser.toml")), self._clock):
-            self._log(f"a dispenser could not be switched off: {words}: switch it off by hand", WARNING)
+        for failure in switch_off(drivers_of(dispensers_from_text(text, "dispenser.toml")), self._clock):
+            self._log(f"a dispenser could not be switched off: {failure}: switch it off by hand", WARNING)
 
     def _send(self, orders: Orders) -> None:
         for order in orders:
             if order is Order.STOP:
-                self._stops_ordered.append(self._clock.now())
+                self._stop_order_times.append(self._clock.now())
             if isinstance(order, BeginPrint):
                 try:
                     order = self._record_begin(order)
                 except InputError as error:
-                    why = f"{error.what} = {error.got}, allowed {error.allowed}"
-                    reason = f"what lies on the surface cannot be printed: {why}"
+                    detail = f"{error.what} = {error.got}, allowed {error.allowed}"
+                    reason = f"what lies on the surface cannot be printed: {detail}"
                     return self._send(self._machine.end(reason, self._clock.now()))
             with suppress(OSError):  # the motion process is gone: the next cycle sees that
                 self._channels.order(order)
 
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
-        """The order with what its recorded texts hold, to the last digit: a replay of them gives the same bytes."""
+        """Record the order as texts, and return it as read from them: a replay of the texts gives the same bytes."""
         if (placement := self._machine.placement) is not None:
             self._channels.placed.put(placement.surface_from_path)
         texts, order = recorded_begin(order, self._prepared.task.dispensers)
-        texts["surface.toml"] = self._lies
+        texts["surface.toml"] = self._placement_text
         for name, text in texts.items():
             self._channels.sender.put(UsedEntry(name, text))
         self._profile = order.profile
@@ -237,9 +237,9 @@ class LiveRun:
         if motion is None or motion.stop is None or motion.stops == self._stops:
             return
         self._stops = motion.stops
-        if self._stops_ordered and motion.stop[1] >= self._stops_ordered[0]:
-            self._statistics.times.add("stop decided to on the wire", motion.stop[1] - self._stops_ordered[0])
-        self._stops_ordered.clear()
+        if self._stop_order_times and motion.stop[1] >= self._stop_order_times[0]:
+            self._statistics.times.add("stop decided to on the wire", motion.stop[1] - self._stop_order_times[0])
+        self._stop_order_times.clear()
 
     # -- page, terminal and log
 
@@ -256,9 +256,9 @@ class LiveRun:
     def _show_view(self, now: float) -> None:
         """Put a view for the page, and restart the page where it has died: the run pauses, as nobody saw it."""
         page, machine = self._page, self._machine
-        if page is None or now < self._view_put + VIEW_PERIOD:
+        if page is None or now < self._view_time + VIEW_PERIOD:
             return
-        self._view_put = now
+        self._view_time = now
         if page.process is not None and not page.process.is_alive():
             self._log("the operator's page has ended, and is started again", WARNING)
             if Wish.PAUSE in machine.offers and not self._prepared.task.unattended:
@@ -270,49 +270,49 @@ class LiveRun:
         self._channels.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics, result))
 
     def _show_surface(self) -> None:
-        """Show path, surface and scan on the page; keep where the path lies, for a run that resumes."""
-        tracking, placed, link = self._reports.tracking, self._machine.placed_path, self._channels.link
+        """Show path, surface and scan on the page; write the path's placement, for a run that resumes."""
+        tracking, placed_path, link = self._reports.tracking, self._machine.placed_path, self._channels.link
         surface, scan = None if tracking is None else tracking.surface, link.scan.get()
-        shown = placed, 0 if surface is None else len(surface), scan, link.laid.get()
-        if any(a is not b and a != b for a, b in zip(shown, self._shown, strict=True)):
-            self._shown = shown
-            link.scene.put(replace(self._scene(surface, scan), laid=shown[3]))
-        if (lies := self._placement()) is not None:
-            self._lies = placement_text(lies)
-            write_placement(self._prepared.files.surface, lies)
+        parts = placed_path, 0 if surface is None else len(surface), scan, link.laid.get()
+        if any(a is not b and a != b for a, b in zip(parts, self._scene_parts, strict=True)):
+            self._scene_parts = parts
+            link.scene.put(replace(self._scene(surface, scan), laid=parts[3]))
+        if (placement := self._placement()) is not None:
+            self._placement_text = placement_text(placement)
+            write_placement(self._prepared.files.surface, placement)
 
     def _scene(self, surface: Array | None, scan: ScanDrawing | None) -> PageScene:
-        """What stands still in the view: path and scan where they are placed, and the landmarks."""
-        rig, placed, placement = self._prepared.rig, self._machine.placed_path, self._machine.placement
-        path = None if placed is None else placed.path
+        """The static part of the view, in the surface frame: path and scan as they are placed, and the landmarks."""
+        rig, placed_path, placement = self._prepared.rig, self._machine.placed_path, self._machine.placement
+        path = None if placed_path is None else placed_path.path
         if scan is None or placement is None:
             return scene_from(rig, path, surface)
-        lies = placement.surface_from_path
-        lines = se3.transform_points(lies, scan.lines.reshape(-1, 3)).reshape(-1, 2, 3)
-        points = se3.transform_points(lies, scan.points)
+        surface_from_path = placement.surface_from_path
+        lines = se3.transform_points(surface_from_path, scan.lines.reshape(-1, 3)).reshape(-1, 2, 3)
+        points = se3.transform_points(surface_from_path, scan.points)
         self._channels.sender.put(PlacedScanEntry(self._clock.now(), points))
         return scene_from(rig, path, points, scan.triangles, lines)
 
     def _placement(self) -> SurfacePlacement | None:
-        """Where the path lies, if that has changed since it was kept."""
+        """The path's placement, if it has changed since it was written."""
         machine, tracking, prepared = self._machine, self._reports.tracking, self._prepared
-        placed, placement = machine.placed_path, machine.placement
-        if placed is None or placement is None or tracking is None:
+        placed_path, placement = machine.placed_path, machine.placement
+        if placed_path is None or placement is None or tracking is None:
             return None
         confirmed = placement.certain or machine.stage not in (RunStage.CHECK, RunStage.FIND, RunStage.CONFIRM)
-        if self._placement_written is not None and self._placement_written[0] is placed:
-            confirmed |= self._placement_written[1]
-            if confirmed == self._placement_written[1]:
+        if self._written_placement is not None and self._written_placement[0] is placed_path:
+            confirmed |= self._written_placement[1]
+            if confirmed == self._written_placement[1]:
                 return None
-        self._placement_written = placed, confirmed
+        self._written_placement = placed_path, confirmed
         verdict = f"{placement.verdict}; moved by hand" if machine.moves else placement.verdict
-        lies, first, earlier = placement.surface_from_path, tracking.placement, prepared.placement
+        surface_from_path, first, earlier = placement.surface_from_path, tracking.placement, prepared.placement
         if earlier is not None and first is not None and first.by is PlacedBy.EARLIER:  # in the frame of its recording
-            moved = se3.inverse(first.surface_from_path) @ lies if machine.moves else np.eye(4)
-            lies = earlier.surface_from_path @ moved
-            return replace(earlier, surface_from_path=lies, certain=confirmed, verdict=verdict)
-        arm_from_base, record = placed.profile.arm.arm_from_base, prepared.files.record
-        return SurfacePlacement(record, tracking.registered, lies, arm_from_base, tracking.since, confirmed, verdict)
+            displacement = se3.inverse(first.surface_from_path) @ surface_from_path if machine.moves else np.eye(4)
+            surface_from_path = earlier.surface_from_path @ displacement
+            return replace(earlier, surface_from_path=surface_from_path, certain=confirmed, verdict=verdict)
+        placed = tracking.registered, surface_from_path, placed_path.profile.arm.arm_from_base
+        return SurfacePlacement(prepared.files.record, *placed, tracking.since, confirmed, verdict)
 
     def _announce(self, now: float) -> None:
         """Log a new stage and a process that has become silent; write a status line now and then."""
@@ -324,7 +324,7 @@ class LiveRun:
             self._gaps = self._reports.unrecorded
             self._log(self._reports.gaps[0], WARNING)
         if machine.turn != self._turn:
-            self._turn, self._view_put = machine.turn, -1e9  # the page is told at once
+            self._turn, self._view_time = machine.turn, -1e9  # the page is told at once
             if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.value):
                 self._channels.start.value = now
             self._log(stage_line(machine.stage, machine.reason))
@@ -332,15 +332,15 @@ class LiveRun:
                 self._console.say(checks_table(machine.checks, sys.stdout))
             elif machine.stage in (RunStage.CONFIRM, RunStage.READY):
                 key = "s: start" if machine.stage is RunStage.READY else self._confirm_key()
-                if self._asked is not machine.stage:
+                if self._prompted_stage is not machine.stage:
                     self._console.say(f"  {KEYS_HELP}\n  now: {key}")
-            self._asked, self._announced = machine.stage, now
+            self._prompted_stage, self._announced = machine.stage, now
         elif now > self._announced + STATUS_PERIOD:
             self._announced = now
             self._console.say(status_line(machine, self._reports))
 
     def _confirm_key(self) -> str:
-        """What can be done about the path as it lies, for the terminal."""
+        """The keys that answer the placement of the path, for the terminal."""
         machine = self._machine
         if machine.confirmable:
             return "y: the path is right"
@@ -355,9 +355,9 @@ class LiveRun:
     # -- the end
 
     def _wait_for_rest(self, wake: socket.socket) -> None:
-        """Wait until the arm is not armed and has nothing under way."""
-        until = self._clock.now() + REST_TIMEOUT
-        while (now := self._clock.now()) < until and self._channels.processes.alive(MOTION):
+        """Wait until the arm is disarmed and its queue is empty."""
+        deadline = self._clock.now() + REST_TIMEOUT
+        while (now := self._clock.now()) < deadline and self._channels.processes.alive(MOTION):
             motion = self._reports.motion = self._channels.motion.get() or self._reports.motion
             self._time_stops()
             if motion is None:
@@ -388,13 +388,13 @@ def _signal_wakeup(run: LiveRun) -> Iterator[socket.socket]:
     for end in (ours, theirs):
         end.setblocking(False)
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, run.on_signal) for number in numbers]
+    previous = [signal.signal(number, run.on_signal) for number in numbers]
     file = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     try:
         yield ours
     finally:
         signal.set_wakeup_fd(file)
-        for number, handler in zip(numbers, before, strict=True):
+        for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)
         ours.close()
         theirs.close()

@@ -65,52 +65,52 @@ class RunStateMachine:
     done: bool = False  # the path is printed
     silence: str = ""  # that a process is silent while the arm may move, "" while both report
     placed_path: PlacedPath | None = None
-    placement: PathPlacement | None = None  # of that path: by what, and what it is worth
+    placement: PathPlacement | None = None  # of that path: its source and certainty
     moves: int = 0  # how often the operator has moved it
     looks: int = 0  # how often the surface is to be looked for anew
-    outline: Polygons = ()  # the wound as the operator corrected its outline, inside which that is done; or none
+    outline: Polygons = ()  # the wound's outline as the operator corrected it: the search stays inside; () without
     answer: RequestAnswer | None = None  # to the last request
     checks: tuple[Check, ...] = ()
-    _since: float = nan  # s, when the stage was entered
-    _ordered: float = -inf  # s, when the last order went to the arm
-    _failing: float = inf  # s, since when a check has failed
-    _begun: bool = False  # whether the order to print was given
-    _home_declared: bool = False  # whether the operator's word that the arm stands at home was passed on
+    _stage_start: float = nan  # s, when the stage was entered
+    _order_time: float = -inf  # s, of the last order to the arm
+    _failing_since: float = inf  # s, since when a check has failed
+    _print_ordered: bool = False  # whether the order to print was given
+    _home_declared: bool = False  # whether AT_HOME was sent: the operator states that the arm is at home
     _unplugged: bool = False
-    _answers: bool = False  # whether the arm ever answered
-    _homed: bool = False  # whether the arm was armed since it was ordered home
-    _armed: bool = False  # whether it was armed since that was ordered
-    _at_home: bool = True  # whether it stands where homing led, and has not left for the surface
+    _arm_answered: bool = False  # whether the arm ever answered
+    _homed: bool = False  # whether the arm was armed since the last Order.HOME
+    _armed: bool = False  # whether it was armed since the last Order.ARM
+    _at_home: bool = True  # whether it is at home, and has not left for the surface
     _after_homing: RunStage = RunStage.APPROACH
-    _outlined: bool = False  # whether the page has pictures of this look, on which the outline can be corrected
-    _wanted: str = ""  # material that the operator was asked for in this pause
-    _looked: int = 0  # looks that the tracking reported and that are known to the motion
+    _outline_offered: bool = False  # whether the page has pictures of this look to correct the outline on
+    _requested_material: str = ""  # that the operator has to put in in this pause
+    _looks_done: int = 0  # looks that tracking has reported and the motion was informed of
 
     @property
     def offers(self) -> tuple[Wish, ...]:
-        """The wishes that would be followed now; where nothing is found inside an outline, a look without it is one."""
+        """The wishes that are accepted now; AGAIN among them where a search inside an outline finds nothing."""
         offers = STAGE_OFFERS.get(self.stage, ())
         if self.stage is RunStage.FIND and self.outline:
             return (Wish.AGAIN, *offers)
-        held = [Wish.LIFT] if self._at_home else []
-        held += [] if self.task.looks and not self._at_home else [Wish.LOOK]
+        withheld = [Wish.LIFT] if self._at_home else []
+        withheld += [] if self.task.looks and not self._at_home else [Wish.LOOK]
         if self.stage is RunStage.CONFIRM and self.placement is not None:
-            held += [Wish.CONFIRM] if not self.confirmable else []
-            held += [Wish.MOVE] if not self.placement.usable else []
-            held += [Wish.OUTLINE] if not self._outlined else []
-        return tuple(wish for wish in offers if wish not in held)
+            withheld += [Wish.CONFIRM] if not self.confirmable else []
+            withheld += [Wish.MOVE] if not self.placement.usable else []
+            withheld += [Wish.OUTLINE] if not self._outline_offered else []
+        return tuple(wish for wish in offers if wish not in withheld)
 
     @property
     def confirmable(self) -> bool:
-        """Whether the path may be confirmed as it lies: found for certain, or moved there by somebody."""
-        placement, placed = self.placement, self.placed_path
-        if placement is None or placed is None or placed.unreachable:
+        """Whether the path's placement may be confirmed: it is certain, or the operator moved the path."""
+        placement, placed_path = self.placement, self.placed_path
+        if placement is None or placed_path is None or placed_path.unreachable:
             return False
         return placement.certain or (placement.usable and self.moves > 0)
 
     @property
     def question(self) -> str:
-        """What the operator is asked or told now."""
+        """The question or instruction for the operator now."""
         if self.stage is RunStage.CONFIRM and self.placement is not None and self.placed_path is not None:
             if not self.placement.usable:
                 return "The path cannot be placed here: look again, or finish"
@@ -123,16 +123,16 @@ class RunStateMachine:
 
     def __call__(self, now: float, reports: RunReports, requests: Sequence[OperatorRequest]) -> Orders:
         """The orders that follow from reports and requests at `now`, s."""
-        if isnan(self._since):
-            self._since = now
+        if isnan(self._stage_start):
+            self._stage_start = now
         orders: Orders = []
         tracking = reports.tracking
-        self._outlined = tracking is not None and tracking.outlined and tracking.looks == self.looks
+        self._outline_offered = tracking is not None and tracking.outlined and tracking.looks == self.looks
         for request in requests:
             orders += self._answer(request, tracking, now)
         task = self.task
-        waited = now - self._since if self.stage is RunStage.CHECK else 0.0
-        self.checks = run_checks(reports, task, self.placed_path, now, waited)
+        waiting_time = now - self._stage_start if self.stage is RunStage.CHECK else 0.0
+        self.checks = run_checks(reports, task, self.placed_path, now, waiting_time)
         if not self.ended:
             orders += self._advance(reports, now)
         self.silence = silent_process(reports, self.task.profile.tick, now) if self.stage in ACTIVE_STAGES else ""
@@ -154,13 +154,13 @@ class RunStateMachine:
     # -- requests
 
     def _answer(self, request: OperatorRequest, tracking: TrackingReport | None, now: float) -> Orders:
-        why = refusal(request.wish, request.turn, self.offers, self.turn)
-        if not why and request.wish is Wish.MOVE:
-            why = self._move(request.move, tracking, now)
-        if not why and request.wish is Wish.OUTLINE and not request.outline:
-            why = "another outline came at the same time: send it again"
-        self.answer = RequestAnswer(request.number, request.wish, not why, why)
-        return [] if why else self._follow(request, now)
+        reason = refusal(request.wish, request.turn, self.offers, self.turn)
+        if not reason and request.wish is Wish.MOVE:
+            reason = self._move(request.move, tracking, now)
+        if not reason and request.wish is Wish.OUTLINE and not request.outline:
+            reason = "another outline came at the same time: send it again"
+        self.answer = RequestAnswer(request.number, request.wish, not reason, reason)
+        return [] if reason else self._follow(request, now)
 
     def _follow(self, request: OperatorRequest, now: float) -> Orders:
         wish = request.wish
@@ -187,33 +187,34 @@ class RunStateMachine:
             return [PauseOrder.LOOK]
         elif wish is Wish.LIFT:
             self._enter(RunStage.PAUSED, "lifted by the operator", now)
-            self._ordered, self._armed = now, False
+            self._order_time, self._armed = now, False
             return [PauseOrder.PAUSE, Order.ARM]
         elif wish is Wish.RESUME:
             resting = self.stage is RunStage.STOPPED
-            material: Orders = [PauseOrder.MATERIAL_IN] if self._wanted else []
+            material: Orders = [PauseOrder.MATERIAL_IN] if self._requested_material else []
             self._enter(RunStage.APPROACH, "", now)
-            self._ordered, self._armed, self._at_home = now, not resting, False
+            self._order_time, self._armed, self._at_home = now, not resting, False
             return [*material, PauseOrder.RESUME, *([Order.ARM] if resting else [])]
         return []
 
     def _move(self, move: MoveRequest | None, tracking: TrackingReport | None, now: float) -> str:
-        """Move the path along the surface; why it stays where it is, "" where it was moved."""
-        placement, placed, task = self.placement, self.placed_path, self.task
-        assert placement is not None and placed is not None
-        moved = moved_placement(placement, task.path, tracking, move)
-        if isinstance(moved, str):
-            return moved
+        """Move the path along the surface; the reason why it was not moved, "" where it was."""
+        placement, placed_path, task = self.placement, self.placed_path, self.task
+        assert placement is not None and placed_path is not None
+        new_placement = moved_placement(placement, task.path, tracking, move)
+        if isinstance(new_placement, str):
+            return new_placement
         assert move is not None and tracking is not None and tracking.pose is not None
-        self.moves, self.placement, lies = self.moves + 1, moved, moved.surface_from_path
-        self.placed_path = place_path(task.path, lies, tracking.pose, placed.profile, False, task.outlets)
-        where = f"x {move.x_mm:.2f} mm, y {move.y_mm:.2f} mm, turn {move.turn_deg:.2f} degrees"
+        self.moves, self.placement, surface_from_path = self.moves + 1, new_placement, new_placement.surface_from_path
+        arm, pose = placed_path.profile, tracking.pose
+        self.placed_path = place_path(task.path, surface_from_path, pose, arm, False, task.outlets)
+        move_text = f"x {move.x_mm:.2f} mm, y {move.y_mm:.2f} mm, turn {move.turn_deg:.2f} degrees"
         reach = f"; out of reach: {self.placed_path.unreachable}" if self.placed_path.unreachable else ""
-        self._enter(RunStage.CONFIRM, f"moved by hand, move {self.moves}: {where}{reach}", now)
+        self._enter(RunStage.CONFIRM, f"moved by hand, move {self.moves}: {move_text}{reach}", now)
         return ""
 
     def _home(self, after: RunStage, now: float, reason: str = "") -> Orders:
-        self._after_homing, self._homed, self._ordered = after, False, now
+        self._after_homing, self._homed, self._order_time = after, False, now
         self._enter(RunStage.HOMING, reason, now)
         declared, self._home_declared = self.task.stands_home and not self._home_declared, True
         return [*([Order.AT_HOME] if declared else []), Order.HOME]
@@ -234,7 +235,7 @@ class RunStateMachine:
             return []
         if self.stage in (RunStage.FIND, RunStage.CONFIRM, RunStage.READY):
             return self._await_surface(tracking, now)
-        self._answers |= motion.tick.status.answers > 0
+        self._arm_answered |= motion.tick.status.answers > 0
         if self.stage in ACTIVE_STAGES:
             if orders := self._check_faults(tracking, motion, now):
                 return orders
@@ -247,15 +248,15 @@ class RunStateMachine:
         return []
 
     def _await_checks(self, now: float) -> Orders:
-        waits = [c for c in self.checks if c.name != "reach" and c.verdict in (CheckVerdict.FAIL, CheckVerdict.BUSY)]
-        if not waits:
+        unmet = [c for c in self.checks if c.name != "reach" and c.verdict in (CheckVerdict.FAIL, CheckVerdict.BUSY)]
+        if not unmet:
             self._enter(RunStage.FIND, OUTLINED_TEXT if self.outline else "", now)
             return []
-        fails = [check for check in waits if check.verdict is CheckVerdict.FAIL]
-        self._failing = min(self._failing, now) if fails else inf
-        late = now - self._failing > self.task.patience or now - self._since > SEARCH_TIMEOUT
-        if self.task.unattended and late:
-            check = (fails or waits)[0]
+        failed = [check for check in unmet if check.verdict is CheckVerdict.FAIL]
+        self._failing_since = min(self._failing_since, now) if failed else inf
+        timed_out = now - self._failing_since > self.task.patience or now - self._stage_start > SEARCH_TIMEOUT
+        if self.task.unattended and timed_out:
+            check = (failed or unmet)[0]
             return self.end(f"the check failed: {check.name}: {check.found}", now)
         return []
 
@@ -264,17 +265,17 @@ class RunStateMachine:
         if self.stage is RunStage.FIND:
             placement = tracking.placement if tracking.looks == self.looks else None
             if placement is None or tracking.pose is None or not tracking.pose.state.measured:
-                if task.unattended and now - self._since > SEARCH_TIMEOUT:
-                    why = "no pictures" if tracking.pose is None else tracking.pose.reason
-                    return self.end(f"the surface was not found: {why}", now)
+                if task.unattended and now - self._stage_start > SEARCH_TIMEOUT:
+                    reason = "no pictures" if tracking.pose is None else tracking.pose.reason
+                    return self.end(f"the surface was not found: {reason}", now)
                 return []
             if task.unattended and not placement.certain:
                 return self.end(f"where the path belongs is not certain: {placement.verdict}", now)
-            by = task.profile, task.place, task.outlets
-            placed = place_path(task.path, placement.surface_from_path, tracking.pose, *by)
-            self.placed_path, self.placement = placed, placement
-            if placed.unreachable and (placement.certain or task.unattended):
-                return self.end(f"out of reach: {placed.unreachable}", now) if task.unattended else []
+            pose, surface_from_path = tracking.pose, placement.surface_from_path
+            placed_path = place_path(task.path, surface_from_path, pose, task.profile, task.place, task.outlets)
+            self.placed_path, self.placement = placed_path, placement
+            if placed_path.unreachable and (placement.certain or task.unattended):
+                return self.end(f"out of reach: {placed_path.unreachable}", now) if task.unattended else []
             self._enter(RunStage.CONFIRM, placement.verdict, now)
         if task.unattended and self.placement is not None:
             return self._home(RunStage.APPROACH, now, self.placement.verdict)
@@ -288,23 +289,23 @@ class RunStateMachine:
         if tracking.pose is not None and not tracking.ended and (age := now - tracking.pose.stamp) > self.task.patience:
             return self._stop(f"no pictures for {age:.1f} s", now)
         if status.state is ArmState.ARMED:
-            self._armed |= motion.tick.stamp > self._ordered  # else the report is from before the last order
+            self._armed |= motion.tick.stamp > self._order_time  # else the report is from before the last order
         elif status.state is ArmState.STOPPED and self._armed and self.stage is not RunStage.HOMING:
             self._enter(RunStage.STOPPED, status.reason, now)
         return []
 
     def _await_home(self, tracking: TrackingReport, motion: LiveMotionReport, now: float) -> Orders:
-        """Wait until the arm is home; then begin the path, then arm, or what else homing leads to."""
+        """Wait until the arm is home; then begin the path and arm, or enter another stage that follows homing."""
         status = motion.tick.status
         if status.state is ArmState.ARMED:
             self._homed = True
         elif self._homed and status.state is ArmState.STOPPED:
             return self._stop(status.reason, now)
         if not self._homed or status.state is ArmState.ARMED:
-            if now - self._since > HOMING_TIMEOUT:
+            if now - self._stage_start > HOMING_TIMEOUT:
                 return self.end(f"the arm did not come home: {motion.tick.answer or status.reason}", now)
-            if not self._homed and now - self._ordered > RESEND_AFTER:
-                self._ordered = now
+            if not self._homed and now - self._order_time > RESEND_AFTER:
+                self._order_time = now
                 return [Order.HOME]
             return []
         if self._after_homing is RunStage.DONE:
@@ -313,18 +314,15 @@ class RunStateMachine:
         self._enter(self._after_homing, "at home" if self._at_home else "", now)
         if self._after_homing is RunStage.STOPPED:
             return []
-        self._ordered, self._armed = now, False
+        self._order_time, self._armed = now, False
         return [*self._begin(tracking.interval, motion), PauseOrder.RESUME, Order.ARM]
 
     def _begin(self, interval: float, motion: LiveMotionReport) -> Orders:
-        """The order to print, once. interval: s between two poses, with which the ticks are to be in step.
-
-        The lag is what is known of it by now; the motion process goes on learning it.
-        """
-        if self._begun:
+        """The order to print, once, with the arm's lag as measured so far. interval: s between poses, for the ticks."""
+        if self._print_ordered:
             return []
         assert self.placed_path is not None and self.placement is not None
-        self._begun = True
+        self._print_ordered = True
         task, profile, status = self.task, self.placed_path.profile, motion.tick.status
         path = self.placed_path.path if task.lift is None else raised_path(self.placed_path.path, task.lift)
         profile = replace(in_step(profile, interval), lag=measured_lag(task.profile, status.lag))
@@ -343,21 +341,21 @@ class RunStateMachine:
             return []
         if progress.phase is PrintPhase.FINISHED or tracking.ended:
             return self._home(RunStage.DONE, now)
-        heeded = now - self._ordered > RESEND_AFTER  # the report is no longer from before the last order
-        if progress.wanted and heeded:
+        report_current = now - self._order_time > RESEND_AFTER  # the report is no longer from before the last order
+        if progress.wanted and report_current:
             return self._ask_for(progress.wanted, now)
-        if motion.material is not None and motion.material.failed and heeded:
+        if motion.material is not None and motion.material.failed and report_current:
             return self.pause(motion.material.text, now)
         if self.stage is RunStage.APPROACH and progress.phase is PrintPhase.PRINTING:
             self._enter(RunStage.PRINT, "", now)
         return []
 
     def _await_look(self, tracking: TrackingReport, now: float) -> Orders:
-        """Go on once the look is done for which the nozzle stands aside; resuming in a pause goes on without it."""
-        self._wanted = LOOK if self.stage is RunStage.PAUSED else ""
-        if tracking.looked == self._looked:
+        """Continue once the look is done for which the nozzle waits; resuming in a pause continues without it."""
+        self._requested_material = LOOK if self.stage is RunStage.PAUSED else ""
+        if tracking.looked == self._looks_done:
             return []
-        self._looked = tracking.looked
+        self._looks_done = tracking.looked
         self._enter(self.stage, tracking.look, now)
         return [PauseOrder.MATERIAL_IN]
 
@@ -366,17 +364,17 @@ class RunStateMachine:
         if self.task.unattended:
             return [PauseOrder.MATERIAL_IN]
         orders = self.pause(f"put in the material {material}, then resume", now)
-        self._wanted = material
+        self._requested_material = material
         return orders
 
     def _arm_again(self, motion: LiveMotionReport, now: float) -> Orders:
-        """Order again, for a while, to arm an arm that still moved."""
-        if now - self._since > ARMING_TIMEOUT:
+        """Repeat the order to arm, for ARMING_TIMEOUT, while the arm still moves."""
+        if now - self._stage_start > ARMING_TIMEOUT:
             self._enter(RunStage.STOPPED, motion.tick.answer or motion.tick.status.reason, now)
             return []
-        if now - self._ordered < RESEND_AFTER:
+        if now - self._order_time < RESEND_AFTER:
             return []
-        self._ordered = now
+        self._order_time = now
         return [Order.ARM]
 
     def _stop(self, reason: str, now: float) -> Orders:
@@ -385,16 +383,16 @@ class RunStateMachine:
         return [Order.STOP]
 
     def _check_replugged(self, motion: LiveMotionReport, now: float) -> None:
-        """Tell the operator once an arm that was unplugged is there again, and what to do then."""
+        """Inform the operator when an unplugged arm is back, and say what to do then."""
         status = motion.tick.status
         if self._unplugged and status.state is not ArmState.UNPLUGGED:
             self._unplugged = False
-            self._home_declared = self._answers
-            self._enter(RunStage.STOPPED, ARM_BACK_TEXT if self._answers else ARM_UNPLACED_TEXT, now)
+            self._home_declared = self._arm_answered
+            self._enter(RunStage.STOPPED, ARM_BACK_TEXT if self._arm_answered else ARM_UNPLACED_TEXT, now)
 
     def _enter(self, stage: RunStage, reason: str, now: float) -> None:
         if (stage, reason) != (self.stage, self.reason):
             self.turn += 1
         if stage is not RunStage.PAUSED:
-            self._wanted = ""
-        self.stage, self.reason, self._since = stage, reason, now
+            self._requested_material = ""
+        self.stage, self.reason, self._stage_start = stage, reason, now

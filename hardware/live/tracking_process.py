@@ -126,7 +126,7 @@ class _TrackingLoop:
         self._commanded_head = CommandedHead(channels.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
         self._lane = TraceLane(TRACKING_LANE, self._clock, sender.put) if prepared.settings.trace else None
-        self._late = 0  # as `TrackingStep.late` was
+        self._late = 0  # `TrackingStep.late` at the last set
         self._source: FrameSource
         self._step: TrackingStep | RegionTrackingStep
         self._outline: SurfaceOutline
@@ -157,7 +157,7 @@ class _TrackingLoop:
             channels.link.scan.put(scan_drawing(self._scan))
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
-        self._rois, self._drawn = rois, region.drawn and not rois
+        self._rois, self._region_drawn = rois, region.drawn and not rois
         self._sheet: OutlineSheet | None = None  # of this look, where a network looked
         task = prepared.task
         adapt = channels.shares.put if prepared.settings.adapt else None
@@ -166,45 +166,45 @@ class _TrackingLoop:
         self._look(0)
 
     def _look(self, looks: int) -> None:
-        """Look for the surface, with a tracker that knows nothing of it yet; a run that resumes shows it its map.
+        """Search for the surface with a new tracker; a run that resumes gives it the earlier map.
 
-        What an operator says is the wound is the region, and no skin beside it: of that the operator has said nothing.
+        An outline by the operator is the region, without the skin beside it.
         """
         outlined = self._outlined(looks)
         self._steps.close()
         self._outline = SurfaceOutline(self._rig)
-        placed, placement, settings = None, self._prepared.placement, self._prepared.settings
+        path_placement, placement, settings = None, self._prepared.placement, self._prepared.settings
         # the stamps of earlier pictures are to end a second ago: the clock may have begun anew since
         shift = 0.0 if placement is None else self._clock.now() - placement.until - SETTLING_TIME - 1.0
-        since = [-np.inf if self._earlier is None else roi.stamp + shift for roi in self._rois]
-        timed = outlined or tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, since, strict=True))
+        starts = [-np.inf if self._earlier is None else roi.stamp + shift for roi in self._rois]
+        timed = outlined or tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, starts, strict=True))
         self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
         find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
-        given = self._scan, self._clock.now, self._prepared.task.profile.tool
-        how = tracker(self._rig, timed, *given, model=settings.model, find=find, waits=False)
-        self._step = self._steps.enter_context(how)
+        clock, tool = self._clock.now, self._prepared.task.profile.tool
+        step = tracker(self._rig, timed, self._scan, clock, tool, model=settings.model, find=find, waits=False)
+        self._step = self._steps.enter_context(step)
         if placement is not None and self._earlier is not None:
             new_from_old = restore_map(
                 self._step, placement.map, placement.since, placement.until, self._earlier, shift
             )
-            words = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
-            lies = new_from_old @ placement.surface_from_path
-            placed = PathPlacement(lies, PlacedBy.EARLIER, words, placement.certain, True)
-        report = replace(self.report, placement=placed, registered=np.nan, surface=None, looks=looks, since=np.nan)
-        self.report = replace(report, outlined=False)
+            verdict = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
+            surface_from_path = new_from_old @ placement.surface_from_path
+            path_placement = PathPlacement(surface_from_path, PlacedBy.EARLIER, verdict, placement.certain, True)
+        report = replace(self.report, placement=path_placement, registered=np.nan, surface=None, looks=looks)
+        self.report = replace(report, since=np.nan, outlined=False)
 
     def _outlined(self, looks: int) -> tuple[Roi, ...]:
-        """The outline corrected before this look, if any, where the wound is now; recorded with its pictures."""
+        """The corrected outline for this look, if any, moved with the wound; recorded with its pictures."""
         order, pose, sheet, self._sheet = self._channels.outline.get(), self.report.pose, self._sheet, None
         if order is None or order.looks != looks or not order.polygons or sheet is None:
             return ()
         for picture in sheet.recorded(order.polygons, self._clock.now()):
             self._sender.put(picture)
-        known = pose is not None and pose.state.measured
-        return sheet.rois(order.polygons, pose.base_from_surface if known and pose is not None else None)
+        measured = pose is not None and pose.state.measured
+        return sheet.rois(order.polygons, pose.base_from_surface if measured and pose is not None else None)
 
     def _offer_outline(self, frames: FrameSet, pose: SurfacePose) -> None:
-        """Give the page, once a look, pictures on which the outline of the wound can be corrected, and it so far."""
+        """Give the page, once a look, pictures with the wound's outline, on which the operator can correct it."""
         step, settings = self._step, self._prepared.settings
         if self._sheet is None and settings.page and not settings.unattended:
             sheet, sight = None, step.sight if isinstance(step, RegionTrackingStep) else None
@@ -224,34 +224,34 @@ class _TrackingLoop:
         while not pipe_closed(self._channels.lifeline):
             if (looks := self._channels.looks.value) != self.report.looks:
                 self._look(looks)
-            arrived = self._source.take(FRAME_WAIT)
-            if arrived is None:
+            timed_set = self._source.take(FRAME_WAIT)
+            if timed_set is None:
                 self.report = replace(self.report, stamp=self._clock.now())
                 self._channels.reports.put(self.report)
             else:
-                self._track(arrived)
+                self._track(timed_set)
 
     def close(self) -> None:
         """Hand over the rest of the trace."""
         if self._lane is not None:
             self._lane.close()
 
-    def _track(self, arrived: TimedFrameSet) -> None:
-        frames = self._with_head(arrived.frames)
+    def _track(self, timed_set: TimedFrameSet) -> None:
+        frames = self._with_head(timed_set.frames)
         start = self._clock.now()
         pose = self._step(frames)
         sent = self._clock.now()
-        self._channels.poses.put(PoseHandover(pose, arrived.handed, sent))
+        self._channels.poses.put(PoseHandover(pose, timed_set.handed, sent))
         self._channels.bell.ring()
-        self._count_times(arrived, pose, start, sent)
+        self._count_times(timed_set, pose, start, sent)
         self._offer_outline(frames, pose)
         self._look_at_print(frames, pose)
-        self._register(pose, arrived)
-        self._report(arrived, pose)
+        self._register(pose, timed_set)
+        self._report(timed_set, pose)
         self._show(frames, pose)
         self._record_region(frames.stamp)
-        self._record(arrived, frames, pose)
-        told = self._clock.now()
+        self._record(timed_set, frames, pose)
+        recorded = self._clock.now()
         self._step.idle()
         self._source.learn(self._step.last.offsets)
         ready = self._clock.now()
@@ -260,12 +260,12 @@ class _TrackingLoop:
             self._late = late
             self._sender.put(EventEntry(ready, MAP_LATE, INFO, "tracking"))
         if self._lane is not None:
-            waited, last = (QUEUE_STAGE, arrived.handed, start), ("map and idle work", told, ready)
             stages = in_turn(start, STAGES, self._step.last.seconds)
-            self._lane.add(pose.stamp, [waited, *stages, ("page and record", sent, told), last])
+            after = ("page and record", sent, recorded), ("map and idle work", recorded, ready)
+            self._lane.add(pose.stamp, [(QUEUE_STAGE, timed_set.handed, start), *stages, *after])
 
     def _look_at_print(self, frames: FrameSet, pose: SurfacePose) -> None:
-        """Look at what was laid where the nozzle stands aside for it."""
+        """Look at the print while the nozzle waits aside."""
         if self._looks is None:
             return
         motion, surface_map = self._channels.motion.get(), self._step.map
@@ -277,42 +277,42 @@ class _TrackingLoop:
             self._channels.link.laid.put(LaidDrawing(station_places(look, self._looks.placed, 2), look.laid.share))
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
-        """The set with the print head where the pictures show it, rounded as in a recording: a replay sees the same."""
+        """The set with the print head's pose at its stamp, rounded as in a recording: a replay gets the same."""
         head = self._commanded_head.at(frames.stamp) if self._prepared.live else frames.head
         if head is not None:
             head = head_from_row(row_from_head(frames.stamp, head), head.extruding)
         return replace(frames, head=head)
 
-    def _count_times(self, arrived: TimedFrameSet, pose: SurfacePose, start: float, sent: float) -> None:
-        (times := self.times).add(EXPOSURE_STAGE, arrived.handed - pose.stamp)
-        times.add(QUEUE_STAGE, start - arrived.handed)
+    def _count_times(self, timed_set: TimedFrameSet, pose: SurfacePose, start: float, sent: float) -> None:
+        (times := self.times).add(EXPOSURE_STAGE, timed_set.handed - pose.stamp)
+        times.add(QUEUE_STAGE, start - timed_set.handed)
         for stage, seconds in zip(STAGES, self._step.last.seconds, strict=False):
             times.add(f"tracking: {stage}", float(seconds))
         times.add(TRACKING_STAGE, sent - start)
-        times.add(HANDED_TO_POSE_STAGE, sent - arrived.handed)
+        times.add(HANDED_TO_POSE_STAGE, sent - timed_set.handed)
 
-    def _register(self, pose: SurfacePose, arrived: TimedFrameSet) -> None:
-        """Place the path, once: by the scan, in the true frame of a simulated world, or as the region lies."""
+    def _register(self, pose: SurfacePose, timed_set: TimedFrameSet) -> None:
+        """Place the path, once: by the scan, in the true frame of a simulated world, or by the region."""
         if np.isnan(self.report.since):
-            self.report = replace(self.report, since=arrived.frames.stamp)
+            self.report = replace(self.report, since=timed_set.frames.stamp)
         if self.report.placement is not None or not pose.state.measured:
             return
-        scan, placed = self._step.registration, None
+        scan, path_placement = self._step.registration, None
         if scan is None and pose.state is not TrackState.TRACKING:
             return
         middle, outward = path_middle(self._prepared.task.path), self._outward(pose)
         if scan is not None:
-            placed = placement_by_scan(scan, middle, outward)
+            path_placement = placement_by_scan(scan, middle, outward)
         elif self._prepared.again and self._truth is not None:
-            lies = se3.inverse(pose.base_from_surface) @ self._truth.at(np.array([arrived.source]))[0]
-            placed = PathPlacement(lies, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
+            surface_from_path = se3.inverse(pose.base_from_surface) @ self._truth.at(np.array([timed_set.source]))[0]
+            path_placement = PathPlacement(surface_from_path, PlacedBy.TRUTH, TRUE_PLACE, True, True, 0.0, 0.0, outward)
         elif (surface_map := self._step.map) is not None:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
             with suppress(NoSurfaceError):  # the map grows
                 outlines = self._outline.on_surface
-                placed = placement_by_region(self._prepared.task.path, outlines, surface_map.points, outward)
-        if placed is not None:
-            self.report = replace(self.report, placement=placed, registered=pose.stamp)
+                path_placement = placement_by_region(self._prepared.task.path, outlines, surface_map.points, outward)
+        if path_placement is not None:
+            self.report = replace(self.report, placement=path_placement, registered=pose.stamp)
             settle_memory()  # what was compiled since, as nothing moves yet
 
     def _outward(self, pose: SurfacePose) -> Array:
@@ -323,22 +323,22 @@ class _TrackingLoop:
         direction = se3.transform_points(se3.inverse(pose.base_from_surface), cameras[None])[0] - points.mean(axis=0)
         return np.asarray(direction / np.linalg.norm(direction))
 
-    def _report(self, arrived: TimedFrameSet, pose: SurfacePose) -> None:
+    def _report(self, timed_set: TimedFrameSet, pose: SurfacePose) -> None:
         report = self.report
         self.report = replace(
             report,
             stamp=self._clock.now(),
-            delivering=tuple(frame.camera for frame in arrived.frames.frames),
+            delivering=tuple(frame.camera for frame in timed_set.frames.frames),
             pose=pose,
             sets=report.sets + 1,
-            dropped=report.dropped + arrived.dropped,
-            interval=self._interval(arrived),
+            dropped=report.dropped + timed_set.dropped,
+            interval=self._interval(timed_set),
             unrecorded=self._sender.dropped,
             timings=self.times.timings(),
             used=tuple(int(n) for n in self._step.last.used),
-            truth=None if self._truth is None else self._truth.at(np.array([arrived.source]))[0],
+            truth=None if self._truth is None else self._truth.at(np.array([timed_set.source]))[0],
             surface=self._landmarks(pose),
-            draws=self._drawn and not self._step.roi,
+            draws=self._region_drawn and not self._step.roi,
             outlined=self._sheet is not None,
             looked=0 if self._looks is None else self._looks.count,
             look="" if self._looks is None else self._looks.text,
@@ -351,20 +351,20 @@ class _TrackingLoop:
             return self.report.surface
         if not self._outline.on_surface and pose.state.measured:
             self._outline.place(self._step.roi, surface_map.points, pose.base_from_surface)
-        shown = np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
-        self._sender.put(SurfaceEntry(pose.stamp, shown, tuple(self._outline.on_surface)))
-        return shown
+        landmarks = np.array(surface_map.points[:: max(len(surface_map) // SHOWN_LANDMARKS, 1)])
+        self._sender.put(SurfaceEntry(pose.stamp, landmarks, tuple(self._outline.on_surface)))
+        return landmarks
 
-    def _interval(self, arrived: TimedFrameSet) -> float:
+    def _interval(self, timed_set: TimedFrameSet) -> float:
         """The time between two sets, s, those that were dropped included; NaN before the second."""
-        stamp = arrived.frames.stamp
+        stamp = timed_set.frames.stamp
         if not np.isnan(self._last_stamp):
-            self._intervals.append((stamp - self._last_stamp) / (1 + arrived.dropped))
+            self._intervals.append((stamp - self._last_stamp) / (1 + timed_set.dropped))
         self._last_stamp = stamp
         return own_interval(self._intervals)
 
     def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
-        """Offer the pictures to the page, where anybody has it open."""
+        """Offer the pictures to the page, if it is open in a browser."""
         if not self._channels.link.requests.windows:
             return
         observations, names = self._step.last.observations, self.report.cameras
@@ -377,17 +377,17 @@ class _TrackingLoop:
         self._thumbnailer.offer(frames.stamp, shots, base_from_surface)
 
     def _record_region(self, stamp: float) -> None:
-        """Record a region that was found or drawn, so that a tracker of the recording begins with this set as well."""
+        """Record a region that was found or drawn, so that tracking of the recording also begins with this set."""
         if self._region_recorded or not self._step.roi:
             return
         self._region_recorded = True
         for roi in self._step.roi:
             self._sender.put(region_since(roi, stamp))
 
-    def _record(self, arrived: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
-        unencoded = tuple(frame for frame in frames.frames if frame.camera not in arrived.encoded)
+    def _record(self, timed_set: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
+        unencoded = tuple(frame for frame in frames.frames if frame.camera not in timed_set.encoded)
         self._sender.check()
-        self._sender.put(SetEntry({f.camera: f.stamp for f in frames.frames}, arrived.encoded, unencoded))
+        self._sender.put(SetEntry({f.camera: f.stamp for f in frames.frames}, timed_set.encoded, unencoded))
         self._sender.put(PoseEntry(pose, self._step.last.observations, frames.head, self.report.truth))
         if (now := self._clock.now()) > self._histograms_recorded + HISTOGRAM_PERIOD:
             self._histograms_recorded = now

@@ -44,10 +44,10 @@ class TickMotion(Protocol):
 
 
 class Order(Enum):
-    """What an operator may ask of the motion."""
+    """An operator's order to the motion."""
 
     AT_HOME = "at home"  # the arm stands at home, as the operator sees
-    ARM = "arm"  # let the arm move; it first goes back to where the motion left off, if that is near
+    ARM = "arm"  # enable the arm; it first returns to its last target, if that is near
     HOME = "home"  # arm, go home, disarm
     DISARM = "disarm"
     STOP = "stop"
@@ -59,12 +59,12 @@ GOING_HOME = Reason("the arm goes home", LinkCode.OWN_MOVE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What one tick did."""
+    """The result of one tick."""
 
     stamp: float  # s, for which it was made
     command: Command
     frame: bytes  # sent; b"" where the link held the command back
-    late: float  # s behind its instant
+    late: float  # s behind schedule
     status: ArmStatus
     answer: Reason  # why the last order was not followed
     recalled: RecalledMoves | None = None  # moves that were called back before it
@@ -74,7 +74,7 @@ class Tick:
 class MotionLoop:
     """One motion on one arm.
 
-    lateness: of its ticks. skipped: ticks left out, as their time had passed. begun: s, when the last one was.
+    lateness: of its ticks. skipped: ticks left out, as their time had passed. tick_start: s, start of the last one.
     """
 
     def __init__(
@@ -96,15 +96,15 @@ class MotionLoop:
         """
         self.motion, self.arm = motion, arm
         self.lateness = Histogram()
-        self.skipped, self.begun = 0, math.nan
+        self.skipped, self.tick_start = 0, math.nan
         self._clock, self._pose, self._orders, self._report, self._homed = clock, pose, orders, report, homed
         profile, settings = arm.profile, arm.settings
         self.material = material
         self._hold_time, self._poll_period = profile.limits.pause, settings.poll
         self._schedule = TickSchedule(profile.tick, settings.ease, clock.now()) if schedule is None else schedule
         self._last_pose: SurfacePose | None = None  # of the last tick
-        self._left_off: Array = profile.arm.home  # where the last move that was sent leads
-        self._refused: RecalledMoves | None = None  # where planner and guard have to go back to: a command was not sent
+        self._last_target: Array = profile.arm.home  # of the last move that was sent
+        self._rollback: RecalledMoves | None = None  # state to which planner and guard return: a command was not sent
         self._homing = False
         self._answer = DONE
         self._quit = False
@@ -132,7 +132,7 @@ class MotionLoop:
             shut_down(self.arm, "the motion has ended", self._clock, self._poll_period)
 
     def _poll_material(self, now: float) -> None:
-        """Close what is open where the arm is not armed, and give the dispensers their turn."""
+        """Close the dispensers where the arm is not armed, and poll them."""
         if self.material is not None:
             if self.arm.state is not ArmState.ARMED:
                 self.material.off(now)
@@ -144,7 +144,7 @@ class MotionLoop:
         if self._homing and (self.arm.state is not ArmState.ARMED or self.arm.arrived(now)):
             self._homing = False
             if self.arm.state is ArmState.ARMED:
-                self._left_off = self.arm.profile.arm.home
+                self._last_target = self.arm.profile.arm.home
                 self._homed()
                 self.arm.disarm(now)
 
@@ -160,7 +160,7 @@ class MotionLoop:
         elif order is Order.AT_HOME:
             return arm.stand(arm.profile.arm.home, now)
         elif order is Order.ARM:
-            return arm.arm(now, self._left_off)
+            return arm.arm(now, self._last_target)
         elif order is Order.HOME:
             if reason := arm.arm(now) or arm.home(now):
                 return reason
@@ -168,30 +168,30 @@ class MotionLoop:
         return DONE
 
     def _begins(self, now: float) -> float:
-        """For which instant, s, a tick is made at `now`: before it is due, when its move leaves the arm's queue."""
+        """The instant, s, of a tick made at `now`: when its move leaves the arm's queue, or when due, if sooner."""
         queued = now + self.arm.in_flight(now) - self.arm.profile.frame_time
         return max(now, min(self._schedule.due, queued))
 
     def _tick(self, pose: SurfacePose | None, now: float, instant: float) -> None:
         """Make at `now`, s, the tick for `instant`, s."""
-        late, self.begun = max(now - self._schedule.due, 0.0), now
+        late, self.tick_start = max(now - self._schedule.due, 0.0), now
         self.lateness.add(late)
         frame = b""
-        if recalled := self.arm.take_up() or self._refused:
-            self._refused = None
-            self._left_off = recalled.stands
+        if recalled := self.arm.take_up() or self._rollback:
+            self._rollback = None
+            self._last_target = recalled.stands
             self.motion.recalled(recalled.place, recalled.stands)
         if hold := GOING_HOME if self._homing else self.arm.hold(now):
             command: Command = Hold(instant, self._hold_time, str(hold))
         else:
             command = self.motion(pose, instant)
             if hold := self.arm.send(command, now):
-                self._refused = RecalledMoves(self._left_off, self._left_off)
+                self._rollback = RecalledMoves(self._last_target, self._last_target)
                 command = Hold(instant, self._hold_time, str(hold))
             else:
                 frame = self.arm.command_frame
                 if isinstance(command, Move):
-                    self._left_off = command.axes
+                    self._last_target = command.axes
         if self.material is not None:  # what was not sent is a Hold here
             self.material.follow(command, now)
         self._report(Tick(instant, command, frame, late, self.arm.status(now), self._answer, recalled, hold.code))
@@ -199,11 +199,11 @@ class MotionLoop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedTick:
-    """A tick of a live run's motion as it is recorded for whoever looks at it; `LoopRecord` is for a replay."""
+    """A tick of a live run's motion, recorded for viewers and reports; `LoopRecord` is for a replay."""
 
     stamp: float  # s
-    pose_stamp: float  # s, of the pose they were given; NaN: none
-    asked: bool  # whether planner and guard were called
+    pose_stamp: float  # s, of the newest pose; NaN: none
+    planned: bool  # whether planner and guard were called
     command: Command  # of the loop
     frame: bytes  # of planner's and guard's command
     fraction: float  # place on the path after it, in checkpoints
@@ -215,22 +215,22 @@ MAX_COMMANDS = 256  # commands, five seconds of them: frames are never that late
 
 
 class CommandedPose:
-    """The print head by the last commands, for the tracker; the arm is there a tick and its lag after each was sent."""
+    """The print head's pose from the last commands, for the tracker: each is reached a tick and the arm's lag later."""
 
     def __init__(self, profile: ArmProfile) -> None:
         self._profile = profile
         self._commands: deque[tuple[float, Array, bool]] = deque(maxlen=MAX_COMMANDS)  # when due, axes, extruding
 
     def add(self, command: Command, now: float) -> None:
-        """Enter a command that is sent at `now`, s; a hold leaves the arm where it was."""
-        due = now + self._profile.tick + self._profile.lag
+        """Enter a command that is sent at `now`, s; in a hold the arm stays at its place."""
+        arrival = now + self._profile.tick + self._profile.lag
         if isinstance(command, Move):
-            self._commands.append((due, command.axes, command.extrude))
+            self._commands.append((arrival, command.axes, command.extrude))
         elif self._commands:
-            self._commands.append((due, self._commands[-1][1], False))
+            self._commands.append((arrival, self._commands[-1][1], False))
 
     def at(self, stamp: float) -> PrintHead | None:
-        """The print head at `stamp`, s; None before the first move, when nobody knows where the arm is."""
+        """The print head at `stamp`, s; None before the first move, as the arm's place is unknown."""
         if not self._commands or stamp < self._commands[0][0]:
             return None
         place = min(bisect_left(self._commands, stamp, key=lambda command: command[0]), len(self._commands) - 1)
@@ -240,27 +240,27 @@ class CommandedPose:
         return PrintHead(np.asarray(nozzle_from_axes(self._profile.arm, axes)), extrude and stamp <= end)
 
 
-FLOW_STEP = 0.05  # share by which a metered flow changes before it is told anew: a line carries few words a tick
-REPEAT_OFF = 0.25  # s between further offs while nothing is to flow: one that was lost on the line is made good
+FLOW_STEP = 0.05  # relative change of a metered flow before it is sent again: a line carries few messages a tick
+REPEAT_OFF = 0.25  # s between repeated offs while nothing is to flow: one may have been lost on the line
 
 
 @dataclass(frozen=True, slots=True)
 class DispenserRecord:
-    """What a dispenser did, as it is recorded."""
+    """An action of a dispenser, as it is recorded."""
 
-    stamp: float  # s, when its line had taken it
+    stamp: float  # s, when its line had accepted it
     name: str
     text: str
-    flow: float | None  # mm^3/s told from then on; None: as before
+    flow: float | None  # mm^3/s commanded from then on; None: unchanged
 
 
 @dataclass(frozen=True, slots=True)
 class MaterialStatus:
-    """Whether material can flow, and what was told."""
+    """Whether material can flow, and the commanded flow."""
 
     text: str  # for a person
     ready: bool
-    failed: bool  # and an operator has to see to it
+    failed: bool  # and needs the operator
 
 
 class MaterialControl:
@@ -271,13 +271,13 @@ class MaterialControl:
         self._materials = tuple(map(str, path.material.tolist()))
         self._temperatures = tuple(map(float, path.temperature.tolist()))
         self._extrude = tuple(map(bool, path.extrude.tolist()))
-        self._current: Dispenser | None = None  # that carries what is printed now
-        self._told = 0.0  # mm^3/s
-        self._pending: tuple[float, float] | None = None  # s, when a flow is told, and the flow
-        self._closed_at = -math.inf  # s, when the last off was sent
-        self._refused = ""
-        self._material = ""  # that is printed now, or comes next
-        self._celsius: float | None = None  # degrees C that were asked for; None: the dispenser sets none
+        self._current: Dispenser | None = None  # of the material that is printed now
+        self._flow = 0.0  # mm^3/s, commanded
+        self._pending: tuple[float, float] | None = None  # s, when a flow is to be commanded, and the flow
+        self._last_off = -math.inf  # s, when the last off was sent
+        self._refusal = ""
+        self._material = ""  # that is printed now or next
+        self._celsius: float | None = None  # degrees C, set-point; None: the dispenser has no heater
 
     @property
     def reason(self) -> str:
@@ -287,7 +287,7 @@ class MaterialControl:
             return ""
         status = current.status
         if status.state in (DispenserState.READY, DispenserState.ON):
-            return self._refused
+            return self._refusal
         return f"dispenser {current.profile.name} is {status.state.value}: {status.reason}"
 
     @property
@@ -296,74 +296,74 @@ class MaterialControl:
         current, reason = self._current, self.reason
         if current is None:
             return MaterialStatus("no material is needed", True, False)
-        failed = bool(self._refused) or current.status.state in (DispenserState.FAILED, DispenserState.CLOSED)
-        flow = f"{self._told:.3g} mm^3/s" if current.profile.metered else "on"
-        text = f"{self._material} by {current.profile.name}: {flow if self._told else 'off'}"
+        failed = bool(self._refusal) or current.status.state in (DispenserState.FAILED, DispenserState.CLOSED)
+        flow = f"{self._flow:.3g} mm^3/s" if current.profile.metered else "on"
+        text = f"{self._material} by {current.profile.name}: {flow if self._flow else 'off'}"
         return MaterialStatus(reason or text, not reason, failed)
 
     @property
     def due(self) -> float:
-        """When a switch is due that was asked for, s; infinite without one."""
+        """When the pending switch is due, s; infinite without one."""
         return math.inf if self._pending is None else self._pending[0]
 
     def begin(self, place: float, now: float) -> None:
-        """Make the dispenser ready whose material comes next at `place`, in checkpoints, and close the others."""
-        ahead = next((i for i in range(math.floor(place) + 1, len(self._extrude)) if self._extrude[i]), None)
-        if ahead is None:
+        """Prepare the dispenser of the next material after `place`, in checkpoints, and close the others."""
+        next_extruding = next((i for i in range(math.floor(place) + 1, len(self._extrude)) if self._extrude[i]), None)
+        if next_extruding is None:
             return
-        self._refused, self._material = "", self._materials[ahead]
-        wanted = self._dispensers.for_material(self._material)
-        if self._current is not wanted:
+        self._refusal, self._material = "", self._materials[next_extruding]
+        dispenser = self._dispensers.for_material(self._material)
+        if self._current is not dispenser:
             self.off(now)
-        self._current = wanted
-        if wanted is not None:
-            sets = wanted.profile.temperature_range is not None
-            self._celsius = self._temperatures[ahead] if sets else None
-            wanted.prepare(now, self._celsius)
+        self._current = dispenser
+        if dispenser is not None:
+            heated = dispenser.profile.temperature_range is not None
+            self._celsius = self._temperatures[next_extruding] if heated else None
+            dispenser.prepare(now, self._celsius)
 
     def follow(self, command: Command, now: float) -> None:
-        """Do what a command that the arm was sent asks for; a hold closes."""
+        """Apply the flow of a command that was sent to the arm; a hold closes."""
         if not isinstance(command, Move):
             self.off(now)
             return
         if command.extrude:
             self._heat(self._temperatures[command.checkpoint], now)
         at = command.stamp + command.flow_after
-        self._pending = (at, command.flow) if command.flow or self._told else None
+        self._pending = (at, command.flow) if command.flow or self._flow else None
         self._switch(now)
 
     def poll(self, now: float) -> None:
         """Switch what is due, repeat offs, and poll the dispensers."""
         self._switch(now)
-        if not self._told and now > self._closed_at + REPEAT_OFF and self._current is not None:
+        if not self._flow and now > self._last_off + REPEAT_OFF and self._current is not None:
             self._close(now)
         self._dispensers.poll(now)
-        if self._told and self._current is not None and self._current.status.state is not DispenserState.ON:
-            self._close(now)  # its line was lost: it is told anew once it is ready
+        if self._flow and self._current is not None and self._current.status.state is not DispenserState.ON:
+            self._close(now)  # its line was lost: the flow is commanded again once it is ready
 
     def off(self, now: float) -> None:
         """Close at once; what was pending is dropped."""
         self._pending = None
-        if self._told:
+        if self._flow:
             self._close(now)
 
     def records(self) -> list[DispenserRecord]:
-        """What each did since the last call."""
+        """The actions of all dispensers since the last call."""
         events = ((each.profile.name, event) for each in self._dispensers for event in each.events())
         return [DispenserRecord(event.stamp, name, event.text, event.flow) for name, event in events]
 
     def close(self, clock: Clock) -> list[str]:
-        """Close all and let their lines go; of each that could not be switched off, why."""
+        """Close all and release their lines; the reason of each that could not be switched off."""
         self.off(clock.now())
         return close_dispensers(self._dispensers, clock)
 
     def _heat(self, celsius: float, now: float) -> None:
-        """Have the dispenser go to another temperature, if the path asks for one that it was not told."""
+        """Set the dispenser's temperature, if the path needs another one."""
         if self._current is None or self._celsius is None or celsius == self._celsius:
             return
         self.off(now)
         self._celsius = celsius
-        self._refused = self._current.set_temperature(celsius, now)
+        self._refusal = self._current.set_temperature(celsius, now)
 
     def _switch(self, now: float) -> None:
         if self._pending is None or now < self._pending[0]:
@@ -374,16 +374,16 @@ class MaterialControl:
             self.off(now)
             return
         low, high = current.profile.flow_range
-        flow = min(max(flow, low), high)  # the path keeps its range; where the nozzle is slower than that, it does not
-        same = self._told and (not current.profile.metered or abs(flow - self._told) <= FLOW_STEP * self._told)
-        if same:
+        flow = min(max(flow, low), high)  # the path's flow is within its range, except where the nozzle is slowed down
+        unchanged = self._flow and (not current.profile.metered or abs(flow - self._flow) <= FLOW_STEP * self._flow)
+        if unchanged:
             return
-        if refused := current.on(flow, now):
-            self._refused = refused
+        if refusal := current.on(flow, now):
+            self._refusal = refusal
             self._close(now)
         else:
-            self._told = flow
+            self._flow = flow
 
     def _close(self, now: float) -> None:
-        self._told, self._closed_at = 0.0, now
+        self._flow, self._last_off = 0.0, now
         self._dispensers.off(now)

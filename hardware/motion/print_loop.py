@@ -1,4 +1,4 @@
-"""The loop of a print: ticks, motion and the arm's link, and the one seam through which all that they are given comes.
+"""The loop of a print: ticks, motion and the arm's link, with one interface, `LoopSource`, for all of its inputs.
 
 A live run, a simulation and a replay have the same loop; they differ by their `LoopSource`.
 """
@@ -24,7 +24,7 @@ LoopOrder = Order | PauseOrder | BeginPrint | FlowShares
 
 
 class LoopSource(Protocol):
-    """All that a print's loop cannot compute."""
+    """The inputs of a print's loop."""
 
     driver: ArmDriver
     material: MaterialControl | None
@@ -56,14 +56,14 @@ class LoopSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """What a loop is begun with beside its arm."""
+    """Settings of a loop."""
 
     link: LinkSettings = DEFAULT_SETTINGS
     until: float | None = None  # s, when it ends by itself; None: an order ends it
 
 
 class PrintLoop:
-    """The loop of a print on one arm, of whatever source. loop, motion, arm: its parts."""
+    """The loop of a print on one arm, with any source. loop, motion, arm: its parts."""
 
     def __init__(
         self,
@@ -78,14 +78,14 @@ class PrintLoop:
 
         InputError where another program has the arm.
         """
-        begun, self._source, self._settings, self._told = source.now(), source, settings, report
+        start, self._source, self._settings, self._report_tick = source.now(), source, settings, report
         self._handover: PoseHandover | None = None
-        self.arm = Arm(source.driver, profile, begun, settings.link)
-        self.ticks = PoseLockedSchedule(profile.tick, settings.link.ease, begun)
-        held, place = source.material, c_double() if place is None else place
-        self.motion = PrintMotion(profile, clock, place, held, lambda: self.arm.lag, source.dry)
-        how = self._pose, self._orders, self._report, self.motion.homed, self.ticks, held
-        self.loop = MotionLoop(self.motion, self.arm, source, *how)
+        self.arm = Arm(source.driver, profile, start, settings.link)
+        self.ticks = PoseLockedSchedule(profile.tick, settings.link.ease, start)
+        material, place = source.material, c_double() if place is None else place
+        self.motion = PrintMotion(profile, clock, place, material, lambda: self.arm.lag, source.dry)
+        inputs, homed = (self._pose, self._orders), self.motion.homed
+        self.loop = MotionLoop(self.motion, self.arm, source, *inputs, self._report, homed, self.ticks, material)
 
     def run(self) -> None:
         """Run until an order or the settings end it."""
@@ -96,7 +96,7 @@ class PrintLoop:
             self._source.flush()
 
     def _report(self, tick: Tick) -> None:
-        self._told(tick)
+        self._report_tick(tick)
         self._source.flush()
 
     def _pose(self) -> SurfacePose | None:
@@ -108,7 +108,7 @@ class PrintLoop:
         return None if handover is None else handover.pose
 
     def _orders(self) -> list[Order]:
-        """Follow the orders that the motion follows; those of the arm are returned."""
+        """Follow the orders for the motion; those for the arm are returned."""
         orders: list[Order] = []
         for order in self._source.orders():
             if isinstance(order, Order):

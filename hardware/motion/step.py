@@ -42,16 +42,16 @@ class MotionStep:
     ) -> None:
         """start: place on the path where printing begins, in checkpoints. outlets: of the path's materials.
 
-        tissue: that the tool is kept out of, where a scan tells of it.
+        tissue: that the tool has to avoid, as scanned; None without a scan.
         """
-        from planning.motion.planner import Planner  # half a second, spent by who plans alone
+        from planning.motion.planner import Planner  # takes half a second: only loaded by processes that plan
 
         self.profile = ArmProfile() if profile is None else profile
-        settings = self.profile.limits, self.profile.arm, self.profile.tick
+        limits = self.profile.limits, self.profile.arm, self.profile.tick
         lag = self.profile.lag
         path = with_offsets(path, outlets or {})
-        self._planner = Planner(path, *settings, lag, start, outlets)
-        self._guard = Guard(*settings, path.zone, lag, tissue)
+        self._planner = Planner(path, *limits, lag, start, outlets)
+        self._guard = Guard(*limits, path.zone, lag, tissue)
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s, as the guard lets it pass. pose: the newest there is."""
@@ -62,21 +62,21 @@ class MotionStep:
         return command
 
     def recalled(self, place: Array, stands: Array) -> None:
-        """Go on from `stands` (6,), where the arm stands after a stop at `place` (6,) on its way."""
+        """Go on from `stands` (6,), the arm's axes after a stop at `place` (6,) on its way."""
         self._planner.recalled(place, stands)
         self._guard.stands(stands)
 
     def material_in(self) -> None:
-        """Note that the material that `progress.wanted` asks for is in."""
+        """Note that the material requested in `progress.wanted` is in."""
         self._planner.material_in()
 
     def adapt(self, shares: FlowShares) -> None:
-        """Let other flows leave on some ways of the path."""
+        """Change the flow on some segments of the path."""
         self._planner.flow.adapt(shares)
 
     @property
     def lag(self) -> float:
-        """Seconds from one tick after a command was sent until the arm is at its axes: by default the profile's."""
+        """The arm's lag, s, from a tick after sending until it is at a command's axes; by default the profile's."""
         return self._planner.lag
 
     @lag.setter
@@ -85,7 +85,7 @@ class MotionStep:
 
     @property
     def paused(self) -> bool:
-        """Whether the nozzle is to retract from the surface and wait there; it then goes on where it left off."""
+        """Whether the nozzle is to retract from the surface and wait; it then resumes at the same place."""
         return self._planner.paused
 
     @paused.setter
@@ -94,7 +94,7 @@ class MotionStep:
 
     @property
     def aside(self) -> bool:
-        """Whether in a pause the nozzle is to stand beside all that is printed, so that cameras see it."""
+        """Whether in a pause the nozzle is to wait beside the print, so that cameras see the print."""
         return self._planner.aside
 
     @aside.setter
@@ -107,40 +107,40 @@ class MotionStep:
         return self._planner.progress
 
 
-CLAIMED_SHARE = 0.95  # of cases that a predicted error holds
+CLAIMED_SHARE = 0.95  # of cases in which the error is within the predicted one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedError:
-    """How far the nozzle will be from its place on the path once it has followed a move, as it is known before."""
+    """The predicted distance of the nozzle from its place on the path at the end of a move."""
 
-    due: float  # s, when that is
-    tip: Array  # (3,) mm, where the tip is led on the surface
-    sigma: float  # mm, standard deviation of the place under it along its worst direction, as the guard limits it
-    radii: Array  # mm, distances that hold the shares of `ERROR_SHARES`
-    within: float  # mm, distance that holds CLAIMED_SHARE
+    arrival: float  # s, of the end of the move
+    tip: Array  # (3,) mm, commanded tip, surface frame
+    sigma: float  # mm, standard deviation of the surface point under it along its worst direction; the guard limits it
+    radii: Array  # mm, quantiles of the distance at `ERROR_SHARES`
+    within: float  # mm, quantile at CLAIMED_SHARE
 
 
 ERROR_SHARES = (np.arange(10) + 0.5) / 10  # tenths of the cases, each by its middle
 
 
 def predicted_error(
-    move: Move, due: float, pose: SurfacePose, profile: ArmProfile, path: Path, fraction: float
+    move: Move, arrival: float, pose: SurfacePose, profile: ArmProfile, path: Path, fraction: float
 ) -> PredictedError:
-    """The error of `move`, made of `pose`, at `due`, s: a tick and the arm's lag after it was sent.
+    """The error of `move`, computed from `pose`, at `arrival`, s: a tick and the arm's lag after it was sent.
 
-    It is uncertain as the pose is until then, and known as far as the move itself misses the place at `fraction` of
-    `path`, in checkpoints: its jerk is limited, and it was made of an older prediction. What the arm itself misses
-    beside its lag is not in it.
+    Its random part is the pose's uncertainty at `arrival`; its known part is the move's offset from the place at
+    `fraction` of `path`, in checkpoints: the move's jerk is limited, and its prediction was older. The arm's own
+    error beside its lag is not in it.
     """
-    then = pose.predict(max(due, pose.stamp), onwards=False)
-    tip = (se3.inverse(then.base_from_surface) @ nozzle_from_axes(profile.arm, move.axes))[:3, 3]
-    before = min(int(fraction), len(path) - 2)
-    near, far = path.surface_from_nozzle[before : before + 2, :3, 3]
-    offset = (tip - near - (fraction - before) * (far - near))[None]
-    sigma, place = float(then.error_at(tip[None])[0]), tip[None]
-    radii = then.radius_at(place, np.append(ERROR_SHARES, CLAIMED_SHARE), offset)
-    return PredictedError(due, tip, sigma, radii[:-1], float(radii[-1]))
+    pose_then = pose.predict(max(arrival, pose.stamp), onwards=False)
+    tip = (se3.inverse(pose_then.base_from_surface) @ nozzle_from_axes(profile.arm, move.axes))[:3, 3]
+    previous = min(int(fraction), len(path) - 2)
+    start_point, end_point = path.surface_from_nozzle[previous : previous + 2, :3, 3]
+    offset = (tip - start_point - (fraction - previous) * (end_point - start_point))[None]
+    sigma, place = float(pose_then.error_at(tip[None])[0]), tip[None]
+    radii = pose_then.radius_at(place, np.append(ERROR_SHARES, CLAIMED_SHARE), offset)
+    return PredictedError(arrival, tip, sigma, radii[:-1], float(radii[-1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,25 +157,25 @@ class BeginPrint:
     """The order to print."""
 
     path: Path  # in the tracker's surface frame
-    profile: ArmProfile  # with the arm's place and lag as they are now known
+    profile: ArmProfile  # with the current estimates of the arm's place and lag
     start: float  # place on the path, counted in checkpoints
     outlets: Outlets  # of its materials
     fingerprint: str  # of the path as its file has it
-    tissue: TissueGuard | None = None  # that the tool is kept out of, in the same frame
+    tissue: TissueGuard | None = None  # that the tool has to avoid, in the same frame
 
 
 class PauseOrder(Enum):
-    """Orders of a live run beside those that the arm follows."""
+    """Orders of a live run to its motion; `Order` has those for the arm."""
 
     PAUSE = "pause"
     RESUME = "resume"
-    MATERIAL_IN = "material in"  # what the motion asked for was put in, or the look that it stands aside for is done
-    LOOK = "look"  # step aside in a pause, for a look at what was laid
+    MATERIAL_IN = "material in"  # the material that the motion requested is in, or the look that it waits for is done
+    LOOK = "look"  # step aside in a pause, for a look at the print
 
 
 PAUSED_REASON = "paused by the operator"
 WAITING_REASON = "no path was confirmed yet"
-LAG_STEP = 0.004  # s that the measured lag is off the one in use before that follows: 0.04 mm at 10 mm/s
+LAG_STEP = 0.004  # s, difference of the measured lag from the one in use from which it is adopted: 0.04 mm at 10 mm/s
 
 
 class PrintMotion:
@@ -184,8 +184,8 @@ class PrintMotion:
     Where material cannot flow, the nozzle waits above the surface as in a pause.
 
     last: the last command.
-    asked: whether planner and guard made it.
-    aside: whether they are told to wait beside all that is printed, for a look.
+    planned: whether planner and guard made it.
+    aside: whether the nozzle is to wait beside the print, for a look.
     """
 
     last: Command
@@ -196,22 +196,22 @@ class PrintMotion:
         clock: Clock,
         place: c_double,
         material: MaterialControl | None = None,
-        measured: Callable[[], float] = lambda: math.nan,
-        dry: Callable[[], str] = str,
+        lag_source: Callable[[], float] = lambda: math.nan,
+        dry_reason: Callable[[], str] = str,
     ) -> None:
         """clock: of the dispensers. place: kept up to date, in checkpoints.
 
-        measured: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
-        dry: says why material cannot flow now, "" where it can.
+        lag_source: gives the arm's lag from set-point to answer, s, NaN while unknown; it is followed in steps.
+        dry_reason: gives why material cannot flow now, "" where it can.
         """
         self._profile, self._clock, self._place = profile, clock, place
-        self._material, self._measured, self._dry = material, measured, dry
+        self._material, self._lag_source, self._dry_reason = material, lag_source, dry_reason
         self.last = Hold(clock.now(), profile.limits.pause, WAITING_REASON)
         self.aside = False
         self._shares: list[FlowShares] = []
         self._step: MotionStep | None = None
         self._begin: Callable[[float], MotionStep] | None = None  # the step at a place on the path
-        self.paused = self.asked = False
+        self.paused = self.planned = False
 
     def begin(
         self, path: Path, profile: ArmProfile, start: float, outlets: Outlets, tissue: TissueGuard | None = None
@@ -219,10 +219,10 @@ class PrintMotion:
         """Print this path, surface frame, from now on. start: place on it, in checkpoints. tissue: see `MotionStep`."""
         self._shares = []
         self._begin = lambda place: MotionStep(path, profile, place, outlets, tissue)
-        self._make(start)
+        self._start_step(start)
 
     def follow(self, order: PauseOrder | BeginPrint | FlowShares) -> None:
-        """Follow an order that the arm has no part in."""
+        """Follow an order for the motion."""
         if isinstance(order, BeginPrint):
             self.begin(order.path, order.profile, order.start, order.outlets, order.tissue)
         elif isinstance(order, FlowShares):
@@ -237,27 +237,27 @@ class PrintMotion:
             self.put_in()
 
     def homed(self) -> None:
-        """Begin anew at the same place of the path, as the arm stands at home."""
+        """Begin again at the same place of the path: the arm is at home."""
         if self._step is not None:
-            self._make(self._step.progress.fraction)
+            self._start_step(self._step.progress.fraction)
 
     def resume(self) -> None:
-        """Go on after a pause, with the dispenser made ready again."""
+        """Go on after a pause, with the dispenser prepared again."""
         self.paused = self.aside = False
         self._prepare_material()
 
     def look(self) -> None:
-        """Step aside in a pause, until what was laid has been looked at, which `put_in` says."""
+        """Step aside in a pause for a look at the print, until `put_in` is called."""
         self.aside = self.paused
 
     def adapt(self, shares: FlowShares) -> None:
-        """Let other flows leave on some stretches, also where the path is begun anew at home."""
+        """Change the flow on some segments, also if the path is begun again at home."""
         if self._step is not None:
             self._shares.append(shares)
             self._step.adapt(shares)
 
     def put_in(self) -> None:
-        """The operator has put in the material that was wanted, or the look is done."""
+        """The operator has put in the requested material, or the look is done."""
         if self.aside:
             self.aside = False
         elif self._step is not None and self._step.progress.wanted:
@@ -271,7 +271,7 @@ class PrintMotion:
 
     @property
     def arm_lag(self) -> float:
-        """The arm's lag that is reckoned with, s; NaN before a path was begun."""
+        """The arm's lag in use, s; NaN before a path was begun."""
         return math.nan if self._step is None else self._step.lag
 
     @property
@@ -281,24 +281,24 @@ class PrintMotion:
 
     def __call__(self, pose: SurfacePose | None, now: float) -> Command:
         """The command of the tick at `now`, s."""
-        self.asked = self._step is not None
+        self.planned = self._step is not None
         if self._step is None:
             self.last = Hold(now, self._profile.limits.pause, WAITING_REASON)
             return self.last
-        dry = self._dry()
-        self._step.paused = waits = self.paused or bool(dry)
+        dry_reason = self._dry_reason()
+        self._step.paused = waiting = self.paused or bool(dry_reason)
         self._step.aside = self.aside
-        measured = self._measured()
+        measured = self._lag_source()
         lag = self._step.lag if math.isnan(measured) else measured_lag(self._profile, measured)
         if abs(lag - self._step.lag) > LAG_STEP:
             self._step.lag = lag
         self.last = self._step(pose, now)
-        if waits and isinstance(self.last, Hold) and self.last.reason != LOOKS:
-            self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry)
+        if waiting and isinstance(self.last, Hold) and self.last.reason != LOOKS:
+            self.last = replace(self.last, reason=PAUSED_REASON if self.paused else dry_reason)
         self._place.value = self._step.progress.fraction
         return self.last
 
-    def _make(self, start: float) -> None:
+    def _start_step(self, start: float) -> None:
         assert self._begin is not None
         self._step = self._begin(start)
         for shares in self._shares:

@@ -249,7 +249,7 @@ def message_from_tick(tick: RecordedTick) -> Message:
     return {
         "stamp": tick.stamp,
         "pose_stamp": _flat(np.array([tick.pose_stamp])),
-        "asked": tick.asked,
+        "asked": tick.planned,
         "recalled": [] if tick.recalled is None else tick.recalled.ravel().tolist(),
         "fraction": tick.fraction,
         "phase": tick.phase.value,
