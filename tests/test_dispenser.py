@@ -293,7 +293,7 @@ def test_no_answer_is_too_bad(answers: list[bytes]) -> None:
         bench.port.extra = answer
         bench.run(POLL)
         assert bench.driver.status.temperature is None or math.isfinite(bench.driver.status.temperature)
-        assert len(bench.driver._rest) <= 256
+        assert len(bench.driver._partial) <= 256
     bench.off()
     assert not bench.open
 

@@ -133,8 +133,8 @@ class StopRetry:
 
     def pending(self, feedback: ArmFeedback, now: float) -> bool:
         """Whether the arm may not have read it: it is too soon to say, the arm moves, or blind retries are left."""
-        soon, blind = now - self._sent < RESEND_AFTER, feedback.axes(now) is None and self._blind > 0
-        return self.active and (soon or blind or not feedback.still(now))
+        too_soon, blind = now - self._sent < RESEND_AFTER, feedback.axes(now) is None and self._blind > 0
+        return self.active and (too_soon or blind or not feedback.still(now))
 
     def due(self, feedback: ArmFeedback, now: float) -> bool:
         """Whether to send it again: RESEND_AFTER later the arm still moves by its answers, or gives none."""
@@ -185,8 +185,8 @@ class ArmDevice:
 
     def reckoned(self, instant: float) -> Array | None:
         """Axes (6,) at `instant`, s, by dead reckoning, the servo's lag included; None where nobody knows."""
-        late = self.profile.lag - self.profile.frame_time
-        return None if self._queue is None else np.array(self._queue.at(instant - max(late, 0.0)))
+        servo_lag = self.profile.lag - self.profile.frame_time
+        return None if self._queue is None else np.array(self._queue.at(instant - max(servo_lag, 0.0)))
 
     def ways(self, since: float) -> list[QueuedCommand]:
         """The ways of the set-point that end after `since`, s, as far as they are known."""
@@ -259,15 +259,15 @@ class ArmDevice:
 
     def _book(self, sent: Sequence[Sent], now: float) -> None:
         """Enter what the arm will do because of what has gone out."""
-        for each in sent:
-            self.frames += each.instruction is not None
-            if isinstance(each.instruction, G1 | G4):
+        for part in sent:
+            self.frames += part.instruction is not None
+            if isinstance(part.instruction, G1 | G4):
                 assert self._queue is not None
-                self._queue.add(each.instruction, now, each.share)
+                self._queue.add(part.instruction, now, part.share)
             elif self._queue is not None:
-                self._queue.occupy(now, each.share)
-            if isinstance(each.instruction, Pause):
-                on_wire = now + each.share * self.profile.frame_time
+                self._queue.occupy(now, part.share)
+            if isinstance(part.instruction, Pause):
+                on_wire = now + part.share * self.profile.frame_time
                 if self._queue is not None:
                     self._queue.stop()
                     on_wire = self._queue.wire_free
@@ -276,10 +276,10 @@ class ArmDevice:
     def _adopt_answers(self, now: float) -> None:
         """Take it that the arm stands where its answers say, unless their rounding allows what was known before."""
         known = self.target
-        stands = self._feedback.stands(known, now)
-        if stands is not None and (known is None or (stands != known).any()):
-            self._queue = ArmQueue(stands.tolist(), self.profile.frame_time, now)
-            self._note(f"stands at {axes_text(stands)} by its own answer", now)
+        rest_axes = self._feedback.stands(known, now)
+        if rest_axes is not None and (known is None or (rest_axes != known).any()):
+            self._queue = ArmQueue(rest_axes.tolist(), self.profile.frame_time, now)
+            self._note(f"stands at {axes_text(rest_axes)} by its own answer", now)
 
     def _change(self, state: ArmState, reason: str, now: float) -> None:
         if (state, reason) != (self.state, self.reason):

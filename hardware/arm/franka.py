@@ -62,12 +62,12 @@ ENABLE, STOP = "enable", "stop"  # orders without numbers
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrankaState:
-    """What the robot's process says."""
+    """A report of the robot's process."""
 
     stamp: float  # s, our clock
     axes: Array | None = None  # (6,) mm and rad, of the nozzle; None before the first state
     fault: str = ""  # why the robot has stopped by itself
-    gone: str = ""  # why there is no connection any more
+    gone: str = ""  # why the connection has ended
 
 
 class Franka(ArmDriver):
@@ -81,7 +81,7 @@ class Franka(ArmDriver):
         self._host, self._profile, self._listener = host, profile, listener
         self._process: Any = None
         self._former: tuple[Any, float] | None = None  # the process before, and when it was closed, s
-        self._last: FrankaState | None = None
+        self._last_state: FrankaState | None = None
         self._patience = FIRST_CONNECT_TIME
 
     def connect(self, now: float) -> None:
@@ -94,45 +94,45 @@ class Franka(ArmDriver):
             self._process = SPAWN.Process(target=serve, args=(self._host, self._profile, theirs, self._states))
             self._process.start()
             theirs.close()
-        clock, self._last = WallClock(), None
-        until, self._patience = clock.now() + self._patience, 0.0
-        while (state := self._states.get()) is None and self._process.is_alive() and clock.now() < until:
+        clock, self._last_state = WallClock(), None
+        deadline, self._patience = clock.now() + self._patience, 0.0
+        while (state := self._states.get()) is None and self._process.is_alive() and clock.now() < deadline:
             clock.wait_until(clock.now() + CONTROL_PERIOD)
         if state is None and self._process.is_alive():
             raise UnpluggedError(f"{SCHEME}{self._host} is being connected to")
         if state is None or state.gone:
-            why = "its process ended" if state is None else state.gone
+            reason = "its process ended" if state is None else state.gone
             self.close()
-            raise UnpluggedError(f"{SCHEME}{self._host}: {why}")
+            raise UnpluggedError(f"{SCHEME}{self._host}: {reason}")
 
     def state(self, now: float) -> Reported:
         """The newest place."""
         state = self._states.get()
         if state is None or state.gone or not self._process.is_alive():
             raise UnpluggedError(f"{SCHEME}{self._host}: {state.gone if state and state.gone else 'its process ended'}")
-        if state is self._last or state.axes is None:
+        if state is self._last_state or state.axes is None:
             return Reported(now, (), b"", state.fault)
-        self._last = state
+        self._last_state = state
         places = Reply(ReplyKind.PLACE, state.axes[:3]), Reply(ReplyKind.TOOL, state.axes[3:])
         return Reported(state.stamp, places, b"", state.fault)
 
     def send(self, instruction: G1 | G4, now: float) -> Sequence[Sent]:
         """Hand it to the process."""
-        self._hand((instruction, now))
+        self._send_order((instruction, now))
         if self._listener is not None:
             self._listener(encode(instruction, self._profile.dialect), True)
         return (Sent(instruction),)
 
     def stop(self, now: float) -> Sequence[Sent]:
         """Have the robot brake as fast as libfranka lets it."""
-        self._hand((STOP, now))
+        self._send_order((STOP, now))
         if self._listener is not None:
             self._listener(encode(Pause(), self._profile.dialect), True)
         return (Sent(Pause()),)
 
     def enable(self, now: float) -> str:
         """Have the robot recover from a reflex; whether it does, its next states say."""
-        self._hand((ENABLE, now))
+        self._send_order((ENABLE, now))
         return ""
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ class Franka(ArmDriver):
                 self._reap(math.inf)
 
     def _reap(self, now: float) -> None:
-        """Do away with the process that was closed, in a while; UnpluggedError until then."""
+        """End the former process once its time is over; UnpluggedError until then."""
         assert self._former is not None
         process, closed = self._former
         if process.is_alive() and now < closed + CLOSE_TIME:
@@ -158,7 +158,7 @@ class Franka(ArmDriver):
         process.join()
         self._former = None
 
-    def _hand(self, order: tuple[object, float]) -> None:
+    def _send_order(self, order: tuple[object, float]) -> None:
         try:
             self._orders.send(order)
         except OSError as error:
@@ -180,11 +180,11 @@ def emergency_stop(address: str, profile: ArmProfile) -> tuple[float, str]:
 
 def find_arms() -> list[tuple[str, str]]:
     """Controllers at the usual addresses; libfranka knows no search."""
-    found = []
+    arms = []
     for host in USUAL_HOSTS:
         with suppress(OSError), socket.create_connection((host, FCI_PORT), FIND_TIME):
-            found.append((f"{SCHEME}{host}", "something answers at libfranka's port"))
-    return found
+            arms.append((f"{SCHEME}{host}", "something answers at libfranka's port"))
+    return arms
 
 
 # -- the robot's own process
@@ -199,8 +199,8 @@ def serve(host: str, profile: ArmProfile, orders: Connection, states: SharedLate
         import franky
 
         kernel = Path("/sys/kernel/realtime").exists()
-        how = franky.RealtimeConfig.Enforce if kernel else franky.RealtimeConfig.Ignore
-        robot = franky.Robot(host, realtime_config=how)
+        realtime = franky.RealtimeConfig.Enforce if kernel else franky.RealtimeConfig.Ignore
+        robot = franky.Robot(host, realtime_config=realtime)
         robot.relative_dynamics_factor = DYNAMICS
         follower = FrankaFollower(franky, robot, profile)
         follower.run(orders, states, clock)
@@ -220,15 +220,15 @@ class FrankaFollower:
         assert profile.flange_from_nozzle is not None
         self._franky, self._robot, self._arm = franky, robot, profile.arm
         self._flange_from_nozzle = profile.flange_from_nozzle
-        self._most = float(profile.limits.feed) * 2  # mm/s: what is missing may be caught up with
+        self._max_speed = float(profile.limits.feed) * 2  # mm/s: what is missing may be caught up with
         self._queue: ArmQueue | None = None  # None: it follows nothing
         self._posture = np.zeros(7)  # rad, of the joints when it set out
-        self._stopped_at = math.inf  # s, when it was told to stop and has not come to rest
-        self._fault, self._heard, self._robot_time = "", 0.0, -1.0
+        self._stop_time = math.inf  # s, when it was told to stop and has not come to rest
+        self._fault, self._last_message, self._robot_time = "", 0.0, -1.0
 
     def run(self, orders: Connection, states: SharedLatest[FrankaState], clock: WallClock) -> None:
-        """Follow `orders`, and put what the robot says; until they end, or the robot says nothing for GONE_TIME."""
-        due = self._heard = clock.now()
+        """Follow `orders` and report the robot's state, until orders end, or the robot is silent for GONE_TIME."""
+        next_cycle = self._last_message = clock.now()
         reported = 0.0  # s, the stamp of the last place
         while True:
             messages, closed = take_messages(orders)
@@ -240,21 +240,21 @@ class FrankaFollower:
                 return
             axes, ee = self._look(now)
             self._check_motion(now)
-            if now - self._heard > GONE_TIME:
+            if now - self._last_message > GONE_TIME:
                 states.put(FrankaState(now, gone=f"the robot said nothing for {GONE_TIME:g} s"))
                 return
-            if self._heard > reported:  # an old place is no answer
-                reported = self._heard
+            if self._last_message > reported:  # an old place is no answer
+                reported = self._last_message
                 states.put(FrankaState(reported, axes, self._fault))
             if self._queue is not None and not self._fault:
                 self._follow(self._queue, axes, ee, now)
-            due = max(due + CONTROL_PERIOD, clock.now())
-            orders.poll(max(due - clock.now(), 0.0))
+            next_cycle = max(next_cycle + CONTROL_PERIOD, clock.now())
+            orders.poll(max(next_cycle - clock.now(), 0.0))
 
     def _take(self, order: object, stamp: float, now: float) -> None:
         """Enter one order. stamp: s, when it was given."""
         if order == STOP:
-            self._queue, self._stopped_at = None, now
+            self._queue, self._stop_time = None, now
             self._brake()
         elif order == ENABLE:
             if self._fault or self._robot.has_errors:
@@ -264,15 +264,15 @@ class FrankaFollower:
             if self._queue is None:
                 if isinstance(order, G4):
                     return
-                self._queue, self._stopped_at = ArmQueue(self._look(now)[0].tolist(), 0.0, stamp), math.inf
+                self._queue, self._stop_time = ArmQueue(self._look(now)[0].tolist(), 0.0, stamp), math.inf
                 self._posture = np.asarray(self._robot.state.q)
             self._queue.add(order, stamp)
 
     def _look(self, now: float) -> tuple[Array, Array]:
-        """Where the nozzle is (6,), mm and rad, and the end effector (3,), mm; what is wrong becomes the fault."""
+        """The nozzle's axes (6,), mm and rad, and the end effector (3,), mm; a wrong posture becomes the fault."""
         state = self._robot.state
         if (robot_time := state.time.to_sec()) != self._robot_time:
-            self._robot_time, self._heard = robot_time, now
+            self._robot_time, self._last_message = robot_time, now
         base_from_ee, flange_from_ee = in_mm(state.O_T_EE.matrix), in_mm(state.F_T_EE.matrix)
         base_from_nozzle = base_from_ee @ se3.inverse(flange_from_ee) @ self._flange_from_nozzle
         angles = se3.euler_from_rotation(base_from_nozzle[:3, :3] @ self._arm.arm_from_upright.T)
@@ -281,36 +281,36 @@ class FrankaFollower:
         return np.concatenate([base_from_nozzle[:3, 3], angles]), base_from_ee[:3, 3]
 
     def _check_motion(self, now: float) -> None:
-        """Learn of reflexes; see that a stop is obeyed."""
+        """Check for reflexes, and that a stop is obeyed."""
         try:
             moving = bool(self._robot.poll_motion())
         except Exception as error:  # franky's ControlException names the reflex
             self._queue, self._fault, moving = None, one_line(error), False
         if self._fault and self._queue is not None:
-            self._queue, self._stopped_at = None, now
+            self._queue, self._stop_time = None, now
             self._brake()
         if not moving:
-            self._stopped_at = math.inf
-        elif now - self._stopped_at > STOP_TIME:
-            self._stopped_at = math.inf
+            self._stop_time = math.inf
+        elif now - self._stop_time > STOP_TIME:
+            self._stop_time = math.inf
             self._robot.stop()
 
     def _follow(self, queue: ArmQueue, axes: Array, ee: Array, now: float) -> None:
-        """Ask for the velocity that leads from where the robot is, `axes` (6,), along the commands."""
+        """Command the velocity that leads from `axes` (6,), the robot's own, along the queue's commands."""
         begin, end = (np.array(queue.at(t)) for t in (now - LOOK_BACK, now - LOOK_BACK + CONTROL_PERIOD))
         arm_from_begin, arm_from_end, arm_from_now = (
-            se3.rotation_from_euler(each[3:]) @ self._arm.arm_from_upright for each in (begin, end, axes)
+            se3.rotation_from_euler(axes_at[3:]) @ self._arm.arm_from_upright for axes_at in (begin, end, axes)
         )
         turn = se3.log_rotation(arm_from_end @ arm_from_begin.T) / CONTROL_PERIOD
         turn = clipped(turn + GAIN * se3.log_rotation(arm_from_begin @ arm_from_now.T), MAX_TURN_RATE)
-        way = (end - begin)[:3] / CONTROL_PERIOD + GAIN * (begin - axes)[:3]
-        way = clipped(way, self._most) + np.cross(turn, ee - axes[:3])  # of the end effector, not of the nozzle
-        self._ask(self._joint_velocities(np.concatenate([way / 1000, turn])), VELOCITY_TIME)
+        velocity = (end - begin)[:3] / CONTROL_PERIOD + GAIN * (begin - axes)[:3]
+        velocity = clipped(velocity, self._max_speed) + np.cross(turn, ee - axes[:3])  # of the end effector
+        self._ask(self._joint_velocities(np.concatenate([velocity / 1000, turn])), VELOCITY_TIME)
 
     def _joint_velocities(self, twist: Array) -> Array:
         """Velocities (7,), rad/s, of the joints for a twist (6,) of the end effector, m/s and rad/s.
 
-        What freedom is left takes the elbow back to where it was when the robot set out.
+        The null space returns the elbow to its posture at the start of the motion.
         """
         state = self._robot.state
         jacobian = np.asarray(self._robot.model.zero_jacobian(self._franky.Frame.EndEffector, state))
@@ -334,9 +334,9 @@ class FrankaFollower:
     def _end(self, clock: WallClock) -> None:
         """Come to rest."""
         self._brake()
-        until = clock.now() + STOP_TIME
+        deadline = clock.now() + STOP_TIME
         with suppress(Exception):  # the reflex that ends it, too, is rest
-            while self._robot.is_in_control and clock.now() < until:
+            while self._robot.is_in_control and clock.now() < deadline:
                 clock.wait_until(clock.now() + CONTROL_PERIOD)
             if self._robot.is_in_control:
                 self._robot.stop()
@@ -349,10 +349,10 @@ def in_mm(matrix: Array) -> Array:
     return pose
 
 
-def clipped(vector: Array, most: float) -> Array:
+def clipped(vector: Array, max_length: float) -> Array:
     """A vector (3,) no longer than `most`."""
     length = float(np.linalg.norm(vector))
-    return vector if length <= most else vector * (most / length)
+    return vector if length <= max_length else vector * (max_length / length)
 
 
 def posture_fault(joints: Array, model: Any, state: Any, franky: Any) -> str:
@@ -360,9 +360,9 @@ def posture_fault(joints: Array, model: Any, state: Any, franky: Any) -> str:
     room = np.minimum(joints - JOINT_LOW, JOINT_HIGH - joints)
     worst = int(np.argmin(room))
     if room[worst] < JOINT_MARGIN:
-        left, limit = math.degrees(room[worst]), math.degrees(JOINT_MARGIN)
-        return f"joint {worst + 1} is {left:.1f} degrees from its end, limit {limit:g}"
+        angle, limit = math.degrees(room[worst]), math.degrees(JOINT_MARGIN)
+        return f"joint {worst + 1} is {angle:.1f} degrees from its end, limit {limit:g}"
     jacobian = np.asarray(model.zero_jacobian(franky.Frame.Flange, state))
-    if (good := float(np.sqrt(max(np.linalg.det(jacobian @ jacobian.T), 0.0)))) < MIN_MANIPULABILITY:
-        return f"the arm is nearly singular: manipulability {good:.3f}, limit {MIN_MANIPULABILITY:g}"
+    if (manipulability := float(np.sqrt(max(np.linalg.det(jacobian @ jacobian.T), 0.0)))) < MIN_MANIPULABILITY:
+        return f"the arm is nearly singular: manipulability {manipulability:.3f}, limit {MIN_MANIPULABILITY:g}"
     return ""

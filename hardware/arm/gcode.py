@@ -77,22 +77,22 @@ class GcodeMachine(SerialDriver):
         super().__init__(opener, listener)
 
     def _reset(self) -> None:
-        self._waits: deque[Line] = deque()  # to be given out
-        self._since = 0.0  # s, when the first of them was to go
+        self._waiting: deque[Line] = deque()  # to be given out
+        self._wait_start = 0.0  # s, when the first of them was to go
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=REMEMBERED)  # number and bytes, to be asked for again
-        self._again: deque[bytes] = deque()  # that were asked for
+        self._resends: deque[bytes] = deque()  # that were asked for
         self._unanswered: deque[tuple[int, float]] = deque()  # number, and s when it went
-        self._question: tuple[float, bool] | None = None  # s, when M114 went, and whether the machine rests
-        self._stops = False  # a stop is on its way out
+        self._query: tuple[float, bool] | None = None  # s, when M114 went, and whether the machine rests
+        self._stop_pending = False  # a stop is on its way out
         self._number, self._resend = 0, 0  # of the last line; from which to send again, 0: none
-        self._rest, self._half = b"", b""  # of a line from the machine, and to it
+        self._rest, self._unwritten = b"", b""  # of a line from the machine, and to it
         self._firmware = self._fault = ""
         self._steps: Array | None = None  # (3,) per mm
         self._offset: Array | None = None  # (3,) mm, place less steps made
-        self._asked, self._greeted = 0.0, -np.inf  # s
-        self._patience = ANSWER_TIME  # s, for an answer
-        self._known = False  # whether it has said where it is
-        self._end: Array | None = None  # (3,) mm, where the last line leads; None: not known
+        self._query_time, self._greeting_time = 0.0, -np.inf  # s
+        self._answer_timeout = ANSWER_TIME  # s, for an answer
+        self._place_known = False  # whether it has said where it is
+        self._last_place: Array | None = None  # (3,) mm, where the last line leads; None: not known
 
     # -- the machine's words
 
@@ -107,77 +107,77 @@ class GcodeMachine(SerialDriver):
             if (place := self._take(line.decode("ascii", "replace").strip(), now)) is not None:
                 stamp, axes = place
                 replies = [Reply(ReplyKind.PLACE, axes), Reply(ReplyKind.TOOL, self._turn)]
-        self._look_after(now)
+        self._maintain(now)
         return Reported(stamp, replies, b"", self._fault)
 
     def _take(self, line: str, now: float) -> tuple[float, Array] | None:
         """Take a line; the instant, s, and the place (3,) that it tells of, None where it tells of none."""
         place = PLACE.search(line)
         if line.startswith("ok"):
-            self._answered()
+            self._count_answer()
         elif line == "start":
-            if self._known:
+            if self._place_known:
                 self._fault = "the machine has started anew and may not know where it is: home it, then arm"
             self._greet(now)
-        elif found := RESEND.match(line):
-            self._resend = int(found[1])
+        elif match := RESEND.match(line):
+            self._resend = int(match[1])
         elif (line.startswith(("Error", "echo:", "fatal", "!!"))) and HALTED.search(line):
             self._fault = f"the machine says: {line}; it has to be reset"
         elif COLD.search(line) and self._axis is not None:
             self._fault = f"the machine says: {line}; M302 P1 lets it push material that is cold"
-        if found := FIRMWARE.search(line):
-            self._firmware = found[1]
-        if found := STEPS.search(line):
-            steps = np.array(found.groups(), float)
+        if match := FIRMWARE.search(line):
+            self._firmware = match[1]
+        if match := STEPS.search(line):
+            steps = np.array(match.groups(), float)
             self._steps = steps if (steps >= MIN_STEPS_PER_MM).all() else None
-        if place is None or self._question is None:
+        if place is None or self._query is None:
             return None
-        (asked, rests), self._question = self._question, None
-        return (asked + now) / 2, self._place(np.array(place.groups(), float), COUNT.search(line), rests)
+        (query_time, at_rest), self._query = self._query, None
+        return (query_time + now) / 2, self._place(np.array(place.groups(), float), COUNT.search(line), at_rest)
 
-    def _place(self, planned: Array, count: re.Match[str] | None, rests: bool) -> Array:
+    def _place(self, planned: Array, count: re.Match[str] | None, at_rest: bool) -> Array:
         """The place (3,), mm, from where the planner ends and the steps that were made."""
-        self._known = True
+        self._place_known = True
         if self._steps is None or count is None:
             return planned
-        made = np.array(count.groups(), float) / self._steps
-        if rests or self._offset is None:
-            self._offset = planned - made
-        return np.asarray(made + self._offset)
+        travelled = np.array(count.groups(), float) / self._steps
+        if at_rest or self._offset is None:
+            self._offset = planned - travelled
+        return np.asarray(travelled + self._offset)
 
-    def _answered(self) -> None:
-        self._patience = ANSWER_TIME
+    def _count_answer(self) -> None:
+        self._answer_timeout = ANSWER_TIME
         if self._unanswered:
             self._unanswered.popleft()
         if self._resend and not self._unanswered:
-            self._again = deque(data for number, data in self._sent if number >= self._resend)
+            self._resends = deque(data for number, data in self._sent if number >= self._resend)
             self._resend = 0
 
-    def _look_after(self, now: float) -> None:
+    def _maintain(self, now: float) -> None:
         """Greet a machine that says nothing, send again what was lost, and ask where it is."""
-        if not self._known and now > self._greeted + GREETING_TIME:
+        if not self._place_known and now > self._greeting_time + GREETING_TIME:
             self._greet(now)
-        if self._known and self._unanswered and now > self._unanswered[0][1] + self._patience:
+        if self._place_known and self._unanswered and now > self._unanswered[0][1] + self._answer_timeout:
             first = self._unanswered[0][0]
             first, self._resend = min(first, self._resend or first), 0
-            self._again = deque(data for number, data in self._sent if number >= first)
+            self._resends = deque(data for number, data in self._sent if number >= first)
             self._unanswered.clear()  # a line that it has had already, it answers by asking for the next one
-            self._patience = min(2 * self._patience, MAX_ANSWER_TIME)
-        if self._known and not self._waits and now > self._asked + ASK_PERIOD:
-            self._waits.append(Line("M114"))
+            self._answer_timeout = min(2 * self._answer_timeout, MAX_ANSWER_TIME)
+        if self._place_known and not self._waiting and now > self._query_time + ASK_PERIOD:
+            self._waiting.append(Line("M114"))
 
     def _greet(self, now: float) -> None:
         """Count lines from 1, learn who it is, and where."""
-        self._greeted, self._known, self._offset = now, False, None
-        self._count_anew(self._greeting, now)
+        self._greeting_time, self._place_known, self._offset = now, False, None
+        self._restart_numbering(self._greeting, now)
 
-    def _count_anew(self, texts: Sequence[str], now: float) -> None:
+    def _restart_numbering(self, texts: Sequence[str], now: float) -> None:
         """Number lines from 0, with `texts` next; nothing that was given before is sent, or sent again."""
-        for lines in (self._waits, self._sent, self._again, self._unanswered):
+        for lines in (self._waiting, self._sent, self._resends, self._unanswered):
             lines.clear()
-        self._number, self._resend, self._question, self._end = -1, 0, None, None
-        self._waits.extend(Line(text, anchor=text == "M114") for text in ("M110 N0", *texts))
-        self._since = now
+        self._number, self._resend, self._query, self._last_place = -1, 0, None, None
+        self._waiting.extend(Line(text, anchor=text == "M114") for text in ("M110 N0", *texts))
+        self._wait_start = now
 
     # -- what it is given
 
@@ -185,31 +185,31 @@ class GcodeMachine(SerialDriver):
         """Give out a move; in a pause nothing is sent but what is left to be drawn back."""
         if isinstance(instruction, G4):
             pushed = self._axis is not None and self._axis.pressed
-            return self._put(Line("", instruction), now) if pushed else (Sent(instruction),)
+            return self._enqueue(Line("", instruction), now) if pushed else (Sent(instruction),)
         if np.abs(instruction.axes[3:] - self._turn).max() > 1e-6:
             got, allowed = np.rad2deg(instruction.axes[3:]).tolist(), f"{np.rad2deg(self._turn).tolist()} degrees"
             raise InputError("arm", "A B C", got, f"{allowed}: a G-code machine does not turn")
-        return self._put(Line("", instruction), now)
+        return self._enqueue(Line("", instruction), now)
 
-    def _line(self, given: G1 | G4) -> tuple[str, G1 | G4]:
+    def _line(self, order: G1 | G4) -> tuple[str, G1 | G4]:
         """The text of an instruction that goes out now, "" where nothing has to, and what the machine does by it."""
-        if isinstance(given, G4):
+        if isinstance(order, G4):
             push = self._pushed(0.0, 0.0)
-            return (f"G1{push.word} F{push.feed(push.seconds):.3f}", G4(push.seconds)) if push.word else ("", given)
-        axes = np.concatenate([np.round(given.axes[:3], PLACE_DIGITS), self._turn])
+            return (f"G1{push.word} F{push.feed(push.seconds):.3f}", G4(push.seconds)) if push.word else ("", order)
+        axes = np.concatenate([np.round(order.axes[:3], PLACE_DIGITS), self._turn])
         goal = "G1" + "".join(f" {name}{v:.{PLACE_DIGITS}f}" for name, v in zip("XYZ", axes[:3].tolist(), strict=True))
-        last, self._end = self._end, axes[:3]
-        way = 0.0 if last is None else float(np.linalg.norm(axes[:3] - last))
-        seconds = way / given.feed
-        push = self._pushed(given.volume, seconds)
-        if push.word and last is not None:  # what it pushes takes its time
+        previous, self._last_place = self._last_place, axes[:3]
+        length = 0.0 if previous is None else float(np.linalg.norm(axes[:3] - previous))
+        seconds = length / order.feed
+        push = self._pushed(order.volume, seconds)
+        if push.word and previous is not None:  # what it pushes takes its time
             seconds = max(seconds, push.seconds)
-            if not way:  # the feed of such a line is E's
+            if not length:  # the feed of such a line is E's
                 return f"{goal}{push.word} F{push.feed(seconds):.3f}", G4(seconds)
-            feed = max(np.floor(60_000 * way / seconds), 1) / 1000  # mm/min, down: E is at its speed's limit
-            return f"{goal}{push.word} F{feed:.3f}", replace(given, axes=axes, feed=feed / 60)
-        feed = max(round(60 * given.feed, 1), 0.1)  # mm/min
-        return f"{goal}{push.word} F{feed:g}", replace(given, axes=axes, feed=feed / 60)
+            feed = max(np.floor(60_000 * length / seconds), 1) / 1000  # mm/min, down: E is at its speed's limit
+            return f"{goal}{push.word} F{feed:.3f}", replace(order, axes=axes, feed=feed / 60)
+        feed = max(round(60 * order.feed, 1), 0.1)  # mm/min
+        return f"{goal}{push.word} F{feed:g}", replace(order, axes=axes, feed=feed / 60)
 
     def _pushed(self, volume: float, seconds: float) -> Push:
         """What E does in a line of `seconds` s of which `volume`, mm^3, is to leave."""
@@ -218,9 +218,9 @@ class GcodeMachine(SerialDriver):
     def stop(self, now: float) -> Sequence[Sent]:
         """Halt the axes; what it was given and has not read is not sent again."""
         assert self.port is not None
-        self._half += STOP
-        self._count_anew(("M400", "M114") if self._known else self._greeting, now)
-        self._stops = True
+        self._unwritten += STOP
+        self._restart_numbering(("M400", "M114") if self._place_known else self._greeting, now)
+        self._stop_pending = True
         return self._write(now)
 
     def enable(self, now: float) -> str:
@@ -229,7 +229,7 @@ class GcodeMachine(SerialDriver):
             self._fault = ""
             self._greet(now)
             return "the machine is greeted again: see that it is homed, then arm once more"
-        if not self._known:
+        if not self._place_known:
             return (
                 f"nothing at {self._address} answers as a G-code machine: is it on, and `baud` of the arm file its own?"
             )
@@ -243,53 +243,53 @@ class GcodeMachine(SerialDriver):
 
     def recall(self) -> None:
         """Take back the moves of which no byte is out."""
-        self._waits = deque(line for line in self._waits if line.instruction is None)
+        self._waiting = deque(line for line in self._waiting if line.instruction is None)
 
     def blocked_for(self, now: float) -> float | None:
         """Seconds that a move has waited."""
-        waits = self._stops or any(line.instruction is not None for line in self._waits)
-        return now - self._since if waits else None
+        blocked = self._stop_pending or any(line.instruction is not None for line in self._waiting)
+        return now - self._wait_start if blocked else None
 
-    def _put(self, line: Line, now: float) -> Sequence[Sent]:
-        if not self._waits:
-            self._since = now
-        self._waits.append(line)
+    def _enqueue(self, line: Line, now: float) -> Sequence[Sent]:
+        if not self._waiting:
+            self._wait_start = now
+        self._waiting.append(line)
         return self._write(now)
 
     def _write(self, now: float) -> Sequence[Sent]:
         """Write what was asked for again, then what waits, while few lines are unanswered."""
         out: list[Sent] = []
         while self._write_rest(out) and len(self._unanswered) < LINES and not self._resend:
-            if self._again:
-                self._half = self._again.popleft()
-                self._unanswered.append((int(self._half[1 : self._half.index(b" ")]), now))
+            if self._resends:
+                self._unwritten = self._resends.popleft()
+                self._unanswered.append((int(self._unwritten[1 : self._unwritten.index(b" ")]), now))
                 continue
-            asks = bool(self._waits) and self._waits[0].text == "M114"
-            if not self._waits or (asks and self._question is not None and now < self._question[0] + ANSWER_TIME):
+            is_query = bool(self._waiting) and self._waiting[0].text == "M114"
+            if not self._waiting or (is_query and self._query is not None and now < self._query[0] + ANSWER_TIME):
                 break
-            line = self._waits.popleft()
-            text, done = (line.text, None) if line.instruction is None else self._line(line.instruction)
-            if done is not None:
-                out.append(Sent(done))
+            line = self._waiting.popleft()
+            text, executed = (line.text, None) if line.instruction is None else self._line(line.instruction)
+            if executed is not None:
+                out.append(Sent(executed))
             if not text:
                 continue
-            self._since, self._number = now, self._number + 1
-            self._half = numbered(self._number, text)
-            self._sent.append((self._number, self._half))
+            self._wait_start, self._number = now, self._number + 1
+            self._unwritten = numbered(self._number, text)
+            self._sent.append((self._number, self._unwritten))
             self._unanswered.append((self._number, now))
-            if asks:
-                self._question, self._asked = (now, line.anchor), now
+            if is_query:
+                self._query, self._query_time = (now, line.anchor), now
         return out
 
     def _write_rest(self, out: list[Sent]) -> bool:
         """Write what is left of the last line, or of a stop; whether all of it is out."""
         assert self.port is not None
-        if self._half:
-            self._half = self._half[self.port.write(self._half) :]
-        if self._stops and not self._half:
-            self._stops = False
+        if self._unwritten:
+            self._unwritten = self._unwritten[self.port.write(self._unwritten) :]
+        if self._stop_pending and not self._unwritten:
+            self._stop_pending = False
             out.append(Sent(Pause()))
-        return not self._half
+        return not self._unwritten
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,29 +316,29 @@ class _PushedAxis:
 
     def __init__(self, extruder: Extruder) -> None:
         self._extruder, self.pressed = extruder, False
-        self._drawn = 0.0  # back by now
+        self._retracted = 0.0  # back by now
         self._rest = 0.0  # mm, what the last words were rounded by
 
     def push(self, volume: float, seconds: float) -> Push:
         """A line of `seconds` s in which `volume` is to leave; what was drawn back is pushed as well, bit by bit."""
-        most, whole = self._extruder.max_flow * seconds, self._extruder.retract_volume
+        capacity, retract_volume = self._extruder.max_flow * seconds, self._extruder.retract_volume
         if volume > 0:
-            given, self.pressed = min(self._drawn, max(most - volume, 0.0)), True
-            self._drawn -= given
-            return self._push(volume + given)
+            returned, self.pressed = min(self._retracted, max(capacity - volume, 0.0)), True
+            self._retracted -= returned
+            return self._push(volume + returned)
         if not self.pressed:
             return NO_PUSH
-        taken = min(whole - self._drawn, most)
-        self._drawn, self.pressed = self._drawn + taken, taken == most > 0
-        return self._push(-taken)
+        retracted = min(retract_volume - self._retracted, capacity)
+        self._retracted, self.pressed = self._retracted + retracted, retracted == capacity > 0
+        return self._push(-retracted)
 
     def _push(self, volume: float) -> Push:
         exact = volume / self._extruder.area + self._rest
-        way = round(exact, PUSH_DIGITS)
-        self._rest = exact - way
-        word = f" E{way:.{PUSH_DIGITS}f}" if way else ""
-        most = max(abs(volume), abs(way) * self._extruder.area)
-        return Push(word, abs(way), most / self._extruder.max_flow)
+        distance = round(exact, PUSH_DIGITS)
+        self._rest = exact - distance
+        word = f" E{distance:.{PUSH_DIGITS}f}" if distance else ""
+        pushed_volume = max(abs(volume), abs(distance) * self._extruder.area)
+        return Push(word, abs(distance), pushed_volume / self._extruder.max_flow)
 
 
 def numbered(number: int, text: str) -> bytes:

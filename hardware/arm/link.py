@@ -43,18 +43,18 @@ class Arm(ArmDevice):
     ) -> None:
         """As ArmDevice's."""
         self._flow = FlowControl(profile, settings)
-        self._own = OwnMoves(settings.speed, settings.turning, profile.tick)
+        self._own_moves = OwnMoves(settings.speed, settings.turning, profile.tick)
         self._recovery = AbortRecovery(self._flow.flight - profile.tick, settings.speed, profile.lag)
-        self._doubt_since: float | None = None
+        self._deviation_start: float | None = None
         self.command_frame = b""
         self._material = False  # whether the last frame let material flow
-        self._leaving = 0.0, -math.inf  # mm^3/s that flow as the last command ends, and s, when it does
+        self._last_flow = 0.0, -math.inf  # mm^3/s that flow as the last command ends, and s, when it does
         super().__init__(driver, profile, now, settings)
 
     # -- an operator's orders
 
     def stand(self, axes: Array, now: float) -> Reason:
-        """Take it that the arm stands at `axes` (6,), mm and rad; only while it is not armed."""
+        """Assume that the arm is at `axes` (6,), mm and rad; only while it is not armed."""
         if self.state is ArmState.ARMED:
             return Reason("the arm is armed", LinkCode.ARMED)
         if axes.shape != (6,) or not np.isfinite(axes).all():
@@ -64,34 +64,34 @@ class Arm(ArmDevice):
         return DONE
 
     def arm(self, now: float, goal: Array | None = None) -> Reason:
-        """Let moves be sent. goal: (6,) where the motion left off: the arm first goes there slowly, if it is near."""
+        """Permit moves. goal: (6,), last target of the motion: the arm first goes there slowly, if it is near."""
         if self.state is ArmState.ARMED:
             return DONE
         if not self._online:
             return Reason(f"the arm is unplugged: {self.reason}", LinkCode.UNPLUGGED)
         if self.in_flight(now) > 0 or not self._feedback.still(now):
             return Reason("the arm still moves", LinkCode.MOVING)
-        if why := self._enable(now):
-            return Reason(why, LinkCode.ARM_FAULT)
+        if fault := self._enable(now):
+            return Reason(fault, LinkCode.ARM_FAULT)
         self._adopt_answers(now)
         if self._queue is None:
-            why = "nobody knows where the arm stands: it does not answer, and was not told"
-            return Reason(why, LinkCode.UNKNOWN_PLACE)
+            fault = "nobody knows where the arm stands: it does not answer, and was not told"
+            return Reason(fault, LinkCode.UNKNOWN_PLACE)
         place = np.array(self._queue.target)
-        if goal is not None and (away := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
-            words = f"the arm is {away:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
-            return Reason(words, LinkCode.FAR_FROM_PATH)
+        if goal is not None and (distance := float(np.linalg.norm((goal - place)[:3]))) > self.settings.lost:
+            text = f"the arm is {distance:.1f} mm from where the motion left off, limit {self.settings.lost:g} mm"
+            return Reason(text, LinkCode.FAR_FROM_PATH)
         self._recovery.resume(place)
         if goal is not None and not self._recovery.undone:
-            self._own.go(place, goal)
+            self._own_moves.go(place, goal)
         self._feedback.forgive()
         self._stop_retry.drop()
-        self._doubt_since = None
+        self._deviation_start = None
         self._change(ArmState.ARMED, BY_OPERATOR, now)
         return DONE
 
     def disarm(self, now: float) -> None:
-        """Send nothing more, except a stop that has not got through; what is under way, 50 ms at most, is done."""
+        """Send nothing more, except a stop that is still pending; the motion in flight, 50 ms at most, is completed."""
         if self.state in (ArmState.ARMED, ArmState.STOPPED) and self._online:
             stop_pending = self.stop_pending(now)
             self._drop_unsent()
@@ -119,7 +119,7 @@ class Arm(ArmDevice):
             return RECALLED
         if axes.shape != (6,) or not ((axes >= limits.low) & (axes <= limits.high)).all():
             return Reason(f"{axes.tolist()} is out of bounds", LinkCode.OUT_OF_BOUNDS)
-        self._own.go(np.array(self._queue.target), axes, lift)
+        self._own_moves.go(np.array(self._queue.target), axes, lift)
         return DONE
 
     def home(self, now: float) -> Reason:
@@ -142,7 +142,7 @@ class Arm(ArmDevice):
     # -- the loop's calls
 
     def poll(self, now: float) -> None:
-        """Read, write what waits, reopen a lost device, repeat a stop, send own moves; every few milliseconds."""
+        """Read, write waiting frames, reopen a lost device, repeat a stop, send own moves; every few milliseconds."""
         if not self._online:
             if now >= self._reopen_at:
                 try:
@@ -168,9 +168,9 @@ class Arm(ArmDevice):
         self._repeat_stop(now)
         if self.state is ArmState.ARMED and not self.busy:
             self._supervise(now)
-        travels = self.state is ArmState.ARMED and self._own.step is not None
-        if travels and self.in_flight(now) <= self.profile.tick and not self._wait(now):  # one step ahead of the arm
-            self._give(self._own.take(), now)
+        pending = self.state is ArmState.ARMED and self._own_moves.step is not None
+        if pending and self.in_flight(now) <= self.profile.tick and not self._wait(now):  # one step ahead of the arm
+            self._give(self._own_moves.take(), now)
 
     def hold(self, now: float) -> Reason:
         """Why no command may be sent now, "" where one may."""
@@ -191,29 +191,29 @@ class Arm(ArmDevice):
             command = Move(command.stamp, np.array(self._queue.target), MIN_FEED, 0, extrude=False)
         self.command_frame = frame_from_command(command, dialect)
         instruction = motion_from_frame(self.command_frame, dialect)
-        leaving, self._leaving = self._leaving, (0.0, -math.inf)
+        leaving, self._last_flow = self._last_flow, (0.0, -math.inf)
         if reason := self.hold(now):
             return reason
         assert self._queue is not None
-        if words := self._flow.excess(instruction, self._queue, now):
-            self.stop(words, now)
-            return Reason(words, LinkCode.LIMIT)
-        self._own.last = None
+        if excess := self._flow.excess(instruction, self._queue, now):
+            self.stop(excess, now)
+            return Reason(excess, LinkCode.LIMIT)
+        self._own_moves.last = None
         self._material = dialect.pwm_on is not None and isinstance(instruction, G1) and instruction.material
         if isinstance(instruction, G1) and isinstance(command, Move):
             instruction = replace(instruction, volume=self._volume(command, *leaving))
         self._give(instruction, now)
         return DONE
 
-    def _volume(self, move: Move, before: float, since: float) -> float:
-        """mm^3 that leave from `since`, s, until a tick after the move; before: mm^3/s, until it tells another flow."""
-        told, end = move.stamp + move.flow_after, move.stamp + self.profile.tick
-        late = told - since if told - since <= MAX_FLOW_GAP * self.profile.tick else 0.0
-        self._leaving = move.flow, end
-        return max(before * late + move.flow * (end - told), 0.0)
+    def _volume(self, move: Move, previous_flow: float, since: float) -> float:
+        """mm^3 that leave from `since`, s, to a tick after the move. previous_flow: mm^3/s, until the move's begins."""
+        flow_start, end = move.stamp + move.flow_after, move.stamp + self.profile.tick
+        gap = flow_start - since if flow_start - since <= MAX_FLOW_GAP * self.profile.tick else 0.0
+        self._last_flow = move.flow, end
+        return max(previous_flow * gap + move.flow * (end - flow_start), 0.0)
 
     def take_up(self) -> RecalledMoves | None:
-        """Where the arm stands after moves were called back, once it obeys again; until then no command is sent."""
+        """The moves that were called back, once the arm obeys again; None before, and no command is sent until then."""
         place, queue = self._recovery.place, self._queue
         if not self._recovery.obeys or place is None or queue is None:
             return None
@@ -222,16 +222,16 @@ class Arm(ArmDevice):
 
     @property
     def lag(self) -> float:
-        """Measured s from set-point to answer; NaN until known."""
+        """Measured delay from set-point to answer, s; NaN until known."""
         return self._feedback.lag
 
     @property
     def travels(self) -> bool:
-        """Whether link or arm make a move of their own: home, or back to where the arm was stopped."""
-        return self._own.step is not None or self.busy
+        """Whether link or arm make a move of their own: home, or back to the last target."""
+        return self._own_moves.step is not None or self.busy
 
     def arrived(self, now: float) -> bool:
-        """Whether the arm stands where it was sent, by dead reckoning and by its answers where it gives any."""
+        """Whether the arm is at its target, by dead reckoning and, where it answers, by its answers."""
         if self._queue is None or self.travels or self._recovery.goal is not None or self._queue.in_flight(now) > 0:
             return False
         if self._feedback.axes(now) is None:
@@ -239,7 +239,7 @@ class Arm(ArmDevice):
         return self._feedback.still(now) and not self._feedback.doubt(now)
 
     def stop_pending(self, now: float) -> bool:
-        """Whether a stop was sent that the arm is not known to have read."""
+        """Whether a stop was sent that the arm may not have read."""
         retry = self._stop_retry
         return self._online and retry.active and (self._blocked(now) or retry.pending(self._feedback, now))
 
@@ -253,13 +253,13 @@ class Arm(ArmDevice):
     # -- own moves, supervision, stops
 
     def _unplugged(self, reason: str, now: float) -> None:
-        """The device is gone, and what was under way with it."""
-        self._own.drop()
+        """The device is gone, and the commands in flight are lost."""
+        self._own_moves.drop()
         self._recovery.break_off(self._feedback.last)
         super()._unplugged(reason, now)
 
     def _enable(self, now: float) -> str:
-        """Have the driver clear what has stopped its arm; why it cannot be."""
+        """Have the driver clear the fault that stopped its arm; the reason if it cannot."""
         try:
             return self.driver.enable(now)
         except UnpluggedError as error:
@@ -277,15 +277,15 @@ class Arm(ArmDevice):
         """Drop own moves, and the frames of which no byte is on the wire."""
         if self._online:
             self.driver.recall()
-        self._own.drop()
+        self._own_moves.drop()
         self._recovery.break_off()
 
     def _wait(self, now: float) -> Reason:
-        """Why no command of a tick may go out now."""
+        """Why no command of a tick may be sent now, "" where one may."""
         assert self._online and self._queue is not None
         backlog = self._feedback.backlog(self._queue, now)
-        if words := self._flow.full(self.driver, self._queue, self.profile.tick, now, backlog):
-            return Reason(words, LinkCode.FLOW_CONTROL)
+        if reason := self._flow.full(self.driver, self._queue, self.profile.tick, now, backlog):
+            return Reason(reason, LinkCode.FLOW_CONTROL)
         return Reason(self._feedback.doubt(now), LinkCode.FEEDBACK)
 
     def _supervise(self, now: float) -> None:
@@ -295,20 +295,20 @@ class Arm(ArmDevice):
         elif self._feedback.off > self.settings.lost:
             self.stop(f"the arm is {self._feedback.off:.1f} mm off its way, limit {self.settings.lost:g} mm", now)
         elif doubt := self._recovery.why or self._feedback.doubt(now):
-            self._doubt_since = now if self._doubt_since is None else self._doubt_since
-            if now - self._doubt_since > self.settings.patience:
+            self._deviation_start = now if self._deviation_start is None else self._deviation_start
+            if now - self._deviation_start > self.settings.patience:
                 self.stop(f"{doubt}, for {self.settings.patience:g} s", now)
         else:
-            self._doubt_since = None
+            self._deviation_start = None
         if self.state is ArmState.ARMED and self.settings.pause_frame:
             self._recover(now)
 
     def _recover(self, now: float) -> None:
-        """Call back the queue of an arm that does not follow; once it rests, try when it obeys again."""
+        """Call back the queue of an arm that does not follow; once it is at rest, test whether it obeys again."""
         assert self._queue is not None
         recovery, feedback = self._recovery, self._feedback
         if recovery.goal is None and (doubt := feedback.doubt(now)):
-            recovery.begin(f"{RECALLED}: {doubt}", np.array(self._queue.target), self._own.break_off(), now)
+            recovery.begin(f"{RECALLED}: {doubt}", np.array(self._queue.target), self._own_moves.break_off(), now)
             self._note(recovery.why, now)
             self._call_back(now)
         elif recovery.goal is not None and not (recovery.obeys or self._blocked(now) or self._queue.in_flight(now) > 0):
@@ -324,11 +324,11 @@ class Arm(ArmDevice):
             if recovery.obeys:
                 self._stop_retry.drop()
                 if recovery.rest is not None:
-                    self._own.go(np.array(self._queue.target), recovery.goal, then=recovery.rest)
+                    self._own_moves.go(np.array(self._queue.target), recovery.goal, then=recovery.rest)
                     recovery.drop()
 
     def _blocked(self, now: float) -> bool:
-        """Whether something waits because the line takes no more."""
+        """Whether bytes wait because the line accepts no more."""
         return self.driver.blocked_for(now) is not None
 
     def _repeat_stop(self, now: float) -> None:
@@ -343,12 +343,12 @@ class Arm(ArmDevice):
 
 
 def shut_down(arm: Arm, reason: str, clock: Clock, poll_period: float) -> None:
-    """Stop an armed arm, and poll it every `poll_period` s until its last stop got through, 1 s at most."""
-    begun = clock.now()
+    """Stop an armed arm, and poll it every `poll_period` s while its last stop is pending, 1 s at most."""
+    start = clock.now()
     if arm.state is ArmState.ARMED:
-        arm.stop(reason, begun)
-    while (now := clock.now()) < begun + MIN_SHUTDOWN_TIME or (
-        arm.stop_pending(now) and now < begun + MAX_SHUTDOWN_TIME
+        arm.stop(reason, start)
+    while (now := clock.now()) < start + MIN_SHUTDOWN_TIME or (
+        arm.stop_pending(now) and now < start + MAX_SHUTDOWN_TIME
     ):
         arm.poll(now)
         clock.wait_until(now + poll_period)

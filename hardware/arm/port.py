@@ -55,8 +55,8 @@ class PortLock:
             owner = _owner(self._file)
             os.close(self._file)
             raise InputError("arm", "port", url, f"a port that is free; process {owner[0]} has it") from error
-        process, whose = _owner(self._file)
-        if process and whose != LOCK_OWNER and process != os.getpid() and _lives(process):
+        process, program = _owner(self._file)
+        if process and program != LOCK_OWNER and process != os.getpid() and _process_exists(process):
             os.close(self._file)
             raise InputError("arm", "port", url, f"a port that is free; process {process} has it by {path}")
         os.ftruncate(self._file, 0)
@@ -84,12 +84,12 @@ def _name(url: str) -> str:
 
 def _owner(file: int) -> tuple[int, str]:
     """Process number, 0 if there is none, and the program that a lock file names."""
-    words = os.pread(file, 100, 0).decode("ascii", "replace").split()
-    number = int(words[0]) if words and words[0].isdigit() else 0
-    return number, words[1] if len(words) > 1 else ""
+    fields = os.pread(file, 100, 0).decode("ascii", "replace").split()
+    number = int(fields[0]) if fields and fields[0].isdigit() else 0
+    return number, fields[1] if len(fields) > 1 else ""
 
 
-def _lives(process: int) -> bool:
+def _process_exists(process: int) -> bool:
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -193,8 +193,8 @@ class SerialPort:
         The system would wait for it, 30 s by default, and nobody could stop the arm meanwhile.
         """
         clock = WallClock()
-        until = clock.now() + CLOSE_TIME
-        while self.waiting() and clock.now() < until:
+        deadline = clock.now() + CLOSE_TIME
+        while self.waiting() and clock.now() < deadline:
             clock.wait_until(clock.now() + CLOSE_TIME / 50)
         if self._device and self._file is not None and self.waiting():
             with suppress(OSError, termios.error):  # of a device that is gone
@@ -243,20 +243,20 @@ def write_last(url: str, baud: int, data: bytes, wire: float) -> tuple[float, st
     wire: s that it takes to the arm. When it was there, s, and why it was not, "" if it was.
     """
     clock, device = WallClock(), PortOpener(url, baud)
-    until, reason = clock.now() + LINE_TAKEOVER_TIME, ""
+    deadline, reason = clock.now() + LINE_TAKEOVER_TIME, ""
     try:
-        while clock.now() < until:
+        while clock.now() < deadline:
             try:
                 with closing(device()) as port:
                     unsent = data
-                    while (unsent := unsent[port.write(unsent) :]) and clock.now() < until:
+                    while (unsent := unsent[port.write(unsent) :]) and clock.now() < deadline:
                         clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
                     if not unsent:
                         sent = clock.now() + wire
                         clock.wait_until(sent + wire)
                         return sent, ""
-                    taken = len(data) - len(unsent)
-                    reason = f"its line is full and took {taken} of the stop's {len(data)} bytes"
+                    written = len(data) - len(unsent)
+                    reason = f"its line is full and took {written} of the stop's {len(data)} bytes"
             except (InputError, UnpluggedError) as error:
                 reason = str(error)
                 clock.wait_until(clock.now() + TAKEOVER_RETRY_PERIOD)
@@ -277,12 +277,12 @@ def _identity(url: str) -> Identity | None:
     """What a USB adapter is known by; None for anything else."""
     if "://" in url or "/by-" in url:
         return None
-    return next((known for path, known in _adapters() if path == os.path.realpath(url)), None)
+    return next((identity for path, identity in _adapters() if path == os.path.realpath(url)), None)
 
 
 def _place(identity: Identity) -> str:
     """The path under which an adapter is there now; UnpluggedError where it is not."""
-    path = next((path for path, known in _adapters() if known == identity), None)
+    path = next((path for path, candidate in _adapters() if candidate == identity), None)
     if path is None:
         raise UnpluggedError(f"no adapter {identity[0]:04x}:{identity[1]:04x} {identity[2]} is plugged in")
     return path

@@ -70,8 +70,8 @@ class ArmQueue:
         """Seconds that an instruction takes after all those before it. G1: in machine axes."""
         if isinstance(instruction, G4):
             return instruction.duration
-        way = [float(b) - a for a, b in zip(self.target, instruction.axes, strict=True)]
-        length, turn = math.hypot(*way[:3]), math.hypot(*way[3:])
+        displacement = [float(b) - a for a, b in zip(self.target, instruction.axes, strict=True)]
+        length, turn = math.hypot(*displacement[:3]), math.hypot(*displacement[3:])
         return length / instruction.feed if length > MIN_TRAVEL or not turn else math.degrees(turn) / instruction.feed
 
     def add(self, instruction: G1 | G4, now: float, left: float = 1.0) -> None:
@@ -92,9 +92,9 @@ class ArmQueue:
             return  # it rests already
         arrival, place = self._wire, self.at(self._wire)
         while self._commands and self._commands[-1].end > arrival:
-            cut = self._commands.pop()
-            if cut.start < arrival:
-                self._commands.append(QueuedCommand(cut.start, arrival, cut.source, place))
+            command = self._commands.pop()
+            if command.start < arrival:
+                self._commands.append(QueuedCommand(command.start, arrival, command.source, place))
         self.stand(place, arrival)
 
     def in_flight(self, now: float) -> float:
@@ -107,8 +107,8 @@ class ArmQueue:
 
     def idle(self, since: float, until: float) -> float:
         """Seconds between two instants, s, no more than a second ago, in which no command is being done."""
-        ways = (command for command in self._commands if command.end > since and command.start < until)
-        return until - since - sum(min(way.end, until) - max(way.start, since) for way in ways)
+        overlaps = (command for command in self._commands if command.end > since and command.start < until)
+        return until - since - sum(min(overlap.end, until) - max(overlap.start, since) for overlap in overlaps)
 
     def frames(self, now: float) -> int:
         """Commands that are not done, those on the wire included."""
@@ -125,37 +125,37 @@ class ArmQueue:
 
     def passed(self, place: Sequence[float], still: float, until: float) -> float:
         """When X Y Z of the set-point were last within `still` mm of a place (3,), s; NaN if not of late."""
-        after = until
+        later = until
         for command in reversed(self._commands):
-            if command.end <= after and _share(command.target, command.target, place, still, 1.0) is not None:
-                return after
-            if command.start < min(after, command.end):
+            if command.end <= later and _share(command.target, command.target, place, still, 1.0) is not None:
+                return later
+            if command.start < min(later, command.end):
                 length = command.end - command.start
-                most = min((after - command.start) / length, 1.0)
-                if (share := _share(command.source, command.target, place, still, most)) is not None:
+                max_share = min((later - command.start) / length, 1.0)
+                if (share := _share(command.source, command.target, place, still, max_share)) is not None:
                     return command.start + share * length
-            after = min(after, command.start)
+            later = min(later, command.start)
         return math.nan
 
     def bounds(self, since: float, until: float) -> tuple[Axes, Axes]:
         """Least and greatest set-point of each axis between two instants, s."""
         knots = [self.at(since), self.at(until)]
         for command in reversed(self.ways(since)):
-            ends = (command.start, command.source), (command.end, command.target)
-            knots += [place for instant, place in ends if since <= instant <= until]
+            endpoints = (command.start, command.source), (command.end, command.target)
+            knots += [place for instant, place in endpoints if since <= instant <= until]
         return tuple(map(min, *knots)), tuple(map(max, *knots))
 
 
-def _share(source: Axes, target: Axes, place: Sequence[float], still: float, most: float) -> float | None:
+def _share(source: Axes, target: Axes, place: Sequence[float], still: float, max_share: float) -> float | None:
     """The last share of a straight way, up to `most`, at which X Y Z are `still` or less from a place (3,), or None."""
-    first, last = 0.0, most
+    first, last = 0.0, max_share
     for a, b, p in zip(source[:3], target[:3], place, strict=True):
         if a == b:
             if abs(p - a) > still:
                 return None
             continue
-        ends = (p - still - a) / (b - a), (p + still - a) / (b - a)
-        first, last = max(first, min(ends)), min(last, max(ends))
+        crossings = (p - still - a) / (b - a), (p + still - a) / (b - a)
+        first, last = max(first, min(crossings)), min(last, max(crossings))
     return last if first <= last else None
 
 
@@ -175,20 +175,20 @@ class FlowControl:
         slow = self.profile.frame_time * (1 + WIRE_ROUNDING_BYTES / FRAME_LENGTH) + self.profile.tick
         return max(self.settings.flight if self.profile.flight is None else self.profile.flight, slow)
 
-    def full(self, driver: ArmDriver, queue: ArmQueue, more: float, now: float, backlog: float = 0.0) -> str:
+    def full(self, driver: ArmDriver, queue: ArmQueue, duration: float, now: float, backlog: float = 0.0) -> str:
         """Why a frame of `more` s must wait; "" where it need not. backlog: s that the arm is behind the model."""
         if (blocked := driver.blocked_for(now)) is not None:
             return f"the port has taken no bytes for {blocked:.3f} s"
         frame_time = self.profile.frame_time
-        passing = max(queue.wire_free - now, 0.0) / frame_time * FRAME_LENGTH if frame_time else 0.0
-        if passing > WIRE_ROUNDING_BYTES:
-            return f"{passing:.0f} bytes are on the wire: a stop would wait for two frames"
-        waiting = driver.waiting() - passing
+        on_wire = max(queue.wire_free - now, 0.0) / frame_time * FRAME_LENGTH if frame_time else 0.0
+        if on_wire > WIRE_ROUNDING_BYTES:
+            return f"{on_wire:.0f} bytes are on the wire: a stop would wait for two frames"
+        waiting = driver.waiting() - on_wire
         if waiting > FRAME_LENGTH:
             return f"{waiting:.0f} bytes wait in the port"
         if (count := queue.frames(now)) >= self.settings.frames:
             return f"{count} frames are under way, limit {self.settings.frames}"
-        if queue.in_flight_with(more, now) + backlog > self.flight:
+        if queue.in_flight_with(duration, now) + backlog > self.flight:
             return f"{1000 * (queue.in_flight(now) + backlog):.0f} ms are under way, limit {1000 * self.flight:g} ms"
         return ""
 

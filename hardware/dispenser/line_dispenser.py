@@ -1,7 +1,7 @@
-"""The driver of every dispenser that is told what to do in messages, over a serial line or by HTTP.
+"""The driver of every dispenser that is controlled by messages, over a serial line or by HTTP.
 
-Messages wait in one queue. One that is partly out is completed; an off goes before all others, and drops what would let
-material out. Where the line was lost, off is the first thing it takes when it is back, and the dispenser is CLOSED.
+Messages wait in one queue. One that is partly sent is completed; an off goes before all others, and removes messages
+that would let material flow. After a lost line, off is the first message sent, and the dispenser is CLOSED.
 """
 
 from __future__ import annotations
@@ -76,16 +76,16 @@ class LineDispenser:
         self._flow = 0.0  # mm^3/s commanded
         self._temperature: float | None = None  # degrees C, answered
         self._target: float | None = None
-        self._near = True  # whether the target was reached since it was set
+        self._target_reached = True  # since it was set
         self._port: Port | None = None
         self._queue = MessageQueue(line.gap)
-        self._rest = b""  # of an answer that is not complete
-        self._fed = math.inf  # s, when the device's watchdog last had a message since on
+        self._partial = b""  # of an answer that is not complete
+        self._last_sent = math.inf  # s, of the last message to the device's watchdog since on
         self._keepalive_at, self._query_at, self._reopen_at = math.inf, math.inf, math.inf  # s
-        self._lost = False  # the line was, and has not taken an off since
-        self._drawn_back = False  # material, by a retract
-        self._closing: float | None = None  # s, since when
-        self._closed = False
+        self._line_lost = False  # whether the line was lost and has accepted no off since
+        self._retracted = False  # whether material is drawn back
+        self._closing_since: float | None = None  # s
+        self._is_closed = False
 
     @property
     def status(self) -> DispenserStatus:
@@ -104,125 +104,125 @@ class LineDispenser:
             self._open(now)
 
     def hang_up(self) -> None:
-        """Let the line go and send nothing: for one that was only listened to."""
-        self._let_go()
+        """Release the line and send nothing: for a dispenser that was only listened to."""
+        self._release_line()
 
     def prepare(self, now: float, celsius: float | None = None) -> None:
-        """Off first, then what sets it up, then its temperature."""
+        """Send off, then the set-up messages, then the temperature."""
         if self._state in (DispenserState.CLOSED, DispenserState.FAILED):
             self.listen(now)
             if self._port is None:
                 return
-            self._closed, self._closing, self._lost = False, None, False
+            self._is_closed, self._closing_since, self._line_lost = False, None, False
             self._queue.drop(MessageKind.SETUP)
             self.off(now)
             if self._line.start:  # what was sent while it started is lost
-                again = self._messages(MessageKind.OFF, self._line.messages.off)
-                self._queue.put(replace(message, urgent=False) for message in again)
+                repeats = self._messages(MessageKind.OFF, self._line.messages.off)
+                self._queue.put(replace(message, urgent=False) for message in repeats)
             self._queue.put(self._messages(MessageKind.SETUP, self._line.messages.prepare))
             self._query_at = now if self._line.messages.temperature_query else math.inf
-            watched = self.profile.watchdog
-            safe = f"switches itself off after {watched:g} s" if watched else "has no watchdog: it stays on"
-            self._change(DispenserState.PREPARING, f"set up; without us it {safe}", now)
+            watchdog = self.profile.watchdog
+            watchdog_text = f"switches itself off after {watchdog:g} s" if watchdog else "has no watchdog: it stays on"
+            self._change(DispenserState.PREPARING, f"set up; without us it {watchdog_text}", now)
         if celsius is not None and (reason := self.set_temperature(celsius, now)):
             self._fail(reason, now)
         self.poll(now)
 
     def on(self, flow: float, now: float) -> str:
-        """Prime where material was drawn back, then on; while on, another flow alone."""
-        if self._closing is not None or self._state not in (DispenserState.READY, DispenserState.ON):
+        """Prime if material is drawn back, then switch on; while on, only change the flow."""
+        if self._closing_since is not None or self._state not in (DispenserState.READY, DispenserState.ON):
             return f"{self.profile.name} is {self._state.value}: {self._reason}"
         if reason := self.profile.wrong_flow(flow):
             return reason
-        given, messages = self.profile.flow_given(flow), self._line.messages
-        if self._state is DispenserState.ON and given == self._flow:
+        device_flow, messages = self.profile.flow_given(flow), self._line.messages
+        if self._state is DispenserState.ON and device_flow == self._flow:
             return ""
-        self._flow = given
+        self._flow = device_flow
 
         def flowing(at: float) -> None:
-            self._log.add(at, f"{given:g} mm^3/s", given)
+            self._log.add(at, f"{device_flow:g} mm^3/s", device_flow)
 
         def switched(at: float) -> None:
-            self._fed, self._keepalive_at = at, at + self._line.keepalive if messages.keepalive else math.inf
-            self._log.add(at, f"on, {given:g} mm^3/s", given)
+            self._last_sent, self._keepalive_at = at, at + self._line.keepalive if messages.keepalive else math.inf
+            self._log.add(at, f"on, {device_flow:g} mm^3/s", device_flow)
 
         if self._state is DispenserState.ON:
             self._queue.drop(MessageKind.FLOW)
             change = messages.on if messages.flow is None else messages.flow
             self._queue.put(self._messages(MessageKind.FLOW, change, flowing))
         else:
-            if self._drawn_back:
+            if self._retracted:
                 prime = self._messages(MessageKind.ON, messages.prime, volume=self.profile.prime_volume)
                 self._queue.put(prime)
-                self._drawn_back = False
+                self._retracted = False
             self._queue.put(self._messages(MessageKind.ON, messages.on, switched))
             self._change(DispenserState.ON, "on", now, quiet=True)
         self._send(now)
         return "" if self._state is DispenserState.ON else self._reason
 
     def off(self, now: float) -> None:
-        """Off, before everything that is not partly out; then back, where it was on."""
+        """Switch off, before all messages that are not partly sent; then retract, if it was on."""
         if self._port is not None:
-            flowed = self._state is DispenserState.ON
-            retract = flowed or self._queue.waits(MessageKind.RETRACT)
+            was_on = self._state is DispenserState.ON
+            retract = was_on or self._queue.waits(MessageKind.RETRACT)
             self._queue.drop(MessageKind.ON, MessageKind.FLOW, MessageKind.KEEPALIVE, MessageKind.RETRACT)
             if not self._queue.waits(MessageKind.OFF, urgent=True):
-                self._put_off(now, flowed)
+                self._queue_off(now, was_on)
             if retract:
                 self._queue.put_first(self._retract_messages(), behind=MessageKind.OFF)
         self._stop(now)
         self._send(now)
 
     def retract(self, now: float) -> None:
-        """Draw back, once."""
-        if self._state in (DispenserState.READY, DispenserState.PREPARING) and not self._drawn_back:
+        """Retract material, once."""
+        if self._state in (DispenserState.READY, DispenserState.PREPARING) and not self._retracted:
             self._queue.put(self._retract_messages())
             self._send(now)
 
     def set_temperature(self, celsius: float, now: float) -> str:
-        """Tell it once; a dispenser that sets none only agrees where it is kept there."""
+        """Set the temperature; without a heater of its own it must already be the one at which material is kept."""
         if allowed := self.profile.wrong_temperature(celsius):
             return f"{celsius:g} degrees C, allowed {allowed}"
         if self.profile.temperature_range is None or celsius == self._target:
             return ""
         if self._state in (DispenserState.CLOSED, DispenserState.FAILED):
             return f"{self.profile.name} is {self._state.value}: {self._reason}"
-        self._target, self._near = celsius, not self._line.messages.temperature_query
+        self._target, self._target_reached = celsius, not self._line.messages.temperature_query
         self._queue.put(self._messages(MessageKind.SETUP, self._line.messages.temperature))
         self._send(now)
         self._settle(now)
         return ""
 
     def close(self, now: float) -> bool:
-        """Off until the line has it all, for CLOSE_TIME at most."""
-        if self._port is None and not self._lost:
-            if self._state is not DispenserState.CLOSED and not self._closed:
+        """Switch off, and wait until the line has sent it, for CLOSE_TIME at most."""
+        if self._port is None and not self._line_lost:
+            if self._state is not DispenserState.CLOSED and not self._is_closed:
                 self._change(DispenserState.CLOSED, f"closed, never open: {self._reason}", now)
-            self._let_go()
+            self._release_line()
             return True
-        if self._closing is None:
-            self._closing = now
+        if self._closing_since is None:
+            self._closing_since = now
             self._queue.drop(MessageKind.OFF, MessageKind.SETUP)
             self.off(now)
         self.poll(now)
         port = self._port
-        if port is not None and not self._lost and MessageKind.OFF not in self._queue and self._queue.idle(port):
+        if port is not None and not self._line_lost and MessageKind.OFF not in self._queue and self._queue.idle(port):
             self._change(DispenserState.CLOSED, "closed, off", now)
-        elif now < self._closing + CLOSE_TIME:
+        elif now < self._closing_since + CLOSE_TIME:
             return False
         else:
-            watched = self.profile.watchdog
-            end = f"it does so itself within {watched:g} s" if watched else "IT MAY STILL BE ON: switch it off by hand"
-            self._change(DispenserState.FAILED, f"could not be switched off ({self._reason}); {end}", now)
-        self._let_go()
+            limit = self.profile.watchdog
+            hint = f"it does so itself within {limit:g} s" if limit else "IT MAY STILL BE ON: switch it off by hand"
+            self._change(DispenserState.FAILED, f"could not be switched off ({self._reason}); {hint}", now)
+        self._release_line()
         return True
 
     # -- the loop's call
 
     def poll(self, now: float) -> None:
-        """Read, send, repeat what keeps the watchdog calm, look for a lost line; every few milliseconds."""
+        """Read, send, repeat the watchdog's keepalive, reopen a lost line; every few milliseconds."""
         if self._port is None:
-            if self._lost and now >= self._reopen_at:
+            if self._line_lost and now >= self._reopen_at:
                 self._open(now)
                 self.off(now)
             return
@@ -236,8 +236,8 @@ class LineDispenser:
             self._query_at = now + QUERY_PERIOD
             self._queue.put(self._messages(MessageKind.SETUP, self._line.messages.temperature_query))
         if now >= self._keepalive_at and not self._queue:
-            late = now - self._keepalive_at > self._line.keepalive
-            self._keepalive_at = (now if late else self._keepalive_at) + self._line.keepalive
+            overdue = now - self._keepalive_at > self._line.keepalive
+            self._keepalive_at = (now if overdue else self._keepalive_at) + self._line.keepalive
             self._queue.put(self._messages(MessageKind.KEEPALIVE, self._line.messages.keepalive))
         self._send(now)
         self._settle(now)
@@ -249,65 +249,65 @@ class LineDispenser:
             self._port = self._opener()
         except (UnpluggedError, InputError) as error:
             self._reopen_at = now + REOPEN_PERIOD
-            words = f"{error.what} {error.got}: needed is {error.allowed}" if isinstance(error, InputError) else error
-            self._change(DispenserState.FAILED, str(words), now)
+            text = f"{error.what} {error.got}: needed is {error.allowed}" if isinstance(error, InputError) else error
+            self._change(DispenserState.FAILED, str(text), now)
             return
         self._queue.restart(now + self._line.start)
-        self._rest = b""
+        self._partial = b""
 
     def _send(self, now: float) -> None:
         if self._port is None:
             return
-        before = self._queue.sent
+        sent_before = self._queue.sent
         try:
             self._queue.send(self._port, now)
         except UnpluggedError as error:
             self._unplugged(str(error), now)
-        if self._queue.sent > before and self._fed < math.inf:
-            self._fed = now
+        if self._queue.sent > sent_before and self._last_sent < math.inf:
+            self._last_sent = now
 
     def _unplugged(self, reason: str, now: float) -> None:
-        """The line is gone, and what waited with it."""
+        """The line is gone, and the waiting messages are dropped."""
         if self._port is not None:
             self._port.close()
         self._port, self._reopen_at = None, now + REOPEN_PERIOD
         self._queue.restart(now)
-        self._lost = True
+        self._line_lost = True
         self._fail(reason, now)
 
     def _fail(self, reason: str, now: float) -> None:
         flow = 0.0 if self._state is DispenserState.ON else None
         self._stop(now)
-        self._target, self._near, self._query_at = None, True, math.inf
+        self._target, self._target_reached, self._query_at = None, True, math.inf
         self._change(DispenserState.FAILED, reason, now, flow)
         self.off(now)
 
-    def _let_go(self) -> None:
+    def _release_line(self) -> None:
         if self._port is not None:
             self._port.close()
         self._opener.release()
-        self._port, self._closed, self._lost, self._query_at = None, True, False, math.inf
+        self._port, self._is_closed, self._line_lost, self._query_at = None, True, False, math.inf
         self._queue.restart(-math.inf)
 
     def _watch(self, port: Port, now: float) -> None:
-        """Note a line that takes nothing, one that is back, and a device that has switched itself off."""
+        """Detect a blocked line, one that is back, and a device that was switched off by its watchdog."""
         watchdog = self.profile.watchdog
-        if watchdog and now - self._fed > watchdog:
-            reason, closed = f"nothing was sent for {now - self._fed:.3f} s: its watchdog", self._fed + watchdog
-            self._log.add(closed, f"off: {reason}", 0.0)
+        if watchdog and now - self._last_sent > watchdog:
+            reason = f"nothing was sent for {now - self._last_sent:.3f} s: its watchdog"
+            self._log.add(self._last_sent + watchdog, f"off: {reason}", 0.0)
             self._change(DispenserState.READY, reason, now, quiet=True)
             self.off(now)
         blocked = self._queue.blocked_for(port, now)
         if blocked > 2 * self._line.timeout and self._state is not DispenserState.FAILED:
-            self._lost = True
+            self._line_lost = True
             self._fail(f"its line took nothing for {blocked:.2f} s", now)
-        elif self._lost and MessageKind.OFF not in self._queue and self._queue.idle(port):
-            self._lost = False
+        elif self._line_lost and MessageKind.OFF not in self._queue and self._queue.idle(port):
+            self._line_lost = False
             self._change(DispenserState.CLOSED, "its line is back and it is off; it must be prepared", now)
 
     def _read(self, data: bytes, now: float) -> None:
-        *answers, self._rest = ANSWER_END.split(self._rest + data)
-        self._rest = self._rest[-MAX_ANSWER:]
+        *answers, self._partial = ANSWER_END.split(self._partial + data)
+        self._partial = self._partial[-MAX_ANSWER:]
         for answer in answers:
             text = answer[-MAX_ANSWER:].decode("ascii", "replace").strip("\x02 ")
             if not text:
@@ -319,14 +319,14 @@ class LineDispenser:
                 self._fail(f"it says {text!r}", now)
 
     def _take_temperature(self, text: str) -> None:
-        found = self._answer.search(text) if self._line.messages.answer else None
+        match = self._answer.search(text) if self._line.messages.answer else None
         try:
-            celsius = math.nan if found is None else float(found[1])
+            celsius = math.nan if match is None else float(match[1])
         except (TypeError, ValueError):  # the file's own pattern
             return
         if math.isfinite(celsius):
             self._temperature = celsius
-            self._near = self._near or abs(celsius - (celsius if self._target is None else self._target)) <= NEAR_TARGET
+            self._target_reached |= self._target is None or abs(celsius - self._target) <= NEAR_TARGET
 
     # -- messages
 
@@ -340,7 +340,7 @@ class LineDispenser:
         last, urgent = len(lines) - 1, kind is MessageKind.OFF
         return [Message(line, kind, taken if i == last else None, urgent) for i, line in enumerate(lines)]
 
-    def _put_off(self, now: float, flowed: bool) -> None:
+    def _queue_off(self, now: float, flowed: bool) -> None:
         """Off at the front; again behind it where the device may still be busy with the line before."""
 
         def taken(at: float) -> None:
@@ -355,14 +355,14 @@ class LineDispenser:
         volume, template = self.profile.retract_volume, self._line.messages.retract
         if not template or not volume:
             return []
-        self._drawn_back = True
+        self._retracted = True
         return self._messages(MessageKind.RETRACT, template, volume=volume)
 
     # -- states
 
     def _stop(self, now: float) -> None:
-        """It is off as far as we are concerned."""
-        self._flow, self._fed, self._keepalive_at = 0.0, math.inf, math.inf
+        """Set the state to off."""
+        self._flow, self._last_sent, self._keepalive_at = 0.0, math.inf, math.inf
         if self._state is DispenserState.ON:
             self._change(DispenserState.READY, "off", now, quiet=True)
             self._settle(now)
@@ -371,16 +371,16 @@ class LineDispenser:
         """PREPARING until it is set up and was at its temperature; then READY."""
         if self._state not in (DispenserState.PREPARING, DispenserState.READY):
             return
-        if not self._near:
-            told = "it has not told its own" if self._temperature is None else f"it is at {self._temperature:g}"
-            self._change(DispenserState.PREPARING, f"set to {self._target:g} degrees C, {told}", now, quiet=True)
+        if not self._target_reached:
+            answer_text = "it has not told its own" if self._temperature is None else f"it is at {self._temperature:g}"
+            self._change(DispenserState.PREPARING, f"set to {self._target:g} degrees C, {answer_text}", now, quiet=True)
         elif self._state is DispenserState.PREPARING and MessageKind.SETUP not in self._queue:
             self._change(DispenserState.READY, "prepared", now)
 
     def _change(
         self, state: DispenserState, reason: str, now: float, flow: float | None = None, quiet: bool = False
     ) -> None:
-        """quiet: an event of its own tells it, or it would be told too often."""
+        """quiet: log nothing, as another event has it, or it would be logged too often."""
         if (state, reason) != (self._state, self._reason) and not quiet:
             self._log.add(now, f"{state.value}: {reason}", flow)
         self._state, self._reason = state, reason

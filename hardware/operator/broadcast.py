@@ -148,13 +148,13 @@ class ErrorHistory:
         if len(self.rows) <= TIMELINE_ROWS:
             return
         self.step *= 2
-        kept = self.rows[:1]
-        for each in self.rows[1:]:
-            if each.stamp - kept[-1].stamp < self.step:
-                kept[-1].add(each)
+        merged = self.rows[:1]
+        for row_before in self.rows[1:]:
+            if row_before.stamp - merged[-1].stamp < self.step:
+                merged[-1].add(row_before)
             else:
-                kept.append(each)
-        self.rows = kept
+                merged.append(row_before)
+        self.rows = merged
 
 
 class Broadcast:
@@ -168,29 +168,29 @@ class Broadcast:
         self._scene: PageScene | None = None
         self._pictures: PagePictures | None = None
         self._sheet: PagePictures | None = None
-        self._since = nan
+        self._view_time = nan
         self._history, self._log = ErrorHistory(), deque[LogLine](maxlen=LOG_ROWS)
         self.view: OperatorView | WavingView | RecordingView | None = None
         self.gone, self.refused = False, 0
         self.view_text, self.scene_text, self.pictures_bytes, self.sheet_bytes = "null", "", b"", b""
         self.news = asyncio.Event()  # set, and replaced, when there is something new
-        self.asked = asyncio.Event()  # something was asked of the run: its answer is looked for more often
+        self.request_event = asyncio.Event()  # something was asked of the run: its answer is looked for more often
 
     def update(self, now: float, watched: bool) -> None:
         """Take what is new at `now`, s; pictures only where they are watched."""
         view = self._link.views.get()
-        new = view is not None and (self.view is None or view.stamp > self.view.stamp)
-        if view is not None and new:
-            self.view, self.view_text, self._since = view, text_of(view), now
+        changed = view is not None and (self.view is None or view.stamp > self.view.stamp)
+        if view is not None and changed:
+            self.view, self.view_text, self._view_time = view, text_of(view), now
             if isinstance(view, OperatorView):
                 self._remember(view)
         if (scene := self._link.scene.get()) is not self._scene and scene is not None:
-            self._scene, self.scene_text, new = scene, scene_text(scene), True
+            self._scene, self.scene_text, changed = scene, scene_text(scene), True
         if watched and (sheet := self._link.sheet.get()) is not self._sheet and sheet is not None:
-            self._sheet, self.sheet_bytes, new = sheet, pictures_bytes(sheet, "sheet"), True
+            self._sheet, self.sheet_bytes, changed = sheet, pictures_bytes(sheet, "sheet"), True
         if watched and (pictures := self._link.pictures.get()) is not self._pictures and pictures is not None:
-            self._pictures, self.pictures_bytes, new = pictures, pictures_bytes(pictures), True
-        if new:
+            self._pictures, self.pictures_bytes, changed = pictures, pictures_bytes(pictures), True
+        if changed:
             self.wake()
 
     def wake(self) -> None:
@@ -205,7 +205,7 @@ class Broadcast:
 
     def age(self, now: float) -> float:
         """For how long, s, the newest view has been the newest; NaN before the first."""
-        return now - self._since
+        return now - self._view_time
 
     def history_text(self) -> str:
         """The error over the run and its log, for a window that has just been opened."""
@@ -217,8 +217,8 @@ class Broadcast:
         self._log.extend(line for line in view.log if line.number > last)
         if (motion := view.motion) is None:
             return
-        aged = motion.error_age > AGED  # nothing is extruded: the errors are of earlier
-        errors = (nan, nan) if aged else (motion.error, motion.true_error)
+        is_old = motion.error_age > AGED  # nothing is extruded: the errors are of earlier
+        errors = (nan, nan) if is_old else (motion.error, motion.true_error)
         limit, held = NORMAL_95 * motion.limit, motion.activity is Activity.HOLDING
         self._history.add(TimelineRow(view.stamp, *errors, limit, held))
 
@@ -261,19 +261,19 @@ def parse_message(text: str) -> RequestMessage | RegionMessage | ShownMessage | 
     if message.keys() == {"shown"}:
         return ShownMessage(message["shown"]) if _is_count(message["shown"]) else None
     if message.keys() == {"region", "turn", "tag"}:
-        sound = isinstance(message["region"], dict) and _is_count(message["turn"]) and _is_count(message["tag"])
-        return RegionMessage(message["region"], message["turn"], message["tag"]) if sound else None
+        valid = isinstance(message["region"], dict) and _is_count(message["turn"]) and _is_count(message["tag"])
+        return RegionMessage(message["region"], message["turn"], message["tag"]) if valid else None
     wish = message.get("ask")
     if not isinstance(wish, str) or wish not in Wish.__members__.values():
         return None
-    more = wish if wish in (Wish.MOVE, Wish.OUTLINE) else None  # what it carries has its name
-    if message.keys() != {"ask", "turn", "tag", *([] if more is None else [more])}:
+    payload_key = wish if wish in (Wish.MOVE, Wish.OUTLINE) else None  # what it carries has its name
+    if message.keys() != {"ask", "turn", "tag", *([] if payload_key is None else [payload_key])}:
         return None
     if not (_is_count(message["turn"]) and _is_count(message["tag"])):
         return None
-    move = _parse_move(message["move"]) if more == Wish.MOVE else None
-    outline = message["outline"] if more == Wish.OUTLINE else None
-    if (more == Wish.MOVE and move is None) or (more == Wish.OUTLINE and not isinstance(outline, dict)):
+    move = _parse_move(message["move"]) if payload_key == Wish.MOVE else None
+    outline = message["outline"] if payload_key == Wish.OUTLINE else None
+    if (payload_key == Wish.MOVE and move is None) or (payload_key == Wish.OUTLINE and not isinstance(outline, dict)):
         return None
     return RequestMessage(Wish(wish), message["turn"], message["tag"], move, outline)
 
@@ -295,14 +295,14 @@ class RateLimiter:
     """A token bucket: `rate` a second, and as many at once as a second's worth and ten."""
 
     def __init__(self, rate: float, now: float) -> None:
-        self._rate, self._most = rate, rate + 10
-        self._left, self._then = self._most, now
+        self._rate, self._max_tokens = rate, rate + 10
+        self._tokens, self._update_time = self._max_tokens, now
 
     def take(self, now: float) -> bool:
         """Whether one more is allowed at `now`, s."""
-        self._left = min(self._most, self._left + self._rate * (now - self._then))
-        self._then = now
-        if self._left < 1:
+        self._tokens = min(self._max_tokens, self._tokens + self._rate * (now - self._update_time))
+        self._update_time = now
+        if self._tokens < 1:
             return False
-        self._left -= 1
+        self._tokens -= 1
         return True

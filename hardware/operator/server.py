@@ -55,10 +55,10 @@ class WindowSession:
     def __init__(
         self, socket: web.WebSocketResponse, newest: Broadcast, link: OperatorLink, limits: WindowLimits
     ) -> None:
-        self._socket, self._newest, self._link, self._limits = socket, newest, link, limits
+        self._socket, self._broadcast, self._link, self._limits = socket, newest, link, limits
         self._clock = WallClock()
         now = self._clock.now()
-        self._messages, self._asks = RateLimiter(limits.messages, now), RateLimiter(limits.asks, now)
+        self._message_limiter, self._request_limiter = RateLimiter(limits.messages, now), RateLimiter(limits.asks, now)
         self._replies: deque[str] = deque(maxlen=16)
         self._bundle, self._shown = 0, asyncio.Event()
         self.malformed = self.dropped = 0
@@ -76,7 +76,7 @@ class WindowSession:
             parsed = parse_message(message.data) if message.type is WSMsgType.TEXT else None
             if isinstance(parsed, RequestMessage) and parsed.wish is Wish.STOP:
                 self._ask(parsed)
-            elif not self._messages.take(self._clock.now()):
+            elif not self._message_limiter.take(self._clock.now()):
                 self.dropped += 1
             elif isinstance(parsed, RequestMessage):
                 self._ask(parsed)
@@ -90,52 +90,52 @@ class WindowSession:
             if self.malformed > self._limits.malformed or self.dropped > MAX_DROPPED_MESSAGES:
                 await self._close(b"too many messages, or none that make sense")
 
-    def _ask(self, ask: RequestMessage) -> None:
-        number, words, outline = None, self._refusal(ask), Polygons()
-        if not words and ask.outline is not None:
+    def _ask(self, request: RequestMessage) -> None:
+        number, reason, outline = None, self._refusal(request), Polygons()
+        if not reason and request.outline is not None:
             try:
-                outline = drawn_region(ask.outline, self._newest.cameras).polygons
+                outline = drawn_region(request.outline, self._broadcast.cameras).polygons
             except InputError as error:
-                words = f"{error.what} = {error.got}, allowed {error.allowed}"
-        if not words and (number := self._link.ask(ask.wish, ask.turn, ask.move, outline)) is None:
-            words = "the run has not yet taken what was asked before"
-        self._newest.asked.set()
-        self._replies.append(text(kind="asked", tag=ask.tag, wish=ask.wish, number=number, words=words))
-        self._newest.wake()
+                reason = f"{error.what} = {error.got}, allowed {error.allowed}"
+        if not reason and (number := self._link.ask(request.wish, request.turn, request.move, outline)) is None:
+            reason = "the run has not yet taken what was asked before"
+        self._broadcast.request_event.set()
+        self._replies.append(text(kind="asked", tag=request.tag, wish=request.wish, number=number, words=reason))
+        self._broadcast.wake()
 
-    def _draw(self, drawn: RegionMessage) -> None:
+    def _draw(self, message: RegionMessage) -> None:
         """Hand a drawn region to the run, or say why not."""
-        words = self._region_refusal(drawn)
-        if not words:
+        reason = self._region_refusal(message)
+        if not reason:
             try:
-                self._link.regions.put(drawn_region(drawn.region, self._newest.cameras))
+                self._link.regions.put(drawn_region(message.region, self._broadcast.cameras))
             except InputError as error:
-                words = f"{error.what} = {error.got}, allowed {error.allowed}"
-        self._replies.append(text(kind="asked", tag=drawn.tag, wish="region", number=None, words=words))
-        self._newest.wake()
+                reason = f"{error.what} = {error.got}, allowed {error.allowed}"
+        self._replies.append(text(kind="asked", tag=message.tag, wish="region", number=None, words=reason))
+        self._broadcast.wake()
 
-    def _region_refusal(self, drawn: RegionMessage) -> str:
-        now, view = self._clock.now(), self._newest.view
-        if not self._asks.take(now):
+    def _region_refusal(self, message: RegionMessage) -> str:
+        now, view = self._clock.now(), self._broadcast.view
+        if not self._request_limiter.take(now):
             return "that was too fast: ask again"
-        if view is None or self._newest.age(now) > self._limits.stale:
+        if view is None or self._broadcast.age(now) > self._limits.stale:
             return "nothing is heard from the run"
         if not getattr(view, "draws", False):
             return "no region is asked for now"
-        if drawn.turn != view.turn:
+        if message.turn != view.turn:
             return "the run has changed since this was shown: look again, then ask again"
         return ""
 
-    def _refusal(self, ask: RequestMessage) -> str:
+    def _refusal(self, request: RequestMessage) -> str:
         """Why a request is not even handed on, "" if it is; the run decides again, by newer knowledge."""
-        if ask.wish is Wish.STOP:
+        if request.wish is Wish.STOP:
             return ""
-        now, view = self._clock.now(), self._newest.view
-        if not self._asks.take(now):
+        now, view = self._clock.now(), self._broadcast.view
+        if not self._request_limiter.take(now):
             return "that was too fast: ask again"
-        if view is None or self._newest.age(now) > self._limits.stale:
-            return "" if ask.wish in CALMING_WISHES else "nothing is heard from the run"
-        return refusal(ask.wish, ask.turn, view.offers, view.turn)
+        if view is None or self._broadcast.age(now) > self._limits.stale:
+            return "" if request.wish in CALMING_WISHES else "nothing is heard from the run"
+        return refusal(request.wish, request.turn, view.offers, view.turn)
 
     async def _send(self) -> None:
         try:
@@ -144,7 +144,7 @@ class WindowSession:
             await self._close(b"nothing was shown for too long")
 
     async def _send_all(self) -> None:
-        newest, scene, pictures, sheet = self._newest, "", b"", b""
+        newest, scene, pictures, sheet = self._broadcast, "", b"", b""
         await self._put(newest.history_text())
         while True:
             news = newest.news
@@ -168,40 +168,40 @@ class WindowSession:
 
     async def _until_shown(self) -> None:
         """Wait until the window has shown the bundle; a new turn, such as a stop, is sent at once all the same."""
-        shown, turn = asyncio.create_task(self._shown.wait()), getattr(self._newest.view, "turn", 0)
+        shown_task, turn = asyncio.create_task(self._shown.wait()), getattr(self._broadcast.view, "turn", 0)
         try:
-            while not shown.done():
-                news = asyncio.create_task(self._newest.news.wait())
-                await asyncio.wait({shown, news}, return_when=asyncio.FIRST_COMPLETED)
+            while not shown_task.done():
+                news = asyncio.create_task(self._broadcast.news.wait())
+                await asyncio.wait({shown_task, news}, return_when=asyncio.FIRST_COMPLETED)
                 news.cancel()
-                if not shown.done() and turn != (turn := getattr(self._newest.view, "turn", 0)):
+                if not shown_task.done() and turn != (turn := getattr(self._broadcast.view, "turn", 0)):
                     await self._put(self._status())
         finally:
-            shown.cancel()
+            shown_task.cancel()
 
     def _status(self) -> str:
-        age = self._newest.age(self._clock.now())
-        kind, stale = "gone" if self._newest.gone else "view", self._limits.stale
-        head = text(kind=kind, bundle=self._bundle, age=age, stale=stale, refused=self._newest.refused)
-        return f'{head[:-1]},"view":{self._newest.view_text}}}'
+        age = self._broadcast.age(self._clock.now())
+        kind, stale = "gone" if self._broadcast.gone else "view", self._limits.stale
+        head = text(kind=kind, bundle=self._bundle, age=age, stale=stale, refused=self._broadcast.refused)
+        return f'{head[:-1]},"view":{self._broadcast.view_text}}}'
 
     async def _put(self, message: str | bytes) -> None:
         if message:
-            sent = self._socket.send_str(message) if isinstance(message, str) else self._socket.send_bytes(message)
-            await asyncio.wait_for(sent, self._limits.patience)
+            sending = self._socket.send_str(message) if isinstance(message, str) else self._socket.send_bytes(message)
+            await asyncio.wait_for(sending, self._limits.patience)
 
-    async def _close(self, why: bytes) -> None:
-        closing = self._socket.close(code=WSCloseCode.POLICY_VIOLATION, message=why)
+    async def _close(self, reason: bytes) -> None:
+        closing = self._socket.close(code=WSCloseCode.POLICY_VIOLATION, message=reason)
         await asyncio.wait_for(closing, self._limits.patience)
 
 
 def drawn_region(region: dict[str, Any], cameras: Sequence[Camera]) -> DrawnRegion:
     """The region in a window's message, checked as that of a session.toml is; InputError."""
-    where = "the page"
-    settings = region_from_table(where, {BY_KEY: RegionBy.POLYGON.value} | region)
+    source = "the page"
+    settings = region_from_table(source, {BY_KEY: RegionBy.POLYGON.value} | region)
     if settings.by is not RegionBy.POLYGON or not settings.polygons:
-        raise InputError(where, "region", "no corners", "corners in two cameras or more")
-    check_region(where, settings, Rig(tuple(cameras)))
+        raise InputError(source, "region", "no corners", "corners in two cameras or more")
+    check_region(source, settings, Rig(tuple(cameras)))
     return DrawnRegion(settings.polygons)
 
 
@@ -214,7 +214,7 @@ class OperatorServer:
         self._headers = {**response_headers(settings, port), "Server": "stillbed"}
         self._windows: dict[WindowSession, asyncio.BaseTransport | None] = {}
         self._files = page_files()
-        self.broadcast, self._hurry_until = Broadcast(link), 0.0
+        self.broadcast, self._fast_poll_until = Broadcast(link), 0.0
 
     def application(self) -> web.Application:
         """The routes, all behind the check of requests."""
@@ -231,18 +231,18 @@ class OperatorServer:
             self._link.requests.fine = getattr(self.broadcast.view, "stage", None) in FINE_STAGES
             self.broadcast.refused = sum(self._access.refused.values())
             self.broadcast.update(self._clock.now(), bool(self._windows))
-            own = set(self._windows.values())
-            for handler in [each for each in connections() if each.transport not in own][:-MAX_OTHER_CONNECTIONS]:
+            sockets = set(self._windows.values())
+            for handler in [each for each in connections() if each.transport not in sockets][:-MAX_OTHER_CONNECTIONS]:
                 handler.force_close()
             await self._wait(self._clock.now())
 
     async def _wait(self, now: float) -> None:
         """Wait until it is time to look again."""
-        asked = self.broadcast.asked
+        asked = self.broadcast.request_event
         if asked.is_set():
             asked.clear()
-            self._hurry_until = now + HURRY_TIME
-        if now < self._hurry_until:
+            self._fast_poll_until = now + HURRY_TIME
+        if now < self._fast_poll_until:
             await asyncio.sleep(HURRY_PERIOD)
             return
         with suppress(TimeoutError):
@@ -290,7 +290,7 @@ class OperatorServer:
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         number = self._link.requests.ask(Wish.STOP, 0)
-        self.broadcast.asked.set()
+        self.broadcast.request_event.set()
         return web.Response(text=f"{number}\n", headers=self._headers)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
@@ -325,17 +325,17 @@ async def serve(
     await web.SockSite(runner, listener, ssl_context=_ssl_context(settings)).start()
     assert runner.server is not None
     handlers = runner.server
-    updating = asyncio.create_task(server.update(lambda: handlers.connections))
-    done = asyncio.create_task(ended.wait())
-    await asyncio.wait({updating, done}, return_when=asyncio.FIRST_COMPLETED)
+    update_task = asyncio.create_task(server.update(lambda: handlers.connections))
+    ended_task = asyncio.create_task(ended.wait())
+    await asyncio.wait({update_task, ended_task}, return_when=asyncio.FIRST_COMPLETED)
     server.last_update()
     server.broadcast.wake()
     if server.windows:
         await asyncio.sleep(SHUTDOWN_DELAY)
     await runner.cleanup()
-    if updating.done():
-        updating.result()  # what ended it
-    updating.cancel()
+    if update_task.done():
+        update_task.result()  # what ended it
+    update_task.cancel()
 
 
 def _ssl_context(settings: OperatorSettings) -> ssl.SSLContext | None:

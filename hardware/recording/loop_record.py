@@ -73,11 +73,11 @@ class RecordingSource:
     ) -> None:
         """profile: of the arm, as LOOP_ARM_ATTACHMENT has it. material: None where nothing flows."""
         self.material = material
-        self._clock, self._newest, self._given, self._put = clock, pose, orders, put
+        self._clock, self._pose_source, self._order_source, self._put_record = clock, pose, orders, put
         self._readings: list[float] = []
         self._calls: list[tuple[int, int, str, Any]] = []
         self._count = self._number = 0
-        self._last: PoseHandover | None = None
+        self._last_handover: PoseHandover | None = None
         settings = LoopSettings() if settings is None else settings
         start = {"link": asdict(settings.link)} | ({} if settings.until is None else {"until": settings.until})
         self.note(START, start)
@@ -101,15 +101,15 @@ class RecordingSource:
 
     def pose(self) -> PoseHandover | None:
         """The newest pose."""
-        handover = self._newest()
-        new = handover is not self._last and handover is not None
-        self._last = handover
-        self.note("pose", [handover.pose.stamp, handover.sent] if new and handover is not None else [])
+        handover = self._pose_source()
+        is_new = handover is not self._last_handover and handover is not None
+        self._last_handover = handover
+        self.note("pose", [handover.pose.stamp, handover.sent] if is_new and handover is not None else [])
         return handover
 
     def orders(self) -> Sequence[LoopOrder]:
         """The orders since the last call."""
-        orders = self._given()
+        orders = self._order_source()
         self.note("orders", [_text_from_order(order) for order in orders])
         return orders
 
@@ -128,7 +128,7 @@ class RecordingSource:
     def flush(self) -> None:
         """Put what was noted since the last time."""
         if self._readings or self._calls:
-            self._put(LoopRecord(self._number, tuple(self._readings), tuple(self._calls)))
+            self._put_record(LoopRecord(self._number, tuple(self._readings), tuple(self._calls)))
             self._number += 1
             self._readings, self._calls = [], []
 
@@ -150,45 +150,45 @@ class _NotedDriver(ArmDriver):
         self._driver.release()
 
     def connect(self, now: float) -> None:
-        self._through("connect", lambda: self._driver.connect(now), lambda nothing: "")
+        self._noted("connect", lambda: self._driver.connect(now), lambda nothing: "")
 
     def state(self, now: float) -> Reported:
-        return self._through("state", lambda: self._driver.state(now), _list_from_reported)
+        return self._noted("state", lambda: self._driver.state(now), _list_from_reported)
 
     def send(self, instruction: G1 | G4, now: float) -> Sequence[Sent]:
         frame = base64.b64encode(encode(instruction, self._dialect)).decode("ascii")
         usual = (Sent(instruction),)
-        return self._through(
+        return self._noted(
             "send", lambda: self._driver.send(instruction, now), lambda sent: [frame, _rows(sent, usual)]
         )
 
     def stop(self, now: float) -> Sequence[Sent]:
         usual = (Sent(Pause()),)
-        return self._through("stop", lambda: self._driver.stop(now), lambda sent: ["", _rows(sent, usual)])
+        return self._noted("stop", lambda: self._driver.stop(now), lambda sent: ["", _rows(sent, usual)])
 
     def set_origin(self, origin: Array, now: float) -> Sequence[Sent]:
-        asked = lambda: self._driver.set_origin(origin, now)  # noqa: E731
-        return self._through("set_origin", asked, lambda sent: [origin.tolist(), _rows(sent, ())])
+        call = lambda: self._driver.set_origin(origin, now)  # noqa: E731
+        return self._noted("set_origin", call, lambda sent: [origin.tolist(), _rows(sent, ())])
 
     def flush(self, now: float) -> Sequence[Sent]:
-        return self._through("flush", lambda: self._driver.flush(now), lambda sent: _rows(sent, ()))
+        return self._noted("flush", lambda: self._driver.flush(now), lambda sent: _rows(sent, ()))
 
     def enable(self, now: float) -> str:
-        return self._through("enable", lambda: self._driver.enable(now), str)
+        return self._noted("enable", lambda: self._driver.enable(now), str)
 
     def home(self, now: float) -> bool:
-        return self._through("home", lambda: self._driver.home(now), bool)
+        return self._noted("home", lambda: self._driver.home(now), bool)
 
     def recall(self) -> None:
         self._driver.recall()
 
     def blocked_for(self, now: float) -> float | None:
-        return self._through("blocked_for", lambda: self._driver.blocked_for(now), lambda s: [] if s is None else [s])
+        return self._noted("blocked_for", lambda: self._driver.blocked_for(now), lambda s: [] if s is None else [s])
 
     def waiting(self) -> float:
-        return self._through("waiting", self._driver.waiting, float)
+        return self._noted("waiting", self._driver.waiting, float)
 
-    def _through(self, kind: str, call: Callable[[], Answer], told: Callable[[Answer], Any]) -> Answer:
+    def _noted(self, kind: str, call: Callable[[], Answer], encode_answer: Callable[[Answer], Any]) -> Answer:
         try:
             answer = call()
         except UnpluggedError as error:
@@ -197,7 +197,7 @@ class _NotedDriver(ArmDriver):
         except InputError as error:
             self._note(kind, {REFUSED: str(error)})
             raise
-        self._note(kind, told(answer))
+        self._note(kind, encode_answer(answer))
         return answer
 
 
@@ -210,16 +210,16 @@ class LoopKeeper:
 
     def arm(self, profile: ArmProfile) -> ArmProfile:
         """The arm as its recorded text has it, to the last digit."""
-        text, kept = recorded_arm(profile)
+        text, recorded = recorded_arm(profile)
         self._attach(LOOP_ARM_ATTACHMENT, text.encode())
-        return kept
+        return recorded
 
     def begun(self, order: BeginPrint) -> BeginPrint:
         """The order as its recorded texts have it, likewise."""
-        texts, kept = recorded_begin(order)
+        texts, recorded = recorded_begin(order)
         for name, text in texts.items():
             self._attach(name, text.encode())
-        return kept
+        return recorded
 
 
 def recorded_arm(profile: ArmProfile) -> tuple[str, ArmProfile]:

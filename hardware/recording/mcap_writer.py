@@ -141,7 +141,7 @@ class McapWriter:
         """Write the open chunk and its message index; one without messages stays open."""
         if not self._messages:
             return
-        data = _ended(self._chunk)
+        data = _finished_bytes(self._chunk)
         packed = zstandard.compress(data) if self._compress else data
         (first, last), kind = self._span, "zstd" if self._compress else ""
         record = _bytes(Chunk(kind, packed, last, first, zlib.crc32(data), len(data)))
@@ -174,8 +174,8 @@ def _bytes(*records: McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
-    return _ended(builder)
+    return _finished_bytes(builder)
 
 
-def _ended(builder: RecordBuilder) -> bytes:
+def _finished_bytes(builder: RecordBuilder) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]

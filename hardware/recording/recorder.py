@@ -153,7 +153,7 @@ class Recorder:
         elif isinstance(record, SurfacePose):
             self._pose(record)
         else:
-            topic, encoded = next(each for kind, each in RECORD_CHANNELS.items() if isinstance(record, kind))
+            topic, encoded = next(entry for kind, entry in RECORD_CHANNELS.items() if isinstance(record, kind))
             self._message(topic, record.stamp, encoded(record))
         if isinstance(record, Observations):
             self._viewers.take_tracks(record)
@@ -170,12 +170,12 @@ class Recorder:
         self, camera: int, stamp: float, kind: str, data: bytes, camera_stamp: float | None = None
     ) -> None:
         """Write an image that is already PNG or JPEG (`kind` "png" or "jpeg"); stamps in s as in `frame`."""
-        own = stamp - self.rig.cameras[camera].clock_offset if camera_stamp is None else camera_stamp
+        camera_clock_stamp = stamp - self.rig.cameras[camera].clock_offset if camera_stamp is None else camera_stamp
         name, number = self.rig.cameras[camera].name, self._numbers[camera]
         self._check_rising(f"stamp of camera {name!r}", stamp)
         image = ros_messages.image(kind, data, camera_frame(name), self._log_time(stamp))
         self._publish([RosMessage(image_topic(name), ros_messages.IMAGE, image)], stamp, number)
-        entry = {"stamp": stamp, "camera_stamp": own, "camera": int(camera), "number": number}
+        entry = {"stamp": stamp, "camera_stamp": camera_clock_stamp, "camera": int(camera), "number": number}
         self._message("/frames", stamp, entry)  # after the image: where this can be read, the image can
         self._numbers[camera] += 1
 
@@ -247,8 +247,8 @@ class Recorder:
 
     def event(self, stamp: float, text: str, level: int = INFO, name: str = "stillbed") -> None:
         """Write an event at `stamp`, s. level: of Python's logging, whose numbers are ROS's."""
-        told = ros_messages.log(level, text, name, self._log_time(stamp))
-        self._publish([RosMessage("/events", ros_messages.LOG, told)], stamp)
+        log_message = ros_messages.log(level, text, name, self._log_time(stamp))
+        self._publish([RosMessage("/events", ros_messages.LOG, log_message)], stamp)
 
     def latency(self, stamp: float, stage: str, width: float, counts: NDArray[np.int64], most: float) -> None:
         """Write how long a stage took until `stamp`, s: counts (N,) in bins of `width` s, and the largest, s."""
@@ -369,15 +369,15 @@ class Recorder:
         try:
             return action()
         except OSError as error:
-            self._failed = f"{self.path}: recording stopped, {(error.strerror or str(error)).lower()}{self._left()}"
+            self._failed = f"{self.path}: recording stopped, {(error.strerror or str(error)).lower()}{self._remains()}"
             raise StillbedError(self._failed) from error
 
-    def _left(self) -> str:
-        """What a failed write leaves, by a look at the file."""
+    def _remains(self) -> str:
+        """Whether the file is still readable after a failed write, as a text."""
         if not self._kept:
             return NOT_KEPT
         try:
-            readable = any(isinstance(part, ChunkMessages) and part.messages for part in walk(self.path))
+            readable = any(isinstance(record, ChunkMessages) and record.messages for record in walk(self.path))
         except (InputError, OSError):
             readable = False
         return "; what was written before is kept" if readable else "; nothing of it can be read"

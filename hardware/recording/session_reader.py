@@ -116,23 +116,23 @@ def open_recording(path: Path) -> Session:
 
 def _contents(path: Path) -> RecordingContents:
     contents, damages = RecordingContents(), list[Damage]()
-    for part in walk(path):
-        if isinstance(part, Damage):
-            damages.append(part)
-        elif isinstance(part, FileMetadata):
-            contents.began = began_of(part.table)
-        elif isinstance(part, AttachedFile):
-            if part.name in SURFACE_NAMES:
-                contents.surface = part
+    for record in walk(path):
+        if isinstance(record, Damage):
+            damages.append(record)
+        elif isinstance(record, FileMetadata):
+            contents.began = began_of(record.table)
+        elif isinstance(record, AttachedFile):
+            if record.name in SURFACE_NAMES:
+                contents.surface = record
         else:
-            for index, stored in enumerate(part.messages):
-                _take(path, contents, (part.offset, index), stored)
+            for index, stored in enumerate(record.messages):
+                _take(path, contents, (record.offset, index), stored)
     contents.damage = damage_words(damages)
     if damages:  # an image may be lost with another chunk than its entry
         names = [] if contents.rig is None else [camera.name for camera in contents.rig.cameras]
         refs = [(key, ref) for key, ref in contents.frames.items() if 0 <= ref.camera < len(names)]
-        held = ((key, ref) for key, ref in refs if (image_topic(names[ref.camera]), ref.number) in contents.places)
-        contents.frames = dict(held)
+        readable = ((key, ref) for key, ref in refs if (image_topic(names[ref.camera]), ref.number) in contents.places)
+        contents.frames = dict(readable)
     return contents
 
 
@@ -173,9 +173,9 @@ def _take_message(path: Path, contents: RecordingContents, topic: str, message: 
             raise InputError(path, "/head: extruding", message["extruding"], "true or false")
         contents.heads.add((tuple(messages.row_from_message(message)), message["extruding"]))
     else:
-        own, common = float(message["camera_stamp"]), float(message["stamp"])
+        camera_stamp, stamp = float(message["camera_stamp"]), float(message["stamp"])
         camera, number = int(message["camera"]), int(message["number"])
-        contents.frames[camera, number] = FrameRef(camera, number, own, common)
+        contents.frames[camera, number] = FrameRef(camera, number, camera_stamp, stamp)
 
 
 def _check_frames(path: Path, contents: RecordingContents, rig: Rig) -> None:
@@ -203,9 +203,9 @@ def _checked_rois(path: Path, contents: RecordingContents, rig: Rig) -> tuple[Ro
 
 def _last_look(rois: tuple[Roi, ...]) -> tuple[Roi, ...]:
     """The regions that count: a run that looks for the surface anew records all of its region again, at one stamp."""
-    last = tuple(roi for roi in rois if roi.stamp == max(each.stamp for each in rois))
-    again = len({roi.camera for roi in rois}) < len(rois)
-    return last if again and len(last) > 1 else rois
+    latest = tuple(roi for roi in rois if roi.stamp == max(each.stamp for each in rois))
+    repeated = len({roi.camera for roi in rois}) < len(rois)
+    return latest if repeated and len(latest) > 1 else rois
 
 
 def _truth(path: Path, contents: RecordingContents) -> Trajectory | None:
@@ -334,32 +334,32 @@ def corrected_pictures(recording: Path) -> list[Labelled]:
     from perception.training.dataset import Labelled
     from perception.wound.segmentation import rgb
 
-    where, newest = Path(recording), dict[tuple[int, float], OutlinedPicture]()
+    source, newest = Path(recording), dict[tuple[int, float], OutlinedPicture]()
     decoders: dict[str, Callable[[Message], Rig | OutlinedPicture]] = {
-        "/rig": partial(messages.rig_from_message, f"{where} /rig"),
-        OUTLINE_TOPIC: partial(messages.outlined_from_message, where),
+        "/rig": partial(messages.rig_from_message, f"{source} /rig"),
+        OUTLINE_TOPIC: partial(messages.outlined_from_message, source),
     }
     rig: Rig | None = None
-    for record in read_channels(where, decoders):
+    for record in read_channels(source, decoders):
         if isinstance(record, Rig):
             rig = record
-        elif not np.isfinite(both := [record.stamp, record.taken]).all():
-            raise InputError(where, f"{OUTLINE_TOPIC}: stamp", both, "finite numbers of seconds")
+        elif not np.isfinite(stamps := [record.stamp, record.taken]).all():
+            raise InputError(source, f"{OUTLINE_TOPIC}: stamp", stamps, "finite numbers of seconds")
         elif (key := (record.camera, record.taken)) not in newest or newest[key].stamp <= record.stamp:
             newest[key] = record
     if rig is None or not newest:
-        raise InputError(where, OUTLINE_TOPIC, recording_damage(where) or "no message", OUTLINE_ALLOWED)
-    made = []
+        raise InputError(source, OUTLINE_TOPIC, recording_damage(source) or "no message", OUTLINE_ALLOWED)
+    pictures = []
     for camera, taken in sorted(newest):
         outlined = newest[camera, taken]
         if not 0 <= camera < len(rig):
-            raise InputError(where, f"{OUTLINE_TOPIC}: camera", camera, f"a camera of /rig, 0..{len(rig) - 1}")
+            raise InputError(source, f"{OUTLINE_TOPIC}: camera", camera, f"a camera of /rig, 0..{len(rig) - 1}")
         name, size = rig.cameras[camera].name, rig.cameras[camera].size
-        check_size(outlined.image, size, where, f"{OUTLINE_TOPIC}: image of camera {name!r}")
-        check_polygon(where, f"{OUTLINE_TOPIC}: polygon of camera {name!r}", outlined.polygon, size)
+        check_size(outlined.image, size, source, f"{OUTLINE_TOPIC}: image of camera {name!r}")
+        check_polygon(source, f"{OUTLINE_TOPIC}: polygon of camera {name!r}", outlined.polygon, size)
         wound = polygon_mask(size, outlined.polygon) > 0
-        made.append(Labelled(f"{where.name}/{name}_{taken:.6f}", rgb(outlined.image), wound))
-    return made
+        pictures.append(Labelled(f"{source.name}/{name}_{taken:.6f}", rgb(outlined.image), wound))
+    return pictures
 
 
 PATH_ATTACHMENT, ARM_ATTACHMENT, DISPENSER_ATTACHMENT = "path.csv", "arm.toml", "dispenser.toml"
@@ -379,14 +379,14 @@ class PrintInputs:
 def input_texts(path: PrintPath, profile: ArmProfile, dispensers: str = "", tissue: str = "") -> dict[str, str]:
     """Path, arm, dispenser file and tissue as texts, by the names of the recording's attachments; "" without."""
     texts = {PATH_ATTACHMENT: path_text(path), ARM_ATTACHMENT: arm_text(profile, "as a live run used it", whole=True)}
-    rest = {DISPENSER_ATTACHMENT: dispensers, TISSUE_ATTACHMENT: tissue}
-    return texts | {name: text for name, text in rest.items() if text}
+    optional = {DISPENSER_ATTACHMENT: dispensers, TISSUE_ATTACHMENT: tissue}
+    return texts | {name: text for name, text in optional.items() if text}
 
 
 def used_inputs(record: Path) -> PrintInputs:
     """What a recorded run printed; InputError where it did not begin to print."""
-    attached = (part for part in walk(record) if isinstance(part, AttachedFile))
-    return inputs_from_texts({part.name: part.data.decode("utf-8", "replace") for part in attached}, record)
+    attachments = (part for part in walk(record) if isinstance(part, AttachedFile))
+    return inputs_from_texts({part.name: part.data.decode("utf-8", "replace") for part in attachments}, record)
 
 
 def inputs_from_texts(texts: Mapping[str, str], record: Path) -> PrintInputs:
@@ -394,7 +394,7 @@ def inputs_from_texts(texts: Mapping[str, str], record: Path) -> PrintInputs:
     if PATH_ATTACHMENT not in texts or ARM_ATTACHMENT not in texts:
         raise InputError(record, "recording", "no path", "the recording of a run that began to print")
     path = path_from_text(texts[PATH_ATTACHMENT], record / PATH_ATTACHMENT)
-    dispensers, where = texts.get(DISPENSER_ATTACHMENT, ""), record / DISPENSER_ATTACHMENT
-    outlets = outlets_from(dispensers_from_text(dispensers, where), where) if dispensers else {}
+    dispensers, source = texts.get(DISPENSER_ATTACHMENT, ""), record / DISPENSER_ATTACHMENT
+    outlets = outlets_from(dispensers_from_text(dispensers, source), source) if dispensers else {}
     tissue = tissue_from_text(texts[TISSUE_ATTACHMENT], record) if TISSUE_ATTACHMENT in texts else None
     return PrintInputs(path, arm_from_text(texts[ARM_ATTACHMENT], record / ARM_ATTACHMENT), outlets, tissue)
