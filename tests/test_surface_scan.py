@@ -24,7 +24,7 @@ from hardware.live.surface_scan import (
     ScanSource,
     SurfaceScan,
     TrackedFrames,
-    _Taken,
+    _FrameSelection,
     camera_advice,
     check_scan,
     fuse,
@@ -182,14 +182,14 @@ def test_a_scan_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_where_the_first_sets_take_longer_than_the_scan_it_goes_on_until_two_are_followed() -> None:
-    taken, picture = _Taken(6, 4.0), np.zeros((4, 4, 3), np.uint8)
+    taken, picture = _FrameSelection(6, 4.0), np.zeros((4, 4, 3), np.uint8)
     seen = []
     for stamp in (0.0, 9.0, 12.0, 13.5, 14.0):
         frames = FrameSet(stamp, tuple(Frame(c, stamp, picture) for c in range(2)))
         pose = replace(identity_pose(stamp, ""), state=TrackState.TRACKING)
         seen.append(taken.add(frames, pose, dict))
     assert seen == [True, True, True, False, False]
-    assert [each.frames.stamp for each in taken.chosen()] == [0.0, 9.0, 12.0]
+    assert [each.frames.stamp for each in taken.selected()] == [0.0, 9.0, 12.0]
 
 
 def test_a_run_may_scan_for_itself(tmp_path: Path) -> None:

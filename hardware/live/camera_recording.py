@@ -68,19 +68,19 @@ class RecordOrder:
 
 def check_order(order: RecordOrder, force: bool) -> RecordOrder:
     """The order; InputError where it cannot be followed, or would overwrite a file and `force` is not set."""
-    where = "command line"
+    source = "command line"
     if order.out.suffix != ".mcap":
-        raise InputError(where, "--out", order.out, "a file that ends in .mcap")
+        raise InputError(source, "--out", order.out, "a file that ends in .mcap")
     if order.out.exists() and (order.out.is_dir() or not force):
         raise InputError(order.out, "--out", "a file that exists", "a new file, or --force")
     if not order.out.parent.is_dir():
         raise InputError(order.out, "--out", "no such folder", "a file in a folder that exists")
     if order.seconds is not None and not 0 < order.seconds < float("inf"):
-        raise InputError(where, "--seconds", order.seconds, "above 0")
+        raise InputError(source, "--seconds", order.seconds, "above 0")
     if not 0 <= order.jpeg_quality <= 100:
-        raise InputError(where, "--jpeg-quality", order.jpeg_quality, "1 to 100, 0: exact")
+        raise InputError(source, "--jpeg-quality", order.jpeg_quality, "1 to 100, 0: exact")
     if order.region.drawn and not order.page:
-        raise InputError(where, "--no-page", "no corners", "a region with corners, or a page to draw them on")
+        raise InputError(source, "--no-page", "no corners", "a region with corners, or a page to draw them on")
     return order
 
 
@@ -90,37 +90,37 @@ class RecordingPage:
     def __init__(self, clock: Clock, rig: Rig) -> None:
         self._clock, self.link = clock, OperatorLink()
         self._page = OperatorPage(self.link, OperatorSettings(page="recording.html"))
-        self._taker = Thumbnailer(self.link.pictures, self.link.requests, near=False)
+        self._thumbnailer = Thumbnailer(self.link.pictures, self.link.requests, near=False)
         self._names = [camera.name for camera in rig.cameras]
         self._view = RecordingView(clock.now(), 1, RecordingStage.RECORD, 0.0, 0, 0, 0)
         self.link.scene.put(scene_from(rig))
         self.address = self._page.address
 
     def show(self, view: RecordingView) -> bool:
-        """Show the state, but for turn and answer, which are kept here; whether somebody asked to end."""
-        before, asked = self._view, False
-        turn = before.turn + ((before.stage, before.draws) != (view.stage, view.draws))
+        """Show the state; turn and answer are filled in here. Returns whether the end was requested on the page."""
+        previous, end_requested = self._view, False
+        turn = previous.turn + ((previous.stage, previous.draws) != (view.stage, view.draws))
         offers = (Wish.END,) if view.stage is RecordingStage.RECORD else ()
-        self._view = replace(view, turn=turn, answer=before.answer, offers=offers)
+        self._view = replace(view, turn=turn, answer=previous.answer, offers=offers)
         for request in self.link.requests.take():
-            why = refusal(request.wish, request.turn, offers, turn)
-            asked |= not why and request.wish in (Wish.STOP, Wish.END)
-            self._view = replace(self._view, answer=RequestAnswer(request.number, request.wish, not why, why))
+            reason = refusal(request.wish, request.turn, offers, turn)
+            end_requested |= not reason and request.wish in (Wish.STOP, Wish.END)
+            self._view = replace(self._view, answer=RequestAnswer(request.number, request.wish, not reason, reason))
         self.link.views.put(self._view)
         self._page.tend(self._clock.now())
-        return asked
+        return end_requested
 
     def pictures(self, frames: FrameSet) -> None:
         """Offer the pictures, where anybody has the page open."""
         if self.link.requests.windows:
             shots = [CameraShot(self._names[frame.camera], frame.image) for frame in frames.frames]
-            self._taker.offer(frames.stamp, shots)
+            self._thumbnailer.offer(frames.stamp, shots)
 
     def close(self) -> None:
         """End the page, once its windows had time for the last view."""
         if self.link.requests.windows:
             self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
-        self._taker.close()
+        self._thumbnailer.close()
         self._page.close()
 
 
@@ -142,7 +142,7 @@ class Sharpness:
 
 
 class CameraRecording:
-    """One recording. Call it; then `words` says what became of it, and `failed` whether that is not what was asked."""
+    """One recording. Call it; then `words` has its outcome as a text, and `failed` whether it was cut short."""
 
     def __init__(self, order: RecordOrder, stream: TextIO | None = None) -> None:
         """stream: for progress, by default stderr."""
@@ -150,16 +150,16 @@ class CameraRecording:
         self._order, self._clock, self._stream = order, WallClock(), stream
         self._signal = 0
         self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
-        self._begun = self._clock.now()
-        self._ready = self._begun  # s, when the recorder had loaded, and pictures were taken
-        self._first = self._last = nan
-        self._sets = self._passed = 0
+        self._start = self._clock.now()
+        self._ready_time = self._start  # s, when the recorder had loaded, and pictures were taken
+        self._first_stamp = self._last_stamp = nan
+        self._sets = self._skipped = 0
         self._counts = Counter[int]()  # of pictures, by camera
-        self._lost: dict[str, None] = {}  # names of cameras that were without pictures for a while, in that order
-        self._viewed = self._looked = -1e9
-        self._arrived = nan  # s, when the first set was there
+        self._interrupted: dict[str, None] = {}  # cameras that were without pictures for a while
+        self._view_time = self._sharpness_stamp = -1e9
+        self._first_set_time = nan  # s, when the first set was there
         self._page: RecordingPage | None = None
-        self._find: FindRegion | None = None
+        self._find_region: FindRegion | None = None
 
     def __call__(self) -> None:
         """Record until the time is over or somebody ends it."""
@@ -177,10 +177,10 @@ class CameraRecording:
             progress = stack.enter_context(Progress("record", "frame sets", self._clock.now, self._stream))
             self._wait_for_recorder(progress)
             self._seek_region(stack, rig)
-            why = ""
-            while not (why := self._ended()):
+            reason = ""
+            while not (reason := self._end_reason()):
                 self._cycle(progress)
-            self._finish(why)
+            self._finish(reason)
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal that asks the recording to end."""
@@ -188,11 +188,11 @@ class CameraRecording:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        before = [signal.signal(number, self.on_signal) for number in ENDING_SIGNALS]
+        previous = [signal.signal(number, self.on_signal) for number in ENDING_SIGNALS]
         try:
             yield
         finally:
-            for number, handler in zip(ENDING_SIGNALS, before, strict=True):
+            for number, handler in zip(ENDING_SIGNALS, previous, strict=True):
                 signal.signal(number, handler)
 
     def _start_recorder(self, stack: ExitStack) -> None:
@@ -203,12 +203,12 @@ class CameraRecording:
         self._sender = RecorderSender(ours)
 
     def _wait_for_recorder(self, progress: Progress) -> None:
-        """Take no picture before the recorder has room for it: it loads for seconds, and few pictures can wait."""
+        """Wait until the recorder is loaded, which takes seconds: its queue has room for few pictures."""
         progress.note = "the recorder starts"
-        while self._reports.get() is None and not self._ended():
+        while self._reports.get() is None and not self._end_reason():
             self._clock.wait_until(self._clock.now() + READY_POLL)
             progress(0, 0)
-            self._ready = self._clock.now()
+            self._ready_time = self._clock.now()
         self._source.take(0.0)  # what came meanwhile
 
     def _open_page(self, stack: ExitStack, rig: Rig) -> None:
@@ -218,14 +218,14 @@ class CameraRecording:
 
     def _seek_region(self, stack: ExitStack, rig: Rig) -> None:
         """Record the region, or prepare to find it in the pictures."""
-        for roi in self._order.region.rois(rig, self._begun):
+        for roi in self._order.region.rois(rig, self._start):
             self._sender.put(roi)
         drawn = SharedLatest[DrawnRegion]() if self._page is None else self._page.link.regions
         search = region_search(rig, self._order.region, drawn)
         if search is not None:
-            self._find = search(stack.enter_context(ThreadPoolExecutor(1)))
+            self._find_region = search(stack.enter_context(ThreadPoolExecutor(1)))
 
-    def _ended(self) -> str:
+    def _end_reason(self) -> str:
         """Why it is over, "" while it is not."""
         now, report = self._clock.now(), self._reports.get()
         if self._signal:
@@ -236,43 +236,43 @@ class CameraRecording:
         if not self._processes.alive(RECORDER):
             self.failed = True
             return f"the recorder {self._processes.ending(RECORDER)}; what was written before is kept"
-        since = self._ready + FIRST_PICTURE_TIME if isnan(self._arrived) else self._arrived
-        if self._order.seconds is not None and now - since >= self._order.seconds:
+        start = self._ready_time + FIRST_PICTURE_TIME if isnan(self._first_set_time) else self._first_set_time
+        if self._order.seconds is not None and now - start >= self._order.seconds:
             return "the time is over"
         return self.words
 
     def _cycle(self, progress: Progress) -> None:
         try:
-            arrived = self._source.take(PICTURE_WAIT)
+            timed_set = self._source.take(PICTURE_WAIT)
         except SourceEnded:
             self.words = "all cameras have ended"
             return
-        if arrived is not None:
-            self._take(arrived)
+        if timed_set is not None:
+            self._take(timed_set)
         now = self._clock.now()
-        if now > self._viewed + VIEW_PERIOD:
-            self._viewed = now
+        if now > self._view_time + VIEW_PERIOD:
+            self._view_time = now
             self._show(RecordingStage.RECORD)
-            progress.note = "; ".join([f"{self._size() / MEGABYTE:.1f} MB", *self._now_wrong()])
+            progress.note = "; ".join([f"{self._size() / MEGABYTE:.1f} MB", *self._camera_troubles()])
         progress(self._sets, 0)
 
-    def _take(self, arrived: TimedFrameSet) -> None:
-        frames = arrived.frames
-        if isnan(self._first):
-            self._first, self._arrived = frames.stamp, self._clock.now()
-        self._last, self._sets = frames.stamp, self._sets + 1
+    def _take(self, timed_set: TimedFrameSet) -> None:
+        frames = timed_set.frames
+        if isnan(self._first_stamp):
+            self._first_stamp, self._first_set_time = frames.stamp, self._clock.now()
+        self._last_stamp, self._sets = frames.stamp, self._sets + 1
         self._counts.update(frame.camera for frame in frames.frames)
-        self._passed += arrived.dropped
+        self._skipped += timed_set.dropped
         self._sender.put(SetEntry({frame.camera: frame.stamp for frame in frames.frames}, {}, frames.frames))
         if self._page is not None:
             self._page.pictures(frames)
-        if frames.stamp > self._looked + SHARPNESS_PERIOD:
-            self._looked = frames.stamp
+        if frames.stamp > self._sharpness_stamp + SHARPNESS_PERIOD:
+            self._sharpness_stamp = frames.stamp
             for frame in frames.frames:
                 self._sharp[frame.camera].add(sharpness(frame.image))
-        if self._find is not None and not isinstance(found := self._find(frames), str):
-            self._find = None
-            for roi in found:
+        if self._find_region is not None and not isinstance(region := self._find_region(frames), str):
+            self._find_region = None
+            for roi in region:
                 self._sender.put(region_since(roi, frames.stamp))
 
     # -- what is said of it
@@ -282,11 +282,11 @@ class CameraRecording:
         report = self._reports.get()
         return 0 if report is None else report.written
 
-    def _now_wrong(self) -> list[str]:
-        """What is wrong with cameras now; who was lost after its first picture is remembered for the end."""
+    def _camera_troubles(self) -> list[str]:
+        """The current troubles of cameras; those interrupted after their first picture are remembered for the end."""
         states = [state for state in self._source.health().cameras if state.trouble]
-        lost = (state.name for state in states if state.given and state.phase is not CameraPhase.ENDED)
-        self._lost |= dict.fromkeys(lost)
+        interrupted = (state.name for state in states if state.given and state.phase is not CameraPhase.ENDED)
+        self._interrupted |= dict.fromkeys(interrupted)
         return [state.trouble for state in states]
 
     def _show(self, stage: RecordingStage, words: str = "") -> None:
@@ -294,8 +294,8 @@ class CameraRecording:
         if self._page is None:
             return
         cameras = tuple(map(self._camera, self._source.health().cameras, self._sharp))
-        seconds, dropped = self._clock.now() - self._begun, self._sender.dropped
-        draws = self._order.region.drawn and self._find is not None and stage is RecordingStage.RECORD
+        seconds, dropped = self._clock.now() - self._start, self._sender.dropped
+        draws = self._order.region.drawn and self._find_region is not None and stage is RecordingStage.RECORD
         view = RecordingView(
             self._clock.now(), 0, stage, seconds, self._size(), self._sets, dropped, cameras, words, draws=draws
         )
@@ -308,34 +308,34 @@ class CameraRecording:
             verdict = CheckVerdict.WARN
         return CameraView(state.name, verdict, state.rate, 0, state.trouble, sharp.share)
 
-    def _finish(self, why: str) -> None:
-        """Have everything written, and say what there is."""
+    def _finish(self, reason: str) -> None:
+        """Have everything written, and describe the recording in `words`."""
         self._sender.close(WRITE_TIMEOUT)
         self._processes.end(RECORDER, WRITE_TIMEOUT)
         report = self._reports.get()
         if report is not None and report.failed and not self.failed:  # the last of it found no place
-            self.failed, why = True, report.failed
-        wrong = self._now_wrong()
+            self.failed, reason = True, report.failed
+        troubles = self._camera_troubles()
         names = [camera.name for camera in self._source.rig.cameras]
         counts = ", ".join(f"{name} {self._counts[k]}" for k, name in enumerate(names))
-        lines = [why, f"{self._order.out}: {self._sets} frame sets ({counts} pictures) {self._span()}"]
+        lines = [reason, f"{self._order.out}: {self._sets} frame sets ({counts} pictures) {self._span()}"]
         if self._sender.dropped:
             lines.append(f"left out, as they found no room on their way to the disk: {self._sender.dropped}")
-        if self._passed:
-            lines.append(f"frame sets left out, as a newer one was there: {self._passed}")
-        if self._lost:
-            lines.append(f"without pictures for a while: {', '.join(self._lost)}")
+        if self._skipped:
+            lines.append(f"frame sets left out, as a newer one was there: {self._skipped}")
+        if self._interrupted:
+            lines.append(f"without pictures for a while: {', '.join(self._interrupted)}")
         lines += filter(None, map(_losses, self._source.health().cameras))
         lines += [f"never came: {state.name}" for state in self._source.health().cameras if not state.given]
         if not self._sets:
             self.failed = True
             self._order.out.unlink(missing_ok=True)
-            lines = [why, "no pictures came, and no file is kept", *wrong]
+            lines = [reason, "no pictures came, and no file is kept", *troubles]
         self.words = "\n".join(lines)
         self._show(RecordingStage.FAILED if self.failed else RecordingStage.ENDED, self.words)
 
     def _span(self) -> str:
-        seconds = self._last - self._first
+        seconds = self._last_stamp - self._first_stamp
         return f"of {seconds:.1f} s, {self._size() / MEGABYTE:.1f} MB"
 
     def _say(self, text: str) -> None:
@@ -347,5 +347,5 @@ def _losses(state: CameraState) -> str:
     count, transport = state.faults.get(FrameFault.INCOMPLETE, 0), state.transport
     if transport is None or not (count or transport.frames_lost):
         return ""
-    whole = f", and {transport.frames_lost} lost altogether" if transport.frames_lost else ""
-    return f"{state.name}: {count} pictures left out, as packets were missing ({transport.lost}){whole}"
+    lost_text = f", and {transport.frames_lost} lost altogether" if transport.frames_lost else ""
+    return f"{state.name}: {count} pictures left out, as packets were missing ({transport.lost}){lost_text}"

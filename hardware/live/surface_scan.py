@@ -186,19 +186,19 @@ def open_source(order: ScanOrder) -> Iterator[ScanSource]:
 def _live_sets(cameras: LiveCameraSource) -> Iterator[FrameSet]:
     while True:
         try:
-            arrived = cameras.take(PICTURE_WAIT)
+            timed_set = cameras.take(PICTURE_WAIT)
         except SourceEnded:
             return
-        if arrived is not None:
-            yield arrived.frames
+        if timed_set is not None:
+            yield timed_set.frames
 
 
 def _rendered(scenario: Path, seconds: float) -> Path:
     """The session of a scenario, rendered as far as it is needed unless all of it is there."""
     from hardware.live.prerender import prerender  # loads all of the simulator
 
-    whole = cached(scenario, cache_folder())
-    return (whole if whole.session.exists() else prerender(scenario, cache_folder(), seconds=seconds + 2)).session
+    entry = cached(scenario, cache_folder())
+    return (entry if entry.session.exists() else prerender(scenario, cache_folder(), seconds=seconds + 2)).session
 
 
 # -- scanning
@@ -212,7 +212,7 @@ def scan_surface(
     Ctrl-C while it is tracked ends that: what was seen until then is fused.
     """
     clock = WallClock()
-    taken, find = _Taken(sets, seconds), region_search(source.rig, region, SharedLatest[DrawnRegion]())
+    selection, find = _FrameSelection(sets, seconds), region_search(source.rig, region, SharedLatest[DrawnRegion]())
     with tracker(source.rig, source.roi, find=find) as step:
         with Progress("scan", "frame sets", clock.now, stream) as progress:
             progress.note = "the surface is being looked for"
@@ -220,9 +220,9 @@ def scan_surface(
             try:
                 for number, frames in enumerate(source.frame_sets, 1):
                     pose = step(frames)
-                    progress.note = pose.reason or f"{len(taken)} of {sets} instants"
+                    progress.note = pose.reason or f"{len(selection)} of {sets} instants"
                     progress(number, 0)
-                    if not taken.add(
+                    if not selection.add(
                         frames,
                         pose,
                         partial(exposed_poses, source.rig, step.map, step.last.observations, pose.base_from_surface),
@@ -230,15 +230,15 @@ def scan_surface(
                         break
                     step.idle()
             except KeyboardInterrupt:
-                if len(taken) < MIN_TRACKED_SETS:
+                if len(selection) < MIN_TRACKED_SETS:
                     raise
-        if len(taken) < MIN_TRACKED_SETS or step.map is None:
-            raise StillbedError(f"{NO_SURFACE}: {taken.why or 'no pictures came'}")
+        if len(selection) < MIN_TRACKED_SETS or step.map is None:
+            raise StillbedError(f"{NO_SURFACE}: {selection.reason or 'no pictures came'}")
         roi, landmarks = step.roi, step.map.points
-    chosen = taken.chosen()
+    selected = selection.selected()
     with Progress("fuse", "%", clock.now, stream) as progress:
         progress(0, 100)
-        return fuse(source.rig, roi, landmarks, chosen, lambda share: progress(round(100 * share), 100))
+        return fuse(source.rig, roi, landmarks, selected, lambda share: progress(round(100 * share), 100))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,52 +250,52 @@ class TrackedFrames:
     exposed: Mapping[int, Array]  # (4, 4) base_from_surface at each camera's own exposure
 
 
-class _Taken:
+class _FrameSelection:
     """Frame sets to choose from, spread over the time."""
 
     def __init__(self, sets: int, seconds: float) -> None:
         self._sets, self._seconds = sets, seconds
-        self._first: float | None = None
-        self._began: float | None = None
+        self._first_stamp: float | None = None
+        self._tracking_start: float | None = None
         self._bins: dict[int, TrackedFrames] = {}
-        self.why = ""
+        self.reason = ""
 
     def __len__(self) -> int:
         return len(self._bins)
 
     def add(self, frames: FrameSet, pose: SurfacePose, exposed: Callable[[], Mapping[int, Array]]) -> bool:
         """Take a frame set where its pose is good; whether more are wanted."""
-        self._first = frames.stamp if self._first is None else self._first
-        self.why = pose.reason or self.why
+        self._first_stamp = frames.stamp if self._first_stamp is None else self._first_stamp
+        self.reason = pose.reason or self.reason
         if pose.state is not TrackState.TRACKING or len(frames.frames) < 2:
-            since = self._first if self._began is None else self._began + self._seconds
-            return frames.stamp < since + MAX_FIND_TIME
-        self._began = frames.stamp if self._began is None else self._began
-        part = int((frames.stamp - self._began) / self._seconds * self._sets)
-        if part >= self._sets and len(self) >= MIN_TRACKED_SETS:
+            start = self._first_stamp if self._tracking_start is None else self._tracking_start + self._seconds
+            return frames.stamp < start + MAX_FIND_TIME
+        self._tracking_start = frames.stamp if self._tracking_start is None else self._tracking_start
+        bin_number = int((frames.stamp - self._tracking_start) / self._seconds * self._sets)
+        if bin_number >= self._sets and len(self) >= MIN_TRACKED_SETS:
             return False
-        if part >= self._sets:  # of live cameras one set alone, as the first take long: once more
-            self._bins, self._began, part = {-1: next(iter(self._bins.values()))}, frames.stamp, 0
-        before = self._bins.get(part)
-        if before is None or self._worth(frames, pose) > self._worth(before.frames, before.pose):
-            self._bins[part] = TrackedFrames(frames, pose, exposed())
+        if bin_number >= self._sets:  # of live cameras one set alone, as the first take long: once more
+            self._bins, self._tracking_start, bin_number = {-1: next(iter(self._bins.values()))}, frames.stamp, 0
+        current = self._bins.get(bin_number)
+        if current is None or self._quality(frames, pose) > self._quality(current.frames, current.pose):
+            self._bins[bin_number] = TrackedFrames(frames, pose, exposed())
         return True
 
     @staticmethod
-    def _worth(frames: FrameSet, pose: SurfacePose) -> tuple[int, float]:
+    def _quality(frames: FrameSet, pose: SurfacePose) -> tuple[int, float]:
         """The more cameras and the slower the surface, the better."""
         return len(frames.frames), -float(np.linalg.norm(pose.twist[3:]))
 
-    def chosen(self) -> list[TrackedFrames]:
+    def selected(self) -> list[TrackedFrames]:
         """One frame set of each part of the time."""
-        return [self._bins[part] for part in sorted(self._bins)]
+        return [self._bins[number] for number in sorted(self._bins)]
 
 
 def fuse(
     rig: Rig,
     roi: Sequence[Roi],
     landmarks: Array,
-    chosen: Sequence[TrackedFrames],
+    selected: Sequence[TrackedFrames],
     progress: Callable[[float], None] = lambda share: None,
 ) -> SurfaceScan:
     """The surface in pictures whose poses are known. landmarks: (N, 3) mm, surface frame."""
@@ -303,27 +303,27 @@ def fuse(
     start = clock.now()
     views = [
         ScanView(c, instant, frame.image, se3.inverse(tracked.exposed[c]) @ rig.cameras[c].base_from_camera)
-        for instant, tracked in enumerate(chosen)
+        for instant, tracked in enumerate(selected)
         for c, frame in ((frame.camera, frame) for frame in tracked.frames.frames)
     ]
     lenses, cameras = Lenses(rig), sorted({view.camera for view in views})
     low, high = np.percentile(landmarks[:, :2], [1, 99], axis=0) + LATTICE_MARGIN_MM * np.array([[-1.0], [1.0]])
-    first = chosen[0].pose.base_from_surface
-    step = node_size(lenses, cameras, se3.transform_points(first, landmarks.mean(0)[None])[0])
+    base_from_surface = selected[0].pose.base_from_surface
+    step = node_size(lenses, cameras, se3.transform_points(base_from_surface, landmarks.mean(0)[None])[0])
     step = max(step, float(np.sqrt(np.prod(high - low) / MAX_NODES)))
     coarse = initial_heights(landmarks, low, high)
     lines = [at + GUESS_SIGMA_MM / 2 * np.arange(n) for at, n in zip(low[::-1], coarse.shape, strict=True)]
     heights = RegularGridInterpolator(lines, coarse.astype(float), bounds_error=False, fill_value=None)
-    begun = tuple(replace(each, stamp=-np.inf) for each in roi)
-    within = region_polygons(begun, chosen[0].frames, [camera.size for camera in rig.cameras])
+    rois = tuple(replace(each, stamp=-np.inf) for each in roi)
+    regions = region_polygons(rois, selected[0].frames, [camera.size for camera in rig.cameras])
     surface = DenseFit(lenses, views, progress)(
-        low, high, step, lambda flat: heights(flat[:, ::-1]), within if isinstance(within, dict) else {}
+        low, high, step, lambda flat: heights(flat[:, ::-1]), regions if isinstance(regions, dict) else {}
     )
     used, triangles = lattice_triangles(surface.sure)
     if not len(triangles):
         raise StillbedError("no part of the surface was seen alike by two cameras")
     scan = Scan(surface.points.reshape(-1, 3)[used], triangles, surface.normals.reshape(-1, 3)[used])
-    return SurfaceScan(surface, scan, used, rig, chosen[0].pose, len(chosen), clock.now() - start)
+    return SurfaceScan(surface, scan, used, rig, selected[0].pose, len(selected), clock.now() - start)
 
 
 # -- report
@@ -345,25 +345,25 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     """The report as one HTML page."""
     sigma, surface = scanned.sigma, scanned.surface
     pictures = "".join(
-        _figure(title, picture_of_scan(scanned.scan, scanned.colours, np.array(way), VIEW_PIXELS)[..., ::-1])
-        for title, way in VIEWS
+        _figure(title, picture_of_scan(scanned.scan, scanned.colours, np.array(direction), VIEW_PIXELS)[..., ::-1])
+        for title, direction in VIEWS
     )
     limits = np.percentile(sigma, [50, 95])
     masks = {camera.name: surface.seen[c] for c, camera in enumerate(scanned.rig.cameras)}
     masks["two cameras or more"], wanted = surface.seen.sum(0) >= 2, surface.wanted
     rows = [(name, f"{(mask & wanted).sum() / max(1, wanted.sum()):.0%}") for name, mask in masks.items()]
     rows.append(("scanned", f"{scanned.coverage:.0%}"))
-    most = max(2 * WEAK_SIGMA_MM, float(np.percentile(sigma, SHADED_PERCENT)))
-    colours = np.where(surface.sure[::-1, :, None], _shaded(surface.sigma[::-1] / most), 255)
-    scale = _figure(f"0 to {most:.2g} mm", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8))
-    known = "Standard deviation across the surface, blue to red. White lies outside, or no two cameras saw it alike."
+    largest = max(2 * WEAK_SIGMA_MM, float(np.percentile(sigma, SHADED_PERCENT)))
+    colours = np.where(surface.sure[::-1, :, None], _shaded(surface.sigma[::-1] / largest), 255)
+    scale = _figure(f"0 to {largest:.2g} mm", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8))
+    caption = "Standard deviation across the surface, blue to red. White lies outside, or no two cameras saw it alike."
     from_above = _figure("from above", np.asarray(colours, np.uint8))
     sigmas = [(f"{v:.3f}", "mm", f"standard deviation, {w}") for v, w in zip(limits, ("median", "95 %"), strict=True)]
     tiles = (f"{scanned.area / 100:.1f}", "cm²", "scanned"), (f"{scanned.coverage:.0%}", "", "of the region"), *sigmas
     body = [
-        row_of_tiles([tile(*each) for each in tiles]),
+        row_of_tiles([tile(*item) for item in tiles]),
         section("The scan", "In plain light, from three sides.", f'<div class="pictures">{pictures}</div>'),
-        section("How well it is known", known, f'<div class="pictures">{from_above}{scale}</div>'),
+        section("How well it is known", caption, f'<div class="pictures">{from_above}{scale}</div>'),
         section("Who saw it", "Share of the region that each camera shows.", figures_table(("camera", "share"), rows)),
         section("Where to put a camera", camera_advice(scanned), ""),
     ]

@@ -88,44 +88,44 @@ class _RunQueue:
 
 
 class TraceLane:
-    """Keeps what the thread that made it does of each set, and what holds it up between one set and the next."""
+    """Spans of the thread that made it for each set, with its waits in the run queue and its page faults."""
 
     def __init__(self, name: str, clock: Clock, put: Callable[[TraceBatch], None]) -> None:
         """put: hands a batch to the recorder."""
-        self._name, self._clock, self._put = name, clock, put
+        self._name, self._clock, self._put_batch = name, clock, put
         self._garbage: list[Span] = []
         self._entries: list[TraceEntry] = []
-        self._collecting, self._due = 0.0, clock.now() + BATCH_S
+        self._collecting, self._batch_due = 0.0, clock.now() + BATCH_S
         self._queue = _RunQueue()
-        self._last = self._counts()
-        gc.callbacks.append(self._collected)
+        self._last_counts = self._counts()
+        gc.callbacks.append(self._on_garbage)
 
     def add(self, stamp: float, spans: Iterable[Span]) -> None:
-        """The set at `stamp`, s, has these spans; hand over what there is, once a second."""
+        """Enter the spans of the set at `stamp`, s; entries are handed over once a second."""
         delay, faults = self._counts()
-        queued, since = delay - self._last[0], faults - self._last[1]
-        self._last = delay, faults
+        queued, new_faults = delay - self._last_counts[0], faults - self._last_counts[1]
+        self._last_counts = delay, faults
         garbage, self._garbage = self._garbage, []
-        self._entries.append(TraceEntry(self._name, stamp, (*spans, *garbage), queued, since))
-        if self._clock.now() > self._due:
+        self._entries.append(TraceEntry(self._name, stamp, (*spans, *garbage), queued, new_faults))
+        if self._clock.now() > self._batch_due:
             self._hand_over()
 
     def close(self) -> None:
-        """Hand over what there is, and count no more."""
+        """Hand over the last entries, and stop counting."""
         self._hand_over()
-        gc.callbacks.remove(self._collected)
+        gc.callbacks.remove(self._on_garbage)
         self._queue.close()
 
     def _hand_over(self) -> None:
-        entries, self._entries, self._due = self._entries, [], self._clock.now() + BATCH_S
+        entries, self._entries, self._batch_due = self._entries, [], self._clock.now() + BATCH_S
         if entries:
-            self._put(TraceBatch(tuple(entries)))
+            self._put_batch(TraceBatch(tuple(entries)))
 
     def _counts(self) -> tuple[float, int]:
         usage = resource.getrusage(resource.RUSAGE_THREAD)
         return self._queue.delay(), usage.ru_minflt + usage.ru_majflt
 
-    def _collected(self, phase: str, information: Mapping[str, int]) -> None:
+    def _on_garbage(self, phase: str, information: Mapping[str, int]) -> None:
         now = self._clock.now()
         if phase == "start":
             self._collecting = now
@@ -135,30 +135,30 @@ class TraceLane:
 
 def in_turn(begin: float, names: Sequence[str], seconds: Array) -> list[Span]:
     """Spans of stages that follow each other from `begin`, s, on; seconds: (N,) of each."""
-    ends = begin + np.cumsum(seconds)
-    return [(name, float(end - spent), float(end)) for name, spent, end in zip(names, seconds, ends, strict=False)]
+    stops = begin + np.cumsum(seconds)
+    return [(name, float(stop - time), float(stop)) for name, time, stop in zip(names, seconds, stops, strict=False)]
 
 
 @dataclass(frozen=True, slots=True)
 class SetWay:
-    """The way of one frame set."""
+    """The instants of one frame set, from its pixels to the wire."""
 
     stamp: float  # s
     handed: float  # s, its pixels are in memory
-    wired: float  # s, the first move made of it is on the wire
+    wired: float  # s, the first move computed from it is on the wire
 
 
 @dataclass(slots=True)
 class RunTrace:
-    """The trace of a run; nothing is added once it is asked what was done."""
+    """The trace of a run; no entry may be added after the first call of `during`."""
 
     entries: list[TraceEntry] = field(default_factory=list)
-    _sorted: list[tuple[float, float, TraceEntry]] | None = None
+    _by_start: list[tuple[float, float, TraceEntry]] | None = None
     _longest: float = 0.0  # s
 
     @property
     def ways(self) -> list[SetWay]:
-        """Of the sets of which a move was made, in order of their stamps."""
+        """The sets from which a move was computed, in order of stamp."""
         wired = {
             entry.stamp: end
             for entry in self.entries
@@ -172,18 +172,18 @@ class RunTrace:
     def during(self, begin: float, end: float) -> dict[str, float]:
         """Seconds of each kind of span between two instants, s; of the run queue its share in proportion."""
         sums: dict[str, float] = {}
-        if self._sorted is None:  # by when they begin, and the longest of them
-            spanned = [(e.spans[0][1], max(span[2] for span in e.spans), e) for e in self.entries if e.spans]
-            self._sorted = sorted(spanned, key=lambda each: each[0])
-            self._longest = max((last - first for first, last, _ in spanned), default=0.0)
-        after = bisect_left(self._sorted, begin - self._longest, key=lambda each: each[0])
-        for first, last, entry in takewhile(lambda each: each[0] < end, islice(self._sorted, after, None)):
+        if self._by_start is None:  # by when they begin, and the longest of them
+            entries = [(e.spans[0][1], max(span[2] for span in e.spans), e) for e in self.entries if e.spans]
+            self._by_start = sorted(entries, key=lambda item: item[0])
+            self._longest = max((last - first for first, last, _ in entries), default=0.0)
+        begin_index = bisect_left(self._by_start, begin - self._longest, key=lambda item: item[0])
+        for first, last, entry in takewhile(lambda item: item[0] < end, islice(self._by_start, begin_index, None)):
             if last <= begin:
                 continue
             for name, start, stop in entry.spans:
-                if name != QUEUE_STAGE and (shared := min(stop, end) - max(start, begin)) > 0:
+                if name != QUEUE_STAGE and (overlap := min(stop, end) - max(start, begin)) > 0:
                     key = f"{entry.lane}: {name}"
-                    sums[key] = sums.get(key, 0.0) + shared
+                    sums[key] = sums.get(key, 0.0) + overlap
             if entry.queued > 0 and last > first:
                 key, share = f"{entry.lane}: {RUN_QUEUE}", (min(last, end) - max(first, begin)) / (last - first)
                 sums[key] = sums.get(key, 0.0) + entry.queued * share
@@ -195,13 +195,14 @@ def read_trace(record: Path) -> RunTrace:
     from hardware.recording.mcap_file import ChunkMessages, parse, walk
 
     trace = RunTrace()
-    for part in walk(record):
-        for stored in part.messages if isinstance(part, ChunkMessages) else ():
+    for record_part in walk(record):
+        for stored in record_part.messages if isinstance(record_part, ChunkMessages) else ():
             if stored.topic == TOPIC:
-                told = parse(record, stored)
-                for stamp, queued, faults, spans in told["entries"]:
-                    read = tuple((str(name), float(begin), float(end)) for name, begin, end in spans)
-                    trace.entries.append(TraceEntry(str(told["lane"]), float(stamp), read, float(queued), int(faults)))
+                message = parse(record, stored)
+                lane = str(message["lane"])
+                for stamp, queued, faults, spans in message["entries"]:
+                    rows = tuple((str(name), float(begin), float(end)) for name, begin, end in spans)
+                    trace.entries.append(TraceEntry(lane, float(stamp), rows, float(queued), int(faults)))
     if not trace.entries:
         raise InputError(record, TOPIC, "no trace", "the recording of a live run without record.trace = false")
     return trace
@@ -209,7 +210,7 @@ def read_trace(record: Path) -> RunTrace:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What sets waited for, s a set: all on average, and the slowest."""
+    """A cause of latency, s a set: the average of all sets, and of the slowest ones."""
 
     name: str
     usual: float
@@ -218,12 +219,12 @@ class Cause:
 
 def slowest_sets(ways: Sequence[SetWay], share: float = SLOWEST_SHARE) -> list[SetWay]:
     """The slowest share of sets, one at least, the slowest first."""
-    ordered = sorted(ways, key=lambda way: way.handed - way.wired)
-    return ordered[: max(round(share * len(ordered)), 1)]
+    by_duration = sorted(ways, key=lambda way: way.handed - way.wired)
+    return by_duration[: max(round(share * len(by_duration)), 1)]
 
 
 def causes(trace: RunTrace, share: float = SLOWEST_SHARE) -> list[Cause]:
-    """What was done on the sets' ways, by what the slowest share spent more on than all do."""
+    """The causes of latency, sorted by the excess of the slowest share over all sets, largest first."""
     ways = trace.ways
     slow = {way.stamp for way in slowest_sets(ways, share)} if ways else set()
     usual, slowest = dict[str, float](), dict[str, float]()
@@ -232,8 +233,8 @@ def causes(trace: RunTrace, share: float = SLOWEST_SHARE) -> list[Cause]:
             usual[name] = usual.get(name, 0.0) + seconds / len(ways)
             if way.stamp in slow:
                 slowest[name] = slowest.get(name, 0.0) + seconds / len(slow)
-    found = [Cause(name, mean, slowest.get(name, 0.0)) for name, mean in usual.items()]
-    return sorted(found, key=lambda cause: cause.usual - cause.slowest)
+    all_causes = [Cause(name, mean, slowest.get(name, 0.0)) for name, mean in usual.items()]
+    return sorted(all_causes, key=lambda cause: cause.usual - cause.slowest)
 
 
 def trace_text(trace: RunTrace) -> str:
@@ -241,13 +242,13 @@ def trace_text(trace: RunTrace) -> str:
     ways = trace.ways
     if not ways:
         return "no move was made of any frame set"
-    spent = 1000 * np.array([way.wired - way.handed for way in ways])
-    median, late, most = np.percentile(spent, [50, 99, 100])
-    found = causes(trace)
-    lines = [f"frames to wire, {len(ways)} sets: {median:.1f} / {late:.1f} / {most:.1f} ms (median, 99 %, largest)"]
-    width = max(len(cause.name) for cause in found)
+    durations = 1000 * np.array([way.wired - way.handed for way in ways])
+    median, p99, largest = np.percentile(durations, [50, 99, 100])
+    all_causes = causes(trace)
+    lines = [f"frames to wire, {len(ways)} sets: {median:.1f} / {p99:.1f} / {largest:.1f} ms (median, 99 %, largest)"]
+    width = max(len(cause.name) for cause in all_causes)
     lines.append(f"{'what was done meanwhile, ms a set':<{width}}  {'all':>7}  slowest {SLOWEST_SHARE:.0%}")
-    lines += [f"{c.name:<{width}}  {1000 * c.usual:7.2f}  {1000 * c.slowest:7.2f}" for c in found]
+    lines += [f"{c.name:<{width}}  {1000 * c.usual:7.2f}  {1000 * c.slowest:7.2f}" for c in all_causes]
     return "\n".join(lines)
 
 
@@ -260,16 +261,16 @@ def chrome_trace(trace: RunTrace) -> str:
         for number, lane in enumerate(lanes)
     ]
     for entry in trace.entries:
-        told = {"stamp": entry.stamp, "ready, but not running, ms": 1000 * entry.queued, "page faults": entry.faults}
+        details = {"stamp": entry.stamp, "ready, but not running, ms": 1000 * entry.queued, "page faults": entry.faults}
         for name, begin, end in entry.spans:
             place = {"pid": lanes.index(entry.lane), "tid": int(name == GARBAGE)}
-            when = {"ts": round(1e6 * (begin - first), 1), "dur": round(1e6 * (end - begin), 1)}
-            events.append({"ph": "X", "name": name, **place, **when, "args": told})
+            timing = {"ts": round(1e6 * (begin - first), 1), "dur": round(1e6 * (end - begin), 1)}
+            events.append({"ph": "X", "name": name, **place, **timing, "args": details})
     return json.dumps({"displayTimeUnit": "ms", "traceEvents": events})
 
 
 def write_trace(record: Path, file: Path) -> str:
-    """Write the trace in a recording for such a viewer; why there is none to write, "" where it is written."""
+    """Write the trace in a recording for such a viewer; the reason where it is not written, else ""."""
     try:
         file.write_text(chrome_trace(read_trace(record)), encoding="utf-8")
     except (InputError, OSError) as error:

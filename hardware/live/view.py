@@ -69,35 +69,34 @@ KEYS_HELP = "   ".join(
     f"{'space or Enter' if wish is Wish.STOP else key}: {WISH_WORDS[wish]}" for wish, key in WISH_KEYS.items()
 )
 LOG_LINES = 16  # newest ones in each view: the page keeps what it was sent before
-REST_SPAN = 10.0  # s over which the surface's movement under a resting nozzle is seen: two breaths
+REST_SPAN = 10.0  # s over which the surface's movement under a resting nozzle is measured: two breaths
 MIN_REST_POINTS = 4  # of it
 
 
 @dataclass(slots=True)
 class NozzleErrorEstimate:
-    """The true error at the nozzle in a simulated world, by dead reckoning while the run goes on.
+    """The true error at the nozzle in a simulated world, by dead reckoning during the run.
 
-    The truth comes with a picture, later than the commands for its instant: so the last commands are kept, and looked
-    up once the truth is there.
+    The truth comes with a picture, later than the commands for its instant: so the last commands are kept until then.
     """
 
     path: Path  # as its file has it, in the true surface frame
     last: float = nan  # mm, NaN while it is unknown or nothing is printed
-    claimed: float = nan  # mm within which it was said to be; NaN where nothing was
+    claimed: float = nan  # mm, its predicted 95 % bound; NaN without
     _commands: deque[tuple[float, Array, float, float]] = field(default_factory=lambda: deque(maxlen=MAX_COMMANDS_KEPT))
     compared: float = nan  # s, stamp of the last pose that it was compared at
-    _ticked: float = nan  # s, stamp of the last tick
+    _tick_stamp: float = nan  # s, stamp of the last tick
 
     def update(self, reports: RunReports, profile: ArmProfile | None, claim: float = nan) -> None:
         """Take what is new. profile: of the arm since the path was begun; None before. claim: mm, of the last tick."""
         tracking, motion = reports.tracking, reports.motion
         if profile is None or motion is None or tracking is None or tracking.truth is None or tracking.pose is None:
             return
-        if motion.tick.stamp != self._ticked:
-            self._ticked, command = motion.tick.stamp, motion.tick.command
+        if motion.tick.stamp != self._tick_stamp:
+            self._tick_stamp, command = motion.tick.stamp, motion.tick.command
             if isinstance(command, Move) and command.extrude and motion.progress is not None:
-                due = command.stamp + profile.tick + profile.lag
-                self._commands.append((due, command.axes, motion.progress.fraction, claim))
+                arrival = command.stamp + profile.tick + profile.lag
+                self._commands.append((arrival, command.axes, motion.progress.fraction, claim))
         if tracking.pose.stamp != self.compared:
             self.compared = tracking.pose.stamp
             self.last = self._error(tracking.pose.stamp, tracking.truth, profile)
@@ -105,10 +104,10 @@ class NozzleErrorEstimate:
     def _error(self, stamp: float, base_from_surface: Array, profile: ArmProfile) -> float:
         """Distance, mm, from the nozzle to its place at `stamp`, s; NaN where it was not printing then."""
         self.claimed = nan
-        after = next((i for i, (due, *_) in enumerate(self._commands) if due >= stamp), 0)
-        if not after or self._commands[after][0] - self._commands[after - 1][0] > MAX_COMMAND_GAP:
+        number = next((i for i, (arrival, *_) in enumerate(self._commands) if arrival >= stamp), 0)
+        if not number or self._commands[number][0] - self._commands[number - 1][0] > MAX_COMMAND_GAP:
             return nan
-        (begin, axes, place, _), following = self._commands[after - 1], self._commands[after]
+        (begin, axes, place, _), following = self._commands[number - 1], self._commands[number]
         end, next_axes, next_place, self.claimed = following
         share = (stamp - begin) / (end - begin)
         nozzle = nozzle_from_axes(profile.arm, axes + share * (next_axes - axes))
@@ -124,35 +123,35 @@ class ViewBuilder:
 
     prepared: Prepared
     _true_error: NozzleErrorEstimate = field(init=False)
-    _times_left: Array = field(init=False)  # (N,) s from each checkpoint to the end
-    _ways: Array = field(init=False)  # (N,) share of the path's length at each checkpoint
+    _remaining_times: Array = field(init=False)  # (N,) s from each checkpoint to the end
+    _path_shares: Array = field(init=False)  # (N,) share of the path's length at each checkpoint
     _last_sets: tuple[float, int] = (nan, 0)  # stamp of the last report, s, and its frame sets
     _rate: float = nan  # frame sets per second, smoothed
     _time_left: TimeLeft = field(default_factory=TimeLeft)
     _log: deque[LogLine] = field(default_factory=lambda: deque(maxlen=LOG_LINES))
-    _logged: float = -inf  # s, stamp of the arm's last event that is in the log
-    _resting: deque[tuple[float, Array, float]] = field(default_factory=deque)  # s, tip on the surface, height: mm
+    _last_event: float = -inf  # s, stamp of the arm's last event that is in the log
+    _rest_points: deque[tuple[float, Array, float]] = field(default_factory=deque)  # s, tip on the surface, height: mm
 
     def __post_init__(self) -> None:
         path, profile = self.prepared.task.path, self.prepared.task.profile
         self._true_error = NozzleErrorEstimate(path)
         times = run_times(path, profile.arm, profile.limits, profile.tick)  # 36,000 checkpoints take 1.5 s
-        self._times_left = times[-1] - times
+        self._remaining_times = times[-1] - times
         lengths = way_lengths(path.surface_from_nozzle)
-        self._ways = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
+        self._path_shares = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
 
     def update(self, reports: RunReports, profile: ArmProfile | None, claim: float) -> tuple[float, float]:
-        """Take the newest reports; the true error at the nozzle and what was claimed of it, mm; NaN where none is new.
+        """Take the newest reports; returns the true error at the nozzle and its claim, mm; NaN where none is new.
 
         profile: of the arm since the path was begun; None before. claim: mm, of the last tick.
         """
         for event in () if reports.motion is None else reports.motion.events:
-            if event.stamp > self._logged:
-                self._logged = event.stamp
+            if event.stamp > self._last_event:
+                self._last_event = event.stamp
                 self.log(event.stamp, event.text)
-        true, before = self._true_error, self._true_error.compared
-        true.update(reports, profile, claim)
-        return (true.last, true.claimed) if true.compared != before else (nan, nan)
+        true_error, compared_before = self._true_error, self._true_error.compared
+        true_error.update(reports, profile, claim)
+        return (true_error.last, true_error.claimed) if true_error.compared != compared_before else (nan, nan)
 
     def log(self, stamp: float, text: str, warning: bool = False) -> None:
         """A line for the page's log."""
@@ -200,9 +199,9 @@ class ViewBuilder:
             return None
         points = None if tracking is None else tracking.surface
         tangent = None if points is None else tangent_of(placement, self.prepared.task.path, points)
-        known = placement.sigma, placement.turn_sigma
-        worth = placement.certain, machine.moves > 0, machine.confirmable
-        return PlacementView(placement.by.value, placement.verdict, *worth, tangent, *known)
+        sigmas = placement.sigma, placement.turn_sigma
+        validity = placement.certain, machine.moves > 0, machine.confirmable
+        return PlacementView(placement.by.value, placement.verdict, *validity, tangent, *sigmas)
 
     def _motion(
         self,
@@ -213,9 +212,9 @@ class ViewBuilder:
         statistics: RunStatistics,
     ) -> MotionView:
         status, command = motion.tick.status, motion.tick.command
-        placed, base_from_nozzle = machine.placed_path, None
-        if placed is not None and status.axes is not None:
-            base_from_nozzle = nozzle_from_axes(placed.profile.arm, status.axes)
+        placed_path, base_from_nozzle = machine.placed_path, None
+        if placed_path is not None and status.axes is not None:
+            base_from_nozzle = nozzle_from_axes(placed_path.profile.arm, status.axes)
         return MotionView(
             activity=_activity(motion, machine.stage),
             reason=machine.silence or command.reason,
@@ -241,43 +240,43 @@ class ViewBuilder:
         tracking: TrackingReport | None,
         base_from_nozzle: Array | None,
     ) -> RestView | None:
-        """How the surface moves under a nozzle that was stopped or paused; None where it moves, or nobody knows."""
-        pose, placed = None if tracking is None else tracking.pose, machine.placed_path
-        stands = machine.stage in (RunStage.STOPPED, RunStage.PAUSED) and isinstance(motion.tick.command, Hold)
-        if not stands or pose is None or placed is None or base_from_nozzle is None:
-            self._resting.clear()
+        """The surface's movement under a stopped or paused nozzle; None while the nozzle moves, or if unknown."""
+        pose, placed_path = None if tracking is None else tracking.pose, machine.placed_path
+        at_rest = machine.stage in (RunStage.STOPPED, RunStage.PAUSED) and isinstance(motion.tick.command, Hold)
+        if not at_rest or pose is None or placed_path is None or base_from_nozzle is None:
+            self._rest_points.clear()
             return None
-        if pose.state.measured and (not self._resting or pose.stamp > self._resting[-1][0]):
+        if pose.state.measured and (not self._rest_points or pose.stamp > self._rest_points[-1][0]):
             surface_from_nozzle, height = se3.inverse(pose.base_from_surface) @ base_from_nozzle, nan
             if motion.progress is not None:
-                goal = placed.path.surface_from_nozzle[min(motion.progress.checkpoint, len(placed.path) - 1)]
+                goal = placed_path.path.surface_from_nozzle[min(motion.progress.checkpoint, len(placed_path.path) - 1)]
                 height = float((se3.inverse(goal) @ surface_from_nozzle)[2, 3])
-            self._resting.append((pose.stamp, surface_from_nozzle[:3, 3], height))
-        while self._resting and self._resting[-1][0] - self._resting[0][0] > REST_SPAN:
-            self._resting.popleft()
-        if len(self._resting) < MIN_REST_POINTS:
+            self._rest_points.append((pose.stamp, surface_from_nozzle[:3, 3], height))
+        while self._rest_points and self._rest_points[-1][0] - self._rest_points[0][0] > REST_SPAN:
+            self._rest_points.popleft()
+        if len(self._rest_points) < MIN_REST_POINTS:
             return None
-        places = np.array([place for _, place, _ in self._resting])
-        along = (places - places.mean(0)) @ np.linalg.svd(places - places.mean(0), full_matrices=False)[2][0]
-        seconds = self._resting[-1][0] - self._resting[0][0]
-        return RestView(float(np.ptp(along)), seconds, float(np.mean([height for *_, height in self._resting])))
+        places = np.array([place for _, place, _ in self._rest_points])
+        excursion = (places - places.mean(0)) @ np.linalg.svd(places - places.mean(0), full_matrices=False)[2][0]
+        seconds = self._rest_points[-1][0] - self._rest_points[0][0]
+        return RestView(float(np.ptp(excursion)), seconds, float(np.mean([height for *_, height in self._rest_points])))
 
     def _progress(
         self, now: float, motion: LiveMotionReport | None, machine: RunStateMachine, statistics: RunStatistics
     ) -> ProgressView | None:
-        """How far it is; before a run that resumes goes on, where it will."""
+        """The progress; before a run that resumes goes on, the place where it will."""
         task, path = self.prepared.task, self.prepared.task.path
         progress = None if motion is None else motion.progress
         if progress is None and not task.start:
             return None
         fraction = task.start if progress is None else progress.fraction
-        left, checkpoint = float(np.interp(fraction, np.arange(len(path)), self._times_left)), int(fraction)
-        self._time_left.add(now, left, machine.stage in (RunStage.APPROACH, RunStage.PRINT))
+        planned, checkpoint = float(np.interp(fraction, np.arange(len(path)), self._remaining_times)), int(fraction)
+        self._time_left.add(now, planned, machine.stage in (RunStage.APPROACH, RunStage.PRINT))
         layers = np.unique(path.layer)
         layer = int(np.searchsorted(layers, path.layer[min(checkpoint + 1, len(path) - 1)])) + 1
-        share = float(np.interp(fraction, np.arange(len(path)), self._ways))
+        share = float(np.interp(fraction, np.arange(len(path)), self._path_shares))
         ink = statistics.ink if task.dispensers or self.prepared.settings.simulated is not None else nan
-        time_left, spread = self._time_left(left)
+        time_left, spread = self._time_left(planned)
         place = fraction, len(path) - 1, share, time_left, spread
         return ProgressView(*place, statistics.duty, layer, len(layers), ink, task.start)
 
@@ -288,19 +287,19 @@ class ViewBuilder:
             self._rate = rate if np.isnan(self._rate) else RATE_DECAY * self._rate + (1 - RATE_DECAY) * rate
         if tracking.sets > sets or np.isnan(stamp):
             self._last_sets = tracking.stamp, tracking.sets
-        late = tracking.pose is None or now - tracking.pose.stamp > MAX_PICTURE_AGE
-        waits = tracking.pose is None or tracking.pose.state is TrackState.INITIALISING  # pictures are looked at slowly
+        outdated = tracking.pose is None or now - tracking.pose.stamp > MAX_PICTURE_AGE
+        slow = tracking.pose is None or tracking.pose.state is TrackState.INITIALISING  # pictures are looked at slowly
         views = []
         for camera, name in enumerate(tracking.cameras):
-            delivers = camera in tracking.delivering and not late
+            delivers = camera in tracking.delivering and not outdated
             tracks = tracking.used[camera] if camera < len(tracking.used) else 0
-            verdict, words = (CheckVerdict.PASS, "") if delivers else (CheckVerdict.FAIL, "no pictures")
-            if not delivers and waits:
-                verdict, words = (
+            verdict, text = (CheckVerdict.PASS, "") if delivers else (CheckVerdict.FAIL, "no pictures")
+            if not delivers and slow:
+                verdict, text = (
                     CheckVerdict.BUSY,
                     "first picture" if tracking.pose is None else "looking",
                 )
-            views.append(CameraView(name, verdict, self._rate if delivers else 0.0, tracks, words))
+            views.append(CameraView(name, verdict, self._rate if delivers else 0.0, tracks, text))
         return tuple(views)
 
 
@@ -325,29 +324,29 @@ def _activity(motion: LiveMotionReport, stage: RunStage) -> Activity:
 
 
 class Console:
-    """Reads single keys of the terminal and writes lines; a terminal that is closed or never was stops nothing.
+    """Reads single keys of the terminal and writes lines; a closed or missing terminal is no error.
 
     file: to wait on, None where there is no terminal.
     """
 
     def __init__(self, opens: bool = False) -> None:
         """opens: whether the page is opened in a browser."""
-        self._opens = opens
+        self._open_browser = opens
         self.file: int | None = None
-        self._before: list[Any] | None = None
+        self._terminal_settings: list[Any] | None = None
 
     def __enter__(self) -> Console:
         with suppress(OSError, ValueError, termios.error):
             if sys.stdin is not None and os.isatty(sys.stdin.fileno()):
-                self._before = termios.tcgetattr(sys.stdin.fileno())
+                self._terminal_settings = termios.tcgetattr(sys.stdin.fileno())
                 tty.setcbreak(sys.stdin.fileno())
                 self.file = sys.stdin.fileno()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._before is not None:
+        if self._terminal_settings is not None:
             with suppress(OSError, ValueError, termios.error):
-                termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)
+                termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._terminal_settings)
 
     def wishes(self) -> list[Wish]:
         """The wishes of the keys that were pressed; a stop stands alone."""
@@ -364,7 +363,7 @@ class Console:
     def offer_page(self, address: str) -> None:
         """Tell where the page is, and open it where that is wanted."""
         self.say(f"open {address} to see and operate the run")
-        if self._opens and not open_in_browser(address):
+        if self._open_browser and not open_in_browser(address):
             self.say("no browser could be opened: this system has no xdg-open")
 
     def say(self, text: str) -> None:
@@ -376,8 +375,8 @@ class Console:
 def status_line(machine: RunStateMachine, reports: RunReports) -> str:
     """The run in one line: stage, place, state of the tracker and why the nozzle stands; in the check, what fails."""
     if machine.stage is RunStage.CHECK:
-        waits = [c for c in machine.checks if c.verdict in (CheckVerdict.BUSY, CheckVerdict.FAIL) and c.name != "reach"]
-        return "check: " + "; ".join(f"{check.name}: {check.found}" for check in waits)
+        unmet = [c for c in machine.checks if c.verdict in (CheckVerdict.BUSY, CheckVerdict.FAIL) and c.name != "reach"]
+        return "check: " + "; ".join(f"{check.name}: {check.found}" for check in unmet)
     pose = None if reports.tracking is None else reports.tracking.pose
     state = "no pose" if pose is None else pose.state.value
     if machine.stage is RunStage.FIND and machine.placed_path is not None:
@@ -385,10 +384,10 @@ def status_line(machine: RunStateMachine, reports: RunReports) -> str:
     if reports.motion is None or reports.motion.progress is None:
         return f"{machine.stage.value}: {state}"
     progress, command = reports.motion.progress, reports.motion.tick.command
-    held = f", holds: {command.reason}" if command.reason else ""
+    suffix = f", holds: {command.reason}" if command.reason else ""
     if machine.silence:
-        held = f", {machine.silence}"
-    return f"{machine.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{held}"
+        suffix = f", {machine.silence}"
+    return f"{machine.stage.value}: {progress.fraction:.1f} of {progress.total - 1} checkpoints, {state}{suffix}"
 
 
 def stage_line(stage: RunStage, reason: str) -> str:

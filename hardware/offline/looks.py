@@ -74,7 +74,7 @@ FLOW_COLOURS = ((0.8, "#1f618d"), (0.99, "#7fb3d5"), (1.01, "#bbb"), (1.25, "#f5
 
 
 class SurfaceLooks:
-    """The looks of one print. surface: as it was measured last, None before the first. last: what the last one told."""
+    """The looks of one print. surface: last measured, None before the first. last: result of the last look."""
 
     def __init__(
         self, rig: Rig, path: Path, start: float = 0.0, adapt: bool = False, flows: Sequence[FlowShares] = ()
@@ -86,21 +86,21 @@ class SurfaceLooks:
         InputError where the path says no amounts.
         """
         self._lenses, self._path = Lenses(rig), path
-        self._adapts, self._told = adapt, reduce(FlowShares.then, flows, AS_PLANNED)
+        self._adaptive, self._commanded_flow = adapt, reduce(FlowShares.then, flows, AS_PLANNED)
         self._layer: list[Look] = []  # those at the layer that is laid
         pieces_between(path, 0, len(path) - 1)
         self._views: list[SurfaceView] = []
-        self._gathered = -math.inf  # s, of the last view
+        self._last_view = -math.inf  # s, of the last view
         self._widths: tuple[float, ...] = WIDTHS
-        self._from = start  # checkpoints, up to where was looked at
-        self._aside, self._now, self._done = math.nan, math.nan, False  # s, since when the needle stands aside, and now
+        self._start_fraction = start  # checkpoints, up to where was looked at
+        self._aside_at, self._stamp, self._complete = math.nan, math.nan, False  # s, needle aside since, newest set
         self.last: Look | None = None
         self.surface: SurfaceHeights | None = None
 
     def at(
         self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose, step: FrameSetStep
     ) -> bool:
-        """Whether a look is done by this frame set and those given before, which is said once; `last` is what it told.
+        """Whether this frame set completes a look, True once a look; its result is then in `last`.
 
         command: the last one. step: the tracker, whose map says about where the surface lies.
         """
@@ -112,27 +112,28 @@ class SurfaceLooks:
 
     def adapted(self) -> FlowShares | None:
         """The flows of the next layer by the last look, which later looks then expect; None where they stay."""
-        if not self._adapts or self.last is None:
+        if not self._adaptive or self.last is None:
             return None
         layer = self.last.laid.stations.layer[-1:]
-        self._layer = [each for each in self._layer if each.laid.stations.layer[-1:] == layer] + [self.last]
-        shares = adapted_flow(self._path, self._layer, self._told)
+        self._layer = [look for look in self._layer if look.laid.stations.layer[-1:] == layer] + [self.last]
+        shares = adapted_flow(self._path, self._layer, self._commanded_flow)
         if shares is not None:
-            self._told, self._layer = self._told.then(shares), []
+            self._commanded_flow, self._layer = self._commanded_flow.then(shares), []
             self.last = replace(self.last, flow=shares)
         return shares
 
     def gather(self, progress: PrintProgress, command: Command, frames: FrameSet, pose: SurfacePose) -> bool:
-        """Keep the views of a look; whether they are enough by this frame set, which is said once."""
+        """Keep the views of a look; whether this frame set completes them, True once a look."""
         if progress.wanted != LOOK:
-            self._aside, self._done = math.nan, False
+            self._aside_at, self._complete = math.nan, False
             return False
-        if self._done or not (isinstance(command, Hold) and command.reason == LOOKS):
+        if self._complete or not (isinstance(command, Hold) and command.reason == LOOKS):
             return False
-        self._aside = pose.stamp if math.isnan(self._aside) else self._aside
-        self._done = self._keep(frames, pose, self._aside) or pose.stamp > self._aside + LOOK_TIMEOUT
-        self._now = pose.stamp
-        return self._done
+        self._aside_at = pose.stamp if math.isnan(self._aside_at) else self._aside_at
+        complete = self._keep_view(frames, pose, self._aside_at)
+        self._complete = complete or pose.stamp > self._aside_at + LOOK_TIMEOUT
+        self._stamp = pose.stamp
+        return self._complete
 
     def begin(self, views: Sequence[SurfaceView], landmarks: Array) -> None:
         """Measure the surface in views from before anything is laid, near landmarks (N, 3) mm, surface frame."""
@@ -140,13 +141,13 @@ class SurfaceLooks:
         self._measure(landmarks)
 
     def finish(self, fraction: float, landmarks: Array) -> None:
-        """Judge what lies there of the path up to `fraction` checkpoints; or measure where nothing was laid yet."""
+        """Judge the printed beads up to `fraction` checkpoints; or measure the surface where nothing is printed yet."""
         self.last = None
-        if self.surface is None or not len(pieces_between(self._path, self._from, fraction)):
-            self._from = fraction
+        if self.surface is None or not len(pieces_between(self._path, self._start_fraction, fraction)):
+            self._start_fraction = fraction
             self._measure(landmarks)
         elif self._views:
-            self.last = self._judge(fraction, self._now)
+            self.last = self._judge(fraction, self._stamp)
 
     def _measure(self, landmarks: Array) -> None:
         views, self._views = self._views, []
@@ -156,29 +157,29 @@ class SurfaceLooks:
         node = node_size(self._lenses, sorted(views[0].images), views[0].base_from_surface[:3, 3])
         self.surface = dense_heights(self._lenses, views, first_heights(landmarks, low, high, max(node, MIN_STEP)))
 
-    def _keep(self, frames: FrameSet, pose: SurfacePose, since: float = -math.inf) -> bool:
+    def _keep_view(self, frames: FrameSet, pose: SurfacePose, since: float = -math.inf) -> bool:
         """Keep a frame set if it is of use; whether there are enough. since: s, when the needle came to rest aside."""
-        due = pose.stamp >= self._gathered + VIEW_SPACING and pose.stamp >= since + SETTLED
-        if due and pose.state is TrackState.TRACKING and len(frames.frames) > 1:
-            self._gathered = pose.stamp
+        is_due = pose.stamp >= self._last_view + VIEW_SPACING and pose.stamp >= since + SETTLED
+        if is_due and pose.state is TrackState.TRACKING and len(frames.frames) > 1:
+            self._last_view = pose.stamp
             self._views.append(view_of(frames, pose.base_from_surface))
         return len(self._views) >= VIEWS
 
     def _judge(self, fraction: float, now: float) -> Look:
-        """What lies there of the path up to `fraction` checkpoints."""
+        """Judge the printed beads up to `fraction` checkpoints."""
         assert self.surface is not None
         views, self._views = self._views, []
-        pieces = pieces_between(self._path, self._from, fraction, told=self._told)
+        pieces = pieces_between(self._path, self._start_fraction, fraction, told=self._commanded_flow)
         laid, self.surface, width = look_at(self._lenses, views, self.surface, pieces, self._widths)
         self._widths = (width,)  # a property of the gel, seen best on the bare surface
-        first, self._from = self._from, fraction
-        return Look(now, first, fraction, now - self._aside, width, laid)
+        start, self._start_fraction = self._start_fraction, fraction
+        return Look(now, start, fraction, now - self._aside_at, width, laid)
 
 
 class LiveLooks:
     """The looks of a live run, judged in a thread while tracking goes on.
 
-    count: done so far. text: of the last one. busy: what is judged now.
+    count: done so far. text: of the last one. busy: the running job.
 
     The bare surface is measured in views from just before the print begins, when the arm stands at its home.
     A look that fails says so, and the print goes on as planned.
@@ -199,12 +200,12 @@ class LiveLooks:
         self._adapt, self._flows = adapt, flows
         self._rig, self._path = rig, path
         self._looks: SurfaceLooks | None = None
-        self._bare = deque[SurfaceView](maxlen=VIEWS)
-        self._kept = -math.inf  # s, of the last of these
+        self._bare_views = deque[SurfaceView](maxlen=VIEWS)
+        self._last_view = -math.inf  # s, of the last of these
         self._worker = ThreadPoolExecutor(1, "looks", step_back)  # not at the priority of the tracking
         stack.callback(self._worker.shutdown, wait=False, cancel_futures=True)
         self.busy: Future[None] | None = None
-        self._counts = False  # whether the job is a look, rather than the bare surface
+        self._job_is_look = False  # whether the job is a look, rather than the bare surface
         self.count, self.text = 0, ""
         self.placed: Path | None = None  # the path, in the surface frame
 
@@ -217,7 +218,7 @@ class LiveLooks:
         landmarks: Array | None,
         lies: Array | None,
     ) -> Look | None:
-        """A look that is done by now; it is None, too, of one that saw nothing, which `count` counts as well.
+        """A look that is complete by now, else None; None also for a look without a result, which `count` includes.
 
         progress, command: of the motion, the last ones. landmarks: (N, 3) mm of the map. lies: (4, 4) mm
         surface_from_path, None before the print begins.
@@ -225,29 +226,30 @@ class LiveLooks:
         if self.busy is not None:
             return self._finished(pose.stamp) if self.busy.done() else None
         if lies is None or landmarks is None or progress is None or command is None:
-            if pose.state is TrackState.TRACKING and len(frames.frames) > 1 and pose.stamp > self._kept + VIEW_SPACING:
-                self._kept = pose.stamp
-                self._bare.append(view_of(frames, pose.base_from_surface))
+            spaced = pose.stamp > self._last_view + VIEW_SPACING
+            if pose.state is TrackState.TRACKING and len(frames.frames) > 1 and spaced:
+                self._last_view = pose.stamp
+                self._bare_views.append(view_of(frames, pose.base_from_surface))
             return None
         if self._looks is None:
             self.placed = replace(self._path, surface_from_nozzle=lies @ self._path.surface_from_nozzle)
             how = progress.fraction, self._adapt is not None, self._flows
             self._looks = SurfaceLooks(self._rig, self.placed, *how)
-            self._counts = False
-            self.busy = self._worker.submit(self._looks.begin, list(self._bare), landmarks)
-            self._bare.clear()
+            self._job_is_look = False
+            self.busy = self._worker.submit(self._looks.begin, list(self._bare_views), landmarks)
+            self._bare_views.clear()
         elif self._looks.gather(progress, command, frames, pose):
-            self._counts = True
+            self._job_is_look = True
             self.busy = self._worker.submit(self._looks.finish, progress.fraction, landmarks)
         return None
 
     def _finished(self, now: float) -> Look | None:
         assert self.busy is not None and self._looks is not None
-        failed, self.busy = self.busy.exception(), None
-        if not self._counts:
+        error, self.busy = self.busy.exception(), None
+        if not self._job_is_look:
             return None
-        why = f"looked at: nothing could be judged, and the path goes on as planned ({type(failed).__name__}: {failed})"
-        self.text = NOTHING_JUDGED if failed is None else why
+        text = f"looked at: nothing could be judged, and the path goes on as planned ({type(error).__name__}: {error})"
+        self.text = NOTHING_JUDGED if error is None else text
         self.count, look = self.count + 1, self._looks.last
         if look is None:
             return None
@@ -265,7 +267,7 @@ def look_at(
     pieces: BeadPieces,
     widths: Sequence[float] = WIDTHS,
 ) -> tuple[LaidBeads, SurfaceHeights, float]:
-    """What lies of planned beads, the surface after, and how wide beads are by the planned, within `widths`."""
+    """The printed share of planned beads, the surface after, and the beads' relative width out of `widths`."""
     nodes = before.nodes
     stations = stations_of(pieces)
     station, _ = nearest_station(pieces, stations, nodes)
@@ -273,21 +275,21 @@ def look_at(
     def due_at(width: float) -> Array:
         return bead_heights(replace(pieces, width=pieces.width * width), nodes)
 
-    swept = sweep_beads(lenses, views, before, due_at, widths, station, np.diff(stations.bead) == 0)
-    due = due_at(swept.width)
-    after = heights_with_beads(before, due, station, swept)
-    known = replace(before, sigma=0.0 * before.sigma)  # a share's sigma holds what the ground is off by
-    laid = judge_beads(known, after, replace(pieces, width=pieces.width * swept.width))
-    ground = heights_with_beads(before, due, station, replace(swept, share=ground_shares(swept)))
-    return laid, replace(after, heights=ground.heights), swept.width
+    bead_shares = sweep_beads(lenses, views, before, due_at, widths, station, np.diff(stations.bead) == 0)
+    planned = due_at(bead_shares.width)
+    after = heights_with_beads(before, planned, station, bead_shares)
+    exact_before = replace(before, sigma=0.0 * before.sigma)  # a share's sigma holds what the ground is off by
+    laid = judge_beads(exact_before, after, replace(pieces, width=pieces.width * bead_shares.width))
+    ground = heights_with_beads(before, planned, station, replace(bead_shares, share=ground_shares(bead_shares)))
+    return laid, replace(after, heights=ground.heights), bead_shares.width
 
 
-def ground_shares(swept: BeadShares) -> Array:
-    """Shares (S,) of pieces as the next look takes them for its ground: what most have, but where one is surely off.
+def ground_shares(bead_shares: BeadShares) -> Array:
+    """Shares (S,) of pieces for the ground of the next look: the median, except where a piece surely differs.
 
-    An error of the ground is one of the next layer, the other way round. What is unknown is taken for laid.
+    An error of the ground is the next layer's with opposite sign. Unknown pieces count as printed.
     """
-    share, doubt = swept.share, np.maximum(GROUND_DOUBT, SURE * swept.sigma)
+    share, doubt = bead_shares.share, np.maximum(GROUND_DOUBT, SURE * bead_shares.sigma)
     usual = float(np.median(share[np.isfinite(share)])) if np.isfinite(share).any() else 1.0
     return np.where(np.abs(share - usual) < doubt, usual, np.where(np.isfinite(share), share, 1.0))
 
@@ -322,17 +324,17 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
         rows.append([f"{look.last:.0f}", f"{look.seconds:.1f}", *values, *counts, clogs])
     head = ("after checkpoint", "aside, s", "laid, mm³", "planned, mm³", "height, mm", "as planned, mm", "uneven, mm")
     table = page.figures_table((*head, "gaps", "blobs", "clogs"), rows)
-    drawn = "".join(
+    figures = "".join(
         f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
         for look in looks
-        for picture, caption in _drawn(look, path)
+        for picture, caption in _captioned_pictures(look, path)
     )
     text = (
         "What lies there of the planned beads, by the cameras while the needle stood aside. Green: as planned to a "
         "quarter; orange: less than 0.8 or more than 1.25; red: a gap; violet: a blob; grey: not seen. What is planned "
         "of a layer that took its flow from the one below is what it was told to lay."
     )
-    return page.section("Looks at what was laid", text, table + f'<div class="pictures">{drawn}</div>')
+    return page.section("Looks at what was laid", text, table + f'<div class="pictures">{figures}</div>')
 
 
 def _median(values: Array) -> float:
@@ -342,11 +344,11 @@ def _median(values: Array) -> float:
 def station_places(look: Look, path: Path, count: int = STATION_POINTS) -> Array:
     """Places (S, count, 3) mm along each piece of bead that was looked at, on the path."""
     knots = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
-    at = np.linspace(look.laid.stations.begin, look.laid.stations.end, count, axis=1)
-    return np.stack([np.interp(at, knots, path.surface_from_nozzle[:, k, 3]) for k in range(3)], axis=-1)
+    lengths = np.linspace(look.laid.stations.begin, look.laid.stations.end, count, axis=1)
+    return np.stack([np.interp(lengths, knots, path.surface_from_nozzle[:, k, 3]) for k in range(3)], axis=-1)
 
 
-def _drawn(look: Look, path: Path) -> list[tuple[str, str]]:
+def _captioned_pictures(look: Look, path: Path) -> list[tuple[str, str]]:
     """The pictures of a look with their captions: what lies there, and the next layer's flow where it has its own."""
     pictures = [(look_picture(look, path), f"after {look.last:.0f} checkpoints: {look.text}")]
     if look.flow is not None:
@@ -360,17 +362,17 @@ def look_picture(look: Look, path: Path) -> str:
     places, widths = station_places(look, path)[..., :2], look.laid.stations.width / look.width
     colours, titles = [], []
     for share in look.laid.share.tolist():
-        seen = not math.isnan(share)
-        colours.append(next(c for most, c in SHARE_COLOURS if share < most) if seen else "#999")
-        titles.append(f"{share:.0%} of the planned" if seen else "not seen")
+        measured = not math.isnan(share)
+        colours.append(next(c for limit, c in SHARE_COLOURS if share < limit) if measured else "#999")
+        titles.append(f"{share:.0%} of the planned" if measured else "not seen")
     return _beads_picture(places, widths, colours, titles, path, "beads by how much lies there")
 
 
 def flow_picture(flow: FlowShares, below: Stations, path: Path) -> str:
     """Stretches of the next layer from above, by the flow that each gets, as SVG; as wide as the beads below them."""
-    at = np.linspace(flow.begin, flow.end, STATION_POINTS, axis=1)
-    places = [np.interp(at, np.arange(len(path)), path.surface_from_nozzle[:, k, 3]) for k in range(2)]
-    colours = [next(c for most, c in FLOW_COLOURS if share < most) for share in flow.share.tolist()]
+    places_on_path = np.linspace(flow.begin, flow.end, STATION_POINTS, axis=1)
+    places = [np.interp(places_on_path, np.arange(len(path)), path.surface_from_nozzle[:, k, 3]) for k in range(2)]
+    colours = [next(c for limit, c in FLOW_COLOURS if share < limit) for share in flow.share.tolist()]
     titles = [f"{share:.0%} of the planned flow" for share in flow.share.tolist()]
     width = np.full(len(titles), np.median(below.width))
     return _beads_picture(np.stack(places, axis=-1), width, colours, titles, path, "the next layer by its flow")
@@ -384,9 +386,9 @@ def _beads_picture(
     size, lines = (high - low) * PLOT_SCALE, []
     for place, width, colour, title in zip(places, widths * 0.85 * PLOT_SCALE, colours, titles, strict=True):
         x, y = ((place - low) * PLOT_SCALE).T
-        way = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, size[1] - y, strict=True))
+        line = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, size[1] - y, strict=True))
         lines.append(
-            f'<path d="M{way}" stroke="{colour}" stroke-width="{width:.1f}" fill="none"><title>{title}</title></path>'
+            f'<path d="M{line}" stroke="{colour}" stroke-width="{width:.1f}" fill="none"><title>{title}</title></path>'
         )
     box = f'viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" width="{min(size[0], 520):.0f}"'
     return f'<svg {box} role="img" aria-label="{label}">{"".join(lines)}</svg>'

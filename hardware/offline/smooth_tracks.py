@@ -54,11 +54,11 @@ def part_path(target: Path) -> Path:
 @contextmanager
 def track_writer(target: Path, rig: Rig, contents: str, began: int | None = None) -> Iterator[Recorder]:
     """A recorder for tracks computed from a source of the hash `contents`; the file gets its name once it is whole."""
-    part = part_path(target)
-    with Recorder(part, rig, overwrite=True, began=began) as recorder:
+    partial_file = part_path(target)
+    with Recorder(partial_file, rig, overwrite=True, began=began) as recorder:
         recorder.attach(SOURCE_ATTACHMENT, contents.encode())
         yield recorder
-    os.replace(part, target)
+    os.replace(partial_file, target)
 
 
 TRACKS_FILE = "tracks.mcap"
@@ -100,7 +100,7 @@ def tracks_of(session: Session, out: Path, contents: str, stream: TextIO | None 
 
 def read_tracks(path: Path) -> SessionTracks:
     """The tracks in a recording, each stamp once: a run interrupted while it wrote may have stored a chunk twice."""
-    observations = {seen.stamp: seen for seen in read_observations(path)}
+    observations = {record.stamp: record for record in read_observations(path)}
     poses = {pose.stamp: pose for pose in read_poses(path) if np.isfinite(pose.base_from_surface).all()}
     return SessionTracks(
         tuple(observations[stamp] for stamp in sorted(observations)), tuple(poses[stamp] for stamp in sorted(poses))
@@ -139,11 +139,11 @@ class ReobservedTracks:
     @property
     def text(self) -> str:
         """A sentence to follow others, "" where nothing was found."""
-        found = f" {self.looks} looks at landmarks were found besides the tracks'" if self.looks else ""
+        sentence = f" {self.looks} looks at landmarks were found besides the tracks'" if self.looks else ""
         parts = [(self.early, "of landmarks that joined the map later"), (self.sets, "frame sets had none")]
         details = ", ".join(f"{count} {what}" for count, what in parts if count)
         trouble = f" Images were not searched to their end: {self.trouble}." if self.trouble else ""
-        return f"{found}{': ' if found and details else ''}{details}{'.' if found else ''}{trouble}"
+        return f"{sentence}{': ' if sentence and details else ''}{details}{'.' if sentence else ''}{trouble}"
 
     @property
     def figures(self) -> dict[str, int]:
@@ -163,50 +163,50 @@ def reobserve(
     if source_hash(file) != contents:
         try:
             with track_writer(file, session.rig, contents) as recorder:
-                for seen in _searched(session, tracks, smoothed, stream):
-                    recorder.write(seen)
+                for record in _search_images(session, tracks, smoothed, stream):
+                    recorder.write(record)
         except InputError as damage:  # the tracks do not need the images
             file, trouble = part_path(file), str(damage)
     return replace(with_looks(tracks, read_tracks(file).observations), trouble=trouble)
 
 
-def with_looks(tracks: SessionTracks, found: Iterable[Observations]) -> ReobservedTracks:
+def with_looks(tracks: SessionTracks, added: Iterable[Observations]) -> ReobservedTracks:
     """The tracks together with more observations, in order of stamp."""
-    whole = {seen.stamp: seen for seen in tracks.observations}
-    first: dict[int, float] = {}
-    for seen in tracks.observations:
-        for track in np.unique(seen.track).tolist():
-            first.setdefault(track, seen.stamp)
+    by_stamp = {record.stamp: record for record in tracks.observations}
+    first_stamps: dict[int, float] = {}
+    for record in tracks.observations:
+        for track in np.unique(record.track).tolist():
+            first_stamps.setdefault(track, record.stamp)
     looks = early = sets = 0
-    for seen in found:
-        before = whole.get(seen.stamp)
-        whole[seen.stamp] = seen if before is None else joined_observations(before, seen)
-        looks += len(seen)
-        early += sum(seen.stamp < first[track] for track in seen.track.tolist())
-        sets += before is None or not len(before)
-    observations = tuple(whole[stamp] for stamp in sorted(whole))
+    for record in added:
+        existing = by_stamp.get(record.stamp)
+        by_stamp[record.stamp] = record if existing is None else joined_observations(existing, record)
+        looks += len(record)
+        early += sum(record.stamp < first_stamps[track] for track in record.track.tolist())
+        sets += existing is None or not len(existing)
+    observations = tuple(by_stamp[stamp] for stamp in sorted(by_stamp))
     return ReobservedTracks(replace(tracks, observations=observations), looks, early, sets)
 
 
-def _searched(
+def _search_images(
     session: Session, tracks: SessionTracks, smoothed: Smoothed, stream: TextIO | None
 ) -> Iterable[Observations]:
     motion = KnownMotion(session.rig, smoothed, tracks.observations)
     references = ReferencePictures(motion)
     stamps = np.array([mean_stamp(refs) for refs in session.sets])
-    wanted = np.abs(stamps[:, None] - references.stamps).min(1, initial=np.inf) < STAMP_TOLERANCE_S
-    some = replace(session, sets=tuple(refs for refs, mine in zip(session.sets, wanted, strict=True) if mine))
-    total = len(some) + len(session)
+    needed = np.abs(stamps[:, None] - references.stamps).min(1, initial=np.inf) < STAMP_TOLERANCE_S
+    subset = replace(session, sets=tuple(refs for refs, mine in zip(session.sets, needed, strict=True) if mine))
+    total = len(subset) + len(session)
     with Progress("relink", "frame sets", WallClock().now, stream) as progress:
-        for done, frames in enumerate(some.frame_sets(), 1):
+        for done, frames in enumerate(subset.frame_sets(), 1):
             references.cut(frames)
             progress(done, total)
-        found = references.matcher()
-        if found is None:
+        matcher = references.matcher()
+        if matcher is None:
             return
-        relinker, looks = Reobserver(motion, *found), list[Observations]()
+        relinker, looks = Reobserver(motion, *matcher), list[Observations]()
         try:
-            for done, frames in enumerate(session.frame_sets(), 1 + len(some)):
+            for done, frames in enumerate(session.frame_sets(), 1 + len(subset)):
                 looks += relinker(frames)
                 progress(done, total)
         finally:
@@ -223,21 +223,19 @@ HARMONICS = 3  # of a rhythm that are fitted; of two alone, three times a pulse'
 RATE_STEPS = 160  # candidate rates of a band, evenly apart in their logarithm
 MIN_EXPLAINED = 0.6  # share of the motion in each window that breathing has to explain
 MAX_SPREAD = {"breathing": 0.25, "pulse": 0.05}  # of the windows' rates, relative: more is no rhythm, but chance
-MIN_COMB = (
-    0.7  # mean over the windows of the log ratio of power on a pulse's harmonics to that between them, summed over
-)
-# the harmonics: with pulses of 0.1 mm beside 8 mm of breathing it is 1.0 and more, without one 0.2 at most
+# least mean over the windows of the log ratio, summed over the harmonics, of a pulse's power to that between them:
+MIN_COMB = 0.7  # with pulses of 0.1 mm beside 8 mm of breathing it is 1.0 and more, without one 0.2 at most
 MIN_WINDOW_SPREAD = 0.01  # of the rate of a window, relative: beats differ by 5 %, and a window holds some fifteen
-CLAIMED = 0.975  # quantile of Student's distribution: with few windows their spread is itself not known well
+CLAIM_QUANTILE = 0.975  # quantile of Student's distribution: with few windows their spread is itself not known well
 MULTIPLES, MULTIPLE_BINS = 12, 1.5  # of an even breathing's rate at which no pulse can be told from it, and how near
 
 
 @dataclass(frozen=True, slots=True)
 class Rhythm:
-    """A rate that the motion has, and what it is good to. why: none is found, "" where one is."""
+    """A rate of the motion with its uncertainty. why: none is found, "" where one is."""
 
     rate: float  # Hz, NaN where none is found
-    claim: float  # Hz, within which of the rate the true one is 19 times of 20
+    claim: float  # Hz, half width of the 95 % interval
     why: str = ""
 
     @property
@@ -258,14 +256,14 @@ def breathing_rhythm(times: Array, along: Array) -> Rhythm:
         return Rhythm(nan, nan, "the recording is too short")
     low = max(BREATHING_BAND_HZ[0], MIN_CYCLES / (times[windows[0]][-1] - times[windows[0]][0]))
     rates = np.geomspace(low, BREATHING_BAND_HZ[1], RATE_STEPS)
-    best = []
-    for part in windows:
-        explained = np.array([_explained(times[part], along[part, None], rate) for rate in rates])
-        at = int(explained.argmax())
-        if explained[at] < MIN_EXPLAINED or at == 0:  # at the slowest rate a drift fits best
+    window_rates = []
+    for window in windows:
+        explained = np.array([_explained_share(times[window], along[window, None], rate) for rate in rates])
+        index = int(explained.argmax())
+        if explained[index] < MIN_EXPLAINED or index == 0:  # at the slowest rate a drift fits best
             return Rhythm(nan, nan, "the motion has no regular rhythm")
-        best.append(float(rates[at]))
-    return _agreed(best, times, "breathing")
+        window_rates.append(float(rates[index]))
+    return _common_rate(window_rates, times, "breathing")
 
 
 def pulse_rhythm(times: Array, positions: Array, breathing: Rhythm) -> Rhythm:
@@ -278,22 +276,23 @@ def pulse_rhythm(times: Array, positions: Array, breathing: Rhythm) -> Rhythm:
     if not windows:
         return Rhythm(nan, nan, "the recording is too short")
     rates = np.geomspace(*PULSE_BAND_HZ, RATE_STEPS)
-    scores = np.array([_comb_scores(times[part], positions[part], rates) for part in windows])  # (W, R)
+    scores = np.array([_comb_scores(times[window], positions[window], rates) for window in windows])  # (W, R)
     mean = scores.mean(axis=0)
     if not mean.max() > MIN_COMB:
         return Rhythm(nan, nan, "what there is, chance explains")
     rate = float(rates[mean.argmax()])
-    fine = rate * np.linspace(0.94, 1.06, 61)
-    best = []
-    for part in windows:
-        faster = np.gradient(np.gradient(positions[part], times[part], axis=0), times[part], axis=0)
-        best.append(float(fine[np.argmax([_explained(times[part], faster, each) for each in fine])]))
-    found, near = _agreed(best, times, "pulse"), MULTIPLE_BINS / float(times[-1] - times[0])
+    candidates = rate * np.linspace(0.94, 1.06, 61)
+    window_rates = []
+    for window in windows:
+        acceleration = np.gradient(np.gradient(positions[window], times[window], axis=0), times[window], axis=0)
+        shares = [_explained_share(times[window], acceleration, candidate) for candidate in candidates]
+        window_rates.append(float(candidates[np.argmax(shares)]))
+    pulse, resolution = _common_rate(window_rates, times, "pulse"), MULTIPLE_BINS / float(times[-1] - times[0])
     for k in range(2, MULTIPLES + 1):
-        blurred = k * breathing.claim > near  # breaths differ, so that there is no line at this multiple of their rate
-        if abs(found.rate - k * breathing.rate) < near and not blurred:
+        blurred = k * breathing.claim > resolution  # breaths differ: no spectral line at this multiple
+        if abs(pulse.rate - k * breathing.rate) < resolution and not blurred:
             return Rhythm(nan, nan, f"{k} times the breathing's rate cannot be told from the breathing")
-    return found
+    return pulse
 
 
 def _windows(times: Array, name: str) -> list[slice]:
@@ -306,26 +305,26 @@ def _windows(times: Array, name: str) -> list[slice]:
     return [slice(k * size, (k + 1) * size) for k in range(count)]
 
 
-def _agreed(rates: Sequence[float], times: Array, name: str) -> Rhythm:
-    """The rate that windows agree on, with what that is good to; none where they do not."""
+def _common_rate(rates: Sequence[float], times: Array, name: str) -> Rhythm:
+    """The mean rate of the windows with its uncertainty; none where they disagree."""
     mean, spread = float(np.mean(rates)), float(np.std(rates, ddof=1))
     if spread > MAX_SPREAD[name] * mean:
         return Rhythm(nan, nan, "its parts do not agree")
     from scipy.stats import t as student
 
     error = max(spread, MIN_WINDOW_SPREAD * mean) / len(rates) ** 0.5
-    return Rhythm(mean, float(student.ppf(CLAIMED, len(rates) - 1)) * error)
+    return Rhythm(mean, float(student.ppf(CLAIM_QUANTILE, len(rates) - 1)) * error)
 
 
-def _explained(times: Array, values: Array, rate: float) -> float:
+def _explained_share(times: Array, values: Array, rate: float) -> float:
     """Share of values (N, D) that a trend and the harmonics of a rate, Hz, explain beyond the trend."""
-    turn = 2 * np.pi * rate * (times - times[0])
-    waves = [wave(k * turn) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
+    phase = 2 * np.pi * rate * (times - times[0])
+    waves = [wave(k * phase) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
     trend = np.vander((times - times.mean()) / np.ptp(times), 3)
-    rest = values - trend @ np.linalg.lstsq(trend, values, rcond=None)[0]
+    detrended = values - trend @ np.linalg.lstsq(trend, values, rcond=None)[0]
     design = np.column_stack([*waves, trend])
-    left = rest - design @ np.linalg.lstsq(design, rest, rcond=None)[0]
-    return 1.0 - float((left**2).sum()) / max(float((rest**2).sum()), 1e-30)
+    residual = detrended - design @ np.linalg.lstsq(design, detrended, rcond=None)[0]
+    return 1.0 - float((residual**2).sum()) / max(float((detrended**2).sum()), 1e-30)
 
 
 def _comb_scores(times: Array, positions: Array, rates: Array) -> Array:
@@ -333,10 +332,10 @@ def _comb_scores(times: Array, positions: Array, rates: Array) -> Array:
     from scipy.signal.windows import dpss
 
     step = float(times[1] - times[0])
-    faster = np.diff(positions, 2, axis=0) / step**2
-    tapers = dpss(len(faster), 3, 5)  # five windows of a bandwidth of three bins
-    size = 4 * len(faster)
-    power = (np.abs(np.fft.rfft(tapers[:, :, None] * (faster - faster.mean(0)), size, axis=1)) ** 2).mean(0).sum(-1)
+    accel = np.diff(positions, 2, axis=0) / step**2
+    tapers = dpss(len(accel), 3, 5)  # five windows of a bandwidth of three bins
+    size = 4 * len(accel)
+    power = (np.abs(np.fft.rfft(tapers[:, :, None] * (accel - accel.mean(0)), size, axis=1)) ** 2).mean(0).sum(-1)
     hertz, total = np.fft.rfftfreq(size, step), np.concatenate([[0.0], np.cumsum(power)])
 
     def between(low: Array, high: Array) -> Array:
@@ -346,11 +345,11 @@ def _comb_scores(times: Array, positions: Array, rates: Array) -> Array:
 
     score = np.zeros(len(rates))
     for k in range(1, HARMONICS + 1):
-        tooth, gap = np.maximum(3 / (len(faster) * step), 0.02 * k * rates), 0.5 * rates
+        tooth, gap = np.maximum(3 / (len(accel) * step), 0.02 * k * rates), 0.5 * rates
         wide = np.maximum(tooth, 0.125 * rates)
-        beside = 0.5 * (
+        background = 0.5 * (
             between(k * rates - gap - wide, k * rates - gap + wide)
             + between(k * rates + gap - wide, k * rates + gap + wide)
         )
-        score += np.log(between(k * rates - tooth, k * rates + tooth) + 1e-30) - np.log(beside + 1e-30)
+        score += np.log(between(k * rates - tooth, k * rates + tooth) + 1e-30) - np.log(background + 1e-30)
     return score

@@ -81,8 +81,8 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     recipe, schedule = loop.Recipe(), loop.Schedule()
     if options.network == "thesis":
         recipe, schedule = loop.THESIS_RECIPE, loop.THESIS_SCHEDULE
-    own = {"seed": options.seed, "threads": options.threads, "device": loop.torch_device(options.device)}
-    schedule = replace(schedule, rounds=options.rounds or schedule.rounds, **own)
+    run_settings = {"seed": options.seed, "threads": options.threads, "device": loop.torch_device(options.device)}
+    schedule = replace(schedule, rounds=options.rounds or schedule.rounds, **run_settings)
     parts = [str(fold) for fold in range(options.folds)] + [ALL] if options.part is None else [options.part]
     trained = {part: _trained(options, part, pictures, recipe, schedule) for part in parts}
     if options.part is not None:
@@ -101,21 +101,21 @@ def _trained(
     from perception.training.samples import Pictures
 
     network = loop.build_network(options.network, schedule.seed)
-    trained = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
+    trained = [item for item, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
     source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), schedule.device)
-    of = _fingerprint(options.network, [*trained, *pictures.others], schedule, recipe)
-    what = "train on all" if part == ALL else f"train without fold {part}"
-    with _progress(what, "steps") as progress:
-        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe, of)
+    fingerprint = _fingerprint(options.network, [*trained, *pictures.others], schedule, recipe)
+    title = "train on all" if part == ALL else f"train without fold {part}"
+    with _progress(title, "steps") as progress:
+        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe, fingerprint)
 
 
 def _fingerprint(network: str, pictures: Sequence[Labelled], schedule: Schedule, recipe: Recipe) -> str:
-    """What a checkpoint is of: pictures with their labels, and all options but those that only say where it is made."""
-    said = network, replace(schedule, device="", threads=0), recipe.augmentation, OTHER_SET_WEIGHT
-    made = hashlib.sha256(repr(said).encode())
-    for each in pictures:
-        made.update(each.name.encode() + each.picture.tobytes() + each.wound.tobytes())
-    return made.hexdigest()
+    """Hash of a checkpoint's inputs: pictures with their labels, and all options but device and threads."""
+    recipe_fields = network, replace(schedule, device="", threads=0), recipe.augmentation, OTHER_SET_WEIGHT
+    digest = hashlib.sha256(repr(recipe_fields).encode())
+    for picture in pictures:
+        digest.update(picture.name.encode() + picture.picture.tobytes() + picture.wound.tobytes())
+    return digest.hexdigest()
 
 
 def _finish(
@@ -148,13 +148,13 @@ def _finish(
         with _progress("judge", "pictures") as progress:
             unseen = _unseen(rounded, pictures, healthy, recipe, progress)
         with _progress("choose", "settings") as progress:
-            settings, judged = metrics.judge(unseen, recipe.looks, rng, progress)
+            settings, metrics_of_folds = metrics.judge(unseen, recipe.looks, rng, progress)
         segmenters = [NetworkSegmenter(network, settings) for network in rounded]
         with _progress("cover", "pictures") as progress:
             before, after = _covered(segmenters, pictures, rng, progress)
         silent = [metrics.silent_share(each, rendered) for each in segmenters]
         figures = export.Figures(
-            judged,
+            metrics_of_folds,
             [each.name for each in pictures.judged],
             [float(each.wound.mean()) for each in pictures.judged],
             len(healthy[0]),
@@ -162,9 +162,9 @@ def _finish(
             before,
             after,
         )
-        made = Path(folder) / out.name
-        export.export(trained[ALL].network, made, settings, terms)
-        alike = export.agreement(trained[ALL].network, made, pictures.judged[:COMPARED], recipe.looks)
+        exported = Path(folder) / out.name
+        export.export(trained[ALL].network, exported, settings, terms)
+        agreement = export.agreement(trained[ALL].network, exported, pictures.judged[:COMPARED], recipe.looks)
         folds = f"{len(pictures.judged)} pictures in {pictures.fold.max() + 1} folds"
         data = (
             f"{folds}, split by {pictures.group_count} groups of near-duplicates (small colour copies, mirrored and"
@@ -172,13 +172,14 @@ def _finish(
             f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
         )
         count = loop.parameter_count(trained[ALL].network)
-        origin = export.NetworkOrigin(out.stem, options.network, count, data, str(schedule), alike, WoundNetwork(made))
+        network = WoundNetwork(exported)
+        origin = export.NetworkOrigin(out.stem, options.network, count, data, str(schedule), agreement, network)
         _write_names(out, [*pictures.judged, *pictures.others])
-        export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), judged)
+        export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), metrics_of_folds)
         export.write_card(out.with_suffix(".md"), origin, figures)
         for suffix in (".toml", ".onnx"):
-            shutil.copy(made.with_suffix(suffix), out.with_suffix(suffix))
-    dice = judged.dice
+            shutil.copy(exported.with_suffix(suffix), out.with_suffix(suffix))
+    dice = metrics_of_folds.dice
     return (
         f"mean Dice of {len(dice)} pictures, each by a network that never saw its group: {dice.mean():.3f} (median"
         f" {np.median(dice):.3f})\n{out}, its settings, card, curves and reliability are written"
@@ -190,9 +191,9 @@ def _pieces(pictures: TrainingPictures, rng: np.random.Generator) -> tuple[list[
     pieces, folds = list[NDArray[np.uint8]](), list[int]()
     for fold in range(int(pictures.fold.max()) + 1):
         inside = [pictures.judged[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
-        found = [piece for _ in range(PIECE_DRAWS) for piece in healthy_pieces(inside, rng, len(inside))]
-        pieces += found
-        folds += [fold] * len(found)
+        fold_pieces = [piece for _ in range(PIECE_DRAWS) for piece in healthy_pieces(inside, rng, len(inside))]
+        pieces += fold_pieces
+        folds += [fold] * len(fold_pieces)
     return pieces, folds
 
 
@@ -201,7 +202,7 @@ def _unseen(
     pictures: TrainingPictures,
     healthy: tuple[list[NDArray[np.uint8]], list[int]],
     recipe: Recipe,
-    seen: Callable[[int, int], None],
+    report: Callable[[int, int], None],
 ) -> Unseen:
     """Each picture and each piece of healthy skin by the network that never saw its group."""
     from perception.training.metrics import Unseen, bgr
@@ -209,35 +210,35 @@ def _unseen(
     from perception.wound.segmentation import NetworkSegmenter
 
     segmenters = [NetworkSegmenter(each, Settings(looks=recipe.looks, trust=0.0)) for each in networks]
-    shown = [(each.picture, each.wound) for each in pictures.judged]
-    shown += [(piece, np.zeros(piece.shape[:2], bool)) for piece in healthy[0]]
+    samples = [(each.picture, each.wound) for each in pictures.judged]
+    samples += [(is_piece, np.zeros(is_piece.shape[:2], bool)) for is_piece in healthy[0]]
     folds = np.array([*pictures.fold.tolist(), *healthy[1]], np.intp)
     logits = []
-    for (picture, _), fold in zip(shown, folds.tolist(), strict=True):
+    for (picture, _), fold in zip(samples, folds.tolist(), strict=True):
         logits.append(segmenters[fold].logits(bgr(picture)).astype(np.float16))
-        seen(len(logits), len(shown))
-    piece = np.arange(len(shown)) >= len(pictures.judged)
-    return Unseen(logits, [wound for _, wound in shown], folds, piece)
+        report(len(logits), len(samples))
+    is_piece = np.arange(len(samples)) >= len(pictures.judged)
+    return Unseen(logits, [wound for _, wound in samples], folds, is_piece)
 
 
 def _covered(
     segmenters: Sequence[Segmenter],
     pictures: TrainingPictures,
     rng: np.random.Generator,
-    seen: Callable[[int, int], None],
+    report: Callable[[int, int], None],
 ) -> tuple[float, float]:
     """Mean Dice on the open half of each wound, before its other half is covered and after."""
     from perception.training.metrics import dice_before_and_after_cover
 
-    reached, counts = [], []
+    dices, counts = [], []
     for fold, segmenter in enumerate(segmenters):
         inside = [pictures.judged[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
         wounded = [each for each in inside if each.wound.any()]
         if wounded:
-            reached.append(dice_before_and_after_cover(segmenter, wounded, rng))
+            dices.append(dice_before_and_after_cover(segmenter, wounded, rng))
             counts.append(len(wounded))
-            seen(sum(counts), len(pictures.judged))
-    before, after = np.average(reached, axis=0, weights=counts)
+            report(sum(counts), len(pictures.judged))
+    before, after = np.average(dices, axis=0, weights=counts)
     return float(before), float(after)
 
 
@@ -245,11 +246,11 @@ def _fit_shapes(out: Path, pictures: TrainingPictures, seed: int) -> str:
     """The shape model, of all folds but the first, by which the bench judges it."""
     from perception.wound.shape_matching import fit_shapes, write_shape_model
 
-    learned = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if fold != 0]
+    training_pictures = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if fold != 0]
     with _progress("fit", "pictures") as progress:
-        model = fit_shapes([(each.picture, each.wound) for each in learned], seed, progress)
+        model = fit_shapes([(each.picture, each.wound) for each in training_pictures], seed, progress)
     write_shape_model(out, model)
-    _write_names(out, learned)
+    _write_names(out, training_pictures)
     return f"{out} is written; judge it with stillbed bench segmentation"
 
 
@@ -266,8 +267,8 @@ def _pictures(options: argparse.Namespace, render_view: RenderView) -> TrainingP
         raise InputError(options.datasets[0], "groups of pictures", count, f"{options.folds} or more, as --folds says")
     wounded = np.array([each.wound.any() for each in judged])
     if len(np.unique(group[wounded])) < 2:
-        found = len(np.unique(group[wounded]))
-        raise InputError(options.datasets[0], "groups of pictures with a wound", found, "two or more")
+        count_with_wound = len(np.unique(group[wounded]))
+        raise InputError(options.datasets[0], "groups of pictures with a wound", count_with_wound, "two or more")
     # every fourth of healthy skin
     rendered = _rendered(render_view, [(RENDERED_SEED + number, number % 4 != 3) for number in range(options.rendered)])
     others = [each for data_set in data_sets[1:] for each in data_set] + rendered
@@ -316,9 +317,9 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError("command line", "--out", str(out), f"a name that ends in {'.toml' if shapes else '.onnx'}")
     if not out.parent.is_dir():
         raise InputError("command line", "--out", str(out), "a file in a folder that exists")
-    least = {"--folds": (options.folds, 2), "--rendered": (options.rendered, 0), "--rounds": (options.rounds, 1)}
-    least |= {"--threads": (options.threads, 1), "--seed": (options.seed, 0)}
-    for name, (value, low) in least.items():
+    minima = {"--folds": (options.folds, 2), "--rendered": (options.rendered, 0), "--rounds": (options.rounds, 1)}
+    minima |= {"--threads": (options.threads, 1), "--seed": (options.seed, 0)}
+    for name, (value, low) in minima.items():
         if value is not None and value < low:
             raise InputError("command line", name, value, f"{low} or more")
     parts = [*map(str, range(options.folds)), ALL]
