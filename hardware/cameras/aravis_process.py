@@ -116,10 +116,10 @@ def choose_format(camera: Any, order: dict[str, Any]) -> None:
     """Set the pixel format that is wanted; ValueError where the camera has none that can be read."""
     offered = camera.dup_available_pixel_formats_as_strings()
     usable = [name for name in order["formats"] if name in offered]
-    wanted = order["format"] or camera.get_pixel_format_as_string()
-    if wanted not in usable:
-        raise ValueError(f"format {wanted!r}: this camera has {', '.join(usable) or 'none that can be read'}")
-    attempt("format", camera.set_pixel_format_from_string, wanted)
+    pixel_format = order["format"] or camera.get_pixel_format_as_string()
+    if pixel_format not in usable:
+        raise ValueError(f"format {pixel_format!r}: this camera has {', '.join(usable) or 'none that can be read'}")
+    attempt("format", camera.set_pixel_format_from_string, pixel_format)
 
 
 def attempt(key: str, call: Any, *values: Any) -> None:
@@ -171,7 +171,7 @@ class Counters:
             data = camera.gv_get_packet_size() - UDP_OVERHEAD
             self._per_frame = -(-payload // data) + ENVELOPE_PACKETS
         self._infos = {stream.get_info_name(i): i for i in range(stream.get_n_infos())}
-        self._ended = self._last = self._turns = 0
+        self._frame_count = self._last_number = self._turns = 0
         self._skipped: set[int] = set()  # numbers that may still come: an incomplete frame comes after whole ones
         self._missing = self.frames_lost = 0
 
@@ -184,31 +184,31 @@ class Counters:
         Packets of a frame under way only lower what seems to be missing, so the largest value that was seen is the
         right one. What comes after its frame has ended was not lost.
         """
-        self._ended += 1
+        self._frame_count += 1
         if number:
             self._follow(number)
-        late, received = self._info("n_ignored_packets"), self._info("n_received_packets")
-        in_time = received - late - self._info("n_duplicated_packets")
-        self._missing = max(self._missing, (self._ended + self.frames_lost) * self._per_frame - in_time)
+        ignored, received = self._info("n_ignored_packets"), self._info("n_received_packets")
+        in_time = received - ignored - self._info("n_duplicated_packets")
+        self._missing = max(self._missing, (self._frame_count + self.frames_lost) * self._per_frame - in_time)
         return {
             "received": received,
-            "lost": max(0, self._missing - late),
+            "lost": max(0, self._missing - ignored),
             "resent": self._info("n_resent_packets"),
             "frames_lost": self.frames_lost,
         }
 
     def _follow(self, number: int) -> None:
         """Take a frame's number, which begins at 1 again after MAX_SHORT_ID."""
-        own = number + self._turns * MAX_SHORT_ID
-        if self._last - own > MAX_SHORT_ID // 2:
-            self._turns, own = self._turns + 1, own + MAX_SHORT_ID
-        if self._last and 0 < own - self._last <= MAX_GAP:
-            self._skipped.update(range(self._last + 1, own))
-        self._skipped.discard(own)
-        self._last = max(self._last, own)
-        gone = {one for one in self._skipped if one < self._last - REORDERED}
-        self._skipped -= gone
-        self.frames_lost += len(gone)
+        extended = number + self._turns * MAX_SHORT_ID
+        if self._last_number - extended > MAX_SHORT_ID // 2:
+            self._turns, extended = self._turns + 1, extended + MAX_SHORT_ID
+        if self._last_number and 0 < extended - self._last_number <= MAX_GAP:
+            self._skipped.update(range(self._last_number + 1, extended))
+        self._skipped.discard(extended)
+        self._last_number = max(self._last_number, extended)
+        expired = {one for one in self._skipped if one < self._last_number - REORDERED}
+        self._skipped -= expired
+        self.frames_lost += len(expired)
 
 
 class Memory:
@@ -273,9 +273,9 @@ def fire(camera: Any, period: float, ended: threading.Event) -> None:
     """
     while not ended.is_set():
         now = time.monotonic()
-        due = (now // period + 1) * period
-        time.sleep(due - now)
-        if time.monotonic() - due < MAX_TRIGGER_DELAY:
+        next_trigger = (now // period + 1) * period
+        time.sleep(next_trigger - now)
+        if time.monotonic() - next_trigger < MAX_TRIGGER_DELAY:
             got(camera.software_trigger)  # that a camera is gone is told by its heartbeat
 
 
@@ -296,18 +296,18 @@ def read_clock(device: Any, ended: threading.Event) -> None:
 
 def pump(stream: Any, memory: Memory, counters: Counters, ended: threading.Event, lost: threading.Event) -> None:
     """Tell of each frame as it ends."""
-    told = time.monotonic()
+    last_report = time.monotonic()
     while not ended.is_set():
         buffer = stream.timeout_pop_buffer(POP_TIMEOUT_US)
         now, today = both_clocks()
         if lost.is_set():
             raise ValueError("the camera does not answer any more")
         if buffer is None:
-            if now - told > ALIVE_PERIOD:
-                told = now
+            if now - last_report > ALIVE_PERIOD:
+                last_report = now
                 say(alive=now)
             continue
-        told = now
+        last_report = now
         say(frame=frame_of(buffer, memory, counters, now, today))
         if buffer.get_status() != Aravis.BufferStatus.SUCCESS:
             stream.push_buffer(buffer)
@@ -326,7 +326,7 @@ def both_clocks() -> tuple[float, int]:
 
 def frame_of(buffer: Any, memory: Memory, counters: Counters, now: float, today: int) -> dict[str, Any]:
     """A frame in words; `buffer` is None where packets are missing. arrival: of its first packet, s."""
-    good = buffer.get_status() == Aravis.BufferStatus.SUCCESS
+    complete = buffer.get_status() == Aravis.BufferStatus.SUCCESS
     number, stamp = buffer.get_frame_id(), buffer.get_timestamp()
     behind = max(0, today - buffer.get_system_timestamp()) / 1e9
     frame: dict[str, Any] = {
@@ -337,7 +337,7 @@ def frame_of(buffer: Any, memory: Memory, counters: Counters, now: float, today:
         "infos": {k: counters._info(k) for k in counters._infos if k.startswith("n_")},
         "buffer": None,
     }
-    if good:
+    if complete:
         frame["buffer"] = next(i for i, one in enumerate(memory.buffers) if one == buffer)
         padding = buffer.get_image_padding()
         frame["size"] = [buffer.get_image_width(), buffer.get_image_height()]

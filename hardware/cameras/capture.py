@@ -116,9 +116,9 @@ def read_controls(port: ControlPort, source: CameraSource) -> tuple[Control, ...
     code = int(port.get(cv2.CAP_PROP_FOURCC))
     picture_format = "".join(chr(code >> 8 * i & 0xFF) for i in range(4)) if code > 0 else None
     rate = port.get(cv2.CAP_PROP_FPS)
-    own = [_read_one(port, one, requested) for one, requested in _requests(source)]
+    controls = [_read_one(port, one, requested) for one, requested in _requests(source)]
     fps = Control("fps", source.fps, rate if rate > 0 else None)
-    return (Control("format", source.format, picture_format), fps, *own)
+    return (Control("format", source.format, picture_format), fps, *controls)
 
 
 def ignored_controls(source: CameraSource) -> tuple[Control, ...]:
@@ -249,32 +249,32 @@ class _OpenCapture:
         self.ends = source.identity.kind is SourceKind.FILE and not Path(source.identity.text).is_fifo()
         rate = capture.get(cv2.CAP_PROP_FPS)
         self._period = 1 / (source.fps or (rate if rate > 0 else FILE_FPS))
-        self._next = clock.now()
-        self._behind = source.identity.text.startswith(("rtsp://", "rtsps://"))  # FFmpeg looks at these for a second
+        self._next_grab = clock.now()
+        self._delayed = source.identity.text.startswith(("rtsp://", "rtsps://"))  # FFmpeg looks at these for a second
 
     def grab(self) -> bool:
         if self.ends:
-            self._clock.wait_until(self._next)
-            self._next = max(self._next, self._clock.now() - self._period) + self._period
-        begun = self._clock.now()
+            self._clock.wait_until(self._next_grab)
+            self._next_grab = max(self._next_grab, self._clock.now() - self._period) + self._period
+        start = self._clock.now()
         try:
-            grabbed = self._catch_up() if self._behind else bool(self._capture.grab())
+            grabbed = self._catch_up() if self._delayed else bool(self._capture.grab())
         except cv2.error:
             return False
         # at the time's end a decoder gives the picture that it still holds, which is as old as that
-        return grabbed and (self.ends or self._clock.now() - begun < READ_TIMEOUT)
+        return grabbed and (self.ends or self._clock.now() - start < READ_TIMEOUT)
 
     def _catch_up(self) -> bool:
         """Grab the first picture that was not read before: the others come faster than they were taken."""
-        seen = deque[tuple[float, float]](maxlen=CATCH_UP_FRAMES)
+        grabs = deque[tuple[float, float]](maxlen=CATCH_UP_FRAMES)
         for _ in range(MAX_BACKLOG):
             if not self._capture.grab():
                 return False
             now, position = self._clock.now(), self.position()
-            seen.append((now, position))
-            if len(seen) == CATCH_UP_FRAMES and now - seen[0][0] >= CATCH_UP * (position - seen[0][1]):
+            grabs.append((now, position))
+            if len(grabs) == CATCH_UP_FRAMES and now - grabs[0][0] >= CATCH_UP * (position - grabs[0][1]):
                 break
-        self._behind = False
+        self._delayed = False
         return True
 
     def position(self) -> float:

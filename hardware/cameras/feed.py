@@ -57,10 +57,10 @@ class FrameWatch:
             return FrameFault.DAMAGED
         if self._size is not None and image.shape[1::-1] != self._size:
             return FrameFault.WRONG_SIZE
-        new = self._fresh(0, image)
+        is_new = self._fresh(0, image)
         if is_black(image):
             return FrameFault.BLACK
-        return None if new else FrameFault.FROZEN
+        return None if is_new else FrameFault.FROZEN
 
 
 def is_black(image: Image) -> bool:
@@ -178,13 +178,13 @@ class Feed:
         self._lock = threading.Lock()
         self._capture: Capture | None = None
         self._closing = threading.Event()
-        self._phase, self._since = CameraPhase.OPENING, clock.now()
-        self._good = self._since  # s, arrival of the last good frame
-        self._back_off, self._opened, self._broken, self._missed = BACK_OFF, 0, 0, 0
+        self._phase, self._phase_start = CameraPhase.OPENING, clock.now()
+        self._last_good = self._phase_start  # s, arrival of the last good frame
+        self._back_off, self._open_count, self._damaged_count, self._missed_count = BACK_OFF, 0, 0, 0
         self._period = 1 / source.fps if source.fps else None  # s, as told
         self._faults: Counter[FrameFault] = Counter()
         self._fault: FrameFault | None = None
-        self._given = 0
+        self._given_count = 0
         self._controls: tuple[Control, ...] = ()
         self._stamped: FrameStamp | None = None
         self._newest: Image | None = None
@@ -223,9 +223,9 @@ class Feed:
         elif grabbed := self._capture.grab():
             self._take(self._capture)
         elif grabbed is not None:
-            ended = self._capture.ends and self._grabbed > 0
+            file_ended = self._capture.ends and self._grabbed > 0
             self._release()
-            self._enter(CameraPhase.ENDED if ended else CameraPhase.GONE)
+            self._enter(CameraPhase.ENDED if file_ended else CameraPhase.GONE)
 
     def _open(self) -> None:
         capture = self._opener(self.source, self.place.size, self._clock)
@@ -233,7 +233,7 @@ class Feed:
             self._pause()
             return
         self._begin()
-        self._capture, self._broken = capture, 0
+        self._capture, self._damaged_count = capture, 0
 
     def _take(self, capture: Capture) -> None:
         now, position, transport = self._clock.now(), capture.position(), capture.transport
@@ -248,13 +248,13 @@ class Feed:
         if capture.incomplete and math.isnan(position):  # its begin was lost: an arrival instead would move the beat
             self._leave_out(FrameFault.INCOMPLETE)
             return
-        missed = self._stamping.pll.missed
+        missed_before = self._stamping.pll.missed
         stamped = self._stamping(now, position, capture.clocked, capture.exact)
         image = capture.retrieve()
         fault = self._watch.fault(image) or (None if stamped.fresh else FrameFault.BACKLOG)
         fault = FrameFault.INCOMPLETE if capture.incomplete else fault
         with self._lock:
-            self._missed += max(0, self._stamping.pll.missed - missed)
+            self._missed_count += max(0, self._stamping.pll.missed - missed_before)
             self._stamped = stamped
             self._newest = self._newest if image is None else image
         if fault is not None or image is None:
@@ -267,7 +267,7 @@ class Feed:
         self._stamping.exposure = locked_exposure(controls)
         with self._lock:
             self._controls = controls
-            self._opened += 1
+            self._open_count += 1
         self._back_off = BACK_OFF
         self._enter(CameraPhase.OPEN)
 
@@ -275,8 +275,8 @@ class Feed:
         offset, now = self.place.offset, self._clock.now()
         frame = Frame(self.place.number, stamped.stamp + offset, image, stamped.by)
         with self._lock:
-            self._fault, self._good, self._broken = None, now, 0
-            self._given += 1
+            self._fault, self._last_good, self._damaged_count = None, now, 0
+            self._given_count += 1
         period = None if self.source.trigger else self._stamping.pll.period
         self._deliver(Arrival(frame, stamped.steady + offset, period, now))
 
@@ -284,8 +284,8 @@ class Feed:
         with self._lock:
             self._faults[fault] += 1
             self._fault = fault
-        self._broken = self._broken + 1 if fault in (FrameFault.DAMAGED, FrameFault.INCOMPLETE) else 0
-        if self._broken >= MAX_DAMAGED_FRAMES:
+        self._damaged_count = self._damaged_count + 1 if fault in (FrameFault.DAMAGED, FrameFault.INCOMPLETE) else 0
+        if self._damaged_count >= MAX_DAMAGED_FRAMES:
             self._release()
             self._enter(CameraPhase.GONE)
 
@@ -301,7 +301,7 @@ class Feed:
     def _enter(self, phase: CameraPhase) -> None:
         with self._lock:
             if phase is not self._phase:
-                self._phase, self._since = phase, self._clock.now()
+                self._phase, self._phase_start = phase, self._clock.now()
 
     def _release(self) -> None:
         if self._capture is not None:
@@ -325,18 +325,18 @@ class Feed:
                 name=self.place.name,
                 source=self.source.identity.shown,
                 phase=self._phase,
-                since=now - self._since,
-                age=now - self._good,
+                since=now - self._phase_start,
+                age=now - self._last_good,
                 rate=1 / pll.period if pll.period else math.nan,
-                jitter=pll.jitter if self._given > 1 else math.nan,
+                jitter=pll.jitter if self._given_count > 1 else math.nan,
                 lag=math.nan if last is None else last.lag,
                 by="" if last is None else last.by,
-                given=self._given - overrun,
-                missed=self._missed,
+                given=self._given_count - overrun,
+                missed=self._missed_count,
                 overrun=overrun,
                 faults=dict(self._faults),
                 fault=self._fault,
-                reopened=max(0, self._opened - 1),
+                reopened=max(0, self._open_count - 1),
                 controls=self._controls,
                 newest=self._newest,
                 error=self._error,

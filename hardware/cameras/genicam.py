@@ -74,11 +74,11 @@ def list_industrial() -> tuple[IndustrialCamera, ...] | None:
         return None
     try:
         run = subprocess.run([python, "-I", PROGRAM, "--list"], capture_output=True, timeout=LIST_TIMEOUT, check=True)
-        found = json.loads(run.stdout)["devices"]
+        devices = json.loads(run.stdout)["devices"]
     except (OSError, subprocess.SubprocessError, ValueError, KeyError):
         return ()
     keys = ("id", "address", "vendor", "model", "serial_nbr")
-    return tuple(IndustrialCamera(*(one[key] for key in keys)) for one in found)
+    return tuple(IndustrialCamera(*(one[key] for key in keys)) for one in devices)
 
 
 def exposure_end(clock: DeviceClock, stamp: int, exposure: float, arrival: float) -> float:
@@ -135,7 +135,7 @@ class GenicamCapture:
                 raise
         finally:
             os.close(memory)
-        self._heard = self._framed = clock.now()  # s, when the process said anything, and when a frame came
+        self._last_message = self._last_frame = clock.now()  # s, when the process said anything, and when a frame came
 
     def _open(self, memory: int, size: tuple[int, int] | None) -> dict[str, Any]:
         source = self._source
@@ -173,16 +173,16 @@ class GenicamCapture:
         line = self._line(GRAB_PERIOD)
         now = self._now()
         if line is not None:
-            self._heard = now
+            self._last_message = now
             if "latch" in line:
                 sent, received, device = line["latch"]
                 self._clock.latched(device, sent, received)
             if "frame" in line:
-                self._framed = now
+                self._last_frame = now
                 self._take(line["frame"])
                 return True
-        waits = self._source.trigger not in (None, SOFTWARE_TRIGGER)
-        return False if now - (self._heard if waits else self._framed) > READ_TIMEOUT else None
+        hardware_triggered = self._source.trigger not in (None, SOFTWARE_TRIGGER)
+        return False if now - (self._last_message if hardware_triggered else self._last_frame) > READ_TIMEOUT else None
 
     def _take(self, frame: dict[str, Any]) -> None:
         self._frame = frame

@@ -38,7 +38,7 @@ def preview_sheet(cameras: Sequence[tuple[Image | None, Sequence[str], bool]]) -
     return np.vstack([np.hstack([*row, *[empty] * (columns - len(row))]) for row in rows])
 
 
-def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> Image:
+def _cell(image: Image | None, lines_of_text: Sequence[str], well: bool, lines: int) -> Image:
     cell = np.full((CELL_SIZE[1] + lines * LINE_HEIGHT + LINE_HEIGHT // 2, CELL_SIZE[0], 3), PAPER_COLOUR, np.uint8)
     if image is not None:
         scale = min(CELL_SIZE[0] / image.shape[1], CELL_SIZE[1] / image.shape[0])
@@ -48,7 +48,7 @@ def _cell(image: Image | None, words: Sequence[str], well: bool, lines: int) -> 
         x, y = (CELL_SIZE[0] - size[0]) // 2, (CELL_SIZE[1] - size[1]) // 2
         cell[y : y + size[1], x : x + size[0]] = small
     colour = INK_COLOUR if well else ALARM_COLOUR
-    for i, line in enumerate(words):
+    for i, line in enumerate(lines_of_text):
         place = 8, CELL_SIZE[1] + LINE_HEIGHT * (i + 1) - LINE_HEIGHT // 4
         cv2.putText(cell, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
     return cell
@@ -86,8 +86,8 @@ def inspect(live: LiveCameras, seconds: float, clock: Clock) -> Inspection:
     while clock.now() < end and (one := live.next_set(end)) is not None:
         sets.append(one)
     health = live.health()
-    behind = [_behind(sets, camera) for camera in range(len(health.cameras))]
-    return Inspection(health, tuple(median for median, _ in behind), tuple(scatter for _, scatter in behind))
+    lags = [_behind(sets, camera) for camera in range(len(health.cameras))]
+    return Inspection(health, tuple(median for median, _ in lags), tuple(scatter for _, scatter in lags))
 
 
 def _behind(sets: Sequence[FrameSet], camera: int) -> tuple[float, float]:

@@ -53,9 +53,9 @@ class FreeRunPhases:
         if camera not in alive:
             return 0.0
         gaps = self._gaps(alive, fastest)
-        best = max(alive, key=lambda c: gaps[c])
-        if gaps.get(self._leader, 0.0) * LEADER_HYSTERESIS < gaps[best]:
-            self._leader = best
+        latest = max(alive, key=lambda c: gaps[c])
+        if gaps.get(self._leader, 0.0) * LEADER_HYSTERESIS < gaps[latest]:
+            self._leader = latest
         gap = gaps[self._leader]
         return (instant - self._beats[self._leader][0] + gap / 2) % fastest - gap / 2
 
@@ -69,8 +69,8 @@ class FreeRunPhases:
         """Gap, s, between each camera's frame and the one before it, of any camera."""
         first, _ = self._beats[alive[0]]
         phases = sorted(((self._beats[c][0] - first) % period, c) for c in alive)
-        before = [phases[-1][0] - period, *(phase for phase, _ in phases[:-1])]
-        return {c: phase - earlier for (phase, c), earlier in zip(phases, before, strict=True)}
+        previous = [phases[-1][0] - period, *(phase for phase, _ in phases[:-1])]
+        return {c: phase - earlier for (phase, c), earlier in zip(phases, previous, strict=True)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +179,7 @@ class LiveCameras:
                 from hardware.cameras.genicam import require_aravis
 
                 require_aravis(place.name, source)
-        self._clock, self._changed = clock, threading.Condition()
+        self._clock, self._condition = clock, threading.Condition()
         self._waiting: deque[Arrival] = deque()
         self._overrun = [0] * len(places)
         self._sets = self._complete = self._passed_over = 0
@@ -198,9 +198,9 @@ class LiveCameras:
 
     def close(self) -> None:
         """Release the cameras; whoever waits for a set gets None."""
-        with self._changed:
+        with self._condition:
             self._closed = True
-            self._changed.notify_all()
+            self._condition.notify_all()
         for feed in self._feeds:
             feed.close()
         for thread in self._threads:
@@ -220,26 +220,26 @@ class LiveCameras:
 
     def next_set(self, until: float | None = None) -> FrameSet | None:
         """Wait for a set newer than the last one; None at the instant `until` (s, None: never), or at the end."""
-        with self._changed:
+        with self._condition:
             while True:
                 ended = all(feed.ended for feed in self._feeds)  # read first: what was delivered before is in the set
                 newest = None if self._closed else self._newest_set(ended)
                 over = self._closed or ended or (until is not None and self._clock.now() >= until)
                 if newest is not None or over:
                     return newest
-                self._changed.wait(SET_POLL)
+                self._condition.wait(SET_POLL)
 
     def learn(self, offsets: Sequence[float] | Array) -> None:
         """Pair frames by the exposure offsets that the estimator has learned: (C,) s, after the set's stamp.
 
         The frames' stamps stay as they are, so that the estimator does not learn from its own output.
         """
-        with self._changed:
+        with self._condition:
             self._builder.learn(offsets)
 
     def health(self) -> LiveHealth:
         """The state of every camera now."""
-        with self._changed:
+        with self._condition:
             overrun, late = list(self._overrun), self._builder.late
             sets, complete, passed = self._sets, self._complete, self._passed_over
         states = tuple(feed.state(count) for feed, count in zip(self._feeds, overrun, strict=True))
@@ -247,13 +247,13 @@ class LiveCameras:
 
     def _deliver(self, arrival: Arrival) -> None:
         camera = arrival.frame.camera
-        with self._changed:
+        with self._condition:
             mine = [one for one in self._waiting if one.frame.camera == camera]
             if len(mine) >= MAX_WAITING_FRAMES:
                 self._waiting.remove(mine[0])
                 self._overrun[camera] += 1
             self._waiting.append(arrival)
-            self._changed.notify_all()
+            self._condition.notify_all()
 
     def _newest_set(self, ended: bool) -> FrameSet | None:
         """The newest set of the waiting frames, or None. ended: no more frames will come."""

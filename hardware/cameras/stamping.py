@@ -99,23 +99,23 @@ class PhaseLockedLoop:
         return True
 
     def _follow(self, instant: float, period: float) -> Beat:
-        ahead = (instant - self._grid) / period
-        if ahead < MIN_BEAT_GAP:
+        lead = (instant - self._grid) / period
+        if lead < MIN_BEAT_GAP:
             return Beat(self._grid, 0)
-        count = max(1, int(np.ceil(ahead - SKIP_AFTER)))
+        count = max(1, int(np.ceil(lead - SKIP_AFTER)))
         off = self._bounded(instant - self._grid - count * period)
         k = min(self._beats, PLL_BEATS)
-        known = min(self._beats + self._known, PLL_BEATS)
+        instants = min(self._beats + self._known, PLL_BEATS)
         self._grid += count * period + off * 2 * (2 * k + 1) / ((k + 1) * (k + 2))
-        self.period = period + off / count * 6 / ((known + 1) * (known + 2))
+        self.period = period + off / count * 6 / ((instants + 1) * (instants + 2))
         self._off += (off * off - self._off) / k
         self._beats, self.missed = self._beats + 1, self.missed + count - 1
         return Beat(self._grid, count)
 
     def _bounded(self, off: float) -> float:
         """A residual, s, with Huber's bound: a delayed instant does not move the phase."""
-        far = MAX_PULL * self.jitter + 1e-4 if self._beats > PULL_AFTER_BEATS else np.inf
-        return float(np.clip(off, -far, far))
+        limit = MAX_PULL * self.jitter + 1e-4 if self._beats > PULL_AFTER_BEATS else np.inf
+        return float(np.clip(off, -limit, limit))
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +166,8 @@ class DeviceClock:
         return self._mapped(device) if self._latched or self._count >= MIN_ARRIVALS else math.nan
 
     def _mapped(self, device: int) -> float:
-        own = (device - self._begin) / 1e9
-        return own + self._line[0] + self._line[1] * own
+        device_seconds = (device - self._begin) / 1e9
+        return device_seconds + self._line[0] + self._line[1] * device_seconds
 
     def _take(self, device: int, ours: float, doubt: float) -> None:
         if self._bins and abs(self._mapped(device) - ours) > CLOCK_STEP:
@@ -175,9 +175,9 @@ class DeviceClock:
         if not self._bins:
             self._begin, self._count = device, 0
         self._count += 1
-        own = (device - self._begin) / 1e9
-        reading = ClockReading(own, ours - own, doubt)
-        if self._bins and own < self._bins[-1].device // CLOCK_BIN * CLOCK_BIN + CLOCK_BIN:
+        device_seconds = (device - self._begin) / 1e9
+        reading = ClockReading(device_seconds, ours - device_seconds, doubt)
+        if self._bins and device_seconds < self._bins[-1].device // CLOCK_BIN * CLOCK_BIN + CLOCK_BIN:
             if self._surer(reading, self._bins[-1]):
                 self._bins[-1] = reading
                 self._line = self._bounded(reading)
@@ -207,8 +207,8 @@ class DeviceClock:
         if len(self._bins) >= DRIFT_BINS:
             slope = float(np.polyfit(x, y, 1)[0]) if self._latched else _lower_slope(x, y)
         slope = float(np.clip(slope, -MAX_DRIFT, MAX_DRIFT))
-        rest = y - slope * x
-        return float(np.median(rest) if self._latched else rest.min()), slope
+        residual = y - slope * x
+        return float(np.median(residual) if self._latched else residual.min()), slope
 
 
 def _lower_slope(x: Array, y: Array) -> float:
@@ -220,8 +220,8 @@ def _lower_slope(x: Array, y: Array) -> float:
         ):
             hull.pop()
         hull.append(i)
-    after = next(k for k in range(1, len(hull)) if k == len(hull) - 1 or x[hull[k]] >= x.mean())
-    a, b = hull[after - 1], hull[after]
+    vertex = next(k for k in range(1, len(hull)) if k == len(hull) - 1 or x[hull[k]] >= x.mean())
+    a, b = hull[vertex - 1], hull[vertex]
     return float((y[b] - y[a]) / (x[b] - x[a]))
 
 

@@ -200,14 +200,14 @@ def arm_for(address: str) -> ArmProfile:
     return read_arm(shipped_file("arms", file)) if file else ArmProfile()
 
 
-def arm_over(known: ArmProfile, address: str) -> ArmProfile:
+def arm_over(configured: ArmProfile, address: str) -> ArmProfile:
     """That profile, put so that the surface below the home of a `known` arm is below this one's; or the known one."""
     if not driver_kind(address).file:
-        return known
+        return configured
     profile = arm_for(address)
-    base_from_surface = se3.inverse(known.arm.arm_from_base) @ ARM_FROM_BENCH
-    moved = profile.arm.home[:3] - ArmProfile().arm.home[:3]
-    return placed(profile, base_from_surface, se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + moved))
+    base_from_surface = se3.inverse(configured.arm.arm_from_base) @ ARM_FROM_BENCH
+    home_shift = profile.arm.home[:3] - ArmProfile().arm.home[:3]
+    return placed(profile, base_from_surface, se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + home_shift))
 
 
 def arm_from_text(text: str, where: str | Path) -> ArmProfile:
@@ -305,8 +305,8 @@ def _part(path: Path, table: checks.Table) -> ToolPart:
     checks.check_keys(path, "tool_part.", table, ("name",), (*PART_KINDS, "radius", "radii"))
     name = checks.text(path, "tool_part.name", table["name"])
     kinds = [kind for kind in PART_KINDS if kind in table]
-    wanted = {"cylinder": ["radius"], "capsule": ["radius"], "cone": ["radii"]}
-    if len(kinds) != 1 or [key for key in ("radius", "radii") if key in table] != wanted.get(kinds[0], []):
+    shape_keys = {"cylinder": ["radius"], "capsule": ["radius"], "cone": ["radii"]}
+    if len(kinds) != 1 or [key for key in ("radius", "radii") if key in table] != shape_keys.get(kinds[0], []):
         allowed = "one of box, cylinder and capsule with radius, cone with radii, mesh"
         raise InputError(path, f"tool_part {name!r}", [key for key in table if key != "name"], allowed)
     kind, key = kinds[0], f"tool_part.{kinds[0]}"

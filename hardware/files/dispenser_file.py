@@ -53,10 +53,10 @@ DELAY_KEYS = {f"{name}_s": name for name in ("on_dead_time", "on_lag", "off_dead
 
 
 def _materials(where: object, key: str, value: object) -> tuple[str, ...]:
-    words = value if isinstance(value, list) else []
-    if not words or not all((isinstance(w, str) and w) or type(w) is int for w in words):
+    names = value if isinstance(value, list) else []
+    if not names or not all((isinstance(w, str) and w) or type(w) is int for w in names):
         raise InputError(where, key, value, "a list of names or whole numbers, one or more")
-    return tuple(map(str, words))
+    return tuple(map(str, names))
 
 
 PROFILE_KEYS: checks.Keys = {
@@ -164,24 +164,24 @@ def drivers_of(settings: Sequence[DispenserSettings], where: object = "dispenser
 def _settings(path: Path, table: checks.Table) -> tuple[DispenserSettings, ...]:
     checks.check_keys(path, "", table, ("dispenser",))
     tables = checks.tables(path, "dispenser", table["dispenser"])
-    found = [_one(path, each) for each in tables]
-    names = [each.profile.name for each in found]
+    settings = [_one(path, each) for each in tables]
+    names = [each.profile.name for each in settings]
     for i, name in enumerate(names):
         if name in names[:i]:
             raise InputError(path, "dispenser.name", name, "a name, and each once")
-    for each in found if len(found) > 1 else ():
+    for each in settings if len(settings) > 1 else ():
         if each.line is None:
             raise InputError(path, "dispenser.preset", each.preset, "the only one: the arm's moves say not for which")
-    Dispensers([ArmPwmDispenser(each.profile, 0, 0) for each in found], path)  # whether two carry one material
-    return tuple(found)
+    Dispensers([ArmPwmDispenser(each.profile, 0, 0) for each in settings], path)  # whether two carry one material
+    return tuple(settings)
 
 
 def _one(path: Path, table: checks.Table) -> DispenserSettings:
     preset = checks.word(PRESET_NAMES)(path, "dispenser.preset", table["preset"]) if "preset" in table else ""
-    own = {ARM_PWM: PWM_KEYS, ARM_AXIS: AXIS_KEYS}.get(preset)
-    special, needs = ({**LINE_KEYS, "messages": ()}, ["port"]) if own is None else (own, list(own))
-    needs += ["flow_range_mm3_s"] if preset == ARM_AXIS else []
-    checks.check_keys(path, "dispenser.", table, ("name", "materials", "preset", *needs), [*PROFILE_KEYS, *special])
+    keys = {ARM_PWM: PWM_KEYS, ARM_AXIS: AXIS_KEYS}.get(preset)
+    special, required = ({**LINE_KEYS, "messages": ()}, ["port"]) if keys is None else (keys, list(keys))
+    required += ["flow_range_mm3_s"] if preset == ARM_AXIS else []
+    checks.check_keys(path, "dispenser.", table, ("name", "materials", "preset", *required), [*PROFILE_KEYS, *special])
     if preset == ARM_AXIS:
         for key in ("metered", "temperature_range_c", "watchdog_s", "prime_mm3", "flow_mm3_s"):
             if table.get(key):
@@ -284,16 +284,16 @@ def write_delays(path: str | Path, name: str, delays: DispenserProfile) -> None:
         raise InputError(path, "dispenser", f"{len(heads)} of {len(names)} tables", "[[dispenser]], each on its line")
     start = heads[names.index(name)] + 1
     end = next((i for i in range(start, len(lines)) if HEADER.match(lines[i])), len(lines))
-    body, new = lines[start:end], []
+    body, replacement = lines[start:end], []
     for key, field_name in DELAY_KEYS.items():
         value = checks.toml_value(round(getattr(delays, field_name), 6))
         at = next((i for i, line in enumerate(body) if re.match(rf"\s*{key}\s*=", line)), None)
         if at is None:
-            new.append(f"{key} = {value}")
+            replacement.append(f"{key} = {value}")
         else:
             body[at] = re.sub(r"=\s*[^#\s]+", f"= {value}", body[at], count=1)
-    text = "\n".join([*lines[:start], *new, *body, *lines[end:]]) + "\n"
+    text = "\n".join([*lines[:start], *replacement, *body, *lines[end:]]) + "\n"
     dispensers_from_text(text, path)
-    beside = path.with_name(path.name + ".new")
-    beside.write_text(text, encoding="utf-8")
-    os.replace(beside, path)
+    partial = path.with_name(path.name + ".new")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)

@@ -65,7 +65,7 @@ def read_rows(path: str | Path) -> Array:
     """Rows (N, 8) of a TUM file, N >= 1: finite, stamps rising, quaternions of unit length to 1 %."""
     path = Path(path)
     lines = ((f"line {number}", line.replace(",", " ").split()) for number, line in _lines(path))
-    rows = checked_rows(path, ((what, row_from_words(path, what, words)) for what, words in lines))
+    rows = checked_rows(path, ((what, row_from_words(path, what, cells)) for what, cells in lines))
     if not len(rows):
         raise InputError(path, "poses", "none", "at least one line `stamp x y z qx qy qz qw`")
     return rows
@@ -91,12 +91,12 @@ def checked_rows(where: object, rows: Iterable[tuple[str, Sequence[float]]]) -> 
     return np.array(checked, float).reshape(-1, 8)
 
 
-def row_from_words(where: object, what: str, words: Sequence[str], allowed: str = TUM_ROW) -> list[float]:
+def row_from_words(where: object, what: str, cells: Sequence[str], allowed: str = TUM_ROW) -> list[float]:
     """The numbers in words; InputError (where, what, with `allowed`) unless they are numbers."""
     try:
-        return [float(word) for word in words]
+        return [float(word) for word in cells]
     except ValueError:
-        raise InputError(where, what, " ".join(words), allowed) from None
+        raise InputError(where, what, " ".join(cells), allowed) from None
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -189,11 +189,11 @@ def frame_line(rig: Rig, ref: FrameRef) -> str:
 def read_heads(path: Path) -> PrintHeadLog:
     """The print heads of head.csv, base_from_nozzle; none is allowed, as where a run ended before the arm moved."""
     table = [(f"line {line}", _cells(row, HEAD_COLUMNS)) for line, row in _rows(path, HEAD_COLUMNS)]
-    rows = checked_rows(path, ((line, row_from_words(path, line, words[:-1])) for line, words in table))
-    for line, words in table:
-        if words[-1] not in ("0", "1"):
-            raise InputError(path, f"{line}: extruding", words[-1], "0 or 1")
-    return PrintHeadLog(rows, np.array([words[-1] == "1" for _, words in table], bool))
+    rows = checked_rows(path, ((line, row_from_words(path, line, cells[:-1])) for line, cells in table))
+    for line, cells in table:
+        if cells[-1] not in ("0", "1"):
+            raise InputError(path, f"{line}: extruding", cells[-1], "0 or 1")
+    return PrintHeadLog(rows, np.array([cells[-1] == "1" for _, cells in table], bool))
 
 
 def write_heads(path: Path, heads: PrintHeadLog) -> None:

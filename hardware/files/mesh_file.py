@@ -61,15 +61,15 @@ class PlyElement:
     row_bytes: int = 0  # of a row without lists
     lists: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # bytes of a count and of an entry, by name
 
-    def whole(self, words: list[bytes]) -> bool:
+    def whole(self, tokens: list[bytes]) -> bool:
         """Whether the words of a line are a number for each property, and a face has three corners or more."""
         at = 0
         for name in self.names:
-            count = words[at] if name in self.lists and at < len(words) else b"0"
+            count = tokens[at] if name in self.lists and at < len(tokens) else b"0"
             if not count.isdigit() or len(count) > MAX_COUNT_DIGITS or (name in FACE_LIST_NAMES and int(count) < 3):
                 return False
             at += 1 + int(count)
-        return at == len(words)
+        return at == len(tokens)
 
 
 def announced_by_ply(path: Path) -> Announcement:
@@ -89,10 +89,10 @@ def announced_by_ply(path: Path) -> Announcement:
         raise InputError(path, "properties of face", _joined(face.names), allowed)
     if kind == b"ascii":
         _check_lines(path, lines, elements)
-    other = sum(len(element.lists) for element in elements.values()) > 1 or len(corners) < len(face.lists)
+    unsupported = sum(len(element.lists) for element in elements.values()) > 1 or len(corners) < len(face.lists)
 
     def check(triangles: int) -> None:
-        if other or kind == b"ascii":  # lists of any length: that of the file follows from nothing
+        if unsupported or kind == b"ascii":  # lists of any length: that of the file follows from nothing
             return
         count = triangles + 2 * face.rows  # of corners: a polygon of n has n - 2 triangles
         size = sum(e.rows * (e.row_bytes + sum(counted for counted, _ in e.lists.values())) for e in elements.values())
@@ -110,24 +110,24 @@ def _joined(names: list[bytes]) -> str:
     return b", ".join(names).decode("utf-8", "replace")
 
 
-def _check_length(path: Path, what: str, got: int, wanted: int) -> None:
-    if got != wanted:
-        raise InputError(path, what, got, f"{wanted}, as it tells (is it cut short, or was more appended?)")
+def _check_length(path: Path, what: str, got: int, expected: int) -> None:
+    if got != expected:
+        raise InputError(path, what, got, f"{expected}, as it tells (is it cut short, or was more appended?)")
 
 
 def _check_lines(path: Path, header_lines: int, elements: dict[bytes, PlyElement]) -> None:
     """InputError where rows of text are not whole: rply, which reads them, takes whatever words come next."""
     owners = (element for element in elements.values() for _ in range(element.rows))
     with path.open("rb") as file:
-        for number, words in text_rows(file, path):
+        for number, tokens in text_rows(file, path):
             if number <= header_lines:
                 continue
             owner = next(owners, None)
             if owner is None:
-                raise wrong_line(path, number, words, "nothing behind the rows that the header tells of")
-            if not owner.whole(words):
+                raise wrong_line(path, number, tokens, "nothing behind the rows that the header tells of")
+            if not owner.whole(tokens):
                 names = b" ".join(b"COUNT " + n + b"..." if n in owner.lists else n for n in owner.names)
-                raise wrong_line(path, number, words, f"{names.decode('utf-8', 'replace')}, in numbers")
+                raise wrong_line(path, number, tokens, f"{names.decode('utf-8', 'replace')}, in numbers")
     if missing := sum(1 for _ in owners):
         raise InputError(path, "rows that are missing", missing, "none (is the file cut short?)")
 
@@ -135,19 +135,19 @@ def _check_lines(path: Path, header_lines: int, elements: dict[bytes, PlyElement
 def _ply_header(file: BinaryIO, path: Path) -> tuple[bytes, dict[bytes, PlyElement], int]:
     """Format, elements and number of lines of a PLY file's header, behind which the file is left."""
     rows = text_rows(file, path)
-    number, words = next(rows, (1, []))
-    if words != [b"ply"]:
-        raise wrong_line(path, number, words, "ply")
+    number, tokens = next(rows, (1, []))
+    if tokens != [b"ply"]:
+        raise wrong_line(path, number, tokens, "ply")
     kind, elements, last = None, dict[bytes, PlyElement](), None
-    for number, words in rows:
-        match words:
+    for number, tokens in rows:
+        match tokens:
             case [b"comment" | b"obj_info", *_]:
                 continue
             case [b"format", form, b"1.0"] if kind is None and form in PLY_FORMATS:
                 kind = form
             case _ if kind is None:
                 formats = ", ".join(map(bytes.decode, PLY_FORMATS))
-                raise wrong_line(path, number, words, f"format, one of {formats}, 1.0")
+                raise wrong_line(path, number, tokens, f"format, one of {formats}, 1.0")
             case [b"element", name, count] if (
                 count.isdigit() and len(count) <= MAX_COUNT_DIGITS and name not in elements
             ):
@@ -155,7 +155,7 @@ def _ply_header(file: BinaryIO, path: Path) -> tuple[bytes, dict[bytes, PlyEleme
             case [b"property", b"list", count, each, name] if last and _countable(count) and each in PLY_TYPES:
                 whole = name not in FACE_LIST_NAMES or _countable(each)
                 if not whole or name in last.names:
-                    raise wrong_line(path, number, words, "a list of whole numbers, no name twice")
+                    raise wrong_line(path, number, tokens, "a list of whole numbers, no name twice")
                 last.names.append(name)
                 last.lists[name] = PLY_TYPES[count], PLY_TYPES[each]
             case [b"property", each, name] if last and each in PLY_TYPES and name not in last.names:
@@ -164,7 +164,7 @@ def _ply_header(file: BinaryIO, path: Path) -> tuple[bytes, dict[bytes, PlyEleme
             case [b"end_header"] if all(element.names for element in elements.values()):
                 return kind, elements, number
             case _:
-                raise wrong_line(path, number, words, f"{PLY_HEADER_LINES}; no name twice, no element without any")
+                raise wrong_line(path, number, tokens, f"{PLY_HEADER_LINES}; no name twice, no element without any")
     raise wrong_line(path, number + 1, [], "end_header somewhere (is the file cut short?)")
 
 
@@ -175,15 +175,15 @@ def _countable(kind: bytes) -> bool:
 def announced_by_off(path: Path) -> Announcement:
     """The first numbers of an OFF file."""
     with path.open("rb") as file:
-        rows = ((n, words) for n, words in text_rows(file, path) if not words[0].startswith(b"#"))
-        number, words = next(rows, (1, []))
-        if not words or not words[0].endswith(b"OFF"):
-            raise wrong_line(path, number, words, "OFF")
-        if len(words) == 1:
-            number, words = next(rows, (number + 1, []))
-    counts = words[-3:]
+        rows = ((n, tokens) for n, tokens in text_rows(file, path) if not tokens[0].startswith(b"#"))
+        number, tokens = next(rows, (1, []))
+        if not tokens or not tokens[0].endswith(b"OFF"):
+            raise wrong_line(path, number, tokens, "OFF")
+        if len(tokens) == 1:
+            number, tokens = next(rows, (number + 1, []))
+    counts = tokens[-3:]
     if len(counts) < 3 or not all(count.isdigit() and len(count) <= MAX_COUNT_DIGITS for count in counts):
-        raise wrong_line(path, number, words, "the numbers of vertices, faces and edges")
+        raise wrong_line(path, number, tokens, "the numbers of vertices, faces and edges")
     for what, count in zip(("vertices", "faces"), counts, strict=False):
         check_rows(path, what, int(count))
     return Announcement(int(counts[0]), int(counts[1]))
@@ -192,11 +192,11 @@ def announced_by_off(path: Path) -> Announcement:
 def announced_by_pcd(path: Path) -> Announcement:
     """The points that the header of a PCD file tells of."""
     with path.open("rb") as file:
-        for _, words in text_rows(file, path):
-            if words[0] == b"POINTS" and len(words) == 2 and words[1].isdigit() and len(words[1]) <= MAX_COUNT_DIGITS:
-                check_rows(path, "points", int(words[1]))
-                return Announcement(int(words[1]), 0)
-            if words[0] == b"DATA":
+        for _, cells in text_rows(file, path):
+            if cells[0] == b"POINTS" and len(cells) == 2 and cells[1].isdigit() and len(cells[1]) <= MAX_COUNT_DIGITS:
+                check_rows(path, "points", int(cells[1]))
+                return Announcement(int(cells[1]), 0)
+            if cells[0] == b"DATA":
                 break
     raise InputError(path, "header", "no line POINTS before DATA", "POINTS and how many there are")
 
@@ -211,11 +211,11 @@ def announced_by_xyz(path: Path) -> Announcement:
     """The lines of an XYZ file, a point each."""
     count = 0
     with path.open("rb") as file:
-        for number, words in text_rows(file, path):
-            if words[0].startswith(b"#"):
+        for number, tokens in text_rows(file, path):
+            if tokens[0].startswith(b"#"):
                 continue
-            if not XYZ_LINE.fullmatch(b" " + b" ".join(words)):
-                raise wrong_line(path, number, words, "three numbers, or more")
+            if not XYZ_LINE.fullmatch(b" " + b" ".join(tokens)):
+                raise wrong_line(path, number, tokens, "three numbers, or more")
             count += 1
             check_rows(path, "points", count)
     return Announcement(count, 0)
@@ -230,13 +230,13 @@ def announced_by_gltf(path: Path) -> Announcement:
         with path.open("rb") as file:
             head = file.read(GLB_HEADER)
             if head[:4] == b"glTF":
-                told = int.from_bytes(head[8:12], "little")
-                _check_length(path, "bytes", path.stat().st_size, told)
+                length = int.from_bytes(head[8:12], "little")
+                _check_length(path, "bytes", path.stat().st_size, length)
                 tree = json.loads(file.read(int.from_bytes(head[12:16], "little")))
             else:
                 tree = json.loads(head + file.read())
-        pieces = [piece for mesh in tree["meshes"] for piece in mesh["primitives"]]
-        accessor = [piece.get("indices", piece["attributes"]["POSITION"]) for piece in pieces]
+        primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
+        accessor = [primitive.get("indices", primitive["attributes"]["POSITION"]) for primitive in primitives]
         count = sum(tree["accessors"][each]["count"] // 3 for each in accessor)
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise InputError(path, "scan", f"{type(error).__name__} in its JSON", "a glTF file with meshes") from None
@@ -273,42 +273,42 @@ def read_raw_mesh(path: str | Path, reader: MeshReader | None = None) -> RawMesh
         raise InputError(path, "scan", path.suffix or "no suffix", f"a file {formats}")
     if not path.is_file():
         raise InputError(path, "scan", "no such file", f"a file {formats}")
-    before = path.stat()
-    if before.st_size > MAX_MESH_FILE_BYTES:
-        raise InputError(path, "size of the file", f"{before.st_size} bytes", f"{MAX_MESH_FILE_BYTES} or fewer")
-    if not before.st_size:
+    stat_before = path.stat()
+    if stat_before.st_size > MAX_MESH_FILE_BYTES:
+        raise InputError(path, "size of the file", f"{stat_before.st_size} bytes", f"{MAX_MESH_FILE_BYTES} or fewer")
+    if not stat_before.st_size:
         raise InputError(path, "scan", "0 bytes", WHOLE_MESH)
     suffix = path.suffix.lower()
     plain = PLAIN_READERS.get(suffix)
-    mesh = _read_apart(path, ANNOUNCED[suffix](path), reader) if plain is None else plain(path)
-    after = path.stat()
-    if (after.st_size, after.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
+    mesh = _read_in_process(path, ANNOUNCED[suffix](path), reader) if plain is None else plain(path)
+    stat_after = path.stat()
+    if (stat_after.st_size, stat_after.st_mtime_ns) != (stat_before.st_size, stat_before.st_mtime_ns):
         raise InputError(path, "scan", "a file that changed while it was read", "one that is finished")
     if not len(mesh.triangles) or not len(mesh.vertices):
-        got = f"{before.st_size} bytes, {len(mesh.vertices)} points, {len(mesh.triangles)} triangles"
+        got = f"{stat_before.st_size} bytes, {len(mesh.vertices)} points, {len(mesh.triangles)} triangles"
         raise InputError(path, "scan", got, WHOLE_MESH)
     return mesh
 
 
-def _read_apart(path: Path, told: Announcement, kept: MeshReader | None) -> RawMesh:
+def _read_in_process(path: Path, announcement: Announcement, reader_process: MeshReader | None) -> RawMesh:
     """What another process reads of a file, InputError where that is not what the file tells of."""
-    if not told.faces and not told.vertices:
+    if not announcement.faces and not announcement.vertices:
         raise InputError(path, "scan", f"{path.stat().st_size} bytes, no vertex in them", WHOLE_MESH)
     try:
-        with nullcontext(kept) if kept is not None else MeshReader() as reader:
-            read = reader.read(path, not told.faces)
+        with nullcontext(reader_process) if reader_process is not None else MeshReader() as reader:
+            arrays = reader.read(path, not announcement.faces)
     except MeshReaderError as error:
         raise InputError(path, "scan", str(error), WHOLE_MESH) from None
-    vertices, triangles = int(read["count"]), len(read["triangles"])
-    cut = "as the file itself says (is it cut short, or damaged?)"
-    if told.vertices is not None and vertices != told.vertices:
-        raise InputError(path, "vertices that could be read", vertices, f"{told.vertices}, {cut}")
-    if told.triangles is not None and triangles != told.triangles:
-        raise InputError(path, "triangles that could be read", triangles, f"{told.triangles}, {cut}")
-    if told.faces and triangles < told.faces:
-        raise InputError(path, "faces that could be read", triangles, f"{told.faces}, {cut}")
-    told.check(triangles if told.faces else 0)
-    return RawMesh(read["vertices"], read["triangles"], read.get("colours"))
+    vertices, triangles = int(arrays["count"]), len(arrays["triangles"])
+    hint = "as the file itself says (is it cut short, or damaged?)"
+    if announcement.vertices is not None and vertices != announcement.vertices:
+        raise InputError(path, "vertices that could be read", vertices, f"{announcement.vertices}, {hint}")
+    if announcement.triangles is not None and triangles != announcement.triangles:
+        raise InputError(path, "triangles that could be read", triangles, f"{announcement.triangles}, {hint}")
+    if announcement.faces and triangles < announcement.faces:
+        raise InputError(path, "faces that could be read", triangles, f"{announcement.faces}, {hint}")
+    announcement.check(triangles if announcement.faces else 0)
+    return RawMesh(arrays["vertices"], arrays["triangles"], arrays.get("colours"))
 
 
 def read_mesh(path: str | Path, reader: MeshReader | None = None) -> MeshFile:
@@ -317,11 +317,11 @@ def read_mesh(path: str | Path, reader: MeshReader | None = None) -> MeshFile:
     raw = read_raw_mesh(path, reader)
     vertices, triangles = raw.vertices, raw.triangles
     if not np.isfinite(vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise InputError(path, f"vertex {bad}", vertices[bad].tolist(), "three finite numbers, mm")
+        index = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise InputError(path, f"vertex {index}", vertices[index].tolist(), "three finite numbers, mm")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        bad = int(np.flatnonzero(((triangles < 0) | (triangles >= len(vertices))).any(axis=1))[0])
-        raise InputError(path, f"triangle {bad}", triangles[bad].tolist(), f"vertices 0..{len(vertices) - 1}")
+        index = int(np.flatnonzero(((triangles < 0) | (triangles >= len(vertices))).any(axis=1))[0])
+        raise InputError(path, f"triangle {index}", triangles[index].tolist(), f"vertices 0..{len(vertices) - 1}")
     _check_size(path, vertices[np.unique(triangles)])
     scan = scan_from_triangles(vertices, triangles)
     if not len(scan.triangles):

@@ -98,10 +98,10 @@ class MeshReader:
         if not length or len(answer) < length:
             raise MeshReaderError(f"the process that reads it ended with {self._process.wait()}")
         with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
-            read = dict(arrays)
-        if "failure" in read:
-            raise MeshReaderError(str(read["failure"]))
-        return read
+            result = dict(arrays)
+        if "failure" in result:
+            raise MeshReaderError(str(result["failure"]))
+        return result
 
     def close(self) -> None:
         """End the process."""
@@ -160,13 +160,13 @@ def _contents(file: int) -> bytes:
     return os.pread(file, os.fstat(file).st_size, 0)
 
 
-def _ending(status: int, words: str) -> str:
+def _ending(status: int, message: str) -> str:
     """How a fork that has not read its file ended."""
     if -status in TIME_SIGNALS:
         return f"not read within {MAX_READER_SECONDS} s of processor time, or {MAX_READER_WAIT} s"
     if status < 0:
         return f"the library that reads it dies of it ({signal.Signals(-status).name})"
-    return words or f"the library that reads it ends with {status}"
+    return message or f"the library that reads it ends with {status}"
 
 
 def _read_and_exit(path: str, cloud: bool, memory: int, printed: int) -> None:
@@ -177,14 +177,14 @@ def _read_and_exit(path: str, cloud: bool, memory: int, printed: int) -> None:
         os.dup2(printed, 1)
         os.dup2(printed, 2)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        most = pages * resource.getpagesize() + MAX_READER_BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        limit = pages * resource.getpagesize() + MAX_READER_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CPU, (MAX_READER_SECONDS, MAX_READER_SECONDS))
         signal.alarm(MAX_READER_WAIT)
         arrays = surface_through(_points_of(path)) if cloud else _mesh_of(path)
-        words = _plain_words(_contents(printed))
-        answer = _packed(failure=words) if words else _packed(**arrays)
+        message = _plain_words(_contents(printed))
+        answer = _packed(failure=message) if message else _packed(**arrays)
         status = 0 if os.write(memory, answer) == len(answer) else 1
     except MemoryError:
         os.write(2, f"it takes more than {MAX_READER_BYTES / 1e9:.1f} GB of memory".encode())
@@ -243,8 +243,8 @@ def surface_through(cloud: Any) -> Arrays:
         cloud = _thinned(cloud)
     if len(cloud.points) <= NORMAL_NEIGHBOURS:
         raise MeshReaderError(f"{len(cloud.points)} different points, {NORMAL_NEIGHBOURS + 1} or more are needed")
-    apart = float(np.median(np.asarray(cloud.compute_nearest_neighbor_distance())))
-    cloud, _ = cloud.remove_radius_outlier(DUST_NEIGHBOURS, DUST_REACH * apart)
+    spacing = float(np.median(np.asarray(cloud.compute_nearest_neighbor_distance())))
+    cloud, _ = cloud.remove_radius_outlier(DUST_NEIGHBOURS, DUST_REACH * spacing)
     if not cloud.has_normals():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
         cloud.orient_normals_consistent_tangent_plane(ORIENTATION_NEIGHBOURS)
@@ -252,7 +252,7 @@ def surface_through(cloud: Any) -> Arrays:
         if np.einsum("ni,ni->", normals, points - points.mean(axis=0)) < 0:
             cloud.normals = o3d.utility.Vector3dVector(-normals)
     cloud.normalize_normals()
-    radii = o3d.utility.DoubleVector([apart * radius for radius in BALL_RADII])
+    radii = o3d.utility.DoubleVector([spacing * radius for radius in BALL_RADII])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
     arrays = {"vertices": np.asarray(mesh.vertices), "triangles": np.asarray(mesh.triangles, np.int64)}
     return {**arrays, "count": count, **_colours_of(mesh)}
@@ -271,16 +271,16 @@ def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int,
     for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES), b""), first):
         if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
             raise InputError(path, f"line {number}", f"{MAX_LINE_BYTES} bytes or more", f"fewer than {MAX_LINE_BYTES}")
-        words = line.split()
+        tokens = line.split()
         if b"\0" in line:  # where C ends a word
-            raise wrong_line(path, number, words, "text without bytes that are 0")
-        if words:
-            yield number, words
+            raise wrong_line(path, number, tokens, "text without bytes that are 0")
+        if tokens:
+            yield number, tokens
 
 
-def wrong_line(path: Path, number: int, words: list[bytes], allowed: str) -> InputError:
+def wrong_line(path: Path, number: int, tokens: list[bytes], allowed: str) -> InputError:
     """The error about a line of a text file."""
-    return InputError(path, f"line {number}", b" ".join(words).decode("utf-8", "replace"), allowed)
+    return InputError(path, f"line {number}", b" ".join(tokens).decode("utf-8", "replace"), allowed)
 
 
 def check_rows(path: Path, what: str, count: int) -> None:
@@ -319,8 +319,8 @@ def read_stl(path: Path) -> RawMesh:
 def _text_corners(file: BinaryIO, path: Path) -> array[float]:
     """Nine numbers for each triangle of a text STL file, of all its solids."""
     corners, step, solid = array("d"), 0, False
-    for number, words in text_rows(file, path):
-        word, expected = words[0].lower(), STL_ORDER[step]
+    for number, tokens in text_rows(file, path):
+        word, expected = tokens[0].lower(), STL_ORDER[step]
         if step == 0 and word == (b"endsolid" if solid else b"solid"):
             solid = not solid
             continue
@@ -328,12 +328,12 @@ def _text_corners(file: BinaryIO, path: Path) -> array[float]:
             if not solid or word != expected:
                 raise ValueError
             if word == b"vertex":
-                x, y, z = words[1:]
+                x, y, z = tokens[1:]
                 corners.extend((float(x), float(y), float(z)))
                 check_rows(path, "triangles", len(corners) // 9)
         except ValueError:
             allowed = expected.decode() + STL_REST.get(expected, "") if solid else "solid"
-            raise wrong_line(path, number, words, allowed) from None
+            raise wrong_line(path, number, tokens, allowed) from None
         step = (step + 1) % len(STL_ORDER)
     if solid:
         raise InputError(path, "scan", "ends within a solid", "endsolid as its last line (is it cut short?)")
@@ -354,36 +354,36 @@ def read_obj(path: Path) -> RawMesh:
     """
     places, triangles, faces = array("d"), array("q"), 0
     with path.open("rb") as file:
-        for number, words in text_rows(file, path):
-            word = words[0]
+        for number, tokens in text_rows(file, path):
+            word = tokens[0]
             if word not in (b"v", b"f"):
                 if word in IGNORED_OBJ_WORDS or word.startswith(b"#"):
                     continue
-                raise wrong_line(path, number, words, f"{OBJ_VERTEX}, or {OBJ_FACE}")
+                raise wrong_line(path, number, tokens, f"{OBJ_VERTEX}, or {OBJ_FACE}")
             try:
                 if word == b"v":
-                    x, y, z = words[1:4]
+                    x, y, z = tokens[1:4]
                     places.extend((float(x), float(y), float(z)))
                     check_rows(path, "vertices", len(places) // 3)
                 else:
-                    first, *others = _corners(words[1:], len(places) // 3)
+                    first, *others = _corners(tokens[1:], len(places) // 3)
                     for one, other in pairwise(others):
                         triangles.extend((first, one, other))
                     faces += 1
                     check_rows(path, "faces", faces)
             except (ValueError, OverflowError):
-                raise wrong_line(path, number, words, OBJ_VERTEX if word == b"v" else OBJ_FACE) from None
+                raise wrong_line(path, number, tokens, OBJ_VERTEX if word == b"v" else OBJ_FACE) from None
     return RawMesh(np.array(places).reshape(-1, 3), np.array(triangles, np.int64).reshape(-1, 3))
 
 
-def _corners(words: list[bytes], vertices: int) -> list[int]:
+def _corners(tokens: list[bytes], vertices: int) -> list[int]:
     """Numbers, from 0, of the corners that the words i, i/t, i//n or i/t/n name. vertices: how many have come so far.
 
     ValueError: they are no face.
     """
-    if b"#" in words:
-        words = words[: words.index(b"#")]
-    corners = [int(word.partition(b"/")[0]) for word in words]
+    if b"#" in tokens:
+        tokens = tokens[: tokens.index(b"#")]
+    corners = [int(word.partition(b"/")[0]) for word in tokens]
     if len(corners) < 3 or 0 in corners or min(corners) < -vertices:
         raise ValueError
     return [one - 1 if one > 0 else vertices + one for one in corners]

@@ -62,22 +62,22 @@ def path_from_text(text: str, where: str | File) -> Path:
 
 
 def _path_from_rows(file: File, rows: list[checks.CsvRow]) -> Path:
-    lines, words = _columns(file, rows)
-    speed_column = next(name for name in SPEED_COLUMNS if name in words)
+    lines, cells = _columns(file, rows)
+    speed_column = next(name for name in SPEED_COLUMNS if name in cells)
     number_columns = (*POSE_COLUMNS, speed_column, "temperature_c")
-    numbers = {name: checks.csv_numbers(file, lines, name, words[name]) for name in number_columns}
+    numbers = {name: checks.csv_numbers(file, lines, name, cells[name]) for name in number_columns}
     pose = np.stack([numbers[name] for name in POSE_COLUMNS], axis=1)
     path = Path(
         surface_from_nozzle=se3.make(se3.rotation_from_euler(np.deg2rad(pose[:, 3:])), pose[:, :3]),
         speed=numbers[speed_column] * SPEED_COLUMNS[speed_column],
-        material=_material(file, lines, words["material"]),
+        material=_material(file, lines, cells["material"]),
         temperature=numbers["temperature_c"],
-        layer=_whole(file, lines, "layer", words.get("layer", ["0"] * len(lines))),
-        extrude=_whole(file, lines, "extrude", words.get("extrude", ["1"] * len(lines)), flags=True) == 1,
-        extra={name: _further(words[name]) for name in words if name not in (*PATH_HEADER, *SPEED_COLUMNS)},
+        layer=_ints(file, lines, "layer", cells.get("layer", ["0"] * len(lines))),
+        extrude=_ints(file, lines, "extrude", cells.get("extrude", ["1"] * len(lines)), flags=True) == 1,
+        extra={name: _further(cells[name]) for name in cells if name not in (*PATH_HEADER, *SPEED_COLUMNS)},
     )
     named = {"speed": speed_column, "temperature": "temperature_c"}
-    check_path(path, file, lines, {value: (column, words[column]) for value, column in named.items()})
+    check_path(path, file, lines, {value: (column, cells[column]) for value, column in named.items()})
     span = float(np.linalg.norm(np.ptp(pose[:, :3], axis=0)))
     if span < MIN_PATH_SPAN:
         allowed = f"{MIN_PATH_SPAN:g} mm or more from corner to corner: are they in metres?"
@@ -104,19 +104,19 @@ def path_text(path: Path) -> str:
     return stream.getvalue()
 
 
-def _further(words: list[str]) -> Column:
+def _further(cells: list[str]) -> Column:
     """A further column: whole numbers, numbers, or text where any word is none."""
     try:
-        whole = np.array([int(word) for word in words], np.int64)
-        if [str(number) for number in whole.tolist()] == words:
+        whole = np.array([int(word) for word in cells], np.int64)
+        if [str(number) for number in whole.tolist()] == cells:
             return whole
     except (ValueError, OverflowError):
         pass
     try:
-        numbers = np.array([float(word) for word in words])
+        numbers = np.array([float(word) for word in cells])
     except ValueError:
-        return np.array(words)
-    return numbers if np.isfinite(numbers).all() else np.array(words)
+        return np.array(cells)
+    return numbers if np.isfinite(numbers).all() else np.array(cells)
 
 
 def _cells(column: Column) -> list[str]:
@@ -129,10 +129,10 @@ def _cells(column: Column) -> list[str]:
 def _columns(file: File, rows: list[checks.CsvRow]) -> tuple[list[int], dict[str, list[str]]]:
     """Line numbers of the checkpoints, and the cells of each column."""
     contents = f"a header {','.join(PATH_HEADER)} and 2 checkpoints or more"
-    lines, words = checks.csv_columns(file, rows, contents, partial(_check_header, file))
+    lines, cells = checks.csv_columns(file, rows, contents, partial(_check_header, file))
     if len(lines) < 2:
         raise InputError(file, "checkpoints", len(lines), "2 or more")
-    return lines, words
+    return lines, cells
 
 
 def _check_header(file: File, header: Sequence[str]) -> None:
@@ -154,21 +154,21 @@ def _check_header(file: File, header: Sequence[str]) -> None:
         raise InputError(file, "header", ",".join(header), f"one of {', '.join(SPEED_COLUMNS)}")
 
 
-def _whole(file: File, lines: Sequence[int], name: str, words: Sequence[str], flags: bool = False) -> NDArray[np.int64]:
-    for line, word in zip(lines, words, strict=True):
-        whole = word.removeprefix("-").isdecimal() and word.isascii() and len(word) < 19
-        if not whole or (flags and int(word) not in (0, 1)):
+def _ints(file: File, lines: Sequence[int], name: str, cells: Sequence[str], flags: bool = False) -> NDArray[np.int64]:
+    for line, word in zip(lines, cells, strict=True):
+        is_integer = word.removeprefix("-").isdecimal() and word.isascii() and len(word) < 19
+        if not is_integer or (flags and int(word) not in (0, 1)):
             raise InputError(file, f"line {line}: {name}", word, "0 or 1" if flags else "a whole number")
-    return np.array([int(word) for word in words], np.int64)
+    return np.array([int(word) for word in cells], np.int64)
 
 
-def _material(file: File, lines: Sequence[int], words: Sequence[str]) -> NDArray[np.int64] | NDArray[np.str_]:
+def _material(file: File, lines: Sequence[int], cells: Sequence[str]) -> NDArray[np.int64] | NDArray[np.str_]:
     """Whole numbers where all are, else names."""
-    if "" in words:
-        raise InputError(file, f"line {lines[words.index('')]}: material", "", "a name or a whole number")
-    if all(word.isascii() and word.isdecimal() and len(word) < 19 and str(int(word)) == word for word in words):
-        return np.array([int(word) for word in words], np.int64)
-    return np.array(words)
+    if "" in cells:
+        raise InputError(file, f"line {lines[cells.index('')]}: material", "", "a name or a whole number")
+    if all(word.isascii() and word.isdecimal() and len(word) < 19 and str(int(word)) == word for word in cells):
+        return np.array([int(word) for word in cells], np.int64)
+    return np.array(cells)
 
 
 GCODE_HEADER = """; stillbed: {count} checkpoints, {layers} layers, {length:.1f} mm
@@ -186,7 +186,7 @@ def gcode_text(path: Path) -> str:
     places = path.surface_from_nozzle[:, :3, 3]
     angles = np.rad2deg(se3.euler_from_rotation(path.surface_from_nozzle[:, :3, :3])) + 0.0
     columns = {name: path.extra[name].astype(float) for name in ("volume_mm3", "wait_s") if name in path.extra}
-    laid = np.cumsum(columns.get("volume_mm3", np.zeros(len(path))))
+    volume = np.cumsum(columns.get("volume_mm3", np.zeros(len(path))))
     wait = columns.get("wait_s", np.zeros(len(path)))
     length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     lines = [GCODE_HEADER.format(count=len(path), layers=len(np.unique(path.layer)), length=length)]
@@ -196,9 +196,9 @@ def gcode_text(path: Path) -> str:
         (x, y, z), (a, b, c) = places[i], angles[i]
         if wait[i] > 0:
             lines.append(f"G4 P{1000 * wait[i]:.0f}\n")
-        end = f" E{laid[i]:.4f}\n" if path.extrude[i] else "\n"
-        way = f"G{int(path.extrude[i])} X{x:.3f} Y{y:.3f} Z{z:.3f} A{a:.3f} B{b:.3f} C{c:.3f}"
-        lines.append(f"{way} F{60 * path.speed[i]:.0f}{end}")
+        end = f" E{volume[i]:.4f}\n" if path.extrude[i] else "\n"
+        line = f"G{int(path.extrude[i])} X{x:.3f} Y{y:.3f} Z{z:.3f} A{a:.3f} B{b:.3f} C{c:.3f}"
+        lines.append(f"{line} F{60 * path.speed[i]:.0f}{end}")
     return "".join([*lines, "M2\n"])
 
 
@@ -228,8 +228,8 @@ def read_contour(file: str | File) -> Array:
             raise InputError(file, "header", ",".join(header), allowed)
 
     contents = f"a header {allowed} and 3 points or more"
-    lines, words = checks.csv_columns(file, checks.read_csv(file), contents, check)
-    points = np.stack([checks.csv_numbers(file, lines, *column) for column in words.items()], axis=1)
+    lines, cells = checks.csv_columns(file, checks.read_csv(file), contents, check)
+    points = np.stack([checks.csv_numbers(file, lines, *column) for column in cells.items()], axis=1)
     if len(points):
         points = points[np.r_[True, (np.diff(points, axis=0) != 0).any(axis=1)]]  # no point twice in a row
     if len(points) > 1 and np.array_equal(points[0], points[-1]):
@@ -272,13 +272,13 @@ def read_progress(file: File, path: Path) -> float:
 def _replace(file: File, mark: ProgressMark, printed: int, durable: bool = False) -> None:
     """Write beside the file and rename, so that a whole file is there always. durable: wait for the disk."""
     text = f'path = "{mark.path}"\nfraction = {checks.toml_value(mark.fraction)}\nprinted = {printed}\n'
-    beside = file.with_name(file.name + ".new")
-    with beside.open("w", encoding="utf-8") as stream:
+    temporary = file.with_name(file.name + ".new")
+    with temporary.open("w", encoding="utf-8") as stream:
         stream.write(text)
         stream.flush()
         if durable:
             os.fsync(stream.fileno())
-    beside.replace(file)
+    temporary.replace(file)
 
 
 class ProgressWriter:
@@ -291,19 +291,19 @@ class ProgressWriter:
         """fingerprint: of the path; "" for a dry run, of which no place is kept. place: on the path, in checkpoints."""
         self.failed = ""
         self._file, self._fingerprint, self._place = file, fingerprint, place
-        self._written = math.nan
-        self._closed = threading.Event()
+        self._written_fraction = math.nan
+        self._close_event = threading.Event()
         self._thread = threading.Thread(target=self._keep, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Write the last place, and end."""
-        self._closed.set()
+        self._close_event.set()
         self._thread.join()
 
     def _keep(self) -> None:
         try:
-            while not self._closed.wait(PROGRESS_PERIOD):
+            while not self._close_event.wait(PROGRESS_PERIOD):
                 self._write()
             self._write()
         except Exception as error:  # whatever ends this thread ends the run
@@ -311,11 +311,11 @@ class ProgressWriter:
 
     def _write(self) -> None:
         fraction = self._place.value
-        if not self._fingerprint or math.isnan(fraction) or fraction == self._written:
+        if not self._fingerprint or math.isnan(fraction) or fraction == self._written_fraction:
             return
         try:
             write_progress_durably(self._file, self._fingerprint, fraction)
-            self._written, self.failed = fraction, ""
+            self._written_fraction, self.failed = fraction, ""
         except OSError as error:
             self.failed = f"{self._file}: {error.strerror or error}"
 

@@ -142,9 +142,9 @@ def read_poses(path: Path) -> PoseTable:
 def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
     cameras = tuple(name.removeprefix("tracks_") for name in head if name.startswith("tracks_"))
     stages = tuple(name.removeprefix("ms_") for name in head if name.startswith("ms_"))
-    learned = head[len(_POSE_TABLE_COLUMNS) + len(cameras) : len(head) - 1 - len(stages)]
-    if learned not in ([], _clock_names(cameras)):
-        raise InputError(path, "header", ",".join(learned), ",".join(_clock_names(cameras)))
+    clock_columns = head[len(_POSE_TABLE_COLUMNS) + len(cameras) : len(head) - 1 - len(stages)]
+    if clock_columns not in ([], _clock_names(cameras)):
+        raise InputError(path, "header", ",".join(clock_columns), ",".join(_clock_names(cameras)))
     state_column = head.index("state")
     for number, row in enumerate(body, start=2):
         if len(row) != len(head):
@@ -152,12 +152,12 @@ def _table(path: Path, head: list[str], body: list[list[str]]) -> PoseTable:
         if row[state_column] not in _STATES:
             raise InputError(path, f"line {number}: state", row[state_column], ", ".join(_STATES))
     numbers = _numbers(path, head, [row[:state_column] + row[state_column + 1 : -1] for row in body])
-    stamps, frames, positions, quaternions, upper, twist, motion, deformation, cameras_used, used, rest = np.split(
+    stamps, frames, positions, quaternions, upper, twist, motion, deformation, cameras_used, used, times = np.split(
         numbers, np.cumsum([1, 1, 3, 4, 21, 6, len(_MOTION), len(_DEFORMATION), 1, len(cameras)]), axis=1
     )
     del cameras_used  # it is np.count_nonzero(used, 1)
-    clocks, milliseconds = np.split(rest, [-len(stages)], axis=1)
-    if not learned:
+    clocks, milliseconds = np.split(times, [-len(stages)], axis=1)
+    if not clock_columns:
         clocks = np.tile(np.repeat([0.0, np.nan], len(cameras)), (len(body), 1))
     offsets, offset_sigmas = np.split(clocks / 1000, [len(cameras)], axis=1)
     covariance = np.zeros((len(body), 6, 6))

@@ -144,10 +144,10 @@ def crossing_edges(points: Array) -> tuple[int, int] | None:
 
     Edges that fold back onto the one before, or that have no length, count as meeting it.
     """
-    count, ends = len(points), np.roll(points, -1, axis=0)
+    count, next_points = len(points), np.roll(points, -1, axis=0)
     for i in range(count):
         for j in range(i + 1, count):
-            a, b, c, d = points[i], ends[i], points[j], ends[j]
+            a, b, c, d = points[i], next_points[i], points[j], next_points[j]
             shared = (b, a, d) if j == i + 1 else (a, b, c) if i == 0 and j == count - 1 else None
             if _folds(*shared) if shared is not None else _meet(a, b, c, d):
                 return i, j
@@ -165,8 +165,8 @@ def _meet(a: Array, b: Array, c: Array, d: Array) -> bool:
     sides = [_side(a, b, c), _side(a, b, d), _side(c, d, a), _side(c, d, b)]
     if sides[0] != sides[1] and sides[2] != sides[3] and 0 not in sides:
         return True
-    ends = ((a, b, c), (a, b, d), (c, d, a), (c, d, b))
-    return any(not side and _between(*end) for side, end in zip(sides, ends, strict=True))
+    orientations = ((a, b, c), (a, b, d), (c, d, a), (c, d, b))
+    return any(not side and _between(*end) for side, end in zip(sides, orientations, strict=True))
 
 
 def _side(a: Array, b: Array, point: Array) -> int:

@@ -129,10 +129,10 @@ def write_rig(
 
 def _source(path: Path, camera: Table) -> ImageSource | None:
     name = camera["name"]
-    named = [key for key in RECORDED_KEYS if key in camera]
-    if len(named) > 1:
+    keys = [key for key in RECORDED_KEYS if key in camera]
+    if len(keys) > 1:
         raise InputError(path, f"camera {name!r}", "video and images", "one of the two")
-    return ImageSource(named[0], checks.text(path, f"camera {name!r}: {named[0]}", camera[named[0]])) if named else None
+    return ImageSource(keys[0], checks.text(path, f"camera {name!r}: {keys[0]}", camera[keys[0]])) if keys else None
 
 
 def _lens_sigma(path: Path, camera: Table) -> Array | None:
@@ -246,8 +246,8 @@ def write_board(path: Path, board: Board) -> None:
 
 
 def _check_whole(path: Path, board: Board) -> None:
-    holds = int(board.dictionary.split("_")[1])
-    if board.markers() > holds:
+    available = int(board.dictionary.split("_")[1])
+    if board.markers() > available:
         raise InputError(path, "dictionary", board.dictionary, f"one with {board.markers()} markers or more")
     if board.kind == "chessboard" and sum(board.squares) % 2 == 0:
         allowed = "an even and an odd number: only then can the board not be taken upside down"
@@ -280,12 +280,12 @@ def surface_of_folder(folder: Path, rig_file: RigFile) -> Path | None:
 
 def scan_of(given: Path | None, session: Path) -> Path | None:
     """The scan that is given, or that the rig file or session folder names; InputError where it cannot be read."""
-    own: Path | None = None
+    session_scan: Path | None = None
     if session.is_dir():
-        own = surface_of_folder(session, read_rig(session / RIG_FILE))
+        session_scan = surface_of_folder(session, read_rig(session / RIG_FILE))
     elif session.suffix == ".toml":
-        own = surface_of_rig(session, read_rig(session).surface)
-    scan = agreed_scan(given, own, session)
+        session_scan = surface_of_rig(session, read_rig(session).surface)
+    scan = agreed_scan(given, session_scan, session)
     if scan is not None:
         read_mesh(scan)
     return scan

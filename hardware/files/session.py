@@ -36,10 +36,10 @@ class PrintHeadLog:
         if not len(self):
             return None
         after = int(np.searchsorted(self.rows[:, 0], stamp))
-        near = min({max(after - 1, 0), min(after, len(self) - 1)}, key=lambda i: abs(float(self.rows[i, 0]) - stamp))
-        if abs(self.rows[near, 0] - stamp) > HEAD_STAMP_TOLERANCE:
+        index = min({max(after - 1, 0), min(after, len(self) - 1)}, key=lambda i: abs(float(self.rows[i, 0]) - stamp))
+        if abs(self.rows[index, 0] - stamp) > HEAD_STAMP_TOLERANCE:
             return None
-        return head_from_row(self.rows[near], bool(self.extruding[near]))
+        return head_from_row(self.rows[index], bool(self.extruding[index]))
 
 
 NO_PRINT_HEADS = PrintHeadLog(np.empty((0, 8)), np.empty(0, bool))

@@ -132,18 +132,18 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)]
 
 
-def _check_count(frames_csv: Path, files: CameraFiles, named: int) -> None:
+def _check_count(frames_csv: Path, files: CameraFiles, expected: int) -> None:
     """InputError unless frames.csv names as many images as there are; a video is decoded to count them if in doubt."""
     if files.video is None:
         there, what = len(files.pictures), "pictures"
     else:
         video = Video(files.video)
-        whole, what = video.reaches(named), f"frames that decode in {files.video.name}"
+        complete, what = video.reaches(expected), f"frames that decode in {files.video.name}"
         video.close()
-        there = named if whole else count_by_decoding(files.video)
-    if there != named:
+        there = expected if complete else count_by_decoding(files.video)
+    if there != expected:
         key = f"number of frames of camera {files.camera.name!r}"
-        raise InputError(frames_csv, key, named, f"{there}, as many as there are {what}")
+        raise InputError(frames_csv, key, expected, f"{there}, as many as there are {what}")
 
 
 def _check_first_image(files: CameraFiles) -> None:

@@ -88,10 +88,10 @@ def csv_columns(
 
     contents: what is allowed instead of nothing. check: refuses a header. InputError for a row that is not as long.
     """
-    full = [(line, [word.strip() for word in row]) for line, row in rows if any(map(str.strip, row))]
-    if not full:
+    non_empty = [(line, [word.strip() for word in row]) for line, row in rows if any(map(str.strip, row))]
+    if not non_empty:
         raise InputError(where, "file", "empty", contents)
-    (_, header), *body = full
+    (_, header), *body = non_empty
     if check is not None:
         check(header)
     for line, row in body:
@@ -100,10 +100,10 @@ def csv_columns(
     return [line for line, _ in body], {name: [row[i] for _, row in body] for i, name in enumerate(header)}
 
 
-def csv_numbers(where: object, lines: Iterable[int], name: str, words: Iterable[str]) -> Array:
+def csv_numbers(where: object, lines: Iterable[int], name: str, cells: Iterable[str]) -> Array:
     """The finite numbers (N,) in the words of a column."""
     out: list[float] = []
-    for line, word in zip(lines, words, strict=True):
+    for line, word in zip(lines, cells, strict=True):
         try:
             out.append(float(word))
         except ValueError:
@@ -155,8 +155,8 @@ def record_from_table(
 
 def one_of_text(word: str, known: Collection[str]) -> str:
     """The allowed words, the nearest one first by name if there is a near one."""
-    near = difflib.get_close_matches(word, known, 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    matches = difflib.get_close_matches(word, known, 1)
+    hint = f"; did you mean {matches[0]!r}?" if matches else ""
     return f"one of {', '.join(known)}{hint}"
 
 
@@ -170,23 +170,23 @@ def near_file_text(*names: object) -> str:
         try:
             if path.exists():
                 continue
-            beside = list(itertools.islice(path.parent.iterdir(), MAX_NAMES)) if path.parent.is_dir() else []
+            siblings = list(itertools.islice(path.parent.iterdir(), MAX_NAMES)) if path.parent.is_dir() else []
         except (OSError, ValueError):  # a name that no file can have
             continue
         if path.name == str(name) == path.stem:  # a word: no file's name, but perhaps a scenario's
-            beside = []
-        near = difflib.get_close_matches(path.name, [each.name for each in beside], 1)
-        found = str(path.parent / near[0]) if near else _shipped_scenario(path.stem)
-        if found:
-            return f"; did you mean {found!r}?"
+            siblings = []
+        matches = difflib.get_close_matches(path.name, [each.name for each in siblings], 1)
+        match = str(path.parent / matches[0]) if matches else _shipped_scenario(path.stem)
+        if match:
+            return f"; did you mean {match!r}?"
     return ""
 
 
 def _shipped_scenario(stem: str) -> str:
     """A scenario that comes with stillbed whose name is near, as `named_path` finds it; else ""."""
     places = (place / "scenarios" for place in (CLONE_DATA, INSTALLED_DATA))
-    near = difflib.get_close_matches(stem, [each.stem for place in places for each in place.glob("*.toml")], 1, 0.8)
-    return f"data/scenarios/{near[0]}.toml" if near else ""
+    matches = difflib.get_close_matches(stem, [each.stem for place in places for each in place.glob("*.toml")], 1, 0.8)
+    return f"data/scenarios/{matches[0]}.toml" if matches else ""
 
 
 def tables(where: object, key: str, value: object) -> list[Table]:

@@ -135,17 +135,17 @@ def tick_in_step(longest: float, interval: float, shortest: float) -> float:
     return tick if tick >= shortest else longest
 
 
-def own_interval(between: Sequence[float]) -> float:
+def own_interval(intervals: Sequence[float]) -> float:
     """The time, s, between two frame sets as cameras make them, from those between the sets that came; NaN of none.
 
     Where a set was lost on the way, the time to the next is a multiple: of a busy beginning that can be most of them.
     """
-    if not between:
+    if not intervals:
         return math.nan
     from statistics import median  # which a command line does not need for its help
 
-    least = sorted(between)[len(between) // 4]  # a quarter came one after the other, or nothing can be told
-    return median(each / max(round(each / least), 1) for each in between) if least > 0 else math.nan
+    quartile = sorted(intervals)[len(intervals) // 4]  # a quarter came one after the other, or nothing can be told
+    return median(each / max(round(each / quartile), 1) for each in intervals) if quartile > 0 else math.nan
 
 
 class TickSchedule:
@@ -247,8 +247,8 @@ class Histogram:
         index = int(np.searchsorted(summed, rank))
         if index < len(self.counts) - 1:
             return (index + 1) * self.width
-        before = int(summed[-2]) if len(summed) > 1 else 0
-        step = int(np.searchsorted(np.cumsum(self._tail), rank - before))
+        below = int(summed[-2]) if len(summed) > 1 else 0
+        step = int(np.searchsorted(np.cumsum(self._tail), rank - below))
         return min(self._end * TAIL_STEP ** (step + 1), self.most)
 
     @property
@@ -281,22 +281,22 @@ def measure_evenness(clock: Clock, pieces: int) -> Evenness:
     import numpy as np
 
     rng = np.random.default_rng(0)
-    small, many = rng.random((6, 6)) + 6 * np.eye(6), rng.random((50, 4, 4))
-    spent = np.empty(pieces)
+    small, batch = rng.random((6, 6)) + 6 * np.eye(6), rng.random((50, 4, 4))
+    durations = np.empty(pieces)
     for k in range(pieces):
-        begun = clock.now()
+        start = clock.now()
         for _ in range(PROBE_CALLS):
             np.linalg.inv(small)
-            many @ many
+            batch @ batch
             np.concatenate([small, small])
-        spent[k] = clock.now() - begun
-    return evenness_from_times(spent)
+        durations[k] = clock.now() - start
+    return evenness_from_times(durations)
 
 
-def evenness_from_times(spent: Array) -> Evenness:
+def evenness_from_times(durations: Array) -> Evenness:
     """Of pieces that took spent (N,), s."""
     import numpy as np
 
-    usual, whole = float(np.median(spent)), float(spent.sum())
-    slow = float(spent[spent > SLOW_RATIO * usual].sum())
-    return Evenness(usual, float(spent.max()), slow / whole if whole > 0 else 0.0)
+    usual, total = float(np.median(durations)), float(durations.sum())
+    slow = float(durations[durations > SLOW_RATIO * usual].sum())
+    return Evenness(usual, float(durations.max()), slow / total if total > 0 else 0.0)

@@ -176,16 +176,16 @@ class Fault:
 
     def __str__(self) -> str:
         """The text that `fault_from_text` reads."""
-        spec, words = self.spec, [self.name]
+        spec, parts = self.spec, [self.name]
         if spec.unit:
-            words.append(f"{_digits(self.amount)}{spec.unit}")
+            parts.append(f"{_digits(self.amount)}{spec.unit}")
         if self.start:
-            words.append(f"at {_digits(self.start)}s")
+            parts.append(f"at {_digits(self.start)}s")
         if self.duration != spec.lasts:
-            words.append(f"for {_digits(self.duration)}s")
+            parts.append(f"for {_digits(self.duration)}s")
         if self.seed:
-            words.append(f"seed {self.seed}")
-        return " ".join(words)
+            parts.append(f"seed {self.seed}")
+        return " ".join(parts)
 
 
 def _digits(value: float) -> str:
@@ -197,18 +197,18 @@ def fault_from_text(where: object, key: str, text: object, part: FaultPart | Non
 
     part: of a text that names none.
     """
-    words = text.split() if isinstance(text, str) else []
-    if words and part is not None and words[0] != part:
-        words.insert(0, part)
-    if not words:
+    tokens = text.split() if isinstance(text, str) else []
+    if tokens and part is not None and tokens[0] != part:
+        tokens.insert(0, part)
+    if not tokens:
         raise InputError(where, key, text, FAULT_EXAMPLES)
-    target, number = _part(where, key, text, words.pop(0))
-    kind = _kind(where, key, text, target, words)
+    target, number = _part(where, key, text, tokens.pop(0))
+    kind = _kind(where, key, text, target, tokens)
     spec = FAULT_SPECS[target, kind]
-    amount = _amount(where, key, text, spec, words) if spec.unit else 0.0
-    if (target, kind) == _STALLING and words and _QUANTITY.fullmatch(words[0]):
-        words.insert(0, "for")
-    options = _options(where, key, text, words)
+    amount = _amount(where, key, text, spec, tokens) if spec.unit else 0.0
+    if (target, kind) == _STALLING and tokens and _QUANTITY.fullmatch(tokens[0]):
+        tokens.insert(0, "for")
+    options = _options(where, key, text, tokens)
     start, duration = options.get("at", 0.0), options.get("for", spec.lasts)
     if duration is None:
         raise InputError(where, key, text, f'how long: "{target} {kind} 600ms"')
@@ -226,31 +226,31 @@ def faults_from_texts(where: object, key: str, texts: object, part: FaultPart | 
 
 
 def _part(where: object, key: str, text: object, word: str) -> tuple[FaultPart, int]:
-    known = [f"{p}0" if p is FaultPart.CAMERA else str(p) for p in dict.fromkeys(part for part, _ in FAULT_SPECS)]
+    part_names = [f"{p}0" if p is FaultPart.CAMERA else str(p) for p in dict.fromkeys(part for part, _ in FAULT_SPECS)]
     camera = re.fullmatch(r"camera(\d)", word)
     if camera and int(camera[1]) < MAX_CAMERAS:
         return FaultPart.CAMERA, int(camera[1])
-    if word not in known:
-        raise InputError(where, key, text, f"{FAULT_EXAMPLES}; the first word {checks.one_of_text(word, known)}")
+    if word not in part_names:
+        raise InputError(where, key, text, f"{FAULT_EXAMPLES}; the first word {checks.one_of_text(word, part_names)}")
     return FaultPart(word), 0
 
 
-def _kind(where: object, key: str, text: object, part: FaultPart, words: list[str]) -> FaultKind:
-    known = [str(kind) for each, kind in FAULT_SPECS if each is part]
-    if not words or words[0] not in known:
-        allowed = checks.one_of_text(words[0] if words else "", known)
+def _kind(where: object, key: str, text: object, part: FaultPart, tokens: list[str]) -> FaultKind:
+    kind_names = [str(kind) for each, kind in FAULT_SPECS if each is part]
+    if not tokens or tokens[0] not in kind_names:
+        allowed = checks.one_of_text(tokens[0] if tokens else "", kind_names)
         raise InputError(where, key, text, f"{FAULT_EXAMPLES}; after {part} {allowed}")
-    return FaultKind(words.pop(0))
+    return FaultKind(tokens.pop(0))
 
 
-def _amount(where: object, key: str, text: object, spec: FaultSpec, words: list[str]) -> float:
+def _amount(where: object, key: str, text: object, spec: FaultSpec, tokens: list[str]) -> float:
     allowed = f"an amount of {spec.low:g} to {spec.high:g} {spec.unit}"
-    match = _QUANTITY.fullmatch(words[0]) if words else None
+    match = _QUANTITY.fullmatch(tokens[0]) if tokens else None
     if match is None:
-        if spec.usual is None or (words and words[0] not in ("at", "for", "seed")):
+        if spec.usual is None or (tokens and tokens[0] not in ("at", "for", "seed")):
             raise InputError(where, key, text, allowed)
         return spec.usual
-    words.pop(0)
+    tokens.pop(0)
     value, unit = _seconds(match) if match[2] in ("ms", "s") else (float(match[1]), match[2])
     if unit != spec.unit or not spec.low <= value <= spec.high or value == 0:
         raise InputError(where, key, text, allowed)
@@ -261,11 +261,11 @@ def _seconds(match: re.Match[str]) -> tuple[float, str]:
     return float(match[1]) * (0.001 if match[2] == "ms" else 1.0), "s"
 
 
-def _options(where: object, key: str, text: object, words: list[str]) -> dict[str, float]:
+def _options(where: object, key: str, text: object, tokens: list[str]) -> dict[str, float]:
     """The values behind "at", "for" and "seed"."""
     options: dict[str, float] = {}
     allowed = f'{FAULT_EXAMPLES}; then "at TIME", "for TIME", "seed N", each once, times up to {MAX_FAULT_TIME:g}s'
-    for name, value in zip(words[::2], [*words[1::2], ""], strict=False):
+    for name, value in zip(tokens[::2], [*tokens[1::2], ""], strict=False):
         match = _QUANTITY.fullmatch(value)
         if name in options or name not in ("at", "for", "seed"):
             raise InputError(where, key, text, allowed)
@@ -289,9 +289,9 @@ def check_faults(
     """InputError for a fault that the command cannot inject, or on a camera that is not there."""
     for fault in faults:
         if runner not in fault.spec.runners:
-            able = ", ".join(f"{part} {kind}" for (part, kind), spec in FAULT_SPECS.items() if runner in spec.runners)
+            known = ", ".join(f"{part} {kind}" for (part, kind), spec in FAULT_SPECS.items() if runner in spec.runners)
             others = " and ".join(fault.spec.runners)
-            raise InputError(where, key, str(fault), f"what {runner} can do: {able}; {fault.name} is for {others}")
+            raise InputError(where, key, str(fault), f"what {runner} can do: {known}; {fault.name} is for {others}")
         if fault.part is FaultPart.CAMERA and fault.number >= cameras:
             raise InputError(where, key, str(fault), f"camera0 to camera{cameras - 1}")
         if fault.kind is FaultKind.SWAP and cameras < 2:

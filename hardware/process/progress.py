@@ -156,12 +156,12 @@ def count_text(count: int, noun: str) -> str:
 
 def duration_text(seconds: float) -> str:
     """Seconds as a person says them: 8 s, 3 min 20 s, 1 h 5 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
+    total = round(seconds)
+    if total < 60:
+        return f"{total} s"
+    minutes, seconds_left = divmod(total, 60)
     if minutes < 60:
-        return f"{minutes} min {rest} s"
+        return f"{minutes} min {seconds_left} s"
     return f"{minutes // 60} h {minutes % 60} min"
 
 
@@ -270,11 +270,11 @@ def left_files_text(out: Path | None) -> str:
 
 def write_error_text(error: Exception, out: Path | None) -> str:
     """An error of the system that names no file, as of a full disk: where it struck, and what is left there."""
-    why = str(getattr(error, "strerror", None) or error).lower()
+    reason = str(getattr(error, "strerror", None) or error).lower()
     if out is None:
-        return why
-    cut = ", of which what was written last may end early" if out.is_dir() and any(out.iterdir()) else ""
-    return f"{out}: {why}; {left_files_text(out)}{cut}"
+        return reason
+    hint = ", of which what was written last may end early" if out.is_dir() and any(out.iterdir()) else ""
+    return f"{out}: {reason}; {left_files_text(out)}{hint}"
 
 
 def write_atomically(file: Path, write: Callable[[Path], object]) -> None:

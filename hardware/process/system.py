@@ -99,11 +99,11 @@ def exit_with_parent() -> None:
 def blocked_sigint() -> Iterator[None]:
     """Ctrl-C waits until the block is left; a process that is started in it never sees one."""
     resource_tracker.ensure_running()  # by itself it would start in the block, and let Ctrl-C through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
@@ -211,19 +211,19 @@ class Bell:
     """Ends the wait of one process as soon as another has something for it; handed to both when they are started."""
 
     def __init__(self) -> None:
-        self._heard, self._rung = SPAWN.Pipe(duplex=False)
-        for end in (self._heard, self._rung):
+        self._receiver, self._sender = SPAWN.Pipe(duplex=False)
+        for end in (self._receiver, self._sender):
             os.set_blocking(end.fileno(), False)
 
     def ring(self) -> None:
         """End the wait, or the next one; never waits itself."""
         with suppress(OSError):  # so often rung that there is no room, or nobody is there any more
-            os.write(self._rung.fileno(), b"!")
+            os.write(self._sender.fileno(), b"!")
 
     def wait(self, patience: float) -> None:
         """Wait `patience` s, or until it is rung."""
-        if select([self._heard.fileno()], [], [], max(patience, 0.0))[0]:
-            os.read(self._heard.fileno(), MOST_RINGS)
+        if select([self._receiver.fileno()], [], [], max(patience, 0.0))[0]:
+            os.read(self._receiver.fileno(), MOST_RINGS)
 
 
 MOST_RINGS = 2**16  # that a pipe holds
@@ -246,7 +246,7 @@ class SharedLatest(Generic[Value]):
     def __init__(self, capacity: int = DEFAULT_CAPACITY) -> None:
         self._capacity = capacity
         self._memory: Any = RawArray("B", _COUNT.size + 2 * (_SLOT_HEAD.size + capacity))
-        self._seen, self._value = 0, None
+        self._read_count, self._value = 0, None
 
     def put(self, value: Value) -> None:
         """Make `value` the newest; InputError where it is too large."""
@@ -265,13 +265,13 @@ class SharedLatest(Generic[Value]):
         memory = memoryview(self._memory).cast("B")
         for _ in range(MAX_READ_TRIES):
             count = _COUNT.unpack_from(memory)[0]
-            if count == self._seen:
+            if count == self._read_count:
                 break
             start = self._start(count)
             written, size, check = _SLOT_HEAD.unpack_from(memory, start)
             data = bytes(memory[start + _SLOT_HEAD.size : start + _SLOT_HEAD.size + min(size, self._capacity)])
             if written == count and crc32(data) == check:
-                self._seen, self._value = count, pickle.loads(data)
+                self._read_count, self._value = count, pickle.loads(data)
                 break
         return self._value
 
@@ -315,9 +315,9 @@ class Provenance:
     def sentence(self) -> str:
         """As the last line of a report."""
         code = f"stillbed {self.version}" + (f", commit {self.commit}" if self.commit else "")
-        who = f" by {self.operator}" if self.operator else ""
+        operator_text = f" by {self.operator}" if self.operator else ""
         files = ", ".join(f"{name} {value[:SHOWN_DIGITS] or '?'}" for name, value in self.inputs.items())
-        return f"{self.started} on {self.host}{who} · {code}" + (f" · SHA-256 of {files}" if files else "")
+        return f"{self.started} on {self.host}{operator_text} · {code}" + (f" · SHA-256 of {files}" if files else "")
 
 
 class _Process:
@@ -328,7 +328,7 @@ class _Process:
 
     def state(self, files: Iterable[Path | None], operator: str) -> None:
         self._files = [file for file in files if file is not None]
-        self._operator, self._began = operator, utc_now()
+        self._operator, self._start_time = operator, utc_now()
         self._known: Provenance | None = None
 
     def provenance(self) -> Provenance:
@@ -336,7 +336,7 @@ class _Process:
             inputs: dict[str, str] = {}
             for file in self._files:
                 inputs[file.name if file.name not in inputs else str(file)] = file_hash(file)
-            started = datetime.fromtimestamp(self._began, UTC).isoformat(timespec="seconds")
+            started = datetime.fromtimestamp(self._start_time, UTC).isoformat(timespec="seconds")
             host = platform.node()
             self._known = Provenance(started, stillbed_version(), code_commit(), host, self._operator, inputs)
         return self._known
@@ -357,17 +357,17 @@ def provenance() -> Provenance:
 
 def file_hash(file: Path) -> str:
     """SHA-256 of a file, or of names and contents of all files in a folder, in order; "" where one is unreadable."""
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     try:
         for part in sorted(file.rglob("*")) if file.is_dir() else [file]:
             if file.is_dir():
-                whole.update(f"{part.relative_to(file).as_posix()}\0".encode())
+                digest.update(f"{part.relative_to(file).as_posix()}\0".encode())
             if part.is_file():
                 with part.open("rb") as stream:
-                    hashlib.file_digest(stream, lambda: whole)
+                    hashlib.file_digest(stream, lambda: digest)
     except OSError:
         return ""
-    return whole.hexdigest()
+    return digest.hexdigest()
 
 
 def stillbed_version() -> str:
@@ -383,12 +383,12 @@ def stillbed_version() -> str:
 @cache
 def code_commit() -> str:
     """The commit of the code that runs, with a + where files differ from it; "" where it is no clone."""
-    here, said = Path(__file__), ""
-    known, named = ["ls-files", "--error-unmatch", here.name], ["describe", "--always", "--dirty=+", "--abbrev=12"]
+    here, output = Path(__file__), ""
+    tracked, describe = ["ls-files", "--error-unmatch", here.name], ["describe", "--always", "--dirty=+", "--abbrev=12"]
     try:
-        for question in (known, named):
+        for question in (tracked, describe):
             command = ["git", "-C", str(here.parent), *question]
-            said = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+            output = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):  # no git, an installed package, or one inside somebody else's clone
         return ""
-    return said
+    return output
