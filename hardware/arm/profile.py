@@ -161,15 +161,15 @@ def limit_unit_text(name: str) -> str:
 
 def far_limits_text(limits: MotionLimits) -> str:
     """One line for the operator about limits of more than FAR_LIMIT times the S6H4D's own; "" where there are none."""
-    usual, far = MotionLimits(), list[str]()
+    usual, texts = MotionLimits(), list[str]()
     for name in LIMIT_KEYS:
-        value, known = (np.atleast_1d(getattr(each, name) / limit_unit(name)) for each in (limits, usual))
-        times = np.abs(value) / np.abs(known)
+        value, usual_value = (np.atleast_1d(getattr(each, name) / limit_unit(name)) for each in (limits, usual))
+        times = np.abs(value) / np.abs(usual_value)
         axis = int(times.argmax())
         if times[axis] > FAR_LIMIT * (1 + UNIT_ROUNDING):
             of = f" of {AXIS_LETTERS[axis]}" if name in AXIS_LIMITS else ""
-            far.append(f"limits.{name} = {value[axis]:g}{of}, {times[axis]:.3g} times its {known[axis]:g}")
-    return f"limits far beyond a SEED S6H4D's: {'; '.join(far)}. Does this arm bear them?" if far else ""
+            texts.append(f"limits.{name} = {value[axis]:g}{of}, {times[axis]:.3g} times its {usual_value[axis]:g}")
+    return f"limits far beyond a SEED S6H4D's: {'; '.join(texts)}. Does this arm bear them?" if texts else ""
 
 
 def unreached_limits_text(profile: ArmProfile) -> str:
@@ -180,9 +180,9 @@ def unreached_limits_text(profile: ArmProfile) -> str:
     groups: dict[str, list[str]] = {}
     for i in axes:
         groups.setdefault(f"{(limits.speed / unit)[i]:g}, at most {(most / unit)[i]:.1f}", []).append(AXIS_LETTERS[i])
-    told = "; ".join(f"{' '.join(letters)} {each}" for each, letters in groups.items())
+    limits_text = "; ".join(f"{' '.join(letters)} {each}" for each, letters in groups.items())
     why = f"limits.jump and limits.turn of a tick of {profile.tick:g} s hold for all axes together"
-    return f"limits.speed that is never reached: {told}, as {why}" if told else ""
+    return f"limits.speed that is never reached: {limits_text}, as {why}" if limits_text else ""
 
 
 def measured_lag(profile: ArmProfile, lag: float) -> float:
@@ -304,5 +304,5 @@ def emergency_stop(address: str, profile: ArmProfile) -> tuple[float, str]:
 
 def find_arms(kind: DriverKind) -> list[tuple[str, str]]:
     """The arms that a driver finds now, as (address, description)."""
-    found: list[tuple[str, str]] = importlib.import_module(kind.module).find_arms()
-    return found
+    arms: list[tuple[str, str]] = importlib.import_module(kind.module).find_arms()
+    return arms

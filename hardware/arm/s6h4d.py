@@ -100,8 +100,8 @@ class S6H4D(SerialDriver):
     def _reset(self) -> None:
         self.origin = np.zeros(3)
         self._frames: deque[tuple[bytes, G1 | G4 | G54 | Pause]] = deque()
-        self._done = 0  # bytes of the first frame that went out
-        self._since = 0.0  # s, when the first frame was to go
+        self._written_bytes = 0  # bytes of the first frame that went out
+        self._wait_start = 0.0  # s, when the first frame was to go
         self._stream = reply_stream()
 
     def state(self, now: float) -> Reported:
@@ -141,7 +141,7 @@ class S6H4D(SerialDriver):
 
     def _put(self, frame: bytes, instruction: G1 | G4 | G54 | Pause, now: float) -> Sequence[Sent]:
         if not self._frames:
-            self._since = now
+            self._wait_start = now
         self._frames.append((frame, instruction))
         return self.flush(now)
 
@@ -152,12 +152,12 @@ class S6H4D(SerialDriver):
         share = 0.0
         while self._frames:
             frame, instruction = self._frames[0]
-            written = self.port.write(frame[self._done :])
-            self._done += written
+            written = self.port.write(frame[self._written_bytes :])
+            self._written_bytes += written
             share += written / FRAME_LENGTH
-            if self._done == FRAME_LENGTH:
+            if self._written_bytes == FRAME_LENGTH:
                 self._frames.popleft()
-                self._done, self._since = 0, now
+                self._written_bytes, self._wait_start = 0, now
                 sent.append(Sent(instruction, share))
                 share = 0.0
             elif not written:
@@ -166,12 +166,12 @@ class S6H4D(SerialDriver):
 
     def recall(self) -> None:
         """Take back the frames of which no byte is gone."""
-        while len(self._frames) > (1 if self._done else 0):
+        while len(self._frames) > (1 if self._written_bytes else 0):
             self._frames.pop()
 
     def blocked_for(self, now: float) -> float | None:
         """Seconds that the first frame has waited."""
-        return now - self._since if self._frames else None
+        return now - self._wait_start if self._frames else None
 
 
 def open_arm(address: str, profile: ArmProfile, listener: ByteListener | None = None) -> S6H4D:

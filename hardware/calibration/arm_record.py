@@ -110,12 +110,12 @@ def _halton(index: int, base: int) -> float:
 
 def straight_move(start: Array, goal: Array, tick: float, options: MoveOptions) -> Iterator[Array]:
     """Set-points (K, 6) of a straight minimum-jerk move, if there is any way to go."""
-    way = goal - start
-    length = max(float(np.linalg.norm(way[:3])), 60.0 * float(np.linalg.norm(way[3:])))  # 1 rad/s at 60 mm/s
+    offset = goal - start
+    length = max(float(np.linalg.norm(offset[:3])), 60.0 * float(np.linalg.norm(offset[3:])))  # 1 rad/s at 60 mm/s
     if length > 0:
         count = max(5, int(np.ceil(PEAK_SPEED_RATIO * length / (options.speed * tick))))
         s = np.linspace(0, 1, count + 1)[1:, None]
-        yield start + (10 * s**3 - 15 * s**4 + 6 * s**5) * way
+        yield start + (10 * s**3 - 15 * s**4 + 6 * s**5) * offset
 
 
 def _swing(middle: Array, limits: MotionLimits, tick: float, options: MoveOptions) -> Array:
@@ -123,9 +123,9 @@ def _swing(middle: Array, limits: MotionLimits, tick: float, options: MoveOption
     t = np.arange(1, round(options.swing / tick) + 1)[:, None] * tick
     size, rate = SWING_SINES
     omega = 2 * np.pi * rate
-    most = np.minimum(SWING_LOAD * limits.acceleration[:3] / omega**2, SWING_LOAD * limits.speed[:3] / omega)
+    limit = np.minimum(SWING_LOAD * limits.acceleration[:3] / omega**2, SWING_LOAD * limits.speed[:3] / omega)
     out = np.repeat(middle[None], len(t), axis=0)
-    out[:, :3] += np.sin(np.pi * t / max(options.swing, tick)) ** 2 * np.minimum(size, most) * np.sin(omega * t)
+    out[:, :3] += np.sin(np.pi * t / max(options.swing, tick)) ** 2 * np.minimum(size, limit) * np.sin(omega * t)
     return out
 
 
@@ -159,20 +159,20 @@ class CommandedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8")
         self._file.write(COMMANDED_HEADER + "\n")
-        self._last = self._until = -np.inf  # s: instant of the last knot, end of the last move
+        self._last_knot = self._move_end = -np.inf  # s: instant of the last knot, end of the last move
 
     def note(self, arm: Arm, now: float) -> None:
         """Write the moves that have ended at `now`, s."""
-        for way in arm.ways(self._until):
+        for way in arm.ways(self._move_end):
             if way.end <= now:
                 self._add(way)
-                self._until = way.end
+                self._move_end = way.end
 
     def _add(self, way: QueuedCommand) -> None:
         for instant, axes in ((way.start, way.source), (way.end, way.target)):
-            if instant >= self._last + STAMP_RESOLUTION:
+            if instant >= self._last_knot + STAMP_RESOLUTION:
                 self._file.write(f"{instant:.6f}," + ",".join(f"{v:.6f}" for v in np.array(axes) * _UNITS) + "\n")
-                self._last = instant
+                self._last_knot = instant
 
     def __enter__(self) -> CommandedFile:
         return self
@@ -215,7 +215,7 @@ class ArmDrive:
     def __init__(
         self, arm: Arm, clock: Clock, log: CommandedFile, beside: Callable[[float], None] = lambda now: None
     ) -> None:
-        self.arm, self._clock, self._log, self._beside = arm, clock, log, beside
+        self.arm, self._clock, self._log, self._background = arm, clock, log, beside
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Wait, while polling the arm."""
@@ -242,14 +242,14 @@ class ArmDrive:
         """
         assert self.arm.target is not None
         arm, at = self.arm, self.arm.target
-        guard, due, number = guard_at(arm.profile, at), self._clock.now(), 0
+        guard, next_tick, number = guard_at(arm.profile, at), self._clock.now(), 0
         try:
             while number < len(targets):
                 now = self._clock.now()
                 self._look(now)
                 if arm.state is not ArmState.ARMED:
                     raise InputError("arm", "motion", arm.reason, "an arm that is left to move")
-                if now >= due and not arm.hold(now):
+                if now >= next_tick and not arm.hold(now):
                     target = targets[number]
                     if (target != at).any():
                         move = Move(now, target, feed_for(at, target, arm.profile.tick), 0, False)
@@ -258,8 +258,8 @@ class ArmDrive:
                         if reason:
                             raise InputError("arm", "motion", reason, "moves that guard and link let pass")
                         at = target
-                    begun = max(due, now - arm.profile.tick)  # missed ticks are not made up
-                    number, due = number + 1, begun + arm.profile.tick * (1 + arm.settings.ease)
+                    tick_start = max(next_tick, now - arm.profile.tick)  # missed ticks are not made up
+                    number, next_tick = number + 1, tick_start + arm.profile.tick * (1 + arm.settings.ease)
                     report(number, len(targets))
                 self._clock.wait_until(now + arm.settings.poll)
             self.wait(SETTLE_TIME, lambda: arm.state is not ArmState.ARMED)
@@ -275,7 +275,7 @@ class ArmDrive:
 
     def _look(self, now: float) -> None:
         self.arm.poll(now)
-        self._beside(now)
+        self._background(now)
         self._log.note(self.arm, now)
 
 

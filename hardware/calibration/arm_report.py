@@ -30,15 +30,15 @@ PLOT_SIZE = (900, 220)  # px of the chart of delays
 def judge_arm(result: ArmCalibration, limit: float) -> CalibrationVerdict:
     """The verdict. limit: mm, one sigma of the tip in 19 of 20 places."""
     typical, worst = float(np.sqrt(np.mean(result.error**2))), float(np.percentile(result.error, 95))
-    beside, px = float(np.nanmedian(result.held_mm)), float(np.nanmedian(result.held_px))
+    median_error, px = float(np.nanmedian(result.held_mm)), float(np.nanmedian(result.held_px))
     sigma, state = result.fit.sigma, result.fit.state
-    late = float(np.sqrt(max(result.fit.covariance[9:11, 9:11].sum(), 0.0)))
-    good = [worst <= limit, beside <= MAX_HELD_OUT_ERROR, late <= MAX_LAG_SIGMA]
+    lag_sigma = float(np.sqrt(max(result.fit.covariance[9:11, 9:11].sum(), 0.0)))
+    good = [worst <= limit, median_error <= MAX_HELD_OUT_ERROR, lag_sigma <= MAX_LAG_SIGMA]
     word = "good enough" if good[0] else "NOT good enough"
     lines = [
         f"{word} to print: the tip is where it is thought to be within {typical:.3f} mm (one sigma), in 19 of 20 "
         f"places within {worst:.3f} mm; {limit:g} mm is allowed",
-        f"pictures that took no part lie {beside:.3f} mm ({px:.2f} px) beside where the arm should be (median); "
+        f"pictures that took no part lie {median_error:.3f} mm ({px:.2f} px) beside where the arm should be (median); "
         f"{MAX_HELD_OUT_ERROR:g} mm is allowed",
     ]
     if result.unknowns.tool:
@@ -50,7 +50,7 @@ def judge_arm(result: ArmCalibration, limit: float) -> CalibrationVerdict:
     if result.unknowns.latency:
         lines.append(
             f"the arm begins {1e3 * state.dead_time:.1f} ± {1e3 * sigma[9]:.1f} ms late and follows with a lag of "
-            f"{1e3 * state.lag:.1f} ± {1e3 * sigma[10]:.1f} ms; both together are known to ± {1e3 * late:.1f} ms, "
+            f"{1e3 * state.lag:.1f} ± {1e3 * sigma[10]:.1f} ms; both together are known to ± {1e3 * lag_sigma:.1f} ms, "
             f"± {1e3 * MAX_LAG_SIGMA:g} ms is allowed"
         )
     out = 1 - result.fit.used.mean()
@@ -214,12 +214,12 @@ def tip_lag(result: ArmCalibration) -> tuple[Array, Array]:
     step = 0.005
     axes = [kinematics(result.set_point.lagged(at.stamp + h, 0.0, step))[:, :3, 3] for h in (-step, step)]
     speed = np.linalg.norm(axes[1] - axes[0], axis=1) / (2 * step)
-    along = -now.by_time[..., 0]  # px/s of the tip's picture
-    rate = np.linalg.norm(along, axis=1)
-    beside = np.einsum("ni,ni->n", at.pixels - now.pixels, along) / np.maximum(rate, 1e-9) ** 2  # s ahead
-    late = state.dead_time + state.lag
-    known = (speed > 5.0) & (rate > 5.0)
-    return speed[known], ((late - beside) * speed)[known]
+    tip_rate = -now.by_time[..., 0]  # px/s of the tip's picture
+    rate = np.linalg.norm(tip_rate, axis=1)
+    lag = np.einsum("ni,ni->n", at.pixels - now.pixels, tip_rate) / np.maximum(rate, 1e-9) ** 2  # s ahead
+    reported_lag = state.dead_time + state.lag
+    measurable = (speed > 5.0) & (rate > 5.0)
+    return speed[measurable], ((reported_lag - lag) * speed)[measurable]
 
 
 def _latency(result: ArmCalibration) -> str:

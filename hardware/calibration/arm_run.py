@@ -136,9 +136,9 @@ def check_record(folder: Path) -> None:
 
 def copy_rig_json(rig: Path, folder: Path) -> None:
     """Copy the .json of a rig's calibration into a recorded calibration, if there is one."""
-    beside = rig.with_suffix(".json")
-    if beside.is_file():
-        shutil.copyfile(beside, folder / RIG_JSON)
+    copy = rig.with_suffix(".json")
+    if copy.is_file():
+        shutil.copyfile(copy, folder / RIG_JSON)
 
 
 def run_folder(
@@ -179,15 +179,15 @@ def _judge_touches(result: TouchFit, points: TouchPoints, poses: Array) -> Calib
     error = tip_error(result.base_from_arm, result.tool, result.covariance, poses)
     spare = 3 * len(away) - 6
     scatter = float(np.sqrt((away**2 / points.sigma**2).sum() / spare))
-    bad = away[worst] > MAX_TOUCH_SIGMAS * points.sigma[worst]
+    is_outlier = away[worst] > MAX_TOUCH_SIGMAS * points.sigma[worst]
     typical, beside = (float(np.sqrt(np.mean(v**2))) for v in (error, away))
     lines = [
         f"the tip is where it is thought to be within {typical:.2f} mm (one sigma) at the points",
         f"the points lie {beside:.2f} mm beside where they should (RMS), point {worst + 1} the most, "
         f"{away[worst]:.2f} mm; {scatter:.1f} times what touching by hand leaves",
     ]
-    hints = (f"touch point {worst + 1} again, or leave it out: was it the same one?",) if bad else ()
-    return CalibrationVerdict(not bad, tuple(lines), hints)
+    hints = (f"touch point {worst + 1} again, or leave it out: was it the same one?",) if is_outlier else ()
+    return CalibrationVerdict(not is_outlier, tuple(lines), hints)
 
 
 def record_on_terminal(
@@ -201,19 +201,19 @@ def record_on_terminal(
     with tempfile.TemporaryDirectory() as place, serve_arm(watched, Path(place) / "arm", clock) as device:
         driver = open_arm(device.device, watched.profile)
         arm, begun = Arm(driver, watched.profile, clock.now()), clock.now()
-        broken: BaseException | None = None
+        failure: BaseException | None = None
         try:
             move_arm(arm, clock, folder, watched.begin, options, moves)
         except (KeyboardInterrupt, InputError) as error:
-            broken = error
+            failure = error
         finally:
             span = begun, clock.now()
             arm.close()
             driver.release()
     assert device.arm is not None
     take_pictures(watched, device.arm, device.begun, span, folder, images)
-    if broken is not None:
-        raise broken
+    if failure is not None:
+        raise failure
     return _truth(watched, device.arm, device.begun, read_commanded(folder / COMMANDED_FILE))
 
 

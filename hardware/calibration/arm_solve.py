@@ -85,14 +85,14 @@ def needle_radius(rig: Rig, tool: Array) -> float:
 
 def find_tips(session: Session, set_point: SetPoint, tool: Array, report: ProgressReport) -> TipObservations:
     """Find the tip in a session's pictures. InputError where there are too few of them."""
-    chosen = _select_sets(session, set_point)
+    selected = _select_sets(session, set_point)
     finders = _finders(session, set_point, needle_radius(session.rig, tool))
     pictures: list[_TipPicture] = []
     with closing(session.open_reader()) as reader, ThreadPoolExecutor(2) as pool:
-        for done, (refs, places) in enumerate(chosen, 1):
+        for done, (refs, places) in enumerate(selected, 1):
             images = [reader.read(ref) for ref in refs]
             pictures += pool.map(partial(_find, finders), refs, places, images)
-            report(done, len(chosen))
+            report(done, len(selected))
     return _collect(pictures, len(session.rig))
 
 
@@ -175,10 +175,10 @@ def _collect(pictures: Sequence[_TipPicture], cameras: int) -> TipObservations:
 
 def _crops(pictures: Sequence[_TipPicture], camera: int) -> tuple[Array, Array]:
     mine = [one.crop for one in pictures if one.crop is not None and one.ref.camera == camera]
-    chosen = mine[:: max(1, len(mine) // CROPS_PER_CAMERA)][:CROPS_PER_CAMERA]
-    if not chosen:
+    selected = mine[:: max(1, len(mine) // CROPS_PER_CAMERA)][:CROPS_PER_CAMERA]
+    if not selected:
         return np.zeros((0, CROP_SIZE, CROP_SIZE, 3), np.uint8), np.zeros((0, 2))
-    return np.stack([image for image, _ in chosen]), np.stack([at for _, at in chosen])
+    return np.stack([image for image, _ in selected]), np.stack([at for _, at in selected])
 
 
 def visible_needle(profile: Array, along: Array) -> Array:
@@ -216,10 +216,10 @@ def hidden_tips(
     axes = set_point.lagged(stamp, state.dead_time, state.lag)
     axis = (state.base_from_arm @ kinematics(axes))[:, :3, 2]
     poses = np.stack([c.base_from_camera for c in rig.cameras])[camera]
-    way = poses[:, :3, 3] - tip_positions(state, set_point, kinematics, stamp)
-    far = np.linalg.norm(way, axis=1)
-    visible = visible_needle(profile, np.sum(way * axis, 1) / far)
-    return np.asarray(visible * rig.matrices[camera, 0, 0] / far < MIN_NEEDLE_LENGTH)
+    view_direction = poses[:, :3, 3] - tip_positions(state, set_point, kinematics, stamp)
+    distance = np.linalg.norm(view_direction, axis=1)
+    visible = visible_needle(profile, np.sum(view_direction * axis, 1) / distance)
+    return np.asarray(visible * rig.matrices[camera, 0, 0] / distance < MIN_NEEDLE_LENGTH)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,8 +241,8 @@ class ArmCalibration:
 
 def kinematics_of(arm: SimpleArm) -> Kinematics:
     """An arm's own kinematics: arm_from_nozzle (N, 4, 4) at axes (N, 6)."""
-    own = replace(arm, arm_from_base=np.eye(4), tool_offset=np.zeros(3))
-    return lambda axes: nozzle_from_axes(own, axes)
+    local_arm = replace(arm, arm_from_base=np.eye(4), tool_offset=np.zeros(3))
+    return lambda axes: nozzle_from_axes(local_arm, axes)
 
 
 def solve_folder(folder: Path, rig_json: Path | None, unknowns: ArmUnknowns, report: ProgressReport) -> ArmCalibration:
@@ -279,28 +279,28 @@ def solve(
     late = max(profile.lag - profile.frame_time, 0.0)
     start = ArmParameters(pose, profile.arm.tool_offset, late / 2, late / 2, float(profile.tool[0, 1]))
 
-    def fit(some: Sightings, begin: ArmParameters = start) -> ArmFit:
-        return fit_arm(some, set_point, kinematics, rig, begin, unknowns, rig_covariance)
+    def fit(subset: Sightings, begin: ArmParameters = start) -> ArmFit:
+        return fit_arm(subset, set_point, kinematics, rig, begin, unknowns, rig_covariance)
 
-    whole = fit(sightings)
-    near = replace(start, base_from_arm=whole.state.base_from_arm)
+    full_fit = fit(sightings)
+    first_guess = replace(start, base_from_arm=full_fit.state.base_from_arm)
 
-    def residuals_of(state: ArmParameters, some: Sightings) -> Array:
-        return predict(state, set_point, kinematics, rig, some.stamp, some.camera).pixels - some.pixels
+    def residuals_of(state: ArmParameters, subset: Sightings) -> Array:
+        return predict(state, set_point, kinematics, rig, subset.stamp, subset.camera).pixels - subset.pixels
 
-    residuals, states = cross_validate(sightings, lambda some: fit(some, near), residuals_of, HELD_OUT_FOLDS)
-    whole = jackknife(whole, states)
-    state, held = whole.state, np.where(whole.used, np.linalg.norm(residuals, axis=1), np.nan)
+    residuals, states = cross_validate(sightings, lambda subset: fit(subset, first_guess), residuals_of, HELD_OUT_FOLDS)
+    full_fit = jackknife(full_fit, states)
+    state, held_out = full_fit.state, np.where(full_fit.used, np.linalg.norm(residuals, axis=1), np.nan)
     points = tip_positions(state, set_point, kinematics, sightings.stamp)
     bases = np.stack([c.base_from_camera for c in rig.cameras])[sightings.camera]
     depth = np.einsum("ni,ni->n", points - bases[:, :3, 3], bases[:, :3, 2])
-    in_mm = held * depth / rig.matrices[sightings.camera, 0, 0]
+    in_mm = held_out * depth / rig.matrices[sightings.camera, 0, 0]
     arm_from_nozzle = kinematics(axes)
     at = se3.transform_points(state.base_from_arm @ arm_from_nozzle, state.tool[None])[:, 0]
-    error = tip_error(state.base_from_arm, state.tool, whole.covariance[:9, :9], arm_from_nozzle)
+    error = tip_error(state.base_from_arm, state.tool, full_fit.covariance[:9, :9], arm_from_nozzle)
     shaded = hidden_tips(state, profile.tool, set_point, kinematics, rig, *tips.missed)
     hidden = np.bincount(tips.missed[1][shaded], minlength=len(rig))
-    return ArmCalibration(rig, profile, tips, set_point, whole, at, error, held, in_mm, unknowns, hidden)
+    return ArmCalibration(rig, profile, tips, set_point, full_fit, at, error, held_out, in_mm, unknowns, hidden)
 
 
 def tip_error(base_from_arm: Array, tool: Array, covariance: Array, arm_from_nozzle: Array) -> Array:

@@ -69,10 +69,10 @@ def read_corners(path: Path, key: str) -> CornerTable | None:
 
 def write_corners(path: Path, key: str, table: CornerTable) -> None:
     """Store the corners atomically."""
-    near = path.with_name(path.name + ".part")
-    with near.open("wb") as stream:
+    partial = path.with_name(path.name + ".part")
+    with partial.open("wb") as stream:
         np.savez_compressed(stream, key=np.array(key), **{f.name: getattr(table, f.name) for f in fields(table)})
-    os.replace(near, path)
+    os.replace(partial, path)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,8 +93,8 @@ class CornerSearch:
 
     def __init__(self, board: Board, cameras: int, store: Path | None, key: str) -> None:
         self._store, self._key = store, key
-        known = None if store is None else read_corners(store, key)
-        self.table = empty_table(board, cameras) if known is None else known
+        stored = None if store is None else read_corners(store, key)
+        self.table = empty_table(board, cameras) if stored is None else stored
         self.done = self.table.done
         self._finders = [CornerFinder(board) for _ in range(cameras)]
         self._rows: list[CornerRow] = []
@@ -169,8 +169,8 @@ def coverage_from_parts(parts: Array, orientations: Array) -> BoardCoverage:
         return BoardCoverage(parts, np.zeros(4), 1.0)
     across, up, depth = orientations.T
     tilted = [across < -MIN_TILT, across > MIN_TILT, up < -MIN_TILT, up > MIN_TILT]
-    near, far = np.percentile(depth, DEPTH_PERCENTILES)
-    return BoardCoverage(parts, np.array([t.mean() for t in tilted]), float(far / near))
+    nearest, farthest = np.percentile(depth, DEPTH_PERCENTILES)
+    return BoardCoverage(parts, np.array([t.mean() for t in tilted]), float(farthest / nearest))
 
 
 def board_orientations(camera_from_board: Array) -> Array:
@@ -198,12 +198,12 @@ def coverage(calibration: Calibration, camera: int) -> BoardCoverage:
 def missing_coverage(name: str, covered: BoardCoverage) -> list[tuple[float, str]]:
     """What one camera still needs: how much of it is missing, 0 to 1, and a text."""
     out: list[tuple[float, str]] = []
-    empty = np.argwhere(covered.parts < MIN_PART_CORNERS)
-    if len(empty):
-        places = [f"{PART_NAMES[1][row]} {PART_NAMES[0][column]}" for row, column in empty[:3]]
-        more = f" and {len(empty) - 3} other parts" if len(empty) > 3 else ""
-        text = f"{name}: hold the board in its picture's {', '.join(places)}{more}"
-        out.append((len(empty) / covered.parts.size, text))
+    sparse = np.argwhere(covered.parts < MIN_PART_CORNERS)
+    if len(sparse):
+        places = [f"{PART_NAMES[1][row]} {PART_NAMES[0][column]}" for row, column in sparse[:3]]
+        suffix = f" and {len(sparse) - 3} other parts" if len(sparse) > 3 else ""
+        text = f"{name}: hold the board in its picture's {', '.join(places)}{suffix}"
+        out.append((len(sparse) / covered.parts.size, text))
     missing = [TILT_NAMES[k] for k in np.flatnonzero(covered.tilts < MIN_TILT_SHARE)]
     if missing:
         out.append((len(missing) / 4, f"{name}: tilt the board by 30 degrees: {', '.join(missing)}"))

@@ -216,14 +216,14 @@ def fit_switch(profiles: Sequence[LineProfile], on: bool) -> SwitchFit:
     begin = np.array([0.05, 0.05, 0.3, *np.zeros(columns.shape[1])])
     low, high = np.full(len(begin), -20.0), np.full(len(begin), 20.0)
     low[:3], high[:3] = [0.0, 5e-4, 0.02], [MAX_JUMP, MAX_JUMP, 3.0]
-    found = least_squares(lambda s: model(s) - y, begin, bounds=(low, high), x_scale=0.1)
-    state, off, slopes = np.asarray(found.x), np.asarray(found.fun), np.asarray(found.jac)
+    solution = least_squares(lambda s: model(s) - y, begin, bounds=(low, high), x_scale=0.1)
+    state, off, slopes = np.asarray(solution.x), np.asarray(solution.fun), np.asarray(solution.jac)
     beside = -np.bincount(row, slopes[:, 3] * off) / np.bincount(row, slopes[:, 3] ** 2)
     lines, free = np.unique(number), (state > low) & (state < high)
     without = np.repeat(state[None], len(lines), axis=0)
     for i, line in enumerate(lines):  # a jackknife, by a step of Gauss and Newton: samples of a line err alike
-        rest = number[row] != line
-        without[i, free] -= np.linalg.lstsq(slopes[rest][:, free], off[rest], rcond=None)[0]
+        remaining = number[row] != line
+        without[i, free] -= np.linalg.lstsq(slopes[remaining][:, free], off[remaining], rcond=None)[0]
     sigma = [np.sqrt((len(lines) - 1) * np.var(v)) for v in (without[:, 0] + LN2 * without[:, 1], without[:, 1])]
     speeds = np.array([speed[number == line].mean() for line in lines])
     places = (state[0] + LN2 * state[1]) * speeds + np.array([beside[number == line].mean() for line in lines])
@@ -255,10 +255,10 @@ def measure_lines(folder: Path, dispenser: DispenserProfile, height: float) -> L
     for name in (COMMANDED_FILE, ARM_FILE, SWITCHES_FILE):
         if not (folder / name).is_file():
             raise InputError(folder, name, "missing", "a folder that `stillbed calibrate dispenser` has recorded")
-    told = read_switches(folder / SWITCHES_FILE, dispenser.name)
+    switches = read_switches(folder / SWITCHES_FILE, dispenser.name)
     session, profile = open_folder(folder), read_arm(folder / ARM_FILE)
-    lines = drawn_lines(folder, profile, dispenser.nozzle_offset, told, height)
-    means = mean_pictures(session, folder, (told[0][0], told[-1][1]))
+    lines = drawn_lines(folder, profile, dispenser.nozzle_offset, switches, height)
+    means = mean_pictures(session, folder, (switches[0][0], switches[-1][1]))
     places = np.stack([line.frame[:3, 3] + line.frame[:3, 0] * line.length / 2 for line in lines])
     gaps = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(len(lines))
     profiles, left_out = [], {}
@@ -273,12 +273,12 @@ def measure_lines(folder: Path, dispenser: DispenserProfile, height: float) -> L
                 left_out[number, camera] = found
             else:
                 profiles.append(found)
-    seen = {p.number for p in profiles}
-    if len(seen) < max(MIN_LINES, MIN_SHARE * len(lines)):
+    numbers = {p.number for p in profiles}
+    if len(numbers) < max(MIN_LINES, MIN_SHARE * len(lines)):
         reasons = list(left_out.values())
-        got = f"{len(seen)} of {len(lines)}; most often: {max(reasons, key=reasons.count)}"
+        got = f"{len(numbers)} of {len(lines)}; most often: {max(reasons, key=reasons.count)}"
         raise InputError(folder, "lines that can be measured", got, f"{MIN_LINES} or more, and half of all")
-    speeds = [lines[n].speed for n in seen]
+    speeds = [lines[n].speed for n in numbers]
     if max(speeds) < MIN_SPEED_RATIO * min(speeds):
         got = f"{min(speeds):.1f} to {max(speeds):.1f} mm/s"
         raise InputError(folder, "speeds", got, f"a ratio of {MIN_SPEED_RATIO:g} or more: one shows no delay alone")
@@ -341,14 +341,14 @@ def lines_page(title: str, result: LinesResult, verdict: CalibrationVerdict) -> 
         )
     rows = []
     for number, line in enumerate(result.lines):
-        seen = [p for p in result.profiles if p.number == number]
-        why = {result.names[c]: text for (n, c), text in result.left_out.items() if n == number}
+        profiles = [p for p in result.profiles if p.number == number]
+        reasons = {result.names[c]: text for (n, c), text in result.left_out.items() if n == number}
         beside = [
             f"{float(f.places[i]):.2f}" for f in (result.on, result.off) for i in np.flatnonzero(f.lines == number)
         ]
-        width = f"{np.mean([p.width for p in seen]):.2f}" if seen else ""
-        words = "; ".join(f"{name}: {text}" for name, text in why.items())
-        rows.append([str(number + 1), f"{line.speed:.1f}", width, *(beside or ["", ""]), words])
+        width = f"{np.mean([p.width for p in profiles]):.2f}" if profiles else ""
+        reason_text = "; ".join(f"{name}: {text}" for name, text in reasons.items())
+        rows.append([str(number + 1), f"{line.speed:.1f}", width, *(beside or ["", ""]), reason_text])
     head = ["line", "mm/s", "width", "on, mm", "off, mm", "left out"]
     body.append(section("Lines", "As above, and which camera could not measure one.", figures_table(head, rows)))
     lead = f"Calibration of the dispenser {'passed' if verdict.passed else 'failed'}: {verdict.lines[0]}."

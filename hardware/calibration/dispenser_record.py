@@ -148,11 +148,11 @@ class SwitchedDrawing:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._rows = csv.writer(self._file)
         self._rows.writerow(SWITCH_COLUMNS)
-        self._on, self._sent = False, clock.now()
+        self._on, self._sent_at = False, clock.now()
 
     def poll(self, now: float) -> None:
         """What is due; every few milliseconds."""
-        stalled = now > self._sent + STALL or self._arm.state is not ArmState.ARMED
+        stalled = now > self._sent_at + STALL or self._arm.state is not ArmState.ARMED
         if stalled and self._dispenser.status.state is DispenserState.ON:
             self._dispenser.off(now)
         self._dispenser.poll(now)
@@ -167,11 +167,11 @@ class SwitchedDrawing:
 
     def sent(self, flow: float | None) -> None:
         """A set-point was sent, and the dispenser is due at `flow`, mm^3/s; None: as before. InputError: it is not."""
-        self._sent = now = self._clock.now()
+        self._sent_at = now = self._clock.now()
         if flow is None and self._on and self._dispenser.status.state is not DispenserState.ON:
             raise InputError("dispenser", "line", self._dispenser.status.reason, "one that stays on until it is told")
-        if flow and (refused := self._dispenser.on(flow, now)):
-            raise InputError("dispenser", "on", refused, "a dispenser that does what it is told")
+        if flow and (refusal := self._dispenser.on(flow, now)):
+            raise InputError("dispenser", "on", refusal, "a dispenser that does what it is told")
         if flow == 0:
             self._dispenser.off(now)
         self._on = bool(flow) if flow is not None else self._on
@@ -248,52 +248,52 @@ def read_switches(path: Path, name: str) -> list[tuple[float, float]]:
     rows = checks.read_csv(path, f"a CSV file with {','.join(SWITCH_COLUMNS)}")
     if not rows or tuple(rows[0][1]) != SWITCH_COLUMNS:
         raise InputError(path, "line 1", ",".join(rows[0][1]) if rows else "nothing", ",".join(SWITCH_COLUMNS))
-    lines, begun = [], None
-    for number, words in rows[1:]:
-        if len(words) == len(SWITCH_COLUMNS) and not words[2]:
+    lines, on_stamp = [], None
+    for number, cells in rows[1:]:
+        if len(cells) == len(SWITCH_COLUMNS) and not cells[2]:
             continue
         try:
-            stamp, dispenser, flow, text = float(words[0]), words[1], float(words[2]), ",".join(words[3:])
+            stamp, dispenser, flow, text = float(cells[0]), cells[1], float(cells[2]), ",".join(cells[3:])
         except (ValueError, IndexError):
-            raise InputError(path, f"line {number}", ",".join(words), ",".join(SWITCH_COLUMNS)) from None
+            raise InputError(path, f"line {number}", ",".join(cells), ",".join(SWITCH_COLUMNS)) from None
         if dispenser != name:
             raise InputError(path, f"line {number}: dispenser", dispenser, f"{name!r}, which is calibrated")
         if flow > 0:
-            begun = stamp
+            on_stamp = stamp
         elif text != "off":
             raise InputError(path, f"line {number}", text, "a dispenser that goes off only where it is told")
-        elif begun is not None:
-            lines.append((begun, stamp))
-            begun = None
+        elif on_stamp is not None:
+            lines.append((on_stamp, stamp))
+            on_stamp = None
     if len(lines) < MIN_LINES:
         raise InputError(path, "lines", len(lines), f"{MIN_LINES} or more, each told on and off")
     return lines
 
 
 def drawn_lines(
-    folder: Path, profile: ArmProfile, offset: Array, told: Sequence[tuple[float, float]], height: float
+    folder: Path, profile: ArmProfile, offset: Array, switches: Sequence[tuple[float, float]], height: float
 ) -> list[DrawnLine]:
     """The lines as the arm drew them, `height` mm under the nozzle; offset: (3,) mm, its tip in the tool's frame."""
-    set_point, late = read_commanded(folder / COMMANDED_FILE), max(profile.lag - profile.frame_time, 0.0)
+    set_point, lag = read_commanded(folder / COMMANDED_FILE), max(profile.lag - profile.frame_time, 0.0)
     lines: list[DrawnLine] = []
     first: Array | None = None
-    for on, off in told:
+    for on, off in switches:
         stamps = np.linspace(on - STEADY / 2, off + 0.8 * TAIL, 200)
-        poses = nozzle_from_axes(profile.arm, set_point.lagged(np.append(stamps, [on, off]), late / 2, late / 2))
+        poses = nozzle_from_axes(profile.arm, set_point.lagged(np.append(stamps, [on, off]), lag / 2, lag / 2))
         tips = se3.transform_points(poses, offset[None])[:, 0]
-        way, up = tips[-1] - tips[-2], poses[-2, :3, 2]
-        length = float(np.linalg.norm(way))
+        direction, up = tips[-1] - tips[-2], poses[-2, :3, 2]
+        length = float(np.linalg.norm(direction))
         if length < MIN_LENGTH:
             lines.append(DrawnLine(0.0, length, np.eye(4), 1.0, f"the nozzle moved by {length:.1f} mm from on to off"))
             continue
-        along, speed = way / length, length / (off - on)
-        beside = np.linalg.norm(tips[:-2] - tips[-2] - np.outer((stamps - on) * speed, along), axis=1).max()
-        across = np.cross(up, along) / np.linalg.norm(np.cross(up, along))
-        frame = se3.make(np.stack([along, across, np.cross(along, across)], 1), tips[-2] - height * up)
-        first = along if first is None else first
-        forth = 1.0 if along @ first > 0 else -1.0
-        wrong = f"the nozzle was up to {beside:.2f} mm off a straight way at constant speed"
-        lines.append(DrawnLine(speed, length, frame, forth, wrong if beside > MAX_OFF_TRACK else ""))
+        axis, speed = direction / length, length / (off - on)
+        deviation = np.linalg.norm(tips[:-2] - tips[-2] - np.outer((stamps - on) * speed, axis), axis=1).max()
+        across = np.cross(up, axis) / np.linalg.norm(np.cross(up, axis))
+        frame = se3.make(np.stack([axis, across, np.cross(axis, across)], 1), tips[-2] - height * up)
+        first = axis if first is None else first
+        forth = 1.0 if axis @ first > 0 else -1.0
+        wrong = f"the nozzle was up to {deviation:.2f} mm off a straight way at constant speed"
+        lines.append(DrawnLine(speed, length, frame, forth, wrong if deviation > MAX_OFF_TRACK else ""))
     return lines
 
 

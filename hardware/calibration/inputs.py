@@ -44,8 +44,8 @@ def check_table(table: CornerTable, board: Board, board_file: Path, names: Seque
     for c, name in enumerate(names):
         views, looked, where = int((table.camera == c).sum()), int(table.looked[c]), f"camera {name}"
         if views < MIN_VIEWS:
-            why = "record more" if 0 < looked <= 2 * views else why_unseen(pictures(c), board)
-            allowed = f"{MIN_VIEWS} or more; it has {looked} pictures: {why}"
+            advice = "record more" if 0 < looked <= 2 * views else why_unseen(pictures(c), board)
+            allowed = f"{MIN_VIEWS} or more; it has {looked} pictures: {advice}"
             raise InputError(where, "pictures that show the board", views, allowed)
         blur = float(np.median(table.blur[table.camera == c]))
         if blur > MAX_BLUR:
@@ -58,8 +58,8 @@ def _check_strangers(table: CornerTable, board: Board, board_file: Path) -> None
     often = ids[counts > max(MIN_STRANGER_SHARE * table.looked.sum() / len(table.looked), 3)]
     if len(often):
         got = f"{board.squares[0]} x {board.squares[1]}, markers 0 to {board.markers() - 1}"
-        seen = ", ".join(str(i) for i in often[:6])
-        raise InputError(board_file, "squares", got, f"those of the board that was held: it has markers {seen} too")
+        examples = ", ".join(str(i) for i in often[:6])
+        raise InputError(board_file, "squares", got, f"those of the board that was held: it has markers {examples} too")
 
 
 def _check_markers(table: CornerTable, board: Board, board_file: Path) -> None:
@@ -97,9 +97,9 @@ def _count_showing(pictures: list[Image], board: Board) -> int:
 def pictures_of(session: Session, camera: int) -> list[Image]:
     """A few pictures of a camera, spread over a recording."""
     refs = [ref for refs in session.sets for ref in refs if ref.camera == camera]
-    chosen = refs[:: max(len(refs) // SAMPLE_PICTURES, 1)][:SAMPLE_PICTURES]
+    selected = refs[:: max(len(refs) // SAMPLE_PICTURES, 1)][:SAMPLE_PICTURES]
     with closing(session.open_reader()) as reader:
-        return [reader.read(ref) for ref in chosen]
+        return [reader.read(ref) for ref in selected]
 
 
 def _similar_boards(board: Board) -> dict[str, Board]:

@@ -355,8 +355,8 @@ class Dispensers:
 
 def close_dispensers(dispensers: Dispensers, clock: Clock) -> list[str]:
     """Close all and wait until it is done, CLOSE_TIME at most; of each that could not be switched off, why."""
-    left = list(dispensers)
-    while left := [each for each in left if not each.close(clock.now())]:
+    open_ones = list(dispensers)
+    while open_ones := [each for each in open_ones if not each.close(clock.now())]:
         clock.wait_until(clock.now() + CLOSE_POLL)
     return [f"{d.profile.name}: {d.status.reason}" for d in dispensers if d.status.state is DispenserState.FAILED]
 
@@ -392,7 +392,7 @@ def check_path_materials(dispensers: Dispensers, path: Path, file: object) -> No
             raise InputError(file, "columns", ", ".join(path.extra) or "no further column", allowed)
         low, high = dispenser.profile.flow_range
         flows = bead_areas(path, file) * path.speed
-        wrong = np.flatnonzero(printed & ~((flows >= low) & (flows <= high)))
-        if len(wrong):
+        outside = np.flatnonzero(printed & ~((flows >= low) & (flows <= high)))
+        if len(outside):
             allowed = f"{low:g} to {high:g} mm^3/s, what {name} can give: another speed, width or height"
-            raise InputError(file, f"checkpoint {wrong[0]}: flow", f"{flows[wrong[0]]:.3g} mm^3/s", allowed)
+            raise InputError(file, f"checkpoint {outside[0]}: flow", f"{flows[outside[0]]:.3g} mm^3/s", allowed)

@@ -128,19 +128,19 @@ def moved_placement(
     pose = None if tracking is None else tracking.pose
     if tracking is None or pose is None or not pose.state.measured or tracking.surface is None:
         return "the surface is not seen now"
-    along = SurfaceMove(move.x_mm, move.y_mm, float(np.deg2rad(move.turn_deg)))
+    surface_move = SurfaceMove(move.x_mm, move.y_mm, float(np.deg2rad(move.turn_deg)))
     try:
-        lies = moved_along(placement, path, tracking.surface, along)
+        surface_from_path = moved_along(placement, path, tracking.surface, surface_move)
     except NoSurfaceError as error:
         return str(error)
-    return replace(placement, surface_from_path=lies, by=PlacedBy.HAND, certain=False)
+    return replace(placement, surface_from_path=surface_from_path, by=PlacedBy.HAND, certain=False)
 
 
 def raised_path(path: Path, lift: float) -> Path:
     """The path for a dry run: each checkpoint `lift` mm farther up along its own axis, nothing extruded or put in."""
     up = se3.make(np.eye(3), np.array([0.0, 0.0, lift]))
-    none, extrude = np.zeros(len(path), np.int64), np.zeros(len(path), bool)
-    return replace(path, surface_from_nozzle=path.surface_from_nozzle @ up, extrude=extrude, material=none)
+    zeros, extrude = np.zeros(len(path), np.int64), np.zeros(len(path), bool)
+    return replace(path, surface_from_nozzle=path.surface_from_nozzle @ up, extrude=extrude, material=zeros)
 
 
 def reach_problem(path: Path, pose: SurfacePose, profile: ArmProfile) -> str:
@@ -174,12 +174,12 @@ def run_checks(
 ) -> tuple[Check, ...]:
     """The checks of a run at `now`, s. waited: s for which it has been checked."""
     path, start = task.path, task.start
-    begun = f"; goes on at checkpoint {start:.2f}, {start / max(len(path) - 1, 1):.0%}" if start else ""
+    resume_text = f"; goes on at checkpoint {start:.2f}, {start / max(len(path) - 1, 1):.0%}" if start else ""
     layers = count_text(len(np.unique(path.layer)), "layer")
     return (
         *_camera_checks(reports.tracking, now, waited),
         _arm_check(reports.motion, task),
-        Check("path", PASS, f"{len(path)} checkpoints, {layers}{begun}"),
+        Check("path", PASS, f"{len(path)} checkpoints, {layers}{resume_text}"),
         *_material_check(reports.motion),
         _reach_check(placed_path),
         _recorder_check(reports.recorder),
@@ -194,15 +194,15 @@ def _camera_checks(report: TrackingReport | None, now: float, waited: float) -> 
     calibration = Check("calibration", PASS, f"{len(report.cameras)} cameras, {', '.join(report.cameras)}")
     if report.pose is None:
         remedy = "plug in the cameras, or see who else uses them" if waited > FIRST_PICTURE_TIME else ""
-        words = f"waits for the first pictures, for {waited:.0f} s: {USUAL_START}"
-        return Check("cameras", BUSY, words, remedy), calibration
+        waiting_text = f"waits for the first pictures, for {waited:.0f} s: {USUAL_START}"
+        return Check("cameras", BUSY, waiting_text, remedy), calibration
     if report.pose.state is TrackState.INITIALISING and (silent := now - report.stamp) > MAX_PICTURE_AGE:
         return Check("cameras", BUSY, f"the surface is looked for in their pictures, for {silent:.0f} s"), calibration
     if (age := now - report.pose.stamp) > MAX_PICTURE_AGE:
         return Check("cameras", FAIL, f"no pictures for {age:.1f} s", "plug in the cameras"), calibration
     if missing := [name for i, name in enumerate(report.cameras) if i not in report.delivering]:
-        verdict, without = WARN if len(report.delivering) >= 2 else FAIL, f"without {', '.join(missing)}"
-        return Check("cameras", verdict, without, "plug it in, or look at its lens"), calibration
+        verdict, missing_text = WARN if len(report.delivering) >= 2 else FAIL, f"without {', '.join(missing)}"
+        return Check("cameras", verdict, missing_text, "plug it in, or look at its lens"), calibration
     return Check("cameras", PASS, f"all {len(report.cameras)} deliver"), calibration
 
 
@@ -216,10 +216,10 @@ def _arm_check(report: LiveMotionReport | None, task: PrintTask) -> Check:
     if status.answered is None and not task.stands_home:
         remedy = "move it to its home by hand, then say so with --stands-home"
         return Check("arm", BUSY if not status.answers else FAIL, "nobody knows where it stands", remedy)
-    said = "stands at home, where a virtual arm begins" if task.virtual else "stands at home by the operator's word"
-    known = "answers" if status.answered is not None else said
+    home = "stands at home, where a virtual arm begins" if task.virtual else "stands at home by the operator's word"
+    place_source = "answers" if status.answered is not None else home
     lag = f", lag {1000 * status.lag:.0f} ms" if np.isfinite(status.lag) else ""
-    return Check("arm", PASS, f"{known}{lag}; {report.priority}")
+    return Check("arm", PASS, f"{place_source}{lag}; {report.priority}")
 
 
 def _material_check(report: LiveMotionReport | None) -> tuple[Check, ...]:

@@ -103,9 +103,9 @@ class SurfacePlacement:
 
 def write_placement(file: File, placement: SurfacePlacement) -> None:
     """Write beside the file and rename: there is always one that can be read, or none."""
-    beside = file.with_name(file.name + ".new")
-    beside.write_text(placement_text(placement), encoding="utf-8")
-    beside.replace(file)
+    temporary = file.with_name(file.name + ".new")
+    temporary.write_text(placement_text(placement), encoding="utf-8")
+    temporary.replace(file)
 
 
 def placement_text(placement: SurfacePlacement) -> str:
@@ -244,7 +244,7 @@ def _prepared(
     scenario, session, virtual = settings.simulated, settings.rig, None
     _check_live_faults(settings, faults)
     check_rig = partial(_check_rig, settings, faults, where)
-    given = None if settings.profile is None else read_arm(settings.profile)
+    profile_given = None if settings.profile is None else read_arm(settings.profile)
     named = settings.path if settings.path is not None or scenario is None else _path_named_in(scenario)
     path = None if named is None else read_path(named)
     dispensers, outlets = _dispensers(settings, path, named)
@@ -257,7 +257,7 @@ def _prepared(
     if scenario is not None:
         rendered = _rendered(scenario, check_rig)
         session, virtual = rendered / RENDERED, rendered / "virtual_arm.toml"
-        given = given or arm_over(read_arm(rendered / "arm.toml"), settings.arm)
+        profile_given = profile_given or arm_over(read_arm(rendered / "arm.toml"), settings.arm)
         path = read_path(rendered / "path.csv") if settings.path is None else path
         notes.append("simulated: pictures rendered before, shown in real time; the arm is not in them")
     assert session is not None and path is not None
@@ -266,8 +266,8 @@ def _prepared(
         path=path,
         dispensers=dispensers,
         outlets=outlets,
-        profile=arm_with_dispensers(given or ArmProfile(), dispensers),
-        place=given is None,
+        profile=arm_with_dispensers(profile_given or ArmProfile(), dispensers),
+        place=profile_given is None,
         stands_home=settings.stands_home or settings.arm == VIRTUAL_ARM,
         virtual=settings.arm == VIRTUAL_ARM,
         lift=settings.lift if settings.dry_run else None,
@@ -301,17 +301,17 @@ def _dispensers(settings: LiveSettings, path: Path | None, where: File | None) -
     file = settings.dispensers
     if file is None or path is None or settings.dry_run:
         return "", {}
-    read = read_dispensers(file)
-    check_arm_moves(read, settings.arm, file)
-    dispensers = drivers_of(read, file)
+    dispensers_read = read_dispensers(file)
+    check_arm_moves(dispensers_read, settings.arm, file)
+    dispensers = drivers_of(dispensers_read, file)
     check_path_materials(dispensers, path, where)
-    outlets = outlets_from(read, file)
+    outlets = outlets_from(dispensers_read, file)
     with_offsets(path, outlets)
-    carried = [dispensers.for_material(name) for name in dict.fromkeys(path.material[path.extrude].tolist())]
-    if settings.unattended and len(set(map(id, carried))) < len(carried):
+    selected = [dispensers.for_material(name) for name in dict.fromkeys(path.material[path.extrude].tolist())]
+    if settings.unattended and len(set(map(id, selected))) < len(selected):
         allowed = "an operator, or a dispenser for each material: one carries several of this path's"
         raise InputError(file, "print.unattended", "true", allowed)
-    if settings.adapt and not all(each is None or each.profile.metered for each in carried):
+    if settings.adapt and not all(each is None or each.profile.metered for each in selected):
         raise InputError(file, "print.adapt", "true", "dispensers that are metered: others give one flow")
     return file.read_text(encoding="utf-8-sig"), outlets
 
@@ -321,9 +321,9 @@ def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
         return []
     if not dispensers:
         return [] if settings.simulated is not None else ["no dispenser is given: nothing is extruded"]
-    why = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
+    warning = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
     given = (each for each in dispensers_from_text(dispensers, "") if each.extruder is None)
-    return [f"dispenser {each.profile.name} {why}" for each in given if each.profile.watchdog is None]
+    return [f"dispenser {each.profile.name} {warning}" for each in given if each.profile.watchdog is None]
 
 
 def rig_from_session(session: File) -> Rig:
@@ -357,7 +357,7 @@ def _rendered(scenario: File, check_rig: Callable[[Rig], None]) -> File:
         process.start()
     theirs.close()
     try:
-        folder, wrong = answer.recv()
+        folder, error = answer.recv()
     except EOFError:
         raise StillbedError(f"{scenario}: rendering ended before it was done") from None
     finally:  # Ctrl-C and SIGTERM come here as well, and wait for nothing
@@ -365,8 +365,8 @@ def _rendered(scenario: File, check_rig: Callable[[Rig], None]) -> File:
         process.join()
         for half in cache_folder().glob(f"*{UNFINISHED}{process.pid}"):
             shutil.rmtree(half, ignore_errors=True)
-    if wrong:
-        raise StillbedError(wrong)
+    if error:
+        raise StillbedError(error)
     return File(folder)
 
 

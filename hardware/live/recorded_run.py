@@ -103,10 +103,10 @@ class PlayedSource:
 
         profile: LOOP_ARM_ATTACHMENT's. taken: is given each frame. PartedError where the beginning is missing.
         """
-        self._records, self._poses, self._begin, self._taken = iter(records), poses, begin, taken
+        self._records, self._poses, self._begin, self._take_frame = iter(records), poses, begin, taken
         self._readings: deque[float] = deque()
         self._calls: deque[tuple[int, int, str, Any]] = deque()
-        self._passed = self._count = self._number = 0  # readings of this record, calls since the last
+        self._readings_used = self._count = self._number = 0  # readings of this record, calls since the last
         self._instant = 0.0
         self._handover: PoseHandover | None = None
         self._parted = ""  # why it parted first
@@ -123,16 +123,16 @@ class PlayedSource:
             self._missed()
         if not self._readings:
             self._fill()
-        if self._calls and self._calls[0][0] <= self._passed:
+        if self._calls and self._calls[0][0] <= self._readings_used:
             self._missed()
-        self._passed, self._count = self._passed + 1, 0
+        self._readings_used, self._count = self._readings_used + 1, 0
         self._instant = self._readings.popleft()
         return self._instant
 
     def wait_until(self, instant: float) -> None:
         """The next reading says how long that took. PlayedOutError where the motion was ended meanwhile."""
-        if told := self.answer("wait"):
-            raise PlayedOutError(f"the motion was ended: {told}")
+        if error_name := self.answer("wait"):
+            raise PlayedOutError(f"the motion was ended: {error_name}")
 
     def pose(self) -> PoseHandover | None:
         """The newest pose."""
@@ -156,16 +156,16 @@ class PlayedSource:
         self._count += 1
         if not self._calls and not self._readings:
             self._fill(optional=True)
-        if not self._calls or self._calls[0][:2] != (self._passed, self._count):
+        if not self._calls or self._calls[0][:2] != (self._readings_used, self._count):
             return None
         if self._calls[0][2] != kind:
             self._missed(kind)
         answer = self._calls.popleft()[3]
         raised = answer if isinstance(answer, dict) else {}
-        if (words := raised.get(UNPLUGGED)) is not None:
-            raise UnpluggedError(words)
-        if (words := raised.get(REFUSED)) is not None:
-            raise _RefusedError(words)
+        if (message := raised.get(UNPLUGGED)) is not None:
+            raise UnpluggedError(message)
+        if (message := raised.get(REFUSED)) is not None:
+            raise _RefusedError(message)
         return answer
 
     def flush(self) -> None:
@@ -173,16 +173,16 @@ class PlayedSource:
 
     def take(self, frame: bytes, recorded: bytes) -> None:
         """The driver is given something."""
-        self._taken(PlayedFrame(self._instant, frame, recorded))
+        self._take_frame(PlayedFrame(self._instant, frame, recorded))
 
-    def _order(self, told: Sequence[Any]) -> LoopOrder:
-        kind, *rest = told
+    def _order(self, row: Sequence[Any]) -> LoopOrder:
+        kind, *values = row
         if kind == "begin":
-            outlets = {name: Outlet(SwitchDelay(**delay), tuple(at)) for name, delay, at in rest[1]}
-            return self._begin(rest[0], outlets)
+            outlets = {name: Outlet(SwitchDelay(**delay), tuple(at)) for name, delay, at in values[1]}
+            return self._begin(values[0], outlets)
         if kind == "flow":
-            return flow_from_message(rest[0])
-        return Order(rest[0]) if kind == "arm" else PauseOrder(rest[0])
+            return flow_from_message(values[0])
+        return Order(values[0]) if kind == "arm" else PauseOrder(values[0])
 
     def _fill(self, optional: bool = False) -> None:
         """Go on to the next record. optional: of what may be the last one."""
@@ -196,11 +196,11 @@ class PlayedSource:
         self._number += 1
         self._readings.extend(record["readings"])
         self._calls.extend((row[0], row[1], row[2], row[3]) for row in record["calls"])
-        self._passed = 0
+        self._readings_used = 0
 
     def _missed(self, kind: str = "the clock") -> NoReturn:
-        asked = self._calls[0][2]
-        self._part(f"after {self._instant:.3f} s the loop asked for {asked!r} then, and now for {kind!r}")
+        expected = self._calls[0][2]
+        self._part(f"after {self._instant:.3f} s the loop asked for {expected!r} then, and now for {kind!r}")
 
     def _part(self, words: str) -> NoReturn:
         """PartedError, whose words are those of the first one: the loop may go on after it for a while."""
@@ -272,21 +272,21 @@ class _PlayedDriver(ArmDriver):
         return answer
 
 
-def _reported_from_list(told: Sequence[Any]) -> Reported:
-    stamp, replies, strays, fault, busy = told
-    known = tuple(Reply(ReplyKind(kind), np.array(values, float)) for kind, values in replies)
-    return Reported(stamp, known, base64.b64decode(strays), fault, busy)
+def _reported_from_list(row: Sequence[Any]) -> Reported:
+    stamp, replies, strays, fault, busy = row
+    parsed = tuple(Reply(ReplyKind(kind), np.array(values, float)) for kind, values in replies)
+    return Reported(stamp, parsed, base64.b64decode(strays), fault, busy)
 
 
 def _sent_from_rows(rows: Sequence[Any]) -> list[Sent]:
-    known: dict[str, Callable[..., G1 | G4 | G54 | Pause | None]] = {
+    constructors: dict[str, Callable[..., G1 | G4 | G54 | Pause | None]] = {
         "G1": lambda axes, feed, material: G1(np.array(axes, float), feed, material),
         "G4": G4,
         "G54": lambda origin: G54(np.array(origin, float)),
         "pause": Pause,
         "part": lambda: None,
     }
-    return [Sent(known[row[1]](*row[2:]), row[0]) for row in rows if row != ["nothing"]]
+    return [Sent(constructors[row[1]](*row[2:]), row[0]) for row in rows if row != ["nothing"]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +306,7 @@ def replay_run(record: File) -> list[PlayedFrame]:
     return frames
 
 
-def _play(run: RecordedRun, record: File, taken: Callable[[PlayedFrame], None], report: Callable[[Tick], None]) -> None:
+def _play(run: RecordedRun, record: File, take: Callable[[PlayedFrame], None], report: Callable[[Tick], None]) -> None:
     """The loop of a recorded run, once more, as far as it was recorded."""
     if LOOP_ARM_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no /loop", "of a run that recorded what its loop was given")
@@ -317,7 +317,7 @@ def _play(run: RecordedRun, record: File, taken: Callable[[PlayedFrame], None], 
         return BeginPrint(inputs.path, inputs.profile, start, outlets, "", inputs.tissue)
 
     try:
-        source = PlayedSource(run.messages["/loop"], run.poses, begin, profile, taken)
+        source = PlayedSource(run.messages["/loop"], run.poses, begin, profile, take)
         PrintLoop(source, profile, source.settings, SimClock(), report).run()
     except PlayedOutError:
         pass
@@ -334,7 +334,7 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
     if PATH_ATTACHMENT not in run.texts:
         raise InputError(record, "recording", "no path", RUN_REQUIRED)
     prepare_out(out, force)
-    same, parted = list[bool](), ""
+    same, parting = list[bool](), ""
     with CommandWriter(out) as writer:
 
         def take(played: PlayedFrame) -> None:
@@ -344,8 +344,8 @@ def write_replay(record: File, out: File, force: bool = False) -> ReplayCount:
         try:
             _play(run, record, take, lambda tick: writer.write(tick.command))
         except PartedError as error:
-            parted = str(error)
-    return ReplayCount(len(same), same.count(False), run.damage, parted)
+            parting = str(error)
+    return ReplayCount(len(same), same.count(False), run.damage, parting)
 
 
 def asked_flows(run: RecordedRun) -> tuple[FlowShares, ...]:

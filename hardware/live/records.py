@@ -98,14 +98,14 @@ class CommandedHead:
 
     def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
         self._reports, self._commanded = reports, CommandedPose(profile)
-        self._last = -np.inf
+        self._last_bin = -np.inf
 
     def at(self, stamp: float) -> PrintHead | None:
         """The head at `stamp`, s; commands between two looks are on a straight line, 40 ms at most."""
         report = self._reports.get()
-        if report is not None and report.tick.stamp > self._last and report.progress is not None:
-            self._last = report.tick.stamp
-            self._commanded.add(report.tick.command, self._last)
+        if report is not None and report.tick.stamp > self._last_bin and report.progress is not None:
+            self._last_bin = report.tick.stamp
+            self._commanded.add(report.tick.command, self._last_bin)
         return self._commanded.at(stamp)
 
 
@@ -326,26 +326,26 @@ class ErrorTimeline:
         self.width = FIRST_BIN_WIDTH
         self.error = np.full(TIMELINE_BINS, np.nan)
         self.held = np.zeros(TIMELINE_BINS)
-        self._begun = nan
-        self._last = 0
+        self._start = nan
+        self._last_bin = 0
 
     @property
     def stamps(self) -> Array:
         """(N,) s since the first tick, the middles of the bins so far."""
-        return np.asarray((np.arange(self._last + 1) + 0.5) * self.width, float)
+        return np.asarray((np.arange(self._last_bin + 1) + 0.5) * self.width, float)
 
     def add(self, stamp: float, error: float, held: float) -> None:
         """A tick at `stamp`, s, with its predicted error, mm or NaN, and the s for which it was held."""
-        if np.isnan(self._begun):
-            self._begun = stamp
-        while (stamp - self._begun) / self.width >= TIMELINE_BINS:
+        if np.isnan(self._start):
+            self._start = stamp
+        while (stamp - self._start) / self.width >= TIMELINE_BINS:
             half = np.full(TIMELINE_BINS // 2, np.nan), np.zeros(TIMELINE_BINS // 2)
             self.error = np.concatenate([np.fmax(self.error[::2], self.error[1::2]), half[0]])
             self.held = np.concatenate([self.held[::2] + self.held[1::2], half[1]])
             self.width *= 2
-        self._last = max(0, int((stamp - self._begun) / self.width))
-        self.error[self._last] = np.fmax(self.error[self._last], error)
-        self.held[self._last] += held
+        self._last_bin = max(0, int((stamp - self._start) / self.width))
+        self.error[self._last_bin] = np.fmax(self.error[self._last_bin], error)
+        self.held[self._last_bin] += held
 
 
 TRACK_STEP, TRACK_PLACES = 0.2, 8000  # mm between places at first, and how many are kept

@@ -157,10 +157,10 @@ def _fixed_row(covariance: Array) -> int:
 
 def relative_errors(estimated: Array, reference: Array, delta: int) -> RelativeErrors:
     """Errors of the change from each pose (M, 4, 4) to the one `delta` later, the pairs end to end."""
-    ends = np.arange(0, len(estimated), delta, dtype=np.int64)
-    change, expected = (se3.inverse(p[ends[:-1]]) @ p[ends[1:]] for p in (estimated, reference))
+    samples = np.arange(0, len(estimated), delta, dtype=np.int64)
+    change, expected = (se3.inverse(p[samples[:-1]]) @ p[samples[1:]] for p in (estimated, reference))
     off = se3.inverse(expected) @ change
-    return RelativeErrors(ends[1:], np.linalg.norm(off[:, :3, 3], axis=-1), se3.angle_of(off[:, :3, :3]))
+    return RelativeErrors(samples[1:], np.linalg.norm(off[:, :3, 3], axis=-1), se3.angle_of(off[:, :3, :3]))
 
 
 def _one_to_one(
@@ -196,20 +196,20 @@ def comparison_verdict(comparison: TrajectoryComparison) -> str:
     """The verdict in a few sentences."""
     fit = [error_statistics(values).rmse for _, values in _by_unit(comparison.fitted.absolute)]
     paired = f"over {len(comparison.stamps)} of {len(comparison.estimated)} poses"
-    words = [f"{figure(fit[0])} mm and {figure(fit[1])}° apart (RMSE) {paired}, in the surface frame that fits best."]
+    texts = [f"{figure(fit[0])} mm and {figure(fit[1])}° apart (RMSE) {paired}, in the surface frame that fits best."]
     if comparison.gap > 1e-6:
-        words.append(f"Their stamps lie {figure(1000 * comparison.gap)} ms apart (median).")
+        texts.append(f"Their stamps lie {figure(1000 * comparison.gap)} ms apart (median).")
     for aligned in comparison.alignments[:-1]:
         off = [error_statistics(values).rmse for _, values in _by_unit(aligned.absolute)]
         if aligned is not comparison.fitted:
             name = aligned.name.capitalize().replace("se(3)", "SE(3)")
-            words.append(f"{name}: {figure(off[0])} mm, {figure(off[1])}°.")
+            texts.append(f"{name}: {figure(off[0])} mm, {figure(off[1])}°.")
     if comparison.of(ALIGNMENTS[1]) is None:
-        words.append("The positions lie on a line and determine no SE(3) alignment.")
+        texts.append("The positions lie on a line and determine no SE(3) alignment.")
     nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        words.append(f"NEES/6: {figure(nees)} laid at one pose, {calibration_words(nees)}.")
-    return " ".join(words)
+        texts.append(f"NEES/6: {figure(nees)} laid at one pose, {calibration_words(nees)}.")
+    return " ".join(texts)
 
 
 def comparison_text(comparison: TrajectoryComparison) -> str:

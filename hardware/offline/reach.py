@@ -98,8 +98,8 @@ def _red(path: Path, reach: Reach) -> list[list[str]]:
         if reason := int(reach.reason[a]):
             which = str(a) if a == b else f"{a} to {b}"
             rows.append([which, str(path.layer[a]), REACH_REASONS[reason], REMEDIES[REACH_REASONS[reason]]])
-    more = len(rows) - MAX_STRETCHES
-    return rows if more <= 0 else [*rows[:MAX_STRETCHES], [f"and {more} stretches more", "", "", "see reach.csv"]]
+    rest = len(rows) - MAX_STRETCHES
+    return rows if rest <= 0 else [*rows[:MAX_STRETCHES], [f"and {rest} stretches more", "", "", "see reach.csv"]]
 
 
 def _arm_picture(model: JointModel, reach: Reach) -> str:
@@ -219,8 +219,8 @@ def run_reach(
 
 def _scan_of(path: File, question: ReachQuestion) -> File | None:
     """The scan that a path was planned on."""
-    beside = path.with_name(f"{path.stem}_scan.ply")
-    return question.scan if question.scan is not None else beside if beside.is_file() else None
+    scan_file = path.with_name(f"{path.stem}_scan.ply")
+    return question.scan if question.scan is not None else scan_file if scan_file.is_file() else None
 
 
 def _with_tissue(

@@ -121,28 +121,28 @@ class ReplaySource(SimClock):
         self._handover: PoseHandover | None = None
         self._next = next(self._coming, None)
         super().__init__(0.0 if self._next is None else self._next.stamp)
-        self._begun = self.now()
-        self._first: list[LoopOrder] = [order, Order.AT_HOME, Order.ARM]
+        self._begin = self.now()
+        self._first_orders: list[LoopOrder] = [order, Order.AT_HOME, Order.ARM]
         self.driver: ArmDriver = S6H4D(lambda: port, order.profile)
 
     def wait_until(self, instant: float) -> None:
         """Go on to `instant`, s, or to the end of a hang."""
-        ends = [self._begun + fault.end for fault in self._hangs if fault.covers(instant - self._begun)]
+        ends = [self._begin + fault.end for fault in self._hangs if fault.covers(instant - self._begin)]
         super().wait_until(max([instant, *ends]))
 
     def pose(self) -> PoseHandover | None:
         """The newest pose that is due; InputError for one whose stamp is not after the one before."""
         while self._next is not None and self._next.stamp + self._delay <= self.now():
-            due = self._next
-            self._handover, self._next = PoseHandover(due, due.stamp, due.stamp + self._delay), next(self._coming, None)
-            if self._next is not None and not self._next.stamp > due.stamp:
-                raise InputError("poses", "stamp", self._next.stamp, f"after the one before, {due.stamp} s")
+            new = self._next
+            self._handover, self._next = PoseHandover(new, new.stamp, new.stamp + self._delay), next(self._coming, None)
+            if self._next is not None and not self._next.stamp > new.stamp:
+                raise InputError("poses", "stamp", self._next.stamp, f"after the one before, {new.stamp} s")
         return self._handover
 
     def orders(self) -> Sequence[LoopOrder]:
         """At first to print; at the end to end."""
-        orders: list[LoopOrder] = self._first
-        self._first = []
+        orders: list[LoopOrder] = self._first_orders
+        self._first_orders = []
         return [Order.QUIT] if self._next is None else orders
 
     def dry(self) -> str:
@@ -158,11 +158,11 @@ class SilentPort:
 
     def __init__(self, taken: Callable[[bytes], None]) -> None:
         """taken: is given what is sent."""
-        self._taken = taken
+        self._take_bytes = taken
 
     def write(self, data: bytes) -> int:
         """All is taken."""
-        self._taken(data)
+        self._take_bytes(data)
         return len(data)
 
     def read(self) -> bytes:

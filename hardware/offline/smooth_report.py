@@ -47,12 +47,12 @@ def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
     positions = smoothed.at(times).base_from_surface[:, :3, 3]
     centred = positions - positions.mean(0)
     direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
-    along = centred @ direction
-    along = along - np.polyval(np.polyfit(times - times[0], along, 1), times - times[0])
-    window = np.hanning(len(along))
-    hertz = np.asarray(np.fft.rfftfreq(len(along), 1 / rate), float)
-    amplitude = np.asarray(2 * np.abs(np.fft.rfft(along * window)) / max(window.sum(), 1e-9), float)
-    breathing = breathing_rhythm(times, along)
+    component = centred @ direction
+    component = component - np.polyval(np.polyfit(times - times[0], component, 1), times - times[0])
+    window = np.hanning(len(component))
+    hertz = np.asarray(np.fft.rfftfreq(len(component), 1 / rate), float)
+    amplitude = np.asarray(2 * np.abs(np.fft.rfft(component * window)) / max(window.sum(), 1e-9), float)
+    breathing = breathing_rhythm(times, component)
     return MotionSpectrum(hertz, amplitude, direction, breathing, pulse_rhythm(times, positions, breathing))
 
 
@@ -163,20 +163,20 @@ SPREAD_HEAD = ("", "median", "RMSE", "95 %", "max")
 
 def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The verdict in a few sentences."""
-    words = [
+    texts = [
         f"{len(result)} poses and {len(result.map)} landmarks over {result.stamps[-1] - result.stamps[0]:.1f} s; "
         f"an axis of a position is known to {figure(evaluation.sigma)} mm (median, one sigma)."
     ]
     if evaluation.live is not None:
-        words.append(f"The live run stood {figure(evaluation.live_rms)} mm off (RMS).")
+        texts.append(f"The live run stood {figure(evaluation.live_rms)} mm off (RMS).")
     if evaluation.errors is not None:
         ours, live = (None if rmse is None else figure(rmse) for rmse in evaluation.rmse)
         live_text = "" if live is None else f", live {live} mm"
-        words.append(f"Against the {_reference_name(evaluation)}: {ours} mm{live_text} (RMS, aligned).")
+        texts.append(f"Against the {_reference_name(evaluation)}: {ours} mm{live_text} (RMS, aligned).")
         nees = evaluation.errors[0].mean_nees / 6
-        words += [f"NEES/6: {figure(nees)}, {calibration_words(nees)}."] if np.isfinite(nees) else []
-    words += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
-    return " ".join(words)
+        texts += [f"NEES/6: {figure(nees)}, {calibration_words(nees)}."] if np.isfinite(nees) else []
+    texts += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
+    return " ".join(texts)
 
 
 def smooth_page(title: str, words: str, result: Smoothed, evaluation: SmoothEvaluation) -> str:
@@ -309,10 +309,10 @@ def _errors_by_delay(evaluation: SmoothEvaluation) -> str:
 def _cameras(result: Smoothed) -> str:
     rows = []
     for i, camera in enumerate(result.rig.cameras):
-        before = result.calibrated.cameras[i]
-        moved = se3.log(se3.inverse(before.base_from_camera) @ camera.base_from_camera)
-        lens = camera.matrix - before.matrix
-        values = [1000 * float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), lens[0, 0], lens[0, 2]]
+        calibrated = result.calibrated.cameras[i]
+        shift = se3.log(se3.inverse(calibrated.base_from_camera) @ camera.base_from_camera)
+        lens = camera.matrix - calibrated.matrix
+        values = [1000 * float(np.linalg.norm(shift[:3])), float(np.linalg.norm(shift[3:])), lens[0, 0], lens[0, 2]]
         clock = f"{1000 * result.offsets[i]:.2f} ± {1000 * result.offset_sigma[i]:.2f}"
         rows.append([camera.name, clock, *(f"{v:.3f}" for v in (*values, lens[1, 2]))])
     head = ["camera", "exposes later, ms", "turned, mrad", "moved, mm", "fx, px", "cx, px", "cy, px"]

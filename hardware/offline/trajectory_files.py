@@ -62,16 +62,16 @@ def read_instants(path: Path) -> tuple[Array, Array, Array]:
     """Stamps (N,), poses (N, 4, 4), covariances (N, 6, 6) of a smoothed.csv; InputError names what is wrong."""
     rows, count = read_csv(path), len(POSE_COLUMNS)
     width = count + len(TWIST_COLUMNS)
-    lines = [(f"line {number}", words) for number, words in rows[1:] if words]
-    for what, words in lines:
-        if len(words) != len(rows[0][1]):
-            raise InputError(path, what, f"{len(words)} columns", f"{len(rows[0][1])} columns")
-    places = checked_rows(path, ((what, row_from_words(path, what, words[:count])) for what, words in lines))
+    lines = [(f"line {number}", cells) for number, cells in rows[1:] if cells]
+    for what, cells in lines:
+        if len(cells) != len(rows[0][1]):
+            raise InputError(path, what, f"{len(cells)} columns", f"{len(rows[0][1])} columns")
+    places = checked_rows(path, ((what, row_from_words(path, what, cells[:count])) for what, cells in lines))
     if not len(places):
         raise InputError(path, "poses", "none", "at least one line")
     covariance = np.empty((len(lines), 6, 6))
-    for k, (what, words) in enumerate(lines):
-        upper = words[width : width + len(COVARIANCE_COLUMNS)]
+    for k, (what, cells) in enumerate(lines):
+        upper = cells[width : width + len(COVARIANCE_COLUMNS)]
         numbers = row_from_words(path, f"{what}: covariance", upper, f"{len(COVARIANCE_COLUMNS)} numbers")
         covariance[k][UPPER_TRIANGLE] = covariance[k].T[UPPER_TRIANGLE] = numbers
     trajectory = trajectory_from_rows(places, exact=False)
@@ -191,11 +191,11 @@ def _without_covariance(name: str, trajectory: Trajectory) -> PoseSeries:
 
 def _of_csv(path: Path) -> PoseSeries:
     """A poses.csv, a smoothed.csv, or rows of `stamp,x,y,z,qx,qy,qz,qw`."""
-    words = next((words for _, words in read_csv(path)), [])
-    if words[: len(POSE_COLUMNS)] == list(POSE_COLUMNS):
+    cells = next((cells for _, cells in read_csv(path)), [])
+    if cells[: len(POSE_COLUMNS)] == list(POSE_COLUMNS):
         stamps, poses, covariance = read_instants(path)
         return PoseSeries(str(path), Trajectory(stamps, poses, exact=False), covariance)
-    if words[:1] == ["stamp_s"]:
+    if cells[:1] == ["stamp_s"]:
         table = read_pose_table(path)
         rows = table.measured
         if not rows.any():

@@ -109,14 +109,14 @@ def open_playback(path: Path, poses: str | None = None, toolpath: Path | None = 
     if not len(stamps):
         raise InputError(path, "frame sets", "none", "a session with pictures")
     recorded, source = _poses(session, poses)
-    shown = _at_stamps(stamps, recorded)
+    shown_poses = _at_stamps(stamps, recorded)
     tracks = _at_stamps(stamps, list(read_observations(session.path)) if session.path.is_file() else [])
-    off = _off(stamps, shown, session)
+    off = _off(stamps, shown_poses, session)
     path_shown = _toolpath(session) if toolpath is None else read_path(toolpath)
-    scene = scene_from(session.rig, path_shown, _surface(session.rig, shown, tracks))
+    scene = scene_from(session.rig, path_shown, _surface(session.rig, shown_poses, tracks))
     commands = list(read_commands(session.path)) if session.path.is_file() else []
     done = _fraction(commands, stamps), off, _held(commands, stamps), _events(session.path)
-    return Playback(session, source, stamps, shown, tracks, *done, scene)
+    return Playback(session, source, stamps, shown_poses, tracks, *done, scene)
 
 
 def _poses(session: Session, named: str | None) -> tuple[list[SurfacePose], str]:
@@ -154,10 +154,10 @@ def _at_stamps(stamps: Array, records: list[Record]) -> tuple[Record | None, ...
 def _surface(rig: Rig, poses: tuple[SurfacePose | None, ...], tracks: tuple[Observations | None, ...]) -> Array | None:
     """Landmarks (V, 3) mm in the surface frame, triangulated in the frame set with most tracks; None without one."""
     pairs = zip(poses, tracks, strict=True)
-    both = [(pose, seen) for pose, seen in pairs if pose is not None and seen is not None][:MAX_SURFACE_SETS]
-    if not both:
+    candidates = [(pose, seen) for pose, seen in pairs if pose is not None and seen is not None][:MAX_SURFACE_SETS]
+    if not candidates:
         return None
-    pose, seen = max(both, key=lambda pair: len(pair[1]))
+    pose, seen = max(candidates, key=lambda pair: len(pair[1]))
     if len(seen) < MIN_SURFACE_TRACKS:
         return None
     try:
@@ -169,15 +169,15 @@ def _surface(rig: Rig, poses: tuple[SurfacePose | None, ...], tracks: tuple[Obse
 
 def _off(stamps: Array, poses: tuple[SurfacePose | None, ...], session: Session) -> Array:
     out, truth = np.full(len(stamps), np.nan), session.truth
-    known = np.array([k for k, pose in enumerate(poses) if pose is not None], np.int64)
-    if truth is None or not len(known):
+    tracked = np.array([k for k, pose in enumerate(poses) if pose is not None], np.int64)
+    if truth is None or not len(tracked):
         return out
-    rows, theirs = associate(stamps[known], truth.stamps)
+    rows, theirs = associate(stamps[tracked], truth.stamps)
     if len(rows):
         ours = np.array([pose.base_from_surface for pose in poses if pose is not None])[rows]
         target = truth.base_from_surface[theirs]
         target = target @ se3.inverse(target[0]) @ ours[0]
-        out[known[rows]] = np.linalg.norm((ours - target)[:, :3, 3], axis=1)
+        out[tracked[rows]] = np.linalg.norm((ours - target)[:, :3, 3], axis=1)
     return out
 
 
@@ -193,29 +193,29 @@ def _fraction(commands: list[Command], stamps: Array) -> Array:
     out = np.full(len(stamps), np.nan)
     moves = [(c.stamp, c.checkpoint) for c in commands if isinstance(c, Move)]
     if moves:
-        when, where = np.array(sorted(moves), float).T
-        last = np.searchsorted(when, stamps, side="right") - 1
+        stamps_known, where = np.array(sorted(moves), float).T
+        last = np.searchsorted(stamps_known, stamps, side="right") - 1
         out[last >= 0] = where[last[last >= 0]]
     return out
 
 
 def _held(commands: list[Command], stamps: Array) -> tuple[str, ...]:
     """Why the nozzle was held at each of the stamps (K,), s, by the last command before it; "" where it was not."""
-    ordered = sorted(commands, key=lambda command: command.stamp)
-    last = np.searchsorted([command.stamp for command in ordered], stamps, side="right") - 1
-    return tuple("" if k < 0 else ordered[k].reason for k in last.tolist())
+    by_stamp = sorted(commands, key=lambda command: command.stamp)
+    last = np.searchsorted([command.stamp for command in by_stamp], stamps, side="right") - 1
+    return tuple("" if k < 0 else by_stamp[k].reason for k in last.tolist())
 
 
 def _events(path: Path) -> tuple[tuple[float, str], ...]:
     """Stamps, s, and words of a recording's log; none of a folder's."""
-    epoch, found = 0, list[tuple[float, str]]()
+    epoch, events = 0, list[tuple[float, str]]()
     for part in walk(path) if path.is_file() else ():
         if isinstance(part, FileMetadata):
             epoch = epoch_of(part.table) or 0
         elif isinstance(part, ChunkMessages):
             for log in (unpacked(LOG, each.data) for each in part.messages if each.topic == "/events"):
-                found.append(((log.stamp.sec * 1_000_000_000 + log.stamp.nanosec - epoch) / 1e9, log.msg))
-    return tuple(sorted(found))
+                events.append(((log.stamp.sec * 1_000_000_000 + log.stamp.nanosec - epoch) / 1e9, log.msg))
+    return tuple(sorted(events))
 
 
 STAGES = {stage.value for stage in RunStage}  # as the log tells them, alone or before a colon

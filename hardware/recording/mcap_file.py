@@ -88,9 +88,9 @@ class Damage:
 
 def damage_words(damages: Sequence[Damage]) -> str:
     """All damages of a file in one text, "" if there are none."""
-    words = [damage.text for damage in damages[:MAX_TOLD_DAMAGES]]
-    more = [f"and {len(damages) - len(words)} more"] if len(damages) > len(words) else []
-    return "; ".join(words + more)
+    texts = [damage.text for damage in damages[:MAX_TOLD_DAMAGES]]
+    remainder = [f"and {len(damages) - len(texts)} more"] if len(damages) > len(texts) else []
+    return "; ".join(texts + remainder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,8 +172,8 @@ def sealed(table: Mapping[str, str]) -> dict[str, str]:
 
 def _is_sound(table: Mapping[str, str]) -> bool:
     """Whether its checksum is right; older recordings have none."""
-    own = {key: text for key, text in table.items() if key != CHECKSUM_KEY}
-    return CHECKSUM_KEY not in table or sealed(own) == table
+    content = {key: text for key, text in table.items() if key != CHECKSUM_KEY}
+    return CHECKSUM_KEY not in table or sealed(content) == table
 
 
 def epoch_of(metadata: Mapping[str, str]) -> int | None:
@@ -199,55 +199,55 @@ class _RecordWalk:
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._size = file, size
-        self._known: set[int] = set()  # channels so far
+        self._channels_so_far: set[int] = set()  # channels so far
         self._epoch = 0  # ns that log times are ahead of stamps, by the metadata
         self._last: float | None = None  # s, last stamp of the newest chunk so far
         self._indexed = False  # behind the data: only the index follows
-        self._broken: _Break | None = None  # not told yet
+        self._gap: _Break | None = None  # not told yet
 
     def groups(self) -> Iterator[RecordGroup | Damage]:
         """What `record_groups` gives."""
         offset, opcode = len(MCAP0_MAGIC), 0
         checked = offset  # behind the last record that was checked; a broken length of another leads anywhere
         while offset < self._size and opcode != Opcode.FOOTER:
-            found = self._record(offset)
-            if found is None:
-                self._broken = self._broken or _Break(offset, self._opcode(offset), self._indexed)
+            group = self._record(offset)
+            if group is None:
+                self._gap = self._gap or _Break(offset, self._opcode(offset), self._indexed)
                 offset = self._next_whole(checked)
                 checked = offset + 1  # from here on it only goes forward
                 continue
-            self._known |= {r.id for r in found.records if isinstance(r, Channel)}
-            stamps = [(r.log_time - self._epoch) / 1e9 for r in found.records if isinstance(r, Message)]
+            self._channels_so_far |= {r.id for r in group.records if isinstance(r, Channel)}
+            stamps = [(r.log_time - self._epoch) / 1e9 for r in group.records if isinstance(r, Message)]
             if stamps:
-                if self._broken is not None:
-                    yield self._damage(self._broken, min(stamps))
-                self._last, self._broken = max(stamps), None
-            for metadata in (r for r in found.records if isinstance(r, Metadata)):
+                if self._gap is not None:
+                    yield self._damage(self._gap, min(stamps))
+                self._last, self._gap = max(stamps), None
+            for metadata in (r for r in group.records if isinstance(r, Metadata)):
                 self._epoch = self._epoch if (epoch := epoch_of(metadata.metadata)) is None else epoch
-            if found.records:
-                yield RecordGroup(offset, found.records)
-            opcode, offset = found.opcode, found.end
-            checked = offset if found.records or opcode == Opcode.DATA_END else checked
+            if group.records:
+                yield RecordGroup(offset, group.records)
+            opcode, offset = group.opcode, group.end
+            checked = offset if group.records or opcode == Opcode.DATA_END else checked
             self._indexed |= opcode == Opcode.DATA_END
-        if self._broken is not None and (opcode == Opcode.FOOTER or self._broken.indexed):
-            yield self._damage(self._broken, None)
-        elif self._broken is not None:
-            yield Damage(f"a record is cut short or broken: read up to byte {self._broken.offset} of {self._size}")
+        if self._gap is not None and (opcode == Opcode.FOOTER or self._gap.indexed):
+            yield self._damage(self._gap, None)
+        elif self._gap is not None:
+            yield Damage(f"a record is cut short or broken: read up to byte {self._gap.offset} of {self._size}")
         elif opcode != Opcode.FOOTER:
             yield Damage(f"the file was not closed: read up to byte {offset} of {self._size}")
 
-    def _damage(self, broken: _Break, until: float | None) -> Damage:
+    def _damage(self, gap: _Break, until: float | None) -> Damage:
         """until: s, first stamp behind it; None if there is none."""
-        lost = "is lost" if broken.opcode == Opcode.CHUNK else "may be lost"
-        if broken.indexed:
-            words = "nothing is lost but the index"
+        lost = "is lost" if gap.opcode == Opcode.CHUNK else "may be lost"
+        if gap.indexed:
+            text = "nothing is lost but the index"
         elif until is None:
-            words = "what was recorded " + ("" if self._last is None else f"after {self._last:.2f} s ") + "may be lost"
+            text = "what was recorded " + ("" if self._last is None else f"after {self._last:.2f} s ") + "may be lost"
         elif self._last is None:
-            words = f"what was recorded before {until:.2f} s {lost}"
+            text = f"what was recorded before {until:.2f} s {lost}"
         else:
-            words = f"what was recorded from {min(self._last, until):.2f} to {max(self._last, until):.2f} s {lost}"
-        return Damage(f"a record is broken at byte {broken.offset} of {self._size}: {words}")
+            text = f"what was recorded from {min(self._last, until):.2f} to {max(self._last, until):.2f} s {lost}"
+        return Damage(f"a record is broken at byte {gap.offset} of {self._size}: {text}")
 
     def _opcode(self, offset: int) -> int:
         self._file.seek(offset)
@@ -284,12 +284,12 @@ class _RecordWalk:
             records = tuple(breakup_chunk(Chunk.read(stream), validate_crc=True))
         except Exception:  # of broken bytes the library, its decompressors and struct raise many kinds
             return None
-        named = {r.id for r in records if isinstance(r, Channel)}
-        used = {r.channel_id for r in records if isinstance(r, Message)}
-        if not used <= self._known | named:  # the chunk that names them is broken
+        registered = {r.id for r in records if isinstance(r, Channel)}
+        referenced = {r.channel_id for r in records if isinstance(r, Message)}
+        if not referenced <= self._channels_so_far | registered:  # the chunk that names them is broken
             records = (*_summary_channels(self._file, self._size), *records)
-            named = {r.id for r in records if isinstance(r, Channel)}
-        return records if used <= self._known | named else None
+            registered = {r.id for r in records if isinstance(r, Channel)}
+        return records if referenced <= self._channels_so_far | registered else None
 
     def _next_whole(self, offset: int) -> int:
         """Where the next record of data, or the end of the data, begins from `offset` on; the file's size if none."""

@@ -230,8 +230,8 @@ def message_from_move(move: Move) -> Message:
 def move_from_message(message: Message) -> Move:
     """A move from its message."""
     axes, reason = np.array(message["axes"], float), message.get("reason", "")
-    told = message.get("flow", 0.0), message.get("flow_after", 0.0)
-    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"], reason, *told)
+    flow = message.get("flow", 0.0), message.get("flow_after", 0.0)
+    return Move(message["stamp"], axes, message["feed"], message["checkpoint"], message["extrude"], reason, *flow)
 
 
 def message_from_hold(hold: Hold) -> Message:

@@ -107,13 +107,13 @@ def _store() -> Typestore:
     """The library's messages and Foxglove's; those alone that are used, as each becomes a class."""
     store = get_typestore(Stores.EMPTY)
     needed = {TRANSFORMS, CAMERA_INFO, IMAGE, ODOMETRY, CLOUD, NUMBER, LOG}
-    done: dict[str, Any] = {}
+    stored: dict[str, Any] = {}
     while needed:
         name = needed.pop()
-        done[name] = FIELDDEFS[name]
-        needed |= {part for part in _parts(FIELDDEFS[name][1]) if part not in done}
-    store.register(done)
-    store.register({k: v for k, v in get_types_from_msg(_ANNOTATIONS_TEXT, ANNOTATIONS).items() if k not in done})
+        stored[name] = FIELDDEFS[name]
+        needed |= {part for part in _parts(FIELDDEFS[name][1]) if part not in stored}
+    store.register(stored)
+    store.register({k: v for k, v in get_types_from_msg(_ANNOTATIONS_TEXT, ANNOTATIONS).items() if k not in stored})
     return store
 
 
@@ -158,14 +158,14 @@ def _header(frame: str, instant: int) -> Any:
 
 def transforms(parent: str, children: Mapping[str, Array], instant: int) -> bytes:
     """TFMessage: the poses (4, 4), mm, of frames in their parent."""
-    made = []
+    messages = []
     for child, pose in children.items():
         x, y, z = (M_PER_MM * pose[:3, 3]).tolist()
         turned = se3.quaternion_from_rotation(pose[:3, :3]).tolist()
         place = _new("geometry_msgs/msg/Vector3", x, y, z), _new("geometry_msgs/msg/Quaternion", *turned)
         placed = _new("geometry_msgs/msg/Transform", *place)
-        made.append(_new("geometry_msgs/msg/TransformStamped", _header(parent, instant), child, placed))
-    return _packed(TRANSFORMS, made)
+        messages.append(_new("geometry_msgs/msg/TransformStamped", _header(parent, instant), child, placed))
+    return _packed(TRANSFORMS, messages)
 
 
 def camera_info(camera: Camera, instant: int) -> bytes:
@@ -240,13 +240,13 @@ class Drawing:
 def image_annotations(drawings: Sequence[Drawing], instant: int) -> bytes:
     """ImageAnnotations: dots and lines over a picture."""
     point, colour = _store().types["foxglove_msgs/msg/Point2"], _store().types["foxglove_msgs/msg/Color"]
-    time, made = _time(instant), []
+    time, items = _time(instant), []
     for each in drawings:
         kind = (_LINE_LOOP if each.closed else _LINE_STRIP) if each.line else _POINTS
         points = [point(x, y) for x, y in each.pixels.tolist()]
         own, none = colour(*each.colour, 1.0), colour(0.0, 0.0, 0.0, 0.0)
-        made.append(_new("foxglove_msgs/msg/PointsAnnotation", time, kind, points, own, [], none, each.thickness))
-    return _packed(ANNOTATIONS, [], made, [])
+        items.append(_new("foxglove_msgs/msg/PointsAnnotation", time, kind, points, own, [], none, each.thickness))
+    return _packed(ANNOTATIONS, [], items, [])
 
 
 def number(value: float) -> bytes:
@@ -281,8 +281,8 @@ class ViewerChannels:
         self._truth: tuple[float, Array] | None = None  # s and (4, 4) mm, the newest
         self._true_from_own: Array | None = None  # (4, 4) mm, between the surface frames of truth and tracker
         self._commanded: CommandedPose | None = None
-        self._placed = -np.inf  # s, when the nozzle was last shown
-        self._drawn = self._coloured = -np.inf  # s, of the last drawing over the pictures, and of the last cloud
+        self._nozzle_stamp = -np.inf  # s, when the nozzle was last shown
+        self._overlaid = self._cloud_stamp = -np.inf  # s, of the last drawing over the pictures, and of the last cloud
 
     def start(self, instant: int) -> Iterator[RosMessage]:
         """The cameras: where they stand, and their lenses."""
@@ -316,8 +316,8 @@ class ViewerChannels:
 
     def progress(self, stamp: float, place: float, instant: int) -> Iterator[RosMessage]:
         """How far the print is, in the unit of the path's places."""
-        if len(self._path) and stamp - self._coloured >= PATH_PERIOD:
-            self._coloured = stamp
+        if len(self._path) and stamp - self._cloud_stamp >= PATH_PERIOD:
+            self._cloud_stamp = stamp
             yield from self._cloud(place, instant)
 
     def _cloud(self, place: float, instant: int) -> Iterator[RosMessage]:
@@ -334,9 +334,9 @@ class ViewerChannels:
         if self._commanded is None:
             return
         self._commanded.add(tick.command, tick.stamp)
-        head = self._commanded.at(tick.stamp) if tick.stamp >= self._placed + NOZZLE_PERIOD else None
+        head = self._commanded.at(tick.stamp) if tick.stamp >= self._nozzle_stamp + NOZZLE_PERIOD else None
         if head is not None:
-            self._placed = tick.stamp
+            self._nozzle_stamp = tick.stamp
             yield from self.nozzle(head.base_from_nozzle, instant)
 
     def nozzle(self, base_from_nozzle: Array, instant: int) -> Iterator[RosMessage]:
@@ -349,21 +349,21 @@ class ViewerChannels:
 
     def pose(self, pose: SurfacePose, instant: int) -> Iterator[RosMessage]:
         """Where the surface is, how well that is known, and what is drawn over the pictures."""
-        lies = pose.base_from_surface
-        if not np.isfinite(lies).all():
+        pose_surface = pose.base_from_surface
+        if not np.isfinite(pose_surface).all():
             return
-        yield RosMessage("/tf", TRANSFORMS, transforms(BASE_FRAME, {SURFACE_FRAME: lies}, instant))
-        moved = odometry(lies, pose.covariance, pose.twist, pose.twist_covariance, instant)
-        yield RosMessage("/surface", ODOMETRY, moved)
+        yield RosMessage("/tf", TRANSFORMS, transforms(BASE_FRAME, {SURFACE_FRAME: pose_surface}, instant))
+        message = odometry(pose_surface, pose.covariance, pose.twist, pose.twist_covariance, instant)
+        yield RosMessage("/surface", ODOMETRY, message)
         if self._truth is not None and self._truth[0] == pose.stamp:
             if self._true_from_own is None and pose.state is TrackState.TRACKING:
-                self._true_from_own = se3.inverse(self._truth[1]) @ lies
+                self._true_from_own = se3.inverse(self._truth[1]) @ pose_surface
             if self._true_from_own is not None:
-                true = se3.transform_points(self._truth[1] @ self._true_from_own, self._middle[None])
-                off = se3.transform_points(lies, self._middle[None]) - true
+                true_point = se3.transform_points(self._truth[1] @ self._true_from_own, self._middle[None])
+                off = se3.transform_points(pose_surface, self._middle[None]) - true_point
                 yield self.error("tracking", float(np.linalg.norm(off)))
-        if pose.stamp - self._drawn >= OVERLAY_PERIOD:
-            self._drawn = pose.stamp
+        if pose.stamp - self._overlaid >= OVERLAY_PERIOD:
+            self._overlaid = pose.stamp
             if np.isfinite(pose.covariance).all():
                 yield self.error("claimed", float(pose.error_at(self._middle[None])[0]))
             yield from self._overlays(pose, instant)
@@ -375,17 +375,17 @@ class ViewerChannels:
         ends = np.cumsum([len(each) for each in lines]).tolist()
         points = np.concatenate([np.empty((0, 3)), *lines])
         for number_, camera in enumerate(self._rig.cameras):
-            drawn = []
+            drawings = []
             if (tracks := self._tracks) is not None and tracks.stamp == pose.stamp:
                 seen = distort(camera, tracks.pixels[tracks.camera == number_])
-                drawn.append(Drawing(seen, TRACK_COLOUR, line=False, thickness=4.0))
+                drawings.append(Drawing(seen, TRACK_COLOUR, line=False, thickness=4.0))
             pixels, depth = pixels_from_points(camera, se3.transform_points(pose.base_from_surface, points))
             for k, (begin, end) in enumerate(pairwise([0, *ends])):
                 if (depth[begin:end] > 0).all():
                     closed = k >= len(path)
                     colour = OUTLINE_COLOUR if closed else PATH_COLOUR
-                    drawn.append(Drawing(pixels[begin:end], colour, closed=closed))
-            yield RosMessage(f"/camera/{camera.name}/annotations", ANNOTATIONS, image_annotations(drawn, instant))
+                    drawings.append(Drawing(pixels[begin:end], colour, closed=closed))
+            yield RosMessage(f"/camera/{camera.name}/annotations", ANNOTATIONS, image_annotations(drawings, instant))
 
 
 def _thinned(points: Array) -> Array:
