@@ -244,15 +244,15 @@ MUTANTS = (
     Mutant(
         "a stop waits for the frames before it",
         "hardware/arm/s6h4d.py",
-        "> (1 if self._done else 0)",
+        "> (1 if self._written_bytes else 0)",
         "> 9",
         ("test_arm_link.py::test_a_frame_of_which_no_byte_is_gone_goes_out_no_more_once_the_arm_is_to_rest",),
     ),
     Mutant(
         "nothing waits until less than 50 ms are under way",
         "hardware/arm/queue.py",
-        "in_flight_with(more, now) + backlog > self.flight",
-        "in_flight_with(more, now) + backlog > 9",
+        "in_flight_with(duration, now) + backlog > self.flight",
+        "in_flight_with(duration, now) + backlog > 9",
         ("test_arm_link.py::test_what_the_link_does_not_hold_back_it_takes_and_never_has_to_stop_the_arm",),
     ),
     Mutant(
