@@ -350,7 +350,7 @@ def in_mm(matrix: Array) -> Array:
 
 
 def clipped(vector: Array, max_length: float) -> Array:
-    """A vector (3,) no longer than `most`."""
+    """A vector (3,) no longer than `max_length`."""
     length = float(np.linalg.norm(vector))
     return vector if length <= max_length else vector * (max_length / length)
 

@@ -147,7 +147,7 @@ class ArmQueue:
 
 
 def _share(source: Axes, target: Axes, place: Sequence[float], still: float, max_share: float) -> float | None:
-    """The last share of a straight way, up to `most`, at which X Y Z are `still` or less from a place (3,), or None."""
+    """The last share of a segment, up to `max_share`, at which X Y Z are `still` or less from a place (3,), or None."""
     first, last = 0.0, max_share
     for a, b, p in zip(source[:3], target[:3], place, strict=True):
         if a == b:
@@ -176,7 +176,7 @@ class FlowControl:
         return max(self.settings.flight if self.profile.flight is None else self.profile.flight, slow)
 
     def full(self, driver: ArmDriver, queue: ArmQueue, duration: float, now: float, backlog: float = 0.0) -> str:
-        """Why a frame of `more` s must wait; "" where it need not. backlog: s that the arm is behind the model."""
+        """Why a frame of `duration` s must wait; "" where it need not. backlog: s that the arm is behind the model."""
         if (blocked := driver.blocked_for(now)) is not None:
             return f"the port has taken no bytes for {blocked:.3f} s"
         frame_time = self.profile.frame_time

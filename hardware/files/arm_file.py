@@ -201,7 +201,7 @@ def arm_for(address: str) -> ArmProfile:
 
 
 def arm_over(configured: ArmProfile, address: str) -> ArmProfile:
-    """That profile, put so that the surface below the home of a `known` arm is below this one's; or the known one."""
+    """The profile at `address`, placed so that the `configured` arm's surface is below its home; or `configured`."""
     if not driver_kind(address).file:
         return configured
     profile = arm_for(address)

@@ -92,7 +92,7 @@ def checked_rows(where: object, rows: Iterable[tuple[str, Sequence[float]]]) -> 
 
 
 def row_from_words(where: object, what: str, cells: Sequence[str], allowed: str = TUM_ROW) -> list[float]:
-    """The numbers in words; InputError (where, what, with `allowed`) unless they are numbers."""
+    """The numbers in `cells`; InputError (where, what, with `allowed`) unless they are numbers."""
     try:
         return [float(word) for word in cells]
     except ValueError:

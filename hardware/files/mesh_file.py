@@ -62,7 +62,7 @@ class PlyElement:
     lists: dict[bytes, tuple[int, int]] = field(default_factory=dict)  # bytes of a count and of an entry, by name
 
     def whole(self, tokens: list[bytes]) -> bool:
-        """Whether the words of a line are a number for each property, and a face has three corners or more."""
+        """Whether the tokens of a line are a number for each property, and a face has three corners or more."""
         at = 0
         for name in self.names:
             count = tokens[at] if name in self.lists and at < len(tokens) else b"0"
@@ -116,7 +116,7 @@ def _check_length(path: Path, what: str, got: int, expected: int) -> None:
 
 
 def _check_lines(path: Path, header_lines: int, elements: dict[bytes, PlyElement]) -> None:
-    """InputError where rows of text are not whole: rply, which reads them, takes whatever words come next."""
+    """InputError where rows of text are incomplete: rply, which reads them, takes any next tokens."""
     owners = (element for element in elements.values() for _ in range(element.rows))
     with path.open("rb") as file:
         for number, tokens in text_rows(file, path):

@@ -267,7 +267,7 @@ def _thinned(cloud: Any) -> Any:
 
 
 def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int, list[bytes]]]:
-    """The number and the words of each line that has any. first: number of the next line of the file."""
+    """The number and the tokens of each line that is not empty. first: number of the next line of the file."""
     for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES), b""), first):
         if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
             raise InputError(path, f"line {number}", f"{MAX_LINE_BYTES} bytes or more", f"fewer than {MAX_LINE_BYTES}")
@@ -377,7 +377,7 @@ def read_obj(path: Path) -> RawMesh:
 
 
 def _corners(tokens: list[bytes], vertices: int) -> list[int]:
-    """Numbers, from 0, of the corners that the words i, i/t, i//n or i/t/n name. vertices: how many have come so far.
+    """Numbers, from 0, of the corners that the tokens i, i/t, i//n or i/t/n name. vertices: how many have come so far.
 
     ValueError: they are no face.
     """

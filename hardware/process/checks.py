@@ -25,7 +25,7 @@ from estimation.se3 import Array
 from perception import CLONE_DATA, INSTALLED_DATA
 
 Table = dict[str, Any]
-CsvRow = tuple[int, list[str]]  # line number and words
+CsvRow = tuple[int, list[str]]  # line number and cells
 Check = Callable[[object, str, object], Any]  # of a file, a key and its value: what a field holds; InputError
 Keys = Mapping[str, tuple[str, Check]]  # a table's keys: each with the field that it gives, and its check
 Made = TypeVar("Made")
@@ -84,7 +84,7 @@ def read_csv(path: Path, allowed: str = "a readable CSV file", text: str | None 
 def csv_columns(
     where: object, rows: Iterable[CsvRow], contents: str, check: Callable[[list[str]], None] | None = None
 ) -> tuple[list[int], dict[str, list[str]]]:
-    """Line numbers of the rows below a header, and the words of each column, without blanks; empty rows do not count.
+    """Line numbers of the rows below a header, and the cells of each column, without blanks; empty rows do not count.
 
     contents: what is allowed instead of nothing. check: refuses a header. InputError for a row that is not as long.
     """
@@ -101,7 +101,7 @@ def csv_columns(
 
 
 def csv_numbers(where: object, lines: Iterable[int], name: str, cells: Iterable[str]) -> Array:
-    """The finite numbers (N,) in the words of a column."""
+    """The finite numbers (N,) in the cells of a column."""
     out: list[float] = []
     for line, word in zip(lines, cells, strict=True):
         try:

@@ -136,7 +136,7 @@ def tick_in_step(longest: float, interval: float, shortest: float) -> float:
 
 
 def own_interval(intervals: Sequence[float]) -> float:
-    """The time, s, between two frame sets as cameras make them, from those between the sets that came; NaN of none.
+    """The cameras' own time between frame sets, s, from the `intervals` between sets that came; NaN of none.
 
     Where a set was lost on the way, the time to the next is a multiple: of a busy beginning that can be most of them.
     """
@@ -294,7 +294,7 @@ def measure_evenness(clock: Clock, pieces: int) -> Evenness:
 
 
 def evenness_from_times(durations: Array) -> Evenness:
-    """Of pieces that took spent (N,), s."""
+    """The evenness of pieces with `durations` (N,), s."""
     import numpy as np
 
     usual, total = float(np.median(durations)), float(durations.sum())
