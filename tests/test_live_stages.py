@@ -805,7 +805,7 @@ def test_what_a_run_came_to_counts_what_runs_before_it_printed() -> None:
 
 def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
     run = Staged(start=2.5)
-    statistics = RunStatistics(stages={"approach": 10.0, "print": 50.0, "homing": 9.0}, extruding=40.0, due=50.0)
+    statistics = RunStatistics(stages={"approach": 10.0, "print": 50.0, "homing": 9.0}, extruding=40.0, printing=50.0)
     statistics.holds = {"pose is … s old": HoldTotal(3, 12.5), "paused by the operator": HoldTotal(1, 2.5)}
     for k in range(100):
         statistics.errors.add(0.2 + 0.001 * k)
