@@ -132,8 +132,8 @@ MUTANTS = (
     Mutant(
         "a surface that is not seen is never lost",
         "estimation/online/surface_state.py",
-        "away > self.settings.coast",
-        "away > np.inf",
+        "seconds > self.settings.coast",
+        "seconds > np.inf",
         ("test_estimator.py::test_an_outage_coasts_then_is_lost_and_then_found",),
     ),
     Mutant(
