@@ -132,8 +132,8 @@ MUTANTS = (
     Mutant(
         "a surface that is not seen is never lost",
         "estimation/online/surface_state.py",
-        "away > self.settings.coast",
-        "away > np.inf",
+        "seconds > self.settings.coast",
+        "seconds > np.inf",
         ("test_estimator.py::test_an_outage_coasts_then_is_lost_and_then_found",),
     ),
     Mutant(
@@ -440,8 +440,8 @@ MUTANTS = (
     Mutant(
         "a surface that deforms looks like cameras that hang",
         "estimation/online/bump_detector.py",
-        "return bool(part > max(",
-        "return bool(part > -max(",
+        "return bool(projection > max(",
+        "return bool(projection > -max(",
         ("test_warp.py::test_the_error_that_is_left_is_the_one_predicted",),
     ),
     Mutant(
@@ -461,14 +461,14 @@ MUTANTS = (
     Mutant(
         "a small bump is only told while it is found",
         "estimation/online/local_motion.py",
-        "self._small[known & (size < MIN_DISPLACEMENT_MM)] = 0.0",
+        "self._small[usable & (size < MIN_DISPLACEMENT_MM)] = 0.0",
         "self._small[:] = 0.0",
         ("test_local_error.py::test_a_bump_of_three_landmarks_is_never_off_by_a_millimetre_in_silence",),
     ),
     Mutant(
         "two groups in a region are no doubt",
         "estimation/online/parted_texture.py",
-        "if not self._core or self._unsure(np.flatnonzero(self._members), MAX_PARTED_SHARE):",
+        "if not self._core or self._ambiguous(np.flatnonzero(self._members), MAX_PARTED_SHARE):",
         "if not self._core:",
         ("test_local_error.py::test_a_region_that_holds_two_groups_is_sure_of_neither",),
     ),

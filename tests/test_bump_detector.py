@@ -120,7 +120,7 @@ def test_a_change_of_one_picture_comes_back_in_its_numbers() -> None:
     true = np.array([0.3, -0.2, 1e-3, 2e-3])
     seen, points, exposed, jacobians = exact(2, breathing(0.0))
     mine = seen.camera == 1
-    slopes = camera_equations(RIG, seen, points, exposed, jacobians)[1].slopes
+    slopes = camera_equations(RIG, seen, points, exposed, jacobians)[1].jacobian
     pixels = seen.pixels.copy()
     pixels[mine] += slopes @ true
     parts = camera_equations(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
@@ -138,7 +138,7 @@ def test_what_is_usual_of_three_cameras_is_usual_of_any_two(hidden: int) -> None
     slopes = camera_equations(RIG, seen, points, exposed, jacobians)
     pixels = seen.pixels.copy()
     for c in range(3):
-        pixels[seen.camera == c] += slopes[c].slopes @ true[c]
+        pixels[seen.camera == c] += slopes[c].jacobian @ true[c]
     parts = camera_equations(RIG, replace(seen, pixels=pixels), points, exposed, jacobians)
     told = reduced_together(parts, 3)
     usual = np.linalg.lstsq(told.information, told.pull, rcond=1e-9)[0].reshape(3, 4)

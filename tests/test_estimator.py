@@ -56,7 +56,7 @@ def look(
     return joined(stamp, parts) if parts else no_observations(stamp)
 
 
-FIRST = EstimatorSettings(states=StateSettings(first=1))
+FIRST = EstimatorSettings(states=StateSettings(averaged_poses=1))
 
 
 def begun(motion: Motion, map_error: float = 0.0, seed: int = 0, settings: EstimatorSettings = FIRST) -> Estimator:
@@ -178,7 +178,7 @@ def test_one_camera_alone_is_degraded_and_says_so() -> None:
 
 def test_the_first_poses_are_averaged_before_one_is_given_out() -> None:
     poses = follow(begun(breathing, settings=EstimatorSettings()), breathing, 0.3)
-    first = StateSettings().first
+    first = StateSettings().averaged_poses
     assert [p.state for p in poses[: first - 1]] == [TrackState.INITIALISING] * (first - 1)
     assert all(f"of {first}" in p.reason for p in poses[: first - 1])
     assert all(p.state is TrackState.TRACKING for p in poses[first - 1 :])
@@ -233,7 +233,7 @@ def test_tracks_that_scatter_widen_the_claim_to_what_they_cost(outliers: float) 
 
 
 def test_a_pose_too_uncertain_is_no_measurement() -> None:
-    sure, unsure = begun(breathing), begun(breathing, settings=EstimatorSettings(sigma_measured=1e-3))
+    sure, unsure = begun(breathing), begun(breathing, settings=EstimatorSettings(max_sigma=1e-3))
     seen = look(breathing, 0.1, 3)
     assert sure.fit(seen, breathing(0.1)).measured
     fit = unsure.fit(seen, breathing(0.1))
@@ -319,5 +319,5 @@ def test_a_caveat_keeps_every_pose_from_being_called_tracking() -> None:
     normals = np.tile([0.0, 0.0, 1.0], (len(LANDMARKS), 1))
     surface_map = SurfaceMap(LANDMARKS, normals, np.zeros((3 * len(LANDMARKS),) * 2))
     estimator.begin(0.0, breathing(0.0), surface_map, "the scan's place is open")
-    for pose in follow(estimator, breathing, 0.3)[StateSettings().first - 1 :]:
+    for pose in follow(estimator, breathing, 0.3)[StateSettings().averaged_poses - 1 :]:
         assert pose.state is TrackState.DEGRADED and pose.reason == "the scan's place is open"

@@ -284,7 +284,7 @@ def test_errors_are_of_the_estimated_frame_and_nothing_is_fitted() -> None:
     world = synthetic_world("breathing", seconds=0.5, noise=0.02)
     for mapping in ("told", "seen"):
         run = follow(world, mapping)
-        after_the_first = len(world) - 1 - StateSettings().first
+        after_the_first = len(world) - 1 - StateSettings().averaged_poses
         assert len(run.poses) == after_the_first == len(run.expected) == len(run.seconds)
         assert np.abs(run.errors[:, 3:]).max() < 0.01 and np.abs(run.twist_errors[3:, 3:]).max() < 4.0
 

@@ -27,7 +27,7 @@ def first_fit(cameras: CameraErrors) -> FrameFit:
     """A fit whose noise is that of tracks and of images as restless as `cameras` believe."""
     rng = np.random.default_rng(2)
     bias, late, tracks = rng.normal(size=(6, 2 * CAMERAS)), 20 * rng.normal(size=(6, CAMERAS)), 1e-3 * spread(3)
-    noise = tracks + cameras.unrest * bias @ bias.T
+    noise = tracks + cameras.shift_variance * bias @ bias.T
     solution = PoseFit(np.eye(4), np.eye(6), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 6)), 1.0)
     zero, none = np.zeros((6, 6)), np.zeros(CAMERAS)
     counts, kept = np.zeros(CAMERAS, np.int64), np.zeros(0, bool)
@@ -62,9 +62,9 @@ def test_at_once_it_is_what_the_window_said_and_what_late_cameras_make_of_it(win
 def test_once_the_images_are_known_to_rest_it_is_what_the_tracks_make_of_it() -> None:
     fit, cameras = first_fit(CameraErrors(CAMERAS)), rested(0.005)
     late = fit.parts.by_delay @ cameras.delays.covariance @ fit.parts.by_delay.T
-    expected = 0.5 * (fit.parts.tracks + cameras.unrest * fit.parts.by_shift @ fit.parts.by_shift.T) + late
+    expected = 0.5 * (fit.parts.tracks + cameras.shift_variance * fit.parts.by_shift @ fit.parts.by_shift.T) + late
     assert error(fit, 0.5, cameras) == pytest.approx(expected, rel=1e-6)
-    assert cameras.unrest < 0.1 * CameraErrors(CAMERAS).unrest
+    assert cameras.shift_variance < 0.1 * CameraErrors(CAMERAS).shift_variance
 
 
 def test_images_found_less_at_rest_than_was_believed_make_it_larger() -> None:
@@ -197,7 +197,7 @@ def test_a_forecast_is_claimed_as_its_pose_is() -> None:
 def test_a_marginal_that_is_a_part_of_the_noise_stays_that_part(scatter: float, rest: float) -> None:
     cameras = CameraErrors(CAMERAS)
     parts = first_fit(cameras).parts
-    known = scatter * parts.tracks + rest * cameras.unrest * parts.by_shift @ parts.by_shift.T
+    known = scatter * parts.tracks + rest * cameras.shift_variance * parts.by_shift @ parts.by_shift.T
     rescaled = rescaling(parts.noise, known)
     assert rescaled @ (0.3 * parts.noise) @ rescaled.T == pytest.approx(0.3 * known, rel=1e-6)
 

@@ -34,7 +34,7 @@ from tests.synthetic import frame_sets, patch, pictures
 RIG = arc_rig(size=(320, 240), focal=560.0)  # 0.7 mm a pixel, 228 mm wide
 LONG = patch(1, (320.0, 60.0), np.inf, Wound((310.0, 56.0)))
 STAMPS = np.arange(36) / 10
-FIRST = StateSettings().first  # the pose that is given out first
+FIRST = StateSettings().averaged_poses  # the pose that is given out first
 SMALL = patch(2, (80.0, 60.0), np.inf, Wound((70.0, 54.0)))
 
 

@@ -148,14 +148,14 @@ def test_landmarks_that_part_together_are_told_at_their_places() -> None:
     known = LocalError(np.zeros((0, 3)), *np.zeros((3, 0)), DENSE, 25.0, 100.0)
     rows = np.linalg.norm(DENSE - DENSE[0], axis=1) < 12.0
     parted._members, parted._size = rows, 1.5
-    told = parted.at_its_places(known, DENSE)
+    told = parted.local_error(known, DENSE)
     assert told is not None and (told.variance_at(DENSE[rows]) >= 0.75 * 1.5**2).all()
     far = np.linalg.norm(DENSE[:, None] - DENSE[rows], axis=2).min(1) > 8.0
     assert not told.variance_at(DENSE[far]).any()
     alone = np.zeros(len(DENSE), bool)
     alone[0] = True
     parted._members = alone  # a motion fits one landmark by chance
-    assert parted.at_its_places(known, DENSE) is known
+    assert parted.local_error(known, DENSE) is known
 
 
 def test_a_hand_over_a_part_is_doubted_there_and_nowhere_else_and_forgotten_when_it_is_gone() -> None:

@@ -57,7 +57,7 @@ class Run:
         """Whether the surface was measured (N,), from the frame set on by which a pose is to be given out."""
         start = max(r.stamp for r in self.session.roi)
         measured = [p.state.measured for p in self.poses if p.stamp >= start - 1e-6]
-        return np.array(measured[StateSettings().first :])
+        return np.array(measured[StateSettings().averaged_poses :])
 
     def errors(self) -> tuple[Array, Array]:
         """Position errors (M,), mm, of the measured poses under the first tracked pose's change of frame, and which

@@ -116,7 +116,7 @@ def test_one_that_hangs_or_is_late_is_left_out_and_the_others_are_believed(
 def test_cameras_in_time_are_never_doubted(motion: Motion) -> None:
     estimator, poses = followed(motion, (), frozen)
     assert {p.state for p in poses} == {TrackState.TRACKING} and not any(p.reason for p in poses)
-    assert not estimator.health.bumps.unequal.apart and not estimator.health.rivals.doubted
+    assert not estimator.health.bumps.unequal_motion.outliers and not estimator.health.rivals.untrusted
 
 
 def test_two_that_hang_while_nothing_moves_are_not_told_from_a_surface_at_rest() -> None:
@@ -188,10 +188,10 @@ def late_from_one(motion: Motion, lag: float) -> Motion:
 
 def test_whoever_trails_the_other_is_the_one_that_is_late() -> None:
     behind, ahead = watched(late_from_one(sway, 0.1), sway), watched(sway, late_from_one(sway, 0.1))
-    assert behind.doubts(NAMES) == [
+    assert behind.messages(NAMES) == [
         f"{NAMES[1]}, {NAMES[2]} late by 0.10 s against {NAMES[0]}: no majority can be trusted"
     ]
-    assert not ahead.doubted and ahead.still_or_late(0) == "shows what the others showed 0.10 s before"
+    assert not ahead.untrusted and ahead.fault_text(0) == "shows what the others showed 0.10 s before"
 
 
 def test_the_claim_covers_what_both_sides_see() -> None:
@@ -202,12 +202,12 @@ def test_the_claim_covers_what_both_sides_see() -> None:
 
 def test_two_are_not_believed_less_for_a_constant_offset() -> None:
     bump = se3.exp([0, 0, 0, 1.5, -2.0, 0.5])
-    assert not watched(sway, lambda t: sway(t) @ bump if t >= 1 else sway(t)).doubted
+    assert not watched(sway, lambda t: sway(t) @ bump if t >= 1 else sway(t)).untrusted
 
 
 def test_one_is_never_believed_against_two_that_agree() -> None:
     watch = watched(sway, lambda t: sway(min(t, 1.0)), cameras=(1, 2), carriers=(0,))
-    assert watch.doubts(NAMES) == [
+    assert watch.messages(NAMES) == [
         f"no motion in {NAMES[1]}, {NAMES[2]} while {NAMES[0]} moved: no majority can be trusted"
     ]
 
@@ -216,6 +216,6 @@ def test_a_rival_out_of_sight_stays_one_while_it_is_left_out() -> None:
     watch = watched(lambda t: sway(min(t, 1.0)), sway)
     for stamp in (2.6, 3.6, 4.6):
         watch.update(RIG, stamp, sway(1.0), [], frozenset([0]))
-        assert watch.doubted
+        assert watch.untrusted
     watch.update(RIG, 5.7, sway(1.0), [], frozenset())
-    assert not watch.doubted
+    assert not watch.untrusted

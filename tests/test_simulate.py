@@ -205,7 +205,7 @@ def test_folder_and_mcap_hold_the_same_session(recorded: Path) -> None:
 
 def test_poses_are_those_of_the_told_surface_and_tracked(recorded: Path) -> None:
     poses: PoseTable = read_poses(recorded / "one" / "tracking" / "poses.csv")
-    assert poses.measured[StateSettings().first :].mean() > 0.9
+    assert poses.measured[StateSettings().averaged_poses :].mean() > 0.9
     summary = json.loads((recorded / "one" / "summary.json").read_text())
     assert summary["tracking_mm"]["max"] < 0.3
     assert summary["complete"]

@@ -20,7 +20,7 @@ from tests.slowly import slowly
 from tests.synthetic import breathing
 
 GOOD = Measurement(("left", "right"), 100, 0.1)
-LIMITS = StateSettings(first=1)
+LIMITS = StateSettings(averaged_poses=1)
 STEP = 1 / 30
 
 measurements = st.builds(
@@ -83,7 +83,7 @@ def test_between_two_thresholds_the_state_stays_what_it_was(name: str, between: 
 
 
 def test_the_first_poses_are_averaged_before_one_is_given_out() -> None:
-    machine = PoseStateMachine(StateSettings(first=3))
+    machine = PoseStateMachine(StateSettings(averaged_poses=3))
     machine.begin(0.0)
     said = [machine.measured(k * STEP, GOOD) for k in (1, 2, 3)]
     assert [state for state, _ in said] == [TrackState.INITIALISING] * 2 + [TrackState.TRACKING]

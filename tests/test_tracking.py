@@ -71,7 +71,7 @@ def same(a: SurfacePose, b: SurfacePose) -> bool:
     )
 
 
-FIRST = StateSettings().first  # frame sets until a pose is given out
+FIRST = StateSettings().averaged_poses  # frame sets until a pose is given out
 
 
 def states(poses: Sequence[SurfacePose]) -> set[TrackState]:

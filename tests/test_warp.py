@@ -123,7 +123,7 @@ def _warped(pose: SurfacePose) -> Array:
     return CHECKPOINTS if pose.warp is None else pose.warp.apply(CHECKPOINTS)
 
 
-FIRST = StateSettings().first  # frame sets until a pose is given out
+FIRST = StateSettings().averaged_poses  # frame sets until a pose is given out
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +199,6 @@ def test_what_the_map_is_told_of_its_error_was_no_deformation() -> None:
     warps = _filtered(BREATH[:25])
     bent = warps.points(MAP)
     before = warps.warp.deformation
-    warps.replace_map(replace(MAP, points=bent), right=True)
+    warps.replace_map(replace(MAP, points=bent), undeformed=True)
     after = np.linalg.norm(warps.points(replace(MAP, points=bent)) - bent, axis=1)
     assert np.sqrt(np.mean(after**2)) < 0.15 * before

@@ -10,9 +10,9 @@ cameras see the surface. A camera whose usual values are not known yet is not ju
 number that the pose could absorb almost whole (two cameras of three, along the plane of their rays) cannot be told
 from small errors of the map, and is held at zero.
 
-A camera that hangs before a slow motion stands off by little for long, most of all where the motion is along its axis
-or along that of the one that does not hang. So the way of each picture within seconds, by a pose of the camera's own,
-is compared with the way by the pose of the others (`UnequalMotion`): lens and map err alike in so short a time.
+A camera that hangs before a slow motion is off by little for long, most of all where the motion is along its axis or
+along that of the one that does not hang. So the motion of each picture within seconds, by the camera's own pose, is
+compared with the motion by the others' pose (`UnequalMotion`): in so short a time errors of lens and map are constant.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ UNEQUAL_SIGMAS = 3.0  # times the noise of both ways (of six degrees of freedom:
 UNEQUAL_SHARE = 0.3  # and such a part of the longer one: what does not follow at all is sought, not what errs a little
 WAY_BLOCKS = (1, 4)  # looks that are averaged at both ends of a way
 WAY_MEMORY_S = 2.0  # over which ways are compared: half a slow breath
-WHOLE_SHARE, FEW_TRACKS = 0.8, 0.4  # of its usual tracks: a whole picture; so few that nothing usual is learned,
+WHOLE_SHARE, FEW_TRACKS_SHARE = 0.8, 0.4  # of its usual tracks: a whole picture; so few that nothing usual is learned,
 TRACKS_SHARE = 0.25  # of a look's number: a first map is looked for whole, later ones in part
 PLACE_PRIOR = 1 / 5.0**2  # mm^-2, of a landmark's displacement: no tissue deforms further
 MIN_CONTRADICTION = 0.5  # of what is expected must be shown by pictures of another instant,
 CONTRADICTION_SIGMAS = 5.0  # and so many of the tracks' noise: lens and map err alike from landmark to landmark
-MIN_UNEQUAL_LOOKS = 2  # one after the other
-EQUAL_AGAIN_S = 0.5  # that ways must be alike until the camera is like the others again
+MIN_UNEQUAL_SETS = 2  # one after the other
+EQUAL_HOLD_S = 0.5  # that ways must be alike until the camera is like the others again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,12 +92,12 @@ class BumpDetector:
         self.bumped: dict[int, str] = {}  # cameras, and the text about each
         self._quick = [ReducedEquations.nothing(PICTURE_DOF)] * count
         self._usual = ReducedEquations.nothing(PICTURE_DOF * count)
-        self._spread, self._looks = np.zeros(count), np.zeros(count)  # px^2, usual mean square change; looks taken
+        self._spread, self._counts = np.zeros(count), np.zeros(count)  # px^2, usual mean square change; looks taken
         self._since = np.full(count, np.nan)  # s, since when a camera looks bumped, or well again
         self._learned = np.zeros(count)  # s in which a camera's usual values were learned
         self._first, self._stamp, self._count = np.nan, np.nan, 0
         self._outliers: frozenset[int] = frozenset()
-        self.unequal = UnequalMotion()
+        self.unequal_motion = UnequalMotion()
 
     @property
     def messages(self) -> dict[int, str]:
@@ -125,17 +125,18 @@ class BumpDetector:
         self._forget(self._outliers - outliers)
         self._outliers = outliers
         parts = camera_equations(rig, observations, points, exposed, jacobians)
-        self.unequal.update(rig, observations.stamp, points, exposed, parts, np.zeros(6) if smear is None else smear)
+        smear = np.zeros(6) if smear is None else smear
+        self.unequal_motion.update(rig, observations.stamp, points, exposed, parts, smear)
         if np.isnan(self._first):
             self._first = self._stamp = observations.stamp
         step, self._stamp = max(observations.stamp - self._stamp, 0.0), observations.stamp
         self._count += 1
-        if young := observations.stamp - self._first < WARMUP_S:
+        if warming_up := observations.stamp - self._first < WARMUP_S:
             self._learn(parts, step, 1 / self._count)
         usual = self._usual.numbers().reshape(-1, PICTURE_DOF)
-        known = {c: part.without(usual[c]) for c, part in parts.items() if self._learned[c] + step >= WARMUP_S / 2}
-        self._judge(known, step, [c for c in known if not young and self._learned[c] + step >= WARMUP_S])
-        if not (young or self.bumped or outliers):
+        relative = {c: part.without(usual[c]) for c, part in parts.items() if self._learned[c] + step >= WARMUP_S / 2}
+        self._judge(relative, step, [c for c in relative if not warming_up and self._learned[c] + step >= WARMUP_S])
+        if not (warming_up or self.bumped or outliers):
             self._learn(parts, step, min(1.0, step / USUAL_MEMORY_S))
 
     def _learn(self, parts: dict[int, CameraEquations], step: float, share: float) -> None:
@@ -143,26 +144,26 @@ class BumpDetector:
         self._usual = self._usual.mixed(reduced_together(parts, len(self._names)), share)
         self._learned[list(parts)] += step
 
-    def _judge(self, parts: dict[int, CameraEquations], step: float, ripe: Collection[int]) -> None:
-        """Update each camera's recent change, and decide on the `ripe` ones: those known for long enough."""
-        steady, now = parts.keys() - self.bumped.keys() - self._outliers, {}
+    def _judge(self, parts: dict[int, CameraEquations], step: float, ready: Collection[int]) -> None:
+        """Update each camera's recent change, and decide on the `ready` ones: those known for long enough."""
+        steady, current = parts.keys() - self.bumped.keys() - self._outliers, {}
         for camera in parts:
             reduced = reduced_alone(parts, camera, steady)
             self._quick[camera] = self._quick[camera].mixed(reduced, min(1.0, step / CHANGE_MEMORY_S))
-            now[camera] = parts[camera].moved(reduced.numbers())
+            current[camera] = parts[camera].moved(reduced.numbers())
         changes = {c: self._quick[c].numbers() for c in parts}
         moved = {c: parts[c].moved(v) for c, v in changes.items()}
         gains = {c: float(v @ self._quick[c].pull) for c, v in changes.items()}
-        for camera in ripe:
+        for camera in ready:
             others = [g for c, g in gains.items() if c != camera and c not in self.bumped]
             clear = gains[camera] > NEXT_CAMERA_RATIO * max(others, default=0.0)
-            self._decide(camera, now[camera] if camera in self.bumped else moved[camera], clear)
+            self._decide(camera, current[camera] if camera in self.bumped else moved[camera], clear)
             if camera in self.bumped:
                 self.bumped[camera] = _bump_text(changes[camera], parts[camera], moved[camera])
         if not self.bumped:
             for camera in parts:
-                self._looks[camera] += 1
-                share = min(1.0, step / USUAL_MEMORY_S) if camera in ripe else 1 / self._looks[camera]
+                self._counts[camera] += 1
+                share = min(1.0, step / USUAL_MEMORY_S) if camera in ready else 1 / self._counts[camera]
                 self._spread[camera] += share * (moved[camera] ** 2 - self._spread[camera])
 
     def _forget(self, cameras: frozenset[int]) -> None:
@@ -172,31 +173,31 @@ class BumpDetector:
             self._since[camera] = np.nan
             self._quick[camera] = replace(self._quick[camera], pull=np.zeros(PICTURE_DOF))
 
-    def _decide(self, camera: int, moved: float, clear: bool) -> None:
-        """Whether a camera counts as bumped from now on. moved: px. clear: whether it explains more than the others."""
-        known = camera in self.bumped
+    def _decide(self, camera: int, change_px: float, clear: bool) -> None:
+        """Whether a camera counts as bumped from now on. clear: whether it explains more than the others."""
+        bumped = camera in self.bumped
         limit = max(MIN_BUMP_PX, USUAL_CHANGE_RATIO * float(np.sqrt(self._spread[camera])))
-        off = moved > limit / 2 if known else moved > limit and clear
-        if off == known:
+        off = change_px > limit / 2 if bumped else change_px > limit and clear
+        if off == bumped:
             self._since[camera] = np.nan
         elif np.isnan(self._since[camera]):
             self._since[camera] = self._stamp
         lasted = self._stamp - self._since[camera]  # nan where nothing changes
-        if off and not known and lasted >= BUMP_LASTS_S:
+        if off and not bumped and lasted >= BUMP_LASTS_S:
             self.bumped[camera] = ""
-        elif known and not off and lasted >= BUMP_OVER_S:
+        elif bumped and not off and lasted >= BUMP_OVER_S:
             self._forget(frozenset([camera]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PictureLook:
-    """One camera's picture in one look: what it says of its own pose, and where K anchors stand."""
+    """One camera's picture in one frame set: its equations of the pose, and the pixels of K anchors."""
 
     stamp: float  # s
     pixels: Array  # (2K,) px, of the anchors by the pose of all
-    slopes: Array  # (2K, 6) px by the pose
+    jacobian: Array  # (2K, 6) px by the pose
     information: Array  # (6, 6) of the pose by this camera alone
-    pulled: Array  # (6,)
+    pull: Array  # (6,)
     smear: float  # px, one sigma, by late exposures
     ways: dict[tuple[int, ...], tuple[Array, float]] = field(default_factory=dict)  # by cameras: computed once
 
@@ -204,10 +205,10 @@ class _PictureLook:
         """Where the anchors stand (2K,), px, by the pose of these looks of the frame set, and the variance, px^2."""
         if tuple(by) not in self.ways:
             information = np.stack([look.information for look in by.values()]).sum(0)
-            known = np.linalg.inv(information + (1e-9 * np.trace(information) + 1e-12) * np.eye(6))
-            spread = float(np.einsum("ki,ij,kj->", self.slopes, known, self.slopes)) / len(self.slopes)
-            step = known @ np.stack([look.pulled for look in by.values()]).sum(0)
-            self.ways[tuple(by)] = self.pixels + self.slopes @ step, spread
+            covariance = np.linalg.inv(information + (1e-9 * np.trace(information) + 1e-12) * np.eye(6))
+            spread = float(np.einsum("ki,ij,kj->", self.jacobian, covariance, self.jacobian)) / len(self.jacobian)
+            step = covariance @ np.stack([look.pull for look in by.values()]).sum(0)
+            self.ways[tuple(by)] = self.pixels + self.jacobian @ step, spread
         return self.ways[tuple(by)]
 
 
@@ -216,45 +217,46 @@ class _PictureWays:
 
     def __init__(self, camera: int, sets: Sequence[Mapping[int, _PictureLook]] = ()) -> None:
         self._camera = camera
-        self._own = self._others = np.zeros((0, 0))  # (T, 2K) px
+        self._own_ways = self._other_ways = np.zeros((0, 0))  # (T, 2K) px
         self._variance = np.zeros((0, 1))  # (T, 1) px^2 per axis, of their difference
         for looks in sets:
             self.add(looks, len(sets))
 
-    def add(self, looks: Mapping[int, _PictureLook], most: int) -> None:
-        """The looks of the next frame set; the last `most` are kept."""
+    def add(self, looks: Mapping[int, _PictureLook], limit: int) -> None:
+        """The looks of the next frame set; the last `limit` are kept."""
         look = looks[self._camera]
         own, noise = look.way({self._camera: look})
-        others, more = look.way({c: other for c, other in looks.items() if c != self._camera})
-        variance = np.array([noise + more + look.smear**2])
-        self._own, self._others = _longer(self._own, own, most), _longer(self._others, others, most)
-        self._variance = _longer(self._variance, variance, most)
+        others, other_noise = look.way({c: other for c, other in looks.items() if c != self._camera})
+        variance = np.array([noise + other_noise + look.smear**2])
+        self._own_ways, self._other_ways = _longer(self._own_ways, own, limit), _longer(self._other_ways, others, limit)
+        self._variance = _longer(self._variance, variance, limit)
 
     def unequal(self) -> float:
-        """By how many times what is allowed the ways differ that end now."""
+        """Largest difference of the ways that end now, over its limit."""
         worst = 0.0
-        for block in (block for block in WAY_BLOCKS if len(self._own) >= 2 * block):
-            mine, theirs, spread = (_block_means(rows, block) for rows in (self._own, self._others, self._variance))
-            apart = mine - theirs
-            differ = _lengths(apart[-1] - apart[:-block])
-            size = np.maximum(_lengths(mine[-1] - mine[:-block]), _lengths(theirs[-1] - theirs[:-block]))
-            doubt = np.sqrt(2 * (spread[-1, 0] + spread[:-block, 0]) / block)
-            allowed = np.maximum(np.maximum(MIN_UNEQUAL_PX, UNEQUAL_SIGMAS * doubt), UNEQUAL_SHARE * size)
-            worst = max(worst, float((differ / allowed).max()))
+        for block in (block for block in WAY_BLOCKS if len(self._own_ways) >= 2 * block):
+            ways = self._own_ways, self._other_ways, self._variance
+            own, others, spread = (_block_means(rows, block) for rows in ways)
+            difference = own - others
+            change = _lengths(difference[-1] - difference[:-block])
+            size = np.maximum(_lengths(own[-1] - own[:-block]), _lengths(others[-1] - others[:-block]))
+            sigma = np.sqrt(2 * (spread[-1, 0] + spread[:-block, 0]) / block)
+            allowed = np.maximum(np.maximum(MIN_UNEQUAL_PX, UNEQUAL_SIGMAS * sigma), UNEQUAL_SHARE * size)
+            worst = max(worst, float((change / allowed).max()))
         return worst
 
 
-def _longer(rows: Array, row: Array, most: int) -> Array:
-    """The last `most` of rows (T, K) and one more."""
-    return row[None] if not len(rows) else np.concatenate([rows[max(0, len(rows) + 1 - most) :], row[None]])
+def _longer(rows: Array, row: Array, limit: int) -> Array:
+    """The last `limit` of rows (T, K) and one more."""
+    return row[None] if not len(rows) else np.concatenate([rows[max(0, len(rows) + 1 - limit) :], row[None]])
 
 
 class UnequalMotion:
-    """Remembers how each camera's picture moved lately, and which camera does not move as the others do."""
+    """Each camera's recent picture motion, and which camera does not move as the others do."""
 
     def __init__(self) -> None:
-        self.apart: frozenset[int] = frozenset()  # the camera without which the others move alike, if one does not
-        self._looks, self._since = 0, np.nan  # in which ways were unequal, in a row; s, stamp of the last
+        self.outliers: frozenset[int] = frozenset()  # the camera without which the others move alike, if one does not
+        self._sets, self._since = 0, np.nan  # in which ways were unequal, in a row; s, stamp of the last
         self._tracks: dict[int, float] = {}  # usual number by camera
         self.forget()
 
@@ -269,28 +271,28 @@ class UnequalMotion:
     ) -> None:
         """Take a look. points: (N, 3) mm. exposed: (C, 4, 4). smear: (6,) mm and rad, of late exposures.
 
-        Cameras with fewer tracks than usual do not count: what covers a picture or blurs it drags the rest along.
+        Cameras with fewer tracks than usual do not count: an occluder or blur drags the other tracks along.
         """
-        parts = {c: part for c, part in parts.items() if self._shows_usual(c, len(part.slopes))}
+        parts = {c: part for c, part in parts.items() if self._shows_usual(c, len(part.jacobian))}
         if len(parts) < 2:
             return
         self._anchors = spread_anchors(points) if self._anchors is None else self._anchors
-        now: dict[int, _PictureLook] = {}
+        looks: dict[int, _PictureLook] = {}
         for c, part in parts.items():
             pixels, _, jacobian = project(rig, np.full(len(self._anchors), c), exposed[c], self._anchors)
             slopes = jacobian.reshape(-1, 6)
-            late = float(np.sqrt(np.mean((slopes @ smear) ** 2)))
-            now[c] = _PictureLook(stamp, pixels.ravel(), slopes, part.pose, part.pulled, late)
-        if self._past and (now.keys() != self._past[-1].keys() or self._old(stamp)):
-            self._forget_before(stamp, now.keys())
-        self._past.append(now)
-        for c in now:
-            self._ways.setdefault(c, _PictureWays(c)).add(now, len(self._past))
-        self._decide(stamp, {c: self._ways[c].unequal() for c in now})
+            smear_px = float(np.sqrt(np.mean((slopes @ smear) ** 2)))
+            looks[c] = _PictureLook(stamp, pixels.ravel(), slopes, part.pose_information, part.pose_pull, smear_px)
+        if self._past and (looks.keys() != self._past[-1].keys() or self._old(stamp)):
+            self._forget_before(stamp, looks.keys())
+        self._past.append(looks)
+        for c in looks:
+            self._ways.setdefault(c, _PictureWays(c)).add(looks, len(self._past))
+        self._decide(stamp, {c: self._ways[c].unequal() for c in looks})
 
     def _shows_usual(self, camera: int, tracks: int) -> bool:
         usual = self._tracks.setdefault(camera, float(tracks))
-        if tracks > FEW_TRACKS * usual:
+        if tracks > FEW_TRACKS_SHARE * usual:
             self._tracks[camera] += TRACKS_SHARE * (tracks - usual)
         return tracks >= WHOLE_SHARE * usual
 
@@ -306,18 +308,18 @@ class UnequalMotion:
     def _decide(self, stamp: float, unequal: dict[int, float]) -> None:
         """Which camera is apart, by how unequal each one's ways are to those of the others."""
         if max(unequal.values()) > 1:
-            self._looks, self._since = self._looks + 1, stamp
-            if self._looks >= MIN_UNEQUAL_LOOKS:
-                self.apart = frozenset([min(unequal, key=self._without)])
+            self._sets, self._since = self._sets + 1, stamp
+            if self._sets >= MIN_UNEQUAL_SETS:
+                self.outliers = frozenset([min(unequal, key=self._without)])
         else:
-            self._looks = 0
-            if stamp - self._since > EQUAL_AGAIN_S:
-                self.apart = frozenset()
+            self._sets = 0
+            if stamp - self._since > EQUAL_HOLD_S:
+                self.outliers = frozenset()
 
     def _without(self, camera: int) -> float:
         """How unequal the others' ways are among themselves without a camera."""
-        rest = [{c: look for c, look in looks.items() if c != camera} for looks in self._past]
-        return max(_PictureWays(c, rest).unequal() for c in rest[-1]) if len(rest[-1]) > 1 else 0.0
+        remaining = [{c: look for c, look in looks.items() if c != camera} for looks in self._past]
+        return max(_PictureWays(c, remaining).unequal() for c in remaining[-1]) if len(remaining[-1]) > 1 else 0.0
 
 
 def _block_means(rows: Array, block: int) -> Array:
@@ -331,40 +333,40 @@ def _lengths(ways: Array) -> Array:
     return np.asarray(np.sqrt(2 * np.mean(ways**2, axis=1)))
 
 
-def contradicts(seen: Observations, carried: PoseFit, rival: RivalPose) -> bool:
-    """Whether a rival's pictures contradict those of the carriers, and not the shape of the map.
+def contradicts(observations: Observations, carrier_fit: PoseFit, rival: RivalPose) -> bool:
+    """Whether a rival's pictures contradict those of the carriers (`carrier_fit`), and not the shape of the map.
 
-    seen: N tracks. carried: the carriers' fit. Where the surface deforms, each camera sees it at a pose of its own, but
-    what two see of a landmark fits one place. What no places explain of both poses' difference, residuals must show.
+    observations: N tracks. Where the surface deforms, each camera sees it at a pose of its own, but two cameras' tracks
+    of a landmark fit one place. The residuals must show the part of the poses' difference that no place explains.
     """
-    count, camera, track = int(seen.track.max()) + 1, seen.camera, seen.track
-    mine, theirs = rival.inlier, (carried.weights > INLIER_WEIGHT) & np.isin(camera, list(rival.carriers))
-    both = (np.bincount(track[mine], minlength=count) > 0) & (np.bincount(track[theirs], minlength=count) > 0)
-    rows = (mine | theirs) & both[track]
-    jacobian, precision = np.ascontiguousarray(carried.jacobians[rows]), seen.sigma[rows] ** -2.0
-    shown, landmark = np.ascontiguousarray(carried.residuals[rows]), np.ascontiguousarray(track[rows])
-    expected = np.ascontiguousarray(mine[rows][:, None] * -(jacobian @ rival.difference))
-    normal, by_shown = displacement_sums(count, landmark, jacobian, shown, precision)[:2]
+    count, camera, track = int(observations.track.max()) + 1, observations.camera, observations.track
+    own, others = rival.inlier, (carrier_fit.weights > INLIER_WEIGHT) & np.isin(camera, list(rival.carriers))
+    both = (np.bincount(track[own], minlength=count) > 0) & (np.bincount(track[others], minlength=count) > 0)
+    rows = (own | others) & both[track]
+    jacobian, precision = np.ascontiguousarray(carrier_fit.jacobians[rows]), observations.sigma[rows] ** -2.0
+    residual, landmark = np.ascontiguousarray(carrier_fit.residuals[rows]), np.ascontiguousarray(track[rows])
+    expected = np.ascontiguousarray(own[rows][:, None] * -(jacobian @ rival.difference))
+    normal, by_residual = displacement_sums(count, landmark, jacobian, residual, precision)[:2]
     _, by_expected, square, _ = displacement_sums(count, landmark, jacobian, expected, precision)
-    placed = solve_symmetric3(normal + PLACE_PRIOR * np.eye(3), by_expected)
-    known = float((square - (placed * by_expected).sum(1)).sum())  # inverse variance of the part that is shown,
-    part = float((precision[:, None] * shown * expected).sum() - (placed * by_shown).sum())
-    return bool(part > max(MIN_CONTRADICTION * known, CONTRADICTION_SIGMAS * known**0.5))
+    displaced = solve_symmetric3(normal + PLACE_PRIOR * np.eye(3), by_expected)
+    information = float((square - (displaced * by_expected).sum(1)).sum())  # of the part that residuals show
+    projection = float((precision[:, None] * residual * expected).sum() - (displaced * by_residual).sum())
+    return bool(projection > max(MIN_CONTRADICTION * information, CONTRADICTION_SIGMAS * information**0.5))
 
 
 def spread_anchors(points: Array) -> Array:
     """Of points (N, 3), the one in the middle and those that lie farthest out to four sides: (5, 3)."""
-    away = points - points.mean(0)
-    along = away @ np.linalg.svd(away, full_matrices=False)[2][:2].T
-    rows = [int(np.argmin((away**2).sum(1))), *np.argmin(along, 0).tolist(), *np.argmax(along, 0).tolist()]
+    offsets = points - points.mean(0)
+    along = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][:2].T
+    rows = [int(np.argmin((offsets**2).sum(1))), *np.argmin(along, 0).tolist(), *np.argmax(along, 0).tolist()]
     return np.asarray(points[rows])
 
 
 def reduced_alone(parts: dict[int, CameraEquations], camera: int, others: Collection[int]) -> ReducedEquations:
     """The equations of this camera's numbers, with the pose determined by it and by these others."""
-    mine = parts[camera]
-    share = _pose_share([mine, *(p for c, p in parts.items() if c in others and c != camera)], mine.cross)
-    return ReducedEquations(mine.own - mine.cross @ share[:, :-1], mine.pull - mine.cross @ share[:, -1], mine.own)
+    own, cross = parts[camera], parts[camera].cross
+    share = _pose_share([own, *(p for c, p in parts.items() if c in others and c != camera)], cross)
+    return ReducedEquations(own.information - cross @ share[:, :-1], own.pull - cross @ share[:, -1], own.information)
 
 
 def reduced_together(parts: dict[int, CameraEquations], count: int) -> ReducedEquations:
@@ -373,21 +375,21 @@ def reduced_together(parts: dict[int, CameraEquations], count: int) -> ReducedEq
     fixed, cross, pull = np.zeros((size, size)), np.zeros((size, 6)), np.zeros(size)
     for camera, part in parts.items():
         at = slice(PICTURE_DOF * camera, PICTURE_DOF * (camera + 1))
-        fixed[at, at], cross[at], pull[at] = part.own, part.cross, part.pull
+        fixed[at, at], cross[at], pull[at] = part.information, part.cross, part.pull
     share = _pose_share(list(parts.values()), cross)
     return ReducedEquations(fixed - cross @ share[:, :-1], pull - cross @ share[:, -1], fixed)
 
 
 def _pose_share(parts: Sequence[CameraEquations], cross: Array) -> Array:
     """(6, n + 1), what the pose by these cameras absorbs of n numbers (cross: (n, 6)) and of their pull."""
-    pose, pulled = np.zeros((6, 6)), np.zeros(6)
+    pose, pull = np.zeros((6, 6)), np.zeros(6)
     for part in parts:
-        pose, pulled = pose + part.pose, pulled + part.pulled
-    held = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
-    return np.asarray(np.linalg.solve(held, np.column_stack([cross.T, pulled])))
+        pose, pull = pose + part.pose_information, pull + part.pose_pull
+    damped = pose + (1e-9 * np.trace(pose) + 1e-12) * np.eye(6)
+    return np.asarray(np.linalg.solve(damped, np.column_stack([cross.T, pull])))
 
 
-def _bump_text(change: Array, part: CameraEquations, moved: float) -> str:
+def _bump_text(change: Array, part: CameraEquations, change_px: float) -> str:
     if part.moved(change * [0, 0, 0, 1]) > part.moved(change * [1, 1, 1, 0]):  # by scale more than by shift and roll
         return f"shows all {100 * abs(change[3]):.1f} % {'larger' if change[3] > 0 else 'smaller'}: its lens was turned"
-    return f"was bumped: its picture stands {moved:.1f} px off where it stood"
+    return f"was bumped: its picture stands {change_px:.1f} px off where it stood"

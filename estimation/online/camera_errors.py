@@ -9,9 +9,9 @@ What varies is learned as two variances. A delay common to all cameras cannot be
 Only the offsets are corrected. The map is made through the same lenses, so a shift that stays is in the map too, and
 correcting it would carry the pose away from the map (measured: 0.04 mm on a surface at rest that had no shift at all).
 
-Pictures that hang, or suddenly come late, show the surface where it once was, and two cameras that hang agree with each
-other. So those that carry the pose are believed against others (`RivalWatch`) only once they have been seen to move,
-and not along the way that the others went before: pictures are late, never early.
+Pictures that hang, or suddenly come late, show an earlier place of the surface, and two cameras that hang agree. So the
+cameras that carry the pose (carriers) are trusted against others (rivals) only once they have moved, and not along the
+way that the rivals went before (`RivalWatch`): pictures are late, never early.
 """
 
 from __future__ import annotations
@@ -44,32 +44,32 @@ class Delays:
 
 
 class VarianceEstimate:
-    """The variance of a quantity that is seen through noise of known size, by Fisher scoring.
+    """The variance of a quantity that is observed through noise of known size, by Fisher scoring.
 
-    A value d known to a variance e is a draw from sigma^2 + e, so sigma^2 is the mean of d^2 - e under the weights
+    A value d with noise variance e is a draw from sigma^2 + e, so sigma^2 is the mean of d^2 - e under the weights
     (sigma^2 + e)^-2. Expectation maximisation needed ten times the frames where single values are uncertain. Values
-    without information do not count, and nothing is forgotten over them.
+    without information do not count, and forget nothing.
     """
 
-    PRIOR_VALUES, RECENT = 3.0, 100  # values that the initial belief is worth; known values over which it is forgotten
+    PRIOR_VALUES, RECENT = 3.0, 100  # values that the prior counts as; informative values over which it is forgotten
 
-    def __init__(self, first: float, least: float, clearest: float) -> None:
-        """All one sigma: first, the initial belief; least, the smallest; clearest, no value is known better."""
-        self._unit, self._least, self._clearest = first**2, least**2, clearest**2
-        self._weight = self.PRIOR_VALUES  # one value known exactly, against a variance of `first`, weighs 1
+    def __init__(self, initial: float, smallest: float, best: float) -> None:
+        """All one sigma. initial: the prior. smallest: lower bound. best: no value is measured better."""
+        self._unit, self._smallest, self._best = initial**2, smallest**2, best**2
+        self._weight = self.PRIOR_VALUES  # one exact value, against a variance of `initial`^2, has a weight of 1
         self._sum = self.PRIOR_VALUES * self._unit  # weighted, of d^2 - e
 
     @property
     def value(self) -> float:
-        """The variance: its mean, and a part of what that may be off by."""
-        return float(max(self._sum / self._weight, self._least) + 0.5 * (2 / self._weight) ** 0.5 * self._unit)
+        """The variance: its mean, and half of the mean's own standard error."""
+        return float(max(self._sum / self._weight, self._smallest) + 0.5 * (2 / self._weight) ** 0.5 * self._unit)
 
     def take(self, value: float, variance: float) -> None:
         """One value, known to a variance."""
-        now = self.value
-        share = (self._unit / (now + variance)) ** 2
-        most = 2 * (self._unit / self._clearest) ** 2
-        keep = min(1 - (now / (now + variance)) ** 2 / self.RECENT, most / (self._weight + share))
+        current = self.value
+        share = (self._unit / (current + variance)) ** 2
+        limit = 2 * (self._unit / self._best) ** 2
+        keep = min(1 - (current / (current + variance)) ** 2 / self.RECENT, limit / (self._weight + share))
         self._weight = keep * self._weight + share
         self._sum = keep * self._sum + share * (value**2 - variance)
 
@@ -86,16 +86,16 @@ class CameraErrors:
 
     def __init__(self, cameras: int) -> None:
         self._count = n = cameras
-        self._free = np.eye(3 * n)  # takes out what all clocks have in common
-        self._free[:n, :n] -= 1 / n
+        self._centering = np.eye(3 * n)  # takes out what all clocks have in common
+        self._centering[:n, :n] -= 1 / n
         self._mean = np.zeros(3 * n)  # delays s, shifts right px, shifts down px
         start = np.diag(np.repeat([self.INITIAL_OFFSET_S**2, self.INITIAL_SHIFT_PX**2, self.INITIAL_SHIFT_PX**2], n))
-        self._covariance = self._free @ start @ self._free
+        self._covariance = self._centering @ start @ self._centering
         # (C,) s, how much later than stamped each camera exposes; zero until offsets are clear: many cameras are
         # triggered together, and a correction by chance would only move the pose about
         self.offset = np.zeros(n)
         self._jitter = VarianceEstimate(0.005, 3e-4, 1e-3)  # s: USB cameras; no stamp is better
-        self._unrest = VarianceEstimate(0.05, 0.005, 0.01)  # px, of a camera's shift from frame to frame
+        self._shift_variance = VarianceEstimate(0.05, 0.005, 0.01)  # px, of a camera's shift from frame to frame
         self.delays = self._expected_delays()  # of the next frame set
 
     @property
@@ -113,18 +113,18 @@ class CameraErrors:
         return Delays(self.offset, self._covariance[:n, :n] + self._jitter.value * np.eye(n))
 
     @property
-    def unrest(self) -> float:
+    def shift_variance(self) -> float:
         """Variance, px^2 per axis, of an image's shift from frame to frame."""
-        return self._unrest.value
+        return self._shift_variance.value
 
-    def beyond(self, corrected: Array) -> Array:
+    def delay_moments(self, corrected: Array) -> Array:
         """Second moments (C, C), s^2, of the delays that are left after a correction by offsets (C,), s."""
-        left = self._mean[: self._count] - corrected
-        return np.asarray(self.delays.covariance + np.outer(left, left))
+        residual = self._mean[: self._count] - corrected
+        return np.asarray(self.delays.covariance + np.outer(residual, residual))
 
-    def shared(self, twist: Array) -> SharedErrors:
+    def shared_errors(self, twist: Array) -> SharedErrors:
         """Shared errors that the next fit has to expect beyond `offset`, at a velocity (6,)."""
-        return SharedErrors(twist, self.delays.covariance, np.full(self._count, self.unrest))
+        return SharedErrors(twist, self.delays.covariance, np.full(self._count, self.shift_variance))
 
     def learn(self, fit: SharedFit, seconds: float, signal_share: float = 1.0) -> None:
         """Take a fit's shared errors, beyond the offsets that it was corrected by, `seconds` after the last one.
@@ -140,32 +140,32 @@ class CameraErrors:
             information[:n] = information[:, :n] = pull[:n] = 0.0
         fit = SharedFit(information, pull)
         drift = np.repeat(self.DRIFT_RATE, [n, 2 * n]) ** 2 * seconds
-        self._covariance = self._covariance + self._free * drift
+        self._covariance = self._covariance + self._centering * drift
         self._learn_variances(fit)
-        # Kalman update in information form; the jitter and unrest of this frame set blur what stays
-        new = np.repeat([self._jitter.value, self._unrest.value], [n, 2 * n])
-        blurred = np.linalg.inv(eye + new[:, None] * fit.information)
-        information = fit.information @ blurred / self.INFORMATION_DIVISOR
+        # Kalman update in information form, marginalised over this frame set's jitter and shifts
+        new = np.repeat([self._jitter.value, self._shift_variance.value], [n, 2 * n])
+        marginal = np.linalg.inv(eye + new[:, None] * fit.information)
+        information = fit.information @ marginal / self.INFORMATION_DIVISOR
         gain = self._covariance @ np.linalg.inv(eye + information @ self._covariance)
-        self._mean = self._free @ (self._mean + gain @ (blurred.T @ fit.pull) / self.INFORMATION_DIVISOR)
-        self._covariance = self._free @ ((gain + gain.T) / 2) @ self._free
+        self._mean = self._centering @ (self._mean + gain @ (marginal.T @ fit.pull) / self.INFORMATION_DIVISOR)
+        self._covariance = self._centering @ ((gain + gain.T) / 2) @ self._centering
         # the offsets as far as chance does not explain them
-        mean, known = self._mean[:n], np.linalg.pinv(self._covariance[:n, :n], hermitian=True)
-        apart = float(mean @ known @ mean) / max(1, n - 1)
-        self.offset = mean * min(1.0, max(0.0, (apart - self.CHANCE_CHI2) / (self.CERTAIN_CHI2 - self.CHANCE_CHI2)))
+        mean, offset_information = self._mean[:n], np.linalg.pinv(self._covariance[:n, :n], hermitian=True)
+        chi2 = float(mean @ offset_information @ mean) / max(1, n - 1)
+        self.offset = mean * min(1.0, max(0.0, (chi2 - self.CHANCE_CHI2) / (self.CERTAIN_CHI2 - self.CHANCE_CHI2)))
         self.delays = self._expected_delays()
 
     def _learn_variances(self, fit: SharedFit) -> None:
         n = self._count
         delays, shifts = np.arange(n), np.arange(n, 3 * n)
-        new = np.repeat([self._jitter.value, self._unrest.value], [n, 2 * n])
-        for part, rest, variance, far in (
+        new = np.repeat([self._jitter.value, self._shift_variance.value], [n, 2 * n])
+        for part, rest, variance, limit in (
             (delays, shifts, self._jitter, self.MAX_DELAY),
-            (shifts, delays, self._unrest, np.inf),
+            (shifts, delays, self._shift_variance, np.inf),
         ):
-            for value, doubt in zip(*self._independent(fit, part, rest, new), strict=True):
-                if doubt < min(far**2, 1e3 * variance.value):
-                    variance.take(float(value), float(doubt))
+            for value, noise in zip(*self._independent(fit, part, rest, new), strict=True):
+                if noise < min(limit**2, 1e3 * variance.value):
+                    variance.take(float(value), float(noise))
 
     def _independent(self, fit: SharedFit, part: Index, rest: Index, new: Array) -> tuple[Array, Array]:
         """Independent combinations (K,) of one part of the errors in this frame set, and their variances (K,)."""
@@ -176,30 +176,30 @@ class CameraErrors:
         information = fit.information[np.ix_(part, part)] - gain @ cross.T
         pull = fit.pull[part] - gain @ fit.pull[rest]
         # along the eigenvectors that are determined
-        known, apart = np.linalg.eigh((information + information.T) / 2)
-        sure = known > 1e-9 * known[-1]
-        known, apart = known[sure], apart[:, sure]
-        doubt = np.einsum("ik,ij,jk->k", apart, self._covariance[np.ix_(part, part)], apart)
-        return (apart.T @ pull) / known, 1 / known + doubt
+        eigenvalues, eigenvectors = np.linalg.eigh((information + information.T) / 2)
+        determined = eigenvalues > 1e-9 * eigenvalues[-1]
+        eigenvalues, eigenvectors = eigenvalues[determined], eigenvectors[:, determined]
+        prior_variance = np.einsum("ik,ij,jk->k", eigenvectors, self._covariance[np.ix_(part, part)], eigenvectors)
+        return (eigenvectors.T @ pull) / eigenvalues, 1 / eigenvalues + prior_variance
 
 
 class CameraErrorHistory:
-    """Camera errors as known some seconds ago: a deformation that begins is first taken for late cameras."""
+    """Camera errors of some seconds ago: a deformation that begins is first mistaken for late cameras."""
 
-    INTERVAL_S = 2.0  # a deformation is seen within one
+    INTERVAL_S = 2.0  # a deformation is detected within one
 
     def __init__(self, cameras: CameraErrors) -> None:
-        self._before, self._last, self._stamp = copy.deepcopy(cameras), copy.deepcopy(cameras), -np.inf
+        self._earlier, self._last, self._stamp = copy.deepcopy(cameras), copy.deepcopy(cameras), -np.inf
 
     def keep(self, stamp: float, cameras: CameraErrors) -> None:
-        """Take the errors as known at `stamp`, s, every INTERVAL_S."""
+        """Store the errors at `stamp`, s, every INTERVAL_S."""
         if stamp - self._stamp >= self.INTERVAL_S:
-            self._before, self._last, self._stamp = self._last, copy.deepcopy(cameras), stamp
+            self._earlier, self._last, self._stamp = self._last, copy.deepcopy(cameras), stamp
 
     @property
     def before(self) -> CameraErrors:
         """As known INTERVAL_S ago or earlier."""
-        return copy.deepcopy(self._before)
+        return copy.deepcopy(self._earlier)
 
 
 MIN_VISIBLE_PX = 0.3  # root mean square over the anchors: more than lens and map change in a second,
@@ -216,185 +216,185 @@ RIVAL_HOLD_S, TRUST_MEMORY_S = 0.12, 1.0  # that doubt or trust stays after a ri
 
 @dataclass(slots=True)
 class _Verdict:
-    """What is known of the carriers against one rival."""
+    """The carriers compared with one rival."""
 
-    rival: RivalPose  # as last seen
-    since: float  # s, when the carriers were last known to be right, or the rival was first seen
-    seen: float  # s, when the rival was last seen
-    trusted: bool = False  # whether the carriers are believed
-    jumped: bool = False  # whether the rival left the motion that the carriers continued: then they are not late
-    stood: bool = False  # whether they have stood still while the rival moved
-    widest: Array = field(default_factory=lambda: np.zeros(6))  # the largest difference: who is late agrees at a turn
-    still: frozenset[int] = frozenset()  # cameras that show no motion while the others move
-    late: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
+    rival: RivalPose  # the newest
+    since: float  # s, when the carriers were last known to be right, or the rival first appeared
+    last_stamp: float  # s, of `rival`
+    trusted: bool = False  # whether the carriers are
+    off_motion: bool = False  # whether the rival left the motion that the carriers continued: then they are not late
+    rested: bool = False  # whether they have stood still while the rival moved
+    widest: Array = field(default_factory=lambda: np.zeros(6))  # largest difference: a late side agrees at a turn
+    hanging: frozenset[int] = frozenset()  # cameras that show no motion while the others move
+    lagging: tuple[frozenset[int], float] = (frozenset(), 0.0)  # cameras that show what the others showed, and s before
 
     @property
-    def open_to_both(self) -> bool:  # the rival may be right, and does not outnumber the carriers
+    def undecided(self) -> bool:  # either side may be right, and the rival does not outnumber the carriers
         return not self.trusted and len(self.rival.cameras) <= len(self.rival.carriers)
 
-    def remembered(self, stamp: float) -> bool:  # at `stamp`, s, though the rival is not seen
-        return stamp - self.seen <= (TRUST_MEMORY_S if self.trusted or self.late[0] else RIVAL_HOLD_S)
+    def remembered(self, stamp: float) -> bool:  # at `stamp`, s, without the rival
+        return stamp - self.last_stamp <= (TRUST_MEMORY_S if self.trusted or self.lagging[0] else RIVAL_HOLD_S)
 
 
 @dataclass(slots=True)
 class RivalWatch:
-    """Remembers where carriers and rivals saw the surface lately, and which carriers may be believed."""
+    """Recent poses by carriers and by rivals, and which carriers can be trusted."""
 
     anchors: Array  # (K, 3) mm, surface frame: where motion is looked for
-    _looks: deque[tuple[float, Array, dict[frozenset[int], Array]]] = field(default_factory=deque)  # s, carried, own
+    _history: deque[tuple[float, Array, dict[frozenset[int], Array]]] = field(default_factory=deque)  # s, carried, own
     _verdicts: dict[frozenset[int], _Verdict] = field(default_factory=dict)
 
     def update(
-        self, rig: Rig, stamp: float, carried: Array, rivals: Sequence[RivalPose], left_out: frozenset[int]
+        self, rig: Rig, stamp: float, base_from_surface: Array, rivals: Sequence[RivalPose], left_out: frozenset[int]
     ) -> None:
-        """Take a frame set: pose (4, 4), those that contradict it, and those left out, which remain rivals unseen."""
-        carried = rivals[0].carried if rivals else carried
-        self._looks.append((stamp, carried, {rival.cameras: rival.own for rival in rivals}))
-        while self._looks[0][0] < stamp - RIVAL_MEMORY_S:
-            self._looks.popleft()
+        """Take a frame set: pose (4, 4), poses that contradict it, and outliers, which stay rivals without a pose."""
+        base_from_surface = rivals[0].carrier_pose if rivals else base_from_surface
+        self._history.append((stamp, base_from_surface, {rival.cameras: rival.own_pose for rival in rivals}))
+        while self._history[0][0] < stamp - RIVAL_MEMORY_S:
+            self._history.popleft()
         for rival in rivals:
             verdict = self._verdicts.get(rival.cameras)
             if verdict is None or verdict.rival.carriers != rival.carriers:
-                verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp, rival.jumped, rival.jumped)
-            verdict.rival, verdict.seen = rival, stamp
+                off = rival.off_motion
+                verdict = self._verdicts[rival.cameras] = _Verdict(rival, stamp, stamp, off, off)
+            verdict.rival, verdict.last_stamp = rival, stamp
             verdict.widest = max(verdict.widest, rival.difference, key=lambda apart: float(np.linalg.norm(apart[3:])))
             self._judge(rig, stamp, verdict)
         self._verdicts = {
             key: verdict
             for key, verdict in self._verdicts.items()
-            if verdict.seen == stamp or key & left_out or verdict.remembered(stamp)
+            if verdict.last_stamp == stamp or key & left_out or verdict.remembered(stamp)
         }
 
     @property
-    def doubted(self) -> list[RivalPose]:
-        """Rivals against which the carriers are not believed."""
+    def untrusted(self) -> list[RivalPose]:
+        """Rivals against which the carriers are not trusted."""
         return [verdict.rival for verdict in self._verdicts.values() if not verdict.trusted]
 
     @property
     def covariance(self) -> Array:
         """(6, 6) that covers the poses of all rivals that may be right."""
-        sides = [v.widest if v.late[0] else v.rival.difference for v in self._verdicts.values() if not v.trusted]
+        sides = [v.widest if v.lagging[0] else v.rival.difference for v in self._verdicts.values() if not v.trusted]
         return np.asarray(np.reshape(sides, (-1, 6)).T @ np.reshape(sides, (-1, 6)))
 
     def outliers(self, bumped: Collection[int]) -> frozenset[int]:
-        """Rivals without which the pose is to be: between both it is wrong. bumped: may stay unless they hang."""
-        sides = [key - set(bumped) if v.open_to_both else v.still | v.late[0] for key, v in self._verdicts.items()]
+        """Rivals to be left out: a pose between both sides is wrong. bumped: may stay unless they hang."""
+        sides = [key - set(bumped) if v.undecided else v.hanging | v.lagging[0] for key, v in self._verdicts.items()]
         return frozenset().union(*sides) & frozenset().union(*self._verdicts)
 
     def own_poses(self, onwards: bool = False) -> dict[int, Array]:
-        """Where each rival camera last saw the surface (4, 4). onwards: moved on as it moved from the look before."""
-        last, before = (self._looks[-n][2] if self._verdicts and len(self._looks) >= n else {} for n in (1, 2))
-        found: dict[int, Array] = {}
+        """base_from_surface (4, 4) by each rival camera, the newest. onwards: extrapolated by its last motion."""
+        last, before = (self._history[-n][2] if self._verdicts and len(self._history) >= n else {} for n in (1, 2))
+        poses: dict[int, Array] = {}
         for cameras, own in last.items():
             moved = se3.inverse(before[cameras]) @ own if onwards and cameras in before else np.eye(4)
-            found.update(dict.fromkeys(cameras, own @ moved))
-        return found
+            poses.update(dict.fromkeys(cameras, own @ moved))
+        return poses
 
-    def still_or_late(self, camera: int) -> str:
-        """What a rival camera that is not believed does, or ''."""
+    def fault_text(self, camera: int) -> str:
+        """For the operator: whether a rival camera that is not trusted hangs or is late, or ''."""
         for cameras, verdict in self._verdicts.items():
             if camera in cameras and verdict.trusted:
-                if camera in verdict.still:
+                if camera in verdict.hanging:
                     return "shows no motion while the others move"
-                if camera in verdict.late[0]:
-                    return f"shows what the others showed {verdict.late[1]:.2f} s before"
+                if camera in verdict.lagging[0]:
+                    return f"shows what the others showed {verdict.lagging[1]:.2f} s before"
         return ""
 
-    def doubts(self, names: Sequence[str]) -> list[str]:
-        """Why the carriers are not believed: a text for each rival. names: of all cameras."""
-        newest = max((v.seen for v in self._verdicts.values() if not v.trusted), default=0.0)
-        return [_doubt_text(v, names) for v in self._verdicts.values() if not v.trusted and v.seen == newest]
+    def messages(self, names: Sequence[str]) -> list[str]:
+        """Why the carriers are not trusted: a text for each rival. names: of all cameras."""
+        newest = max((v.last_stamp for v in self._verdicts.values() if not v.trusted), default=0.0)
+        return [_doubt_text(v, names) for v in self._verdicts.values() if not v.trusted and v.last_stamp == newest]
 
     def _judge(self, rig: Rig, stamp: float, verdict: _Verdict) -> None:
-        """Who has moved since the carriers were last known to be right, and whether one side trails the other."""
+        """Which side has moved since the carriers were last known to be right, and whether one side lags the other."""
         key, carriers = verdict.rival.cameras, verdict.rival.carriers
-        looks = [look for look in self._looks if look[0] >= verdict.since and key in look[2]]
-        _, a, b = _series(looks, key)
-        noise, own_noise = verdict.rival.noise
-        moved = max(_visible(self._pixels(rig, c, a), noise) for c in carriers)
-        rival_moved, expected = (max(_visible(self._pixels(rig, c, x), own_noise) for c in key) for x in (b, a))
-        lag = self._lag(rig, verdict) if moved > HANGS_RATIO else 0.0  # at a turn one side rests while the other trails
-        lag = min(lag, 0.0) if verdict.jumped else lag
-        hang, both = moved < 1 and rival_moved > HANGS_RATIO, min(moved, rival_moved) > 1
-        rival_hangs = rival_moved < 1 and expected > HANGS_RATIO and lag <= 0
-        lag = 0.0 if rival_hangs or (lag < 0 and rival_moved < HANGS_RATIO) else lag
+        _, by_carriers, by_rival = _series([h for h in self._history if h[0] >= verdict.since and key in h[2]], key)
+        (noise, own_noise), ways = verdict.rival.noise, (by_rival, by_carriers)
+        carriers_px = max(_visible(self._pixels(rig, c, by_carriers), noise) for c in carriers)
+        rivals_px, expected = (max(_visible(self._pixels(rig, c, way), own_noise) for c in key) for way in ways)
+        lag = self._lag(rig, verdict) if carriers_px > HANGS_RATIO else 0.0  # at a turn one rests, the other trails
+        lag = min(lag, 0.0) if verdict.off_motion else lag
+        hang, both = carriers_px < 1 and rivals_px > HANGS_RATIO, min(carriers_px, rivals_px) > 1
+        rival_hangs = rivals_px < 1 and expected > HANGS_RATIO and lag <= 0
+        lag = 0.0 if rival_hangs or (lag < 0 and rivals_px < HANGS_RATIO) else lag
         if hang or rival_hangs or both or lag > 0:  # else as it was
-            verdict.still = carriers if hang else key if rival_hangs else frozenset()
-            verdict.late = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
-        verdict.stood |= hang
+            verdict.hanging = carriers if hang else key if rival_hangs else frozenset()
+            verdict.lagging = (carriers, lag) if lag > 0 else (key, -lag) if lag < 0 else (frozenset(), 0.0)
+        verdict.rested |= hang
         in_step = both and stamp - verdict.since >= LAG_WINDOW_S
-        in_step = in_step and (not verdict.stood or self._steady(rig, min(key), a, b))
-        if hang or verdict.late[0] == carriers or len(key) > len(carriers) or not verdict.rival.united:
+        in_step = in_step and (not verdict.rested or self._steady(rig, min(key), by_carriers, by_rival))
+        if hang or verdict.lagging[0] == carriers or len(key) > len(carriers) or not verdict.rival.carriers_agree:
             verdict.trusted = False
         elif rival_hangs or in_step:
             verdict.trusted = True
-            verdict.since, verdict.stood = stamp, False
+            verdict.since, verdict.rested = stamp, False
 
     def _pixels(self, rig: Rig, camera: int, poses: Array) -> Array:  # (T, 4, 4) -> (T, K, 2) px of the anchors
         points = self.anchors @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
         return ideal_pixels(rig.cameras[camera], points.reshape(-1, 3))[0].reshape(len(poses), -1, 2)
 
     def _newest(self, rig: Rig, verdict: _Verdict) -> tuple[int, Array, Array, Array]:
-        """Looks that count, and stamps (T,) and anchors (T, 2K) px by carriers and by rival in the rival's picture."""
-        stamps, a, b = _series(self._looks, verdict.rival.cameras)
+        """Count of newest entries, and stamps (T,) and anchors (T, 2K) px by carriers and by rival in its picture."""
+        stamps, a, b = _series(self._history, verdict.rival.cameras)
         start, camera, key = stamps[-1] - LAG_WINDOW_S, min(verdict.rival.cameras), verdict.rival.cameras
-        parted = [look[0] >= start and key in look[2] for look in reversed(self._looks)]
-        count = parted.index(False) if False in parted else len(parted)
+        apart = [look[0] >= start and key in look[2] for look in reversed(self._history)]
+        count = apart.index(False) if False in apart else len(apart)
         first, second = (self._pixels(rig, camera, poses).reshape(len(stamps), -1) for poses in (a, b))
         return count, stamps, first, second
 
     def _lag(self, rig: Rig, verdict: _Verdict) -> float:
-        """By how much, s, the carriers show later what the rival shows; negative: the rival is late; 0: no lag."""
+        """Lag, s, of the carriers behind the rival; negative: the rival is late; 0: neither."""
         count, stamps, a, b = self._newest(rig, verdict)
-        apart = _rms(a[-count:] - b[-count:])
+        distance = _rms(a[-count:] - b[-count:])
         lags = np.arange(LAG_STEP_S, min(MAX_LAG_S, stamps[-count] - stamps[0]) + 1e-9, LAG_STEP_S)
-        if not len(lags) or apart < MIN_VISIBLE_PX:
+        if not len(lags) or distance < MIN_VISIBLE_PX:
             return 0.0
-        behind = [_lagged(stamps, count, x, y, lags) for x, y in ((a, b), (b, a))]
-        best = [int(np.argmin(left)) for left in behind]
-        carriers, rival = behind[0][best[0]], behind[1][best[1]]
-        if min(carriers, rival) > LAG_SHARE * apart:
+        lagged = [_lagged(stamps, count, x, y, lags) for x, y in ((a, b), (b, a))]
+        best = [int(np.argmin(residuals)) for residuals in lagged]
+        carriers, rival = lagged[0][best[0]], lagged[1][best[1]]
+        if min(carriers, rival) > LAG_SHARE * distance:
             return 0.0
-        first = carriers < min(LAG_SHARE * apart, CLEAR_LAG_RATIO * rival)  # a way to and fro fits both: it is open
+        first = carriers < min(LAG_SHARE * distance, CLEAR_LAG_RATIO * rival)  # a way to and fro fits both: it is open
         return float(lags[best[0]] if first else -lags[best[1]])
 
     def _steady(self, rig: Rig, camera: int, a: Array, b: Array) -> bool:
-        """Whether a rival's picture by poses b (T, 4, 4) stands apart by the same while the carriers move as a."""
-        way, own = (self._pixels(rig, camera, poses).reshape(len(poses), -1) for poses in (a, b))
-        moved, apart = _rms(way - way.mean(0)), own - way
+        """Whether a rival's picture by poses b (T, 4, 4) keeps its distance from that by the moving carriers' a."""
+        carrier_px, rival_px = (self._pixels(rig, camera, poses).reshape(len(poses), -1) for poses in (a, b))
+        moved, apart = _rms(carrier_px - carrier_px.mean(0)), rival_px - carrier_px
         return moved > MIN_VISIBLE_PX / 2 and _rms(apart - apart.mean(0)) < STEADY_SHARE * moved
 
 
 def _series(
-    looks: Sequence[tuple[float, Array, dict[frozenset[int], Array]]], key: frozenset[int]
+    history: Sequence[tuple[float, Array, dict[frozenset[int], Array]]], key: frozenset[int]
 ) -> tuple[Array, Array, Array]:
-    """Stamps (T,) and poses (T, 4, 4) by carriers and by rival; before they parted they were the same."""
-    own = np.stack([look[2].get(key, look[1]) for look in looks])
-    return np.array([look[0] for look in looks]), np.stack([look[1] for look in looks]), own
+    """Stamps (T,) and poses (T, 4, 4) by carriers and by rival; the same before they differed."""
+    own = np.stack([entry[2].get(key, entry[1]) for entry in history])
+    return np.array([entry[0] for entry in history]), np.stack([entry[1] for entry in history]), own
 
 
 def _visible(pixels: Array, noise: float) -> float:  # way of anchors (T, K, 2) px, in parts of what is visible
-    away = np.sqrt(((pixels - pixels[0]) ** 2).sum(2).mean(1))
-    return float(away.max() / max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
+    distance = np.sqrt(((pixels - pixels[0]) ** 2).sum(2).mean(1))
+    return float(distance.max() / max(MIN_VISIBLE_PX, VISIBLE_SIGMAS * noise))
 
 
-def _rms(away: Array) -> float:  # length, px, of flat pixels (T, 2K)
-    return float(np.sqrt(2 * np.mean(away**2)))
+def _rms(difference: Array) -> float:  # length, px, of flat pixels (T, 2K)
+    return float(np.sqrt(2 * np.mean(difference**2)))
 
 
 def _lagged(stamps: Array, count: int, late: Array, early: Array, lags: Array) -> Array:
-    """What is left (L,), px, of the newest `count` looks of one side against the other's so much earlier."""
-    then = np.stack([np.interp(stamps[-count:] - lags[:, None], stamps, column) for column in early.T], -1)
-    return np.asarray(np.sqrt(2 * ((late[-count:] - then) ** 2).mean((1, 2))))
+    """RMS difference (L,), px, of one side's newest `count` entries from the other's, for each lag (L,) s."""
+    earlier = np.stack([np.interp(stamps[-count:] - lags[:, None], stamps, column) for column in early.T], -1)
+    return np.asarray(np.sqrt(2 * ((late[-count:] - earlier) ** 2).mean((1, 2))))
 
 
 def _doubt_text(verdict: _Verdict, names: Sequence[str]) -> str:
     carriers, key = verdict.rival.carriers, verdict.rival.cameras
-    first = verdict.still or verdict.late[0] or key
+    first = verdict.hanging or verdict.lagging[0] or key
     one, other = (", ".join(names[c] for c in sorted(side)) for side in (first, key if first == carriers else carriers))
-    said = f"{one} against {other}"
-    if verdict.still:
-        said = f"no motion in {one} while {other} moved"
-    elif verdict.late[0]:
-        said = f"{one} late by {verdict.late[1]:.2f} s against {other}"
-    return f"{said}: no majority can be trusted"
+    text = f"{one} against {other}"
+    if verdict.hanging:
+        text = f"no motion in {one} while {other} moved"
+    elif verdict.lagging[0]:
+        text = f"{one} late by {verdict.lagging[1]:.2f} s against {other}"
+    return f"{text}: no majority can be trusted"

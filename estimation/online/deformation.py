@@ -1,4 +1,4 @@
-"""The warp of soft tissue: what a rigid fit to the warped map leaves over, as a few modes followed by a Kalman filter.
+"""The warp of soft tissue: the residuals of a rigid fit to the warped map, as a few modes tracked by a Kalman filter.
 
 Modes: a Gaussian process with a bell as covariance, known at a dozen control points, spans the smooth fields. Those
 that move or turn the landmarks as a whole are taken out; of the rest the strongest are kept, orthonormal over the
@@ -49,10 +49,10 @@ class WarpModes:
     landmarks: Array  # (N, 3, M) displacement of each landmark by each mode
     weights: Array  # (N,) how much each landmark counts, sum 1
 
-    def modes_of(self, moved: Array) -> Array:
+    def modes_of(self, displacements: Array) -> Array:
         """The modes (M,) mm in displacements (N, 3) mm of the first N landmarks, which hold all that count."""
-        count = len(moved)
-        return np.asarray(np.einsum("nim,n,ni->m", self.landmarks[:count], self.weights[:count], moved))
+        count = len(displacements)
+        return np.asarray(np.einsum("nim,n,ni->m", self.landmarks[:count], self.weights[:count], displacements))
 
     def extended(self, points: Array) -> WarpModes:
         """The same modes with further landmarks at `points` (N, 3): they are moved by them, but do not count."""
@@ -74,23 +74,23 @@ class WarpModes:
 def modes_from_map(surface_map: SurfaceMap) -> WarpModes:
     """The modes of the surface that a map of twelve landmarks or more shows."""
     points = surface_map.points
-    known = np.diag(surface_map.covariance).reshape(-1, 3).mean(1)
-    weights = 1 / np.maximum(known, WELL_KNOWN_MM**2)
+    variances = np.diag(surface_map.covariance).reshape(-1, 3).mean(1)
+    weights = 1 / np.maximum(variances, WELL_KNOWN_MM**2)
     weights = weights / weights.sum()
     best = points[weights >= np.median(weights)]  # the half that is known best
     first = int(np.argmin(np.linalg.norm(best - weights @ points, axis=1)))
     control = best[farthest_points(best, first, min(CONTROL_POINTS, len(best)))]
-    apart = np.linalg.norm(control[:, None] - control, axis=-1) + np.diag(np.full(len(control), np.inf))
-    reach = BELL_OVERLAP * float(apart.min(1).mean())
-    own = bells(control, control, reach) + BELL_JITTER * np.eye(len(control))
-    whiten = np.kron(np.linalg.inv(np.linalg.cholesky(own)).T, np.eye(3))  # coefficients of unit variance fields
+    distances = np.linalg.norm(control[:, None] - control, axis=-1) + np.diag(np.full(len(control), np.inf))
+    reach = BELL_OVERLAP * float(distances.min(1).mean())
+    kernel = bells(control, control, reach) + BELL_JITTER * np.eye(len(control))
+    whiten = np.kron(np.linalg.inv(np.linalg.cholesky(kernel)).T, np.eye(3))  # coefficients of unit variance fields
     field = np.kron(bells(points, control, reach), np.eye(3)) @ whiten  # (3N, 3K)
     root = np.sqrt(np.repeat(weights, 3))[:, None]
     lever = se3.point_jacobians(points - weights @ points)
     rigid = (lever.reshape(-1, 6) * root).T @ (field * root)  # (6, 3K)
-    free = np.linalg.svd(rigid)[2][6:].T  # (3K, 3K - 6)
-    _, size, modes = np.linalg.svd(field * root @ free, full_matrices=False)
-    fields = whiten @ free @ (modes[:MODE_COUNT] / size[:MODE_COUNT, None]).T
+    non_rigid = np.linalg.svd(rigid)[2][6:].T  # (3K, 3K - 6)
+    _, size, modes = np.linalg.svd(field * root @ non_rigid, full_matrices=False)
+    fields = whiten @ non_rigid @ (modes[:MODE_COUNT] / size[:MODE_COUNT, None]).T
     landmarks = _displacements(points, control, reach, fields)
     share = size[:MODE_COUNT] ** 2
     return WarpModes(control, reach, fields, share / share.sum(), landmarks, weights)
@@ -106,8 +106,8 @@ class WarpFilter:
 
     def __init__(self, surface_map: SurfaceMap) -> None:
         self._points = surface_map.points
-        enough = len(surface_map) >= 2 * MIN_MODE_LANDMARKS
-        self._modes: WarpModes | None = modes_from_map(surface_map) if enough else None
+        sufficient = len(surface_map) >= 2 * MIN_MODE_LANDMARKS
+        self._modes: WarpModes | None = modes_from_map(surface_map) if sufficient else None
         count = 0 if self._modes is None else len(self._modes.share)
         self._state = np.zeros(2 * count)  # deformation, and the map's error
         self._covariance = np.zeros((2 * count, 2 * count))
@@ -135,24 +135,24 @@ class WarpFilter:
         if self.warp is None or self._modes is None:
             return np.zeros((6, 6))
         count, weighted = len(self._modes.share), jacobians * weight[:, None, None]
-        moved = jacobians[:, :, 3:] @ self._modes.landmarks[track]  # (N, 2, M)
-        sensitivity = np.einsum("nki,nkm->im", weighted, moved, optimize=True)
+        by_modes = jacobians[:, :, 3:] @ self._modes.landmarks[track]  # (N, 2, M)
+        sensitivity = np.einsum("nki,nkm->im", weighted, by_modes, optimize=True)
         return np.asarray(sensitivity @ self._covariance[:count, :count] @ sensitivity.T)
 
-    def replace_map(self, surface_map: SurfaceMap, right: bool = False) -> None:
-        """Take a refined or longer map: what it has absorbed of the map's error or the deformation is no error now.
+    def replace_map(self, surface_map: SurfaceMap, undeformed: bool = False) -> None:
+        """Take a refined or longer map: the error or deformation that it has absorbed is subtracted from the state.
 
-        right: whether it is that of the undeformed surface: then the error of the other was no deformation.
+        undeformed: whether it shows the undeformed surface: then the whole change was the old map's error.
         """
         if self._modes is not None:
             count, before = len(self._modes.share), len(self._points)
             change = self._modes.modes_of(surface_map.points[:before] - self._points)
-            if right:
+            if undeformed:
                 # the map's error was `change`; the sum of both vectors was observed, so the rest was deformation
                 total = self._state[:count] + self._state[count:]
-                spread, rest = _sum_covariance(self._covariance, count), _map_mode_covariance(self._modes, surface_map)
+                spread, prior = _sum_covariance(self._covariance, count), _map_mode_covariance(self._modes, surface_map)
                 self._state = np.concatenate([total - change, change])
-                self._covariance = np.block([[spread + rest, -rest], [-rest, rest]])
+                self._covariance = np.block([[spread + prior, -prior], [-prior, prior]])
             self._state[count:] -= change
             if len(surface_map) > before:
                 self._modes = self._modes.extended(surface_map.points[before:])
@@ -186,18 +186,18 @@ class WarpFilter:
         keep = np.concatenate([np.full(count, np.exp(-dt / DECAY_S)), np.ones(count)])
         self._covariance = keep[:, None] * self._covariance * keep
         prior = _sum_covariance(self._covariance, count)
-        shared = share[:, None] * information
-        looks = float(np.einsum("ij,ji->", shared, shared))
-        expected = float(np.trace(shared) + np.einsum("ij,ji->", shared @ prior, information))
+        weighted = share[:, None] * information
+        curvature = float(np.einsum("ij,ji->", weighted, weighted))
+        expected = float(np.trace(weighted) + np.einsum("ij,ji->", weighted @ prior, information))
         recent = min(1.0, dt / LIVELINESS_MEMORY_S)
-        if looks > 0:
-            rate = (float(gradient @ (share * gradient)) - expected) / (looks * dt)
+        if curvature > 0:
+            rate = (float(gradient @ (share * gradient)) - expected) / (curvature * dt)
             self._rate += recent * (rate - self._rate)
-            self._rate_variance = recent / (looks * dt**2)
-            clear = self._rate if self._rate > CHANCE_SIGMAS * float(np.sqrt(self._rate_variance)) else 0.0
-            now = max(clear, self.liveliness * float(np.exp(-dt / DECAY_S)))
-            self._liveliest = max(self._liveliest, now)
-            self.liveliness = now if now > RIGID_SHARE * self._liveliest else 0.0
+            self._rate_variance = recent / (curvature * dt**2)
+            significant = self._rate if self._rate > CHANCE_SIGMAS * float(np.sqrt(self._rate_variance)) else 0.0
+            current = max(significant, self.liveliness * float(np.exp(-dt / DECAY_S)))
+            self._liveliest = max(self._liveliest, current)
+            self.liveliness = current if current > RIGID_SHARE * self._liveliest else 0.0
         wander = self.liveliness * dt * share
         self._covariance[:count, :count] += np.diag(wander)
         self._state = keep * self._state
@@ -205,9 +205,9 @@ class WarpFilter:
 
 def _map_mode_covariance(modes: WarpModes, surface_map: SurfaceMap) -> Array:
     """Covariance (M, M), mm^2, of the modes in a map's error."""
-    known = 3 * len(modes.weights)
-    fields = (modes.landmarks * modes.weights[:, None, None]).reshape(known, -1)
-    joint = fields.T @ surface_map.covariance[:known, :known] @ fields
+    entries = 3 * len(modes.weights)
+    fields = (modes.landmarks * modes.weights[:, None, None]).reshape(entries, -1)
+    joint = fields.T @ surface_map.covariance[:entries, :entries] @ fields
     return np.asarray(joint + MAP_MODE_SIGMA_MM**2 * np.eye(len(modes.share)))
 
 
@@ -225,19 +225,19 @@ def _mode_evidence(
     root = np.sqrt(fit.weights) / (sigma * fit.scale)
     row = contiguous(observations.track, np.int64)
     camera = contiguous(observations.camera, np.int64)
-    fitted = contiguous(fit.jacobians), contiguous(fit.residuals)
+    geometry = contiguous(fit.jacobians), contiguous(fit.residuals)
     # the fit's points hold the deformation, but not the map's error
     fields = contiguous(modes.landmarks)
-    whole = rows_of_modes(camera, row, *fitted, root, fields, state[count:].copy(), twist)
-    normal = whole.T @ whole
-    own, other = slice(0, count), slice(count, count + 6 + cameras)
-    held = normal[other, other] + np.diag([1e-9] * 6 + [1 / max(skew, 1e-4) ** 2] * cameras)
-    solved = np.linalg.solve(held, np.concatenate([normal[other, own], normal[other, -1:]], 1))
-    information = normal[own, own] - normal[own, other] @ solved[:, :-1]
-    gradient = normal[own, -1] - normal[own, other] @ solved[:, -1]
-    dull = np.linalg.inv(np.eye(count) + MODE_BIAS_MM**2 * information)
-    information = dull @ information
-    return np.asarray((information + information.T) / 2), np.asarray(dull @ gradient)
+    rows = rows_of_modes(camera, row, *geometry, root, fields, state[count:].copy(), twist)
+    normal = rows.T @ rows
+    of_modes, nuisance = slice(0, count), slice(count, count + 6 + cameras)
+    damped = normal[nuisance, nuisance] + np.diag([1e-9] * 6 + [1 / max(skew, 1e-4) ** 2] * cameras)
+    solved = np.linalg.solve(damped, np.concatenate([normal[nuisance, of_modes], normal[nuisance, -1:]], 1))
+    information = normal[of_modes, of_modes] - normal[of_modes, nuisance] @ solved[:, :-1]
+    gradient = normal[of_modes, -1] - normal[of_modes, nuisance] @ solved[:, -1]
+    bias_gain = np.linalg.inv(np.eye(count) + MODE_BIAS_MM**2 * information)
+    information = bias_gain @ information
+    return np.asarray((information + information.T) / 2), np.asarray(bias_gain @ gradient)
 
 
 @compiled("f8[:,::1](i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[::1], f8[::1])")
@@ -253,20 +253,20 @@ def rows_of_modes(
     count = modes.shape[2]
     rows = np.zeros((2 * len(camera), count + 7 + cameras))
     for i in range(len(camera)):
-        own = modes[track[i]]
+        shapes = modes[track[i]]
         for k in range(2):
-            row, along, left = rows[2 * i + k], 0.0, -residual[i, k]
+            row, along, gap = rows[2 * i + k], 0.0, -residual[i, k]
             for m in range(count):
-                moved = 0.0
+                shift = 0.0
                 for a in range(3):
-                    moved += jacobian[i, k, 3 + a] * own[a, m]
-                row[m] = root[i] * moved
-                left -= moved * error[m]
+                    shift += jacobian[i, k, 3 + a] * shapes[a, m]
+                row[m] = root[i] * shift
+                gap -= shift * error[m]
             for a in range(6):
                 row[count + a] = root[i] * jacobian[i, k, a]
                 along += jacobian[i, k, a] * twist[a]
             row[count + 6 + camera[i]] = root[i] * along
-            row[count + 6 + cameras] = root[i] * left
+            row[count + 6 + cameras] = root[i] * gap
     return rows
 
 
@@ -282,16 +282,16 @@ def displacement_sums(
     normal, right = np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3))
     square, views = np.zeros(landmarks), np.zeros(landmarks, np.int64)
     for i in range(len(landmark)):
-        own, weight = landmark[i], precision[i]
-        views[own] += weight > 0
+        row, weight = landmark[i], precision[i]
+        views[row] += weight > 0
         for k in range(2):
-            left = -residual[i, k]
-            square[own] += weight * left * left
+            gap = -residual[i, k]
+            square[row] += weight * gap * gap
             for a in range(3):
                 scaled = weight * jacobian[i, k, 3 + a]
-                right[own, a] += scaled * left
+                right[row, a] += scaled * gap
                 for b in range(3):
-                    normal[own, a, b] += scaled * jacobian[i, k, 3 + b]
+                    normal[row, a, b] += scaled * jacobian[i, k, 3 + b]
     return normal, right, square, views
 
 
@@ -318,20 +318,20 @@ def pose_pulls(
     return by_landmark, by_camera
 
 
-def own_residuals(camera: Index, fit: PoseFit, sure: Array) -> Array:
+def own_residuals(camera: Index, fit: PoseFit, weights: Array) -> Array:
     """Residuals (N, 2) px that are left when each camera has a pose of its own, to first order.
 
-    sure: (N,) weights of the tracks that determine it. Cameras with fewer than eight keep their residuals.
+    weights: (N,) weights of the tracks that determine it. Cameras with fewer than eight keep their residuals.
     """
-    left = fit.residuals.copy()
+    residuals = fit.residuals.copy()
     for c in np.unique(camera):
-        mine = camera == c
-        root = np.sqrt(np.repeat(sure[mine], 2))
+        rows = camera == c
+        root = np.sqrt(np.repeat(weights[rows], 2))
         if np.count_nonzero(root) >= 16:
-            jacobian, residual = fit.jacobians[mine].reshape(-1, 6), fit.residuals[mine].ravel()
-            own = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
-            left[mine] = (residual - jacobian @ own).reshape(-1, 2)
-    return left
+            jacobian, residual = fit.jacobians[rows].reshape(-1, 6), fit.residuals[rows].ravel()
+            step = np.linalg.lstsq(jacobian * root[:, None], residual * root, rcond=None)[0]
+            residuals[rows] = (residual - jacobian @ step).reshape(-1, 2)
+    return residuals
 
 
 @compiled("f8[::1](f8[:,:,::1], f8[::1])")
@@ -348,18 +348,18 @@ def squared_speeds(jacobian: Array, twist: Array) -> Array:
 
 
 @compiled("Tuple((f8[::1], f8[::1]))(i8, i8[::1], f8[:,::1], f8[::1], f8)")
-def camera_medians(cameras: int, camera: Index, residual: Array, sigma: Array, least: float) -> tuple[Array, Array]:
-    """Upper medians (C,) of each camera's residuals' (N, 2) lengths and sigmas (N,); nan of fewer than `least`."""
-    lengths, sigmas, middle = np.full(cameras, np.nan), np.full(cameras, np.nan), np.empty((2, len(camera)))
+def camera_medians(cameras: int, camera: Index, residual: Array, sigma: Array, tracks: float) -> tuple[Array, Array]:
+    """Upper medians (C,) of each camera's residuals' (N, 2) lengths and sigmas (N,); nan of fewer than `tracks`."""
+    lengths, sigmas, columns = np.full(cameras, np.nan), np.full(cameras, np.nan), np.empty((2, len(camera)))
     for c in range(cameras):
         count = 0
         for i in range(len(camera)):
             if camera[i] == c:
-                middle[0, count] = np.sqrt(residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1])
-                middle[1, count] = sigma[i]
+                columns[0, count] = np.sqrt(residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1])
+                columns[1, count] = sigma[i]
                 count += 1
-        if count >= least:
-            ordered = np.sort(middle[0, :count])  # nan comes last, and leaves nothing known
+        if count >= tracks:
+            ordered = np.sort(columns[0, :count])  # nan comes last, and leaves nothing known
             lengths[c] = ordered[-1] if np.isnan(ordered[-1]) else ordered[count // 2]
-            sigmas[c] = np.sort(middle[1, :count])[count // 2]
+            sigmas[c] = np.sort(columns[1, :count])[count // 2]
     return lengths, sigmas

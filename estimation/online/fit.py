@@ -18,7 +18,7 @@ from estimation.surface_map import MapError
 
 PRIOR_RESIDUALS = 20.0  # for which the stated sigmas count when the scatter is estimated
 DELAY_ERROR_PX = 0.05  # half the least sigma of a track
-MIN_KNOWN_SHARE = 1e-6  # of the information of the best known effect; less is rounding
+MIN_EIGENVALUE_SHARE = 1e-6  # of the information of the best known effect; less is rounding
 CLOCK_SIGMAS = 2.0  # of what is known of a clock: what lies farther off is something else
 MIN_WEIGHT_SLOPE = 0.1  # of the weights' sum: with less of it most tracks are outliers, and the rest tells nothing
 DISPLACEMENT_FLOOR = 1e-3  # mm^-2: prior of a displacement along a line that all cameras look along
@@ -44,17 +44,17 @@ class RivalPose:
 
     cameras: frozenset[int]  # that agree among themselves
     carriers: frozenset[int]  # that carry the pose
-    carried: Array  # (4, 4) base_from_surface by the carriers alone
-    own: Array  # (4, 4) base_from_surface by `cameras` alone
+    carrier_pose: Array  # (4, 4) base_from_surface by the carriers alone
+    own_pose: Array  # (4, 4) base_from_surface by `cameras` alone
     noise: tuple[float, float]  # px, one sigma, of what both poses do to their own pictures: carriers', own
     inlier: Mask  # (N,) tracks of `cameras` that agree with the own pose
-    united: bool = True  # whether the carriers agree among themselves as they usually do
-    jumped: bool = False  # whether the own pose alone contradicts the motion until now
+    carriers_agree: bool = True  # whether the carriers agree among themselves as they usually do
+    off_motion: bool = False  # whether the own pose alone contradicts the motion until now
 
     @property
     def difference(self) -> Array:
         """(6,) the tangent vector from the carried pose to the own one."""
-        return se3.log(se3.inverse(self.carried) @ self.own)
+        return se3.log(se3.inverse(self.carrier_pose) @ self.own_pose)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,9 +70,9 @@ class FrameFit:
     used: Index  # (C,) inliers
     reason: str  # why it is no measurement, or ''
     offsets: Array  # (C,) px by which each camera stands off the pose, nan where it does not see the surface
-    allowed: Array  # (C,) px, one sigma of that
+    offset_sigma: Array  # (C,) px, one sigma of that
     outliers: frozenset[int] = frozenset()  # cameras that were left out
-    lit: Mask | None = None  # (N,) outliers whose grain is where the pose puts it: a shadow's edge has bent the track
+    shadowed: Mask | None = None  # (N,) outliers whose texture is where the pose puts it: a shadow's edge moved them
     rivals: tuple[RivalPose, ...] = ()  # what cameras that are left out, or look bumped, say against it
 
     @property
@@ -102,7 +102,7 @@ class FrameFit:
 def failed_fit(
     observations: Observations, start: Array, cameras: int, reason: str, outliers: frozenset[int]
 ) -> FrameFit:
-    """No measurement of what was `seen` by a rig of so many cameras: the pose stays `start` (4, 4)."""
+    """No measurement by `observations` of a rig of so many cameras: the pose stays `start` (4, 4)."""
     count, zero, unknown = len(observations), np.zeros((6, 6)), np.full(cameras, np.nan)
     by_delay, by_shift = np.zeros((6, cameras)), np.zeros((6, 2 * cameras))
     return FrameFit(
@@ -115,7 +115,7 @@ def failed_fit(
         used=np.zeros(cameras, np.int64),
         reason=reason,
         offsets=unknown,
-        allowed=unknown,
+        offset_sigma=unknown,
         outliers=outliers,
     )
 
@@ -131,33 +131,33 @@ def delay_gain(solution: PoseFit, shared: SharedErrors, twist_variance: Array) -
     - What is not linear: a delay acts along the velocity, and where that errs too, the product of both errors must stay
       below DELAY_ERROR_PX. So what is waved by hand at 6 Hz stays as it is fitted.
     """
-    seen, known = solution.shared, np.diag(shared.delay)
-    assert seen is not None
-    prior, information, pull = shared.covariance(), contiguous(seen.information), contiguous(seen.pull[:, None])
+    fit, variances = solution.shared, np.diag(shared.delay)
+    assert fit is not None
+    prior, information, pull = shared.covariance(), contiguous(fit.information), contiguous(fit.pull[:, None])
     speed = mean_square_along(contiguous(solution.jacobians), contiguous(solution.weights), contiguous(twist_variance))
     gain, clarity = _gain_and_clarity(prior, information, pull)
-    product_px = speed * float(np.mean(known)) / DELAY_ERROR_PX**2
-    far = float(np.max((gain @ seen.pull) ** 2 / np.maximum(known, 1e-12))) / CLOCK_SIGMAS**2
+    product_px = speed * float(np.mean(variances)) / DELAY_ERROR_PX**2
+    outside = float(np.max((gain @ fit.pull) ** 2 / np.maximum(variances, 1e-12))) / CLOCK_SIGMAS**2
     clear = max(0.0, 1 - 1 / max(clarity, 1e-9))
-    return np.asarray(gain * (clear / ((1 + product_px**3) * (1 + far**3))))  # sharp, yet without a jump of the pose
+    return np.asarray(gain * (clear / ((1 + product_px**3) * (1 + outside**3))))  # sharp, without a jump of the pose
 
 
 @compiled("f8(f8[:,:,::1], f8[::1], f8[::1])")
 def mean_square_along(jacobian: Array, weight: Array, square: Array) -> float:
-    """Weighted mean, px^2, of what entries of the pose with mean squares (6,) move tracks: (N, 2, 6), (N,)."""
+    """Weighted mean, px^2, by which a pose's entries of mean squares (6,) move tracks of jacobian (N, 2, 6)."""
     total, weights = 0.0, 0.0
     for i in range(len(weight)):
-        one = 0.0
+        variance = 0.0
         for k in range(2):
             for a in range(6):
-                one += jacobian[i, k, a] ** 2 * square[a]
-        total, weights = total + weight[i] * one, weights + weight[i]
+                variance += jacobian[i, k, a] ** 2 * square[a]
+        total, weights = total + weight[i] * variance, weights + weight[i]
     return total / weights if weights > 0 else 0.0
 
 
 @compiled("Tuple((f8, i8))(f8[:,::1], f8[:,::1])")
 def _squared_sigmas(information: Array, pull: Array) -> tuple[float, int]:
-    """What the effects come to that pull (K, 1), and how many are known; information (K, K) may be singular."""
+    """Squared sigmas of the effects that pull (K, 1), and their rank; information (K, K) may be singular."""
     count = len(pull)
     scaled, size = np.empty_like(information), np.empty(count)
     for i in range(count):
@@ -165,45 +165,45 @@ def _squared_sigmas(information: Array, pull: Array) -> tuple[float, int]:
     for i in range(count):
         for j in range(count):
             scaled[i, j] = information[i, j] * size[i] * size[j]
-    known, axes = np.linalg.eigh(scaled)
-    squares, sure = 0.0, 0
+    eigenvalues, axes = np.linalg.eigh(scaled)
+    squares, rank = 0.0, 0
     for k in range(count):
-        if known[k] > MIN_KNOWN_SHARE * max(known[-1], 1e-300):
+        if eigenvalues[k] > MIN_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300):
             along = 0.0
             for i in range(count):
                 along += axes[i, k] * size[i] * pull[i, 0]
-            squares, sure = squares + along * along / known[k], sure + 1
-    return squares, sure
+            squares, rank = squares + along * along / eigenvalues[k], rank + 1
+    return squares, rank
 
 
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
 def _gain(prior: Array, information: Array) -> Array:
     """prior @ (1 + information @ prior)^-1 of symmetric (K, K), whatever of them is singular."""
-    weighed = product(prior, information)  # transposed
+    system = product(prior, information)  # transposed
     for i in range(len(prior)):
-        weighed[i, i] += 1.0
-    return solved(weighed, prior)
+        system[i, i] += 1.0
+    return solved(system, prior)
 
 
 @compiled("Tuple((f8[:,::1], f8))(f8[:,::1], f8[:,::1], f8[:,::1])")
 def _gain_and_clarity(prior: Array, information: Array, pull: Array) -> tuple[Array, float]:
-    """The prediction's gain (C, 3C), and how clearly it is delays that make the cameras disagree.
+    """The prediction's gain (C, 3C), and how clearly delays explain that the cameras disagree (an F ratio).
 
-    That is what delays explain of the disagreement, in parts of what they do not; of each a mean, in squared sigmas for
-    a degree of freedom, the latter one at least. prior: (3C, 3C) of the effects. The rest as `SharedFit`.
+    Squared sigmas per degree of freedom that delays explain, over those that they do not explain (one at least).
+    prior: (3C, 3C) of the effects. information, pull: as in `SharedFit`.
     """
     count = len(prior) // 3
     cross = information[:count, count:].copy()
     shifts = product(cross, _gain(prior[count:, count:].copy(), information[count:, count:].copy()))
-    own, by_shifts = product(shifts, cross.T.copy()), product(shifts, pull[count:])
+    delay_information, delay_pull = product(shifts, cross.T.copy()), product(shifts, pull[count:])
     for i in range(count):
-        by_shifts[i, 0] = pull[i, 0] - by_shifts[i, 0]
+        delay_pull[i, 0] = pull[i, 0] - delay_pull[i, 0]
         for j in range(count):
-            own[i, j] = information[i, j] - own[i, j]
-    explained, freedom = _squared_sigmas(own, by_shifts)
-    whole, every = _squared_sigmas(information, pull)
-    other = max(1.0, (whole - explained) / max(1, every - freedom))
-    return _gain(prior, information)[:count].copy(), explained / max(1, freedom) / other
+            delay_information[i, j] = information[i, j] - delay_information[i, j]
+    explained, delay_rank = _squared_sigmas(delay_information, delay_pull)
+    total, total_rank = _squared_sigmas(information, pull)
+    unexplained = max(1.0, (total - explained) / max(1, total_rank - delay_rank))
+    return _gain(prior, information)[:count].copy(), explained / max(1, delay_rank) / unexplained
 
 
 def residual_scatter(observations: Observations, solution: PoseFit) -> float:
@@ -245,30 +245,30 @@ def fit_covariance(
     warp: WarpFilter,
     twist_variance: Array,
 ) -> FitCovariance:
-    """The covariance of a pose that was fitted to what was `seen`, by its parts.
+    """The parts of the covariance of a pose fitted to `observations`.
 
     The pose is the fitted one without what the cameras' delays in this frame set did to it, as far as their tracks show
     these delays (`delay_gain`). twist_variance: (6,) of `shared.twist`.
     """
     noise = _inverse(contiguous(solution.information), 1e-9, 0.0)
     weight = EFFICIENCY * solution.weights / (observations.sigma * solution.scale) ** 2
-    places = np.zeros(observations.track.max(initial=0) + 1, np.int64)
-    places[observations.track] = 1
-    rows, landmark = np.flatnonzero(places), (np.cumsum(places) - 1)[observations.track]
+    mapped = np.zeros(observations.track.max(initial=0) + 1, np.int64)
+    mapped[observations.track] = 1
+    rows, landmark = np.flatnonzero(mapped), (np.cumsum(mapped) - 1)[observations.track]
     cameras, camera = len(shared.shift), contiguous(observations.camera, np.int64)
     by_landmark, by_camera = pose_pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
     lasting = map_error.reaching_pose(rows, by_landmark)
     lasting = noise @ (lasting + warp.pull(observations.track, weight, solution.jacobians)) @ noise
     # the pose by each delay, shift right and shift down; what a correction by the seen delays leaves of that, and adds
-    effects, seen = noise @ by_camera.reshape(6, -1), solution.shared
-    assert seen is not None
+    effects, shared_fit = noise @ by_camera.reshape(6, -1), solution.shared
+    assert shared_fit is not None
     gain = effects[:, :cameras] @ delay_gain(solution, shared, twist_variance)
-    effects, tracks = effects - gain @ seen.information, noise + gain @ seen.information @ gain.T
+    effects, tracks = effects - gain @ shared_fit.information, noise + gain @ shared_fit.information @ gain.T
     by_delay = effects[:, :cameras]
     by_shift = effects[:, cameras:].reshape(6, 2, -1).swapaxes(1, 2).reshape(6, -1)
-    new = tracks + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
+    noise_and_shift = tracks + (by_shift * np.repeat(shared.shift, 2)) @ by_shift.T
     smear, scatter = by_delay @ shared.delay @ by_delay.T, residual_scatter(observations, solution)
-    return FitCovariance(new, smear, lasting, scatter, tracks, by_delay, by_shift, -gain @ seen.pull)
+    return FitCovariance(noise_and_shift, smear, lasting, scatter, tracks, by_delay, by_shift, -gain @ shared_fit.pull)
 
 
 @compiled("f8[:,::1](f8[:,:,::1], f8[:,::1])")
@@ -281,10 +281,10 @@ def solve_symmetric3(normal: Array, right: Array) -> Array:
         s -= m[0, 2] * m[1, 1]
         t, u, v = m[0, 0] * m[2, 2] - m[0, 2] ** 2, m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1]
         v -= m[0, 1] ** 2
-        whole = m[0, 0] * p + m[0, 1] * q + m[0, 2] * s
-        out[i, 0] = (p * r[0] + q * r[1] + s * r[2]) / whole
-        out[i, 1] = (q * r[0] + t * r[1] + u * r[2]) / whole
-        out[i, 2] = (s * r[0] + u * r[1] + v * r[2]) / whole
+        determinant = m[0, 0] * p + m[0, 1] * q + m[0, 2] * s
+        out[i, 0] = (p * r[0] + q * r[1] + s * r[2]) / determinant
+        out[i, 1] = (q * r[0] + t * r[1] + u * r[2]) / determinant
+        out[i, 2] = (s * r[0] + u * r[1] + v * r[2]) / determinant
     return out
 
 
@@ -292,23 +292,23 @@ def solve_symmetric3(normal: Array, right: Array) -> Array:
 def unusual_displacements(
     normal: Array, right: Array, square: Array, usual_normal: Array, usual_right: Array
 ) -> tuple[Array, Array, Array]:
-    """What landmarks' displacements are beside their usual ones, all from `displacement_sums`; usual_normal: definite.
+    """Landmarks' displacements relative to their usual ones, all from `displacement_sums`; usual_normal: definite.
 
-    The right sides (L, 3) without what is usual, the square (L,) of the residuals about that, and how much of it (L,)
-    a displacement explains.
+    Returns right sides (L, 3) less the usual ones, squares (L,) of the residuals about the usual displacement, and the
+    part of them (L,) that a displacement explains.
     """
     usual, ridged = solve_symmetric3(usual_normal, usual_right), normal.copy()
-    plain, about, explained = right.copy(), square.copy(), np.zeros(len(right))
+    excess, excess_square, explained = right.copy(), square.copy(), np.zeros(len(right))
     for i in range(len(right)):
         for a in range(3):
             for b in range(3):
-                plain[i, a] -= normal[i, a, b] * usual[i, b]
-            about[i] -= (right[i, a] + plain[i, a]) * usual[i, a]
+                excess[i, a] -= normal[i, a, b] * usual[i, b]
+            excess_square[i] -= (right[i, a] + excess[i, a]) * usual[i, a]
             ridged[i, a, a] += DISPLACEMENT_FLOOR
-    moved = solve_symmetric3(ridged, plain)
+    shift = solve_symmetric3(ridged, excess)
     for i in range(len(right)):
-        explained[i] = moved[i, 0] * plain[i, 0] + moved[i, 1] * plain[i, 1] + moved[i, 2] * plain[i, 2]
-    return plain, about, explained
+        explained[i] = shift[i, 0] * excess[i, 0] + shift[i, 1] * excess[i, 1] + shift[i, 2] * excess[i, 2]
+    return excess, excess_square, explained
 
 
 PICTURE_DOF = 4  # of a camera's picture: shift right and down, px; roll, rad; scale
@@ -320,20 +320,20 @@ OUTLIER_PX = 6.0  # px beside the median of its camera at which a track counts f
 class CameraEquations:
     """The normal equations of one camera's N tracks in one frame set, by its own four numbers and by the pose."""
 
-    own: Array  # (4, 4) information of the numbers
+    information: Array  # (4, 4) information of the numbers
     pull: Array  # (4,)
-    pose: Array  # (6, 6) information of the pose
-    pulled: Array  # (6,)
+    pose_information: Array  # (6, 6) information of the pose
+    pose_pull: Array  # (6,)
     cross: Array  # (4, 6)
-    slopes: Array  # (N, 2, 4) px by the numbers
+    jacobian: Array  # (N, 2, 4) px by the numbers
 
-    def without(self, numbers: Array) -> CameraEquations:
-        """The same with these numbers (4,) subtracted from the residuals."""
-        return replace(self, pull=self.pull - self.own @ numbers, pulled=self.pulled - numbers @ self.cross)
+    def without(self, values: Array) -> CameraEquations:
+        """The same with these values (4,) of the numbers subtracted from the residuals."""
+        return replace(self, pull=self.pull - self.information @ values, pose_pull=self.pose_pull - values @ self.cross)
 
     def moved(self, numbers: Array) -> float:
         """Root mean square, px, by which these numbers (4,) move its tracks."""
-        return float(np.sqrt(np.mean(((self.slopes @ numbers) ** 2).sum(-1))))
+        return float(np.sqrt(np.mean(((self.jacobian @ numbers) ** 2).sum(-1))))
 
 
 def camera_equations(
@@ -342,18 +342,18 @@ def camera_equations(
     """The equations of each camera with enough tracks, by camera number."""
     parts: dict[int, CameraEquations] = {}
     for camera in range(len(rig)):
-        mine = np.flatnonzero(observations.camera == camera)
-        if len(mine) < MIN_CAMERA_TRACKS:
+        tracks = np.flatnonzero(observations.camera == camera)
+        if len(tracks) < MIN_CAMERA_TRACKS:
             continue
-        pixels = observations.pixels[mine]
-        left = pixels - project(rig, observations.camera[mine], exposed[camera], points[mine])[0]
-        middle = np.array([median(left[:, 0]), median(left[:, 1])])
-        beside = ((left - middle) ** 2).sum(1) / OUTLIER_PX**2
-        weights = np.repeat((np.maximum(1 - beside, 0.0) / np.maximum(observations.sigma[mine], 0.1)) ** 2, 2)[:, None]
-        rows, slopes = jacobians[mine].reshape(-1, 6), _picture_jacobian(rig, camera, pixels)
-        flat, gap = slopes.reshape(-1, PICTURE_DOF), left.ravel()
-        posed, own = (rows * weights).T, (flat * weights).T
-        parts[camera] = CameraEquations(own @ flat, own @ gap, posed @ rows, posed @ gap, own @ rows, slopes)
+        pixels = observations.pixels[tracks]
+        residuals = pixels - project(rig, observations.camera[tracks], exposed[camera], points[tracks])[0]
+        centre = np.array([median(residuals[:, 0]), median(residuals[:, 1])])
+        robust = np.maximum(1 - ((residuals - centre) ** 2).sum(1) / OUTLIER_PX**2, 0.0)
+        weights = np.repeat((robust / np.maximum(observations.sigma[tracks], 0.1)) ** 2, 2)[:, None]
+        rows, slopes = jacobians[tracks].reshape(-1, 6), _picture_jacobian(rig, camera, pixels)
+        flat, gap = slopes.reshape(-1, PICTURE_DOF), residuals.ravel()
+        pose, own = (rows * weights).T, (flat * weights).T
+        parts[camera] = CameraEquations(own @ flat, own @ gap, pose @ rows, pose @ gap, own @ rows, slopes)
     return parts
 
 
@@ -366,9 +366,9 @@ def _picture_jacobian(rig: Rig, camera: int, pixels: Array) -> Array:
 
 def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
     """By how many sigmas a pose differs from the one expected by the motion, at least one."""
-    off = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
+    difference = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
     spread = expected.covariance + _inverse(contiguous(fit.information), 1e-9, 1e-12)  # without information: one
-    return max(1.0, float(np.sqrt(off @ solved(spread, off[:, None])[:, 0] / 6)))
+    return max(1.0, float(np.sqrt(difference @ solved(spread, difference[:, None])[:, 0] / 6)))
 
 
 def picture_noise(fit: PoseFit, rows: Mask) -> float:
@@ -378,9 +378,9 @@ def picture_noise(fit: PoseFit, rows: Mask) -> float:
 
 
 @compiled("f8[:,::1](f8[:,::1], f8, f8)")
-def _inverse(information: Array, share: float, least: float) -> Array:
-    """Covariance (N, N) of an information with that share of its trace, and `least`, added; zero of none at all."""
-    damped, eye, damping = information.copy(), np.zeros_like(information), least
+def _inverse(information: Array, share: float, floor: float) -> Array:
+    """Covariance (N, N) of an information with that share of its trace, and `floor`, added; zero of none at all."""
+    damped, eye, damping = information.copy(), np.zeros_like(information), floor
     for i in range(len(damped)):
         damping += share * information[i, i]
     if damping == 0.0:

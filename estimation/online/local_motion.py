@@ -37,7 +37,7 @@ NONLINEAR_SHARE = 0.02  # and of the square of what they see: cameras expose apa
 MAX_LANDMARK_SIGMAS = 3.0  # a landmark counts as no more: what strayed alike in two cameras is no part of the surface
 USUAL_MEMORY_SETS = 100  # frame sets over which it is learned what is usual,
 MIN_LANDMARK_SETS = 10  # and in which a landmark must have been seen before it counts
-PLACED_SETS = 20  # frame sets after which a landmark's usual place is known: from there it may wander by
+PLACE_SETS = 20  # frame sets after which a landmark's usual place is known: from there it may wander by
 MAX_USUAL_DRIFT_MM = 0.2  # and by the map's own two sigmas: by lenses, and as patches are seen from other sides
 MAX_USUAL_RISE = 3.0  # times the usual, as which one frame set counts at most: a fold must not become usual
 MIN_BELL_LANDMARKS = 4.0  # as which those under a bell must count
@@ -51,14 +51,14 @@ SMALL_RATIO, SMALL_REACH_MM = 2.0, 4.0  # times a landmark's displacement: the t
 SMEAR_SIGMAS = 3.0  # of the exposures, whose motion looks like a displacement: the pose cannot fit it everywhere
 HEIGHT_RATIO = 3.0  # times the bell's mean: the height of a fold, and what it grows by until the arm has obeyed
 DISPLACEMENT_RIDGE = 1.0  # mm^-2: prior of a landmark's place, also along a line that all its cameras share
-AT_ONE_REACH = 4 / 3  # times a bell's height that is told, so that it holds one sigma away from its middle
-STILL_BELL = 0.3  # value of a bell below which a landmark is not part of it
+BELL_HEIGHT_RATIO = 4 / 3  # times a bell's height that is told, so that it holds one sigma away from its middle
+MIN_BELL_VALUE = 0.3  # value of a bell below which a landmark is not part of it
 GATE_TRACKS = 32  # tracks, about, by which it is judged how far an outlier is away
 RIGID_STEPS = 5  # reweighted fits of a map's change
 TISSUE_SPEED = 5.0  # mm/s, one sigma: how fast tissue moves against its surroundings, as a deep breath lifts a chest
 
-FOUND_MEMORY_SETS = 1000  # over which that is learned: a slow rise takes landmark after landmark
-USUALLY_FOUND = 0.7  # share of the frame sets: a landmark found less often tells nothing by its absence
+RATE_MEMORY_SETS = 1000  # over which that is learned: a slow rise takes landmark after landmark
+MIN_USUAL_RATE = 0.7  # share of the frame sets: a landmark found less often tells nothing by its absence
 MIN_PICTURE_SHARE = 0.5  # of what a camera usually finds: with less, its picture is at fault, not a place
 MIN_MISSING_LANDMARKS = 2.5  # as which those that are looked for under a bell must count
 MIN_MISSING_SHARE = 0.5  # of them
@@ -81,12 +81,12 @@ class LocalMotion:
         self.size = 0.0  # mm, largest mean displacement under a bell while a part moves by itself, else 0
         self.error: LocalError | None = None  # of places, at the last frame set; None: nothing to add
         self._points, self._centres = np.zeros((0, 3)), np.zeros((0, 3))
-        self._reach, self._known = np.zeros(0), np.zeros(0)  # per bell, mm; per landmark, mm, by the map's covariance
+        self._reach, self._drift_limit = np.zeros(0), np.zeros(0)  # per bell, mm; per landmark, mm, by the map's sigma
         self._bells = self._squares = np.zeros((0, 0))  # (C, N)
         # per landmark: normal equations of its usual displacement, and in how many frame sets it was seen
-        self._normal, self._right, self._looks = np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._normal, self._right, self._counts = np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
         self._small = np.zeros(0)  # mm, by which a landmark stands out beside its neighbours, else 0;
-        self._stood = np.zeros(0, bool)  # whether it seemed to in the last frame set
+        self._stood_out = np.zeros(0, bool)  # whether it seemed to in the last frame set
         self._place = np.zeros((0, 3))  # mm, where it usually was after PLACED_SETS, nan before
         self._usual, self._learned = np.zeros(0), np.zeros(0)  # per bell: mean chi square per axis, and looks
         self._moving = np.zeros(0, bool)  # per bell
@@ -108,85 +108,85 @@ class LocalMotion:
     def __call__(
         self, observations: Observations, fit: FrameFit, sigma: Array, surface_map: SurfaceMap, smeared: float
     ) -> None:
-        """Take an accepted fit to what was `seen`. sigma: (N,) px. Cameras that were left out count for nothing.
+        """Take an accepted fit to `observations`. sigma: (N,) px. Cameras that were left out do not count.
 
-        smeared: mm that the surface moves in the time by which the cameras' exposures are unknown.
+        smeared: mm that the surface moves in one sigma of the cameras' exposure delays.
         """
         self._take(surface_map)
-        normal, right, weight, plain = self._landmarks(observations, fit, sigma)
-        moved, square, enough = self._means(normal, plain, weight, (weight > 0) & (self._looks >= MIN_LANDMARK_SETS))
+        normal, right, weight, excess = self._landmarks(observations, fit, sigma)
+        usable = (weight > 0) & (self._counts >= MIN_LANDMARK_SETS)
+        shift, square, supported = self._means(normal, excess, weight, usable)
         chance = square / np.maximum(self._usual, 1.0)
-        far, moves = np.linalg.norm(moved, axis=1), self._moving
-        limit, least = np.where(moves, END_CHI2, ONSET_CHI2), np.where(moves, 0.5, 1.0)
-        beyond = far - SMEAR_SIGMAS * smeared
-        usual = (chance > limit) & (beyond > least * MIN_DISPLACEMENT_MM)
-        self._moving = enough & (usual | (square > limit) & (beyond > least * CLEAR_DISPLACEMENT_MM))
-        self.size = float(far[self._moving].max(initial=0.0))
-        by_point = fit.solution.jacobians[:: 1 + len(sigma) // GATE_TRACKS, :, 3:]
-        along = float(np.sqrt((by_point * by_point).mean() * 3))  # px per mm
-        self._gate = GATE * fit.solution.scale * median(sigma) / max(along, 1e-9)
+        size, was_moving = np.linalg.norm(shift, axis=1), self._moving
+        limit, share = np.where(was_moving, END_CHI2, ONSET_CHI2), np.where(was_moving, 0.5, 1.0)
+        clear_size = size - SMEAR_SIGMAS * smeared
+        usual = (chance > limit) & (clear_size > share * MIN_DISPLACEMENT_MM)
+        self._moving = supported & (usual | (square > limit) & (clear_size > share * CLEAR_DISPLACEMENT_MM))
+        self.size = float(size[self._moving].max(initial=0.0))
+        gradients = fit.solution.jacobians[:: 1 + len(sigma) // GATE_TRACKS, :, 3:]
+        pixels_per_mm = float(np.sqrt((gradients * gradients).mean() * 3))  # px per mm
+        self._gate = GATE * fit.solution.scale * median(sigma) / max(pixels_per_mm, 1e-9)
         unseen = self._support(observations, fit, self._bells, self._squares)
-        self._learn(normal, right, weight, square, enough)
-        moved = np.where(self._moving, HEIGHT_RATIO * np.maximum(far, MIN_DISPLACEMENT_MM), 0.0)
-        self._look_at_small(normal, plain, weight, SMEAR_SIGMAS * smeared)
-        self._set_error(moved, unseen)
+        self._learn(normal, right, weight, square, supported)
+        self._look_at_small(normal, excess, weight, SMEAR_SIGMAS * smeared)
+        self._set_error(np.where(self._moving, HEIGHT_RATIO * np.maximum(size, MIN_DISPLACEMENT_MM), 0.0), unseen)
 
-    def _look_at_small(self, normal: Array, plain: Array, weight: Array, smear: float) -> None:
-        """Learn how far landmarks stand out beside the others of their bell; kept until they are seen in place again.
+    def _look_at_small(self, normal: Array, excess: Array, weight: Array, smear: float) -> None:
+        """Learn how far landmarks stand out from the others of their bell; stored until they are in place again.
 
-        One alone may have strayed; another one within SMALL_MM that goes the same way, be it less far, has not.
+        One alone may be a mismatch; not if another one within SMALL_MM moves in the same direction, even if less far.
         """
-        shift = solve_symmetric3(normal + DISPLACEMENT_RIDGE * np.eye(3), np.ascontiguousarray(plain))
-        size, square = np.linalg.norm(shift, axis=1) - smear, (shift * plain).sum(1)
-        known = (weight > 0) & (self._looks >= MIN_LANDMARK_SETS) & (size < MAX_SMALL_MM)
-        top = np.flatnonzero(known & (square > ONSET_CHI2) & (size > CLEAR_DISPLACEMENT_MM))
-        self._small[known & (size < MIN_DISPLACEMENT_MM)] = 0.0
-        stands = np.zeros(len(size), bool)
+        shift = solve_symmetric3(normal + DISPLACEMENT_RIDGE * np.eye(3), np.ascontiguousarray(excess))
+        size, square = np.linalg.norm(shift, axis=1) - smear, (shift * excess).sum(1)
+        usable = (weight > 0) & (self._counts >= MIN_LANDMARK_SETS) & (size < MAX_SMALL_MM)
+        top = np.flatnonzero(usable & (square > ONSET_CHI2) & (size > CLEAR_DISPLACEMENT_MM))
+        self._small[usable & (size < MIN_DISPLACEMENT_MM)] = 0.0
+        stands_out = np.zeros(len(size), bool)
         if len(top):
-            beside = np.flatnonzero(known & (square > END_CHI2) & (size > MIN_DISPLACEMENT_MM))
-            away = np.linalg.norm(self._points[top, None] - self._points[beside], axis=2)
-            way = shift / np.maximum(np.linalg.norm(shift, axis=1), 1e-9)[:, None]
-            along = (away < SMALL_MM) & (top[:, None] != beside) & (way[top] @ way[beside].T > MIN_COSINE)
-            stands[top[along.any(1)]] = True
-        again = stands & self._stood
-        self._small[again], self._stood = (size + smear)[again], stands
+            neighbours = np.flatnonzero(usable & (square > END_CHI2) & (size > MIN_DISPLACEMENT_MM))
+            distance = np.linalg.norm(self._points[top, None] - self._points[neighbours], axis=2)
+            direction = shift / np.maximum(np.linalg.norm(shift, axis=1), 1e-9)[:, None]
+            alike = direction[top] @ direction[neighbours].T > MIN_COSINE
+            stands_out[top[((distance < SMALL_MM) & (top[:, None] != neighbours) & alike).any(1)]] = True
+        twice = stands_out & self._stood_out
+        self._small[twice], self._stood_out = (size + smear)[twice], stands_out
 
-    def _set_error(self, moved: Array, unseen: Array) -> None:
+    def _set_error(self, heights: Array, unseen: Array) -> None:
         """Take the sigma, mm, of each bell (C,), by its displacement and as it is not seen."""
-        sigma = np.maximum(moved, unseen)
-        told, top = np.flatnonzero(sigma), np.flatnonzero(self._small)
-        variance, growth = AT_ONE_REACH * sigma[told] ** 2, AT_ONE_REACH * 2 * sigma[told] * TISSUE_SPEED
-        support = self._anchors[self._near @ self._support.present > 0]
-        bells_told = self._centres[told], variance, growth, self._reach[told]
-        self.error = LocalError(*bells_told, support, self._span, MAX_UNSEEN_MM**2)
+        sigma = np.maximum(heights, unseen)
+        rows, top = np.flatnonzero(sigma), np.flatnonzero(self._small)
+        variance, growth = BELL_HEIGHT_RATIO * sigma[rows] ** 2, BELL_HEIGHT_RATIO * 2 * sigma[rows] * TISSUE_SPEED
+        support, limit = self._anchors[self._near @ self._support.present > 0], MAX_UNSEEN_MM**2
+        centres, reach = self._centres[rows], self._reach[rows]
+        self.error = LocalError(centres, variance, growth, reach, support, self._span, limit)
         if len(top):
             peak = (SMALL_RATIO * self._small[top]) ** 2
             self.error = self.error.with_bells(self._points[top], peak, SMALL_REACH_MM)
 
     def _take(self, surface_map: SurfaceMap) -> None:
         """Follow a map that was refined or has grown: rows keep their meaning, and landmarks their places."""
-        points, known = surface_map.points, len(self._points)
+        points, count = surface_map.points, len(self._points)
         if points is self._points:
             return
-        if known:
-            change = points[:known] - self._points
+        if count:
+            change = points[:count] - self._points
             rigid = rigid_part(self._points, change, self._gate)
             self._place = self._place + rigid
             usual = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
             self._right = self._right - (usual @ (change - rigid)[..., None])[..., 0]
-        self._points, further = points, len(points) - known
-        own = np.diag(surface_map.covariance).reshape(-1, 3).max(1)
-        self._known = MAX_USUAL_DRIFT_MM + 2 * np.sqrt(np.maximum(own, 0.0))
-        if further:
-            self._normal = np.concatenate([self._normal, np.zeros((further, 3, 3))])
-            self._right = np.concatenate([self._right, np.zeros((further, 3))])
-            self._place = np.concatenate([self._place, np.full((further, 3), np.nan)])
-            self._looks, self._small = (np.append(old, np.zeros(further)) for old in (self._looks, self._small))
-            self._stood = np.append(self._stood, np.zeros(further, bool))
+        self._points, new = points, len(points) - count
+        variance = np.diag(surface_map.covariance).reshape(-1, 3).max(1)
+        self._drift_limit = MAX_USUAL_DRIFT_MM + 2 * np.sqrt(np.maximum(variance, 0.0))
+        if new:
+            self._normal = np.concatenate([self._normal, np.zeros((new, 3, 3))])
+            self._right = np.concatenate([self._right, np.zeros((new, 3))])
+            self._place = np.concatenate([self._place, np.full((new, 3), np.nan)])
+            self._counts, self._small = (np.append(old, np.zeros(new)) for old in (self._counts, self._small))
+            self._stood_out = np.append(self._stood_out, np.zeros(new, bool))
             self._centres = bell_centres(points, self._centres)
-            more = np.zeros(len(self._centres) - len(self._usual))
-            self._usual, self._learned = np.append(self._usual, more), np.append(self._learned, more)
-            self._moving = np.append(self._moving, more > 0)
+            added = np.zeros(len(self._centres) - len(self._usual))
+            self._usual, self._learned = np.append(self._usual, added), np.append(self._learned, added)
+            self._moving = np.append(self._moving, added > 0)
             self._reach = bell_reaches(points, self._centres)
             self._bells = np.ascontiguousarray(bells(points, self._centres, self._reach).T)
             self._squares = self._bells**2
@@ -210,103 +210,99 @@ class LocalMotion:
         residual = contiguous(fit.solution.residuals)
         normal, right, square, views = displacement_sums(len(self._points), row, jacobian, residual, precision)
         usual = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
-        plain, about, explained = unusual_displacements(normal, right, square, usual, self._right)
-        agree = about - explained < MAX_VIEW_SIGMAS**2 * (2 * views - 3) + NONLINEAR_SHARE * about
+        excess, excess_square, explained = unusual_displacements(normal, right, square, usual, self._right)
+        agree = excess_square - explained < MAX_VIEW_SIGMAS**2 * (2 * views - 3) + NONLINEAR_SHARE * excess_square
         capped = np.minimum(1.0, MAX_LANDMARK_SIGMAS / np.sqrt(np.maximum(explained, 1e-9)))
-        return normal, right, np.where((views >= MIN_VIEWS) & agree, capped, 0.0), plain
+        return normal, right, np.where((views >= MIN_VIEWS) & agree, capped, 0.0), excess
 
-    def _means(self, normal: Array, plain: Array, weight: Array, counts: Mask) -> tuple[Array, Array, Mask]:
+    def _means(self, normal: Array, excess: Array, weight: Array, counts: Mask) -> tuple[Array, Array, Mask]:
         """Mean displacement (C, 3) mm under each bell, its chi square (C,), and where enough landmarks count (C,).
 
         weight: (N,), of landmarks that count (N,). The chi square supposes that all of them have a weight of one.
         """
         count, ridge = len(weight), DISPLACEMENT_RIDGE * np.eye(3)
         flat, pulls = normal.reshape(count, 9), (weight * counts)[:, None]
-        sums = self._bells @ np.concatenate([pulls * flat, pulls * plain, counts[:, None]], 1)
+        sums = self._bells @ np.concatenate([pulls * flat, pulls * excess, counts[:, None]], 1)
         spread = self._squares @ (counts[:, None] * np.concatenate([flat, np.ones((count, 1))], 1))
         pull = np.ascontiguousarray(sums[:, 9:12])
-        moved = solve_symmetric3(sums[:, :9].reshape(-1, 3, 3) + ridge, pull)
+        shift = solve_symmetric3(sums[:, :9].reshape(-1, 3, 3) + ridge, pull)
         square = (solve_symmetric3(spread[:, :9].reshape(-1, 3, 3) + ridge, pull) * pull).sum(1)
-        return moved, square, sums[:, 12] ** 2 > MIN_BELL_LANDMARKS * spread[:, 9]
+        return shift, square, sums[:, 12] ** 2 > MIN_BELL_LANDMARKS * spread[:, 9]
 
-    def _learn(self, normal: Array, right: Array, weight: Array, square: Array, enough: Mask) -> None:
+    def _learn(self, normal: Array, right: Array, weight: Array, square: Array, supported: Mask) -> None:
         """Learn what is usual, except under bells that move by themselves."""
-        still = ~self._moving
-        seen = weight > 0
+        resting = ~self._moving
+        learned = weight > 0
         if self.active:
-            seen &= self._bells[self._moving].max(0) < STILL_BELL
-        forgets = seen / USUAL_MEMORY_SETS
-        self._normal += (seen * weight)[:, None, None] * normal - forgets[:, None, None] * self._normal
-        self._right += (seen * weight)[:, None] * right - forgets[:, None] * self._right
-        self._looks += seen
-        enough = enough & still
-        self._learned = np.minimum(self._learned + enough, USUAL_MEMORY_SETS)
+            learned &= self._bells[self._moving].max(0) < MIN_BELL_VALUE
+        forgotten = learned / USUAL_MEMORY_SETS
+        self._normal += (learned * weight)[:, None, None] * normal - forgotten[:, None, None] * self._normal
+        self._right += (learned * weight)[:, None] * right - forgotten[:, None] * self._right
+        self._counts += learned
+        supported = supported & resting
+        self._learned = np.minimum(self._learned + supported, USUAL_MEMORY_SETS)
         now = np.minimum(square / 3, MAX_USUAL_RISE * np.maximum(self._usual, 1.0))
-        self._usual += enough * (now - self._usual) / np.maximum(self._learned, 1.0)
+        self._usual += supported * (now - self._usual) / np.maximum(self._learned, 1.0)
         self._bound()
 
     def _bound(self) -> None:
         """Keep usual displacements near the places where landmarks usually were at first."""
-        held = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
-        usual = solve_symmetric3(held, self._right)
-        placed = (self._looks == PLACED_SETS) & np.isnan(self._place[:, 0])
-        self._place[placed] = (self._points + usual)[placed]
+        damped = self._normal + DISPLACEMENT_RIDGE * np.eye(3)
+        usual = solve_symmetric3(damped, self._right)
+        first_time = (self._counts == PLACE_SETS) & np.isnan(self._place[:, 0])
+        self._place[first_time] = (self._points + usual)[first_time]
         drift = self._points + usual - self._place
-        far = np.flatnonzero((drift * drift).sum(1) > self._known**2)  # not where one is unknown
+        far = np.flatnonzero((drift * drift).sum(1) > self._drift_limit**2)  # not where one is unknown
         if len(far):
-            back = drift[far] * (1 - self._known[far] / np.linalg.norm(drift[far], axis=1))[:, None]
-            self._right[far] -= (held[far] @ back[..., None])[..., 0]
+            excess = drift[far] * (1 - self._drift_limit[far] / np.linalg.norm(drift[far], axis=1))[:, None]
+            self._right[far] -= (damped[far] @ excess[..., None])[..., 0]
 
 
 class SupportedPlaces:
     """Remembers which landmarks each camera usually finds, and where most of them are missing."""
 
     def __init__(self, cameras: int) -> None:
-        self._rate, self._looks = np.zeros((cameras, 0)), np.zeros((cameras, 0))  # share found, and looks
-        self._usual, self._lost = np.zeros(0), np.zeros(0, np.int64)  # per bell: missing share; sets in a row
+        self._rate, self._counts = np.zeros((cameras, 0)), np.zeros((cameras, 0))  # share found, and looks
+        self._usual, self._lost_sets = np.zeros(0), np.zeros(0, np.int64)  # per bell: missing share; sets in a row
         self._supported = np.zeros(0)  # per bell, s, stamp at which it was last not lost
-        self._asked = np.zeros(0), np.zeros(0), np.zeros(0)  # those asked for (N,), their sum and count by bell (K,)
+        self._bell_sums = np.zeros(0), np.zeros(0), np.zeros(0)  # expected landmarks (N,), their sum and count by bell
         self.present = np.zeros(0)  # (N,) 1 for landmarks that were found when they were last looked for, else 0
 
     def __call__(self, observations: Observations, fit: FrameFit, bell: Array, squares: Array) -> Array:
         """Sigma (K,) mm of the bells' places: 0 where landmarks are found. bell, squares: (K, N) and its squares."""
         self._extend(bell.shape[0], bell.shape[1], fit.stamp)
         found, sought = self._sights(observations, fit)
-        expected = sought & (self._rate > USUALLY_FOUND) & (self._looks >= MIN_LANDMARK_SETS)
-        there = found & expected
-        expected &= (there.sum(1) >= MIN_PICTURE_SHARE * expected.sum(1))[:, None]
-        eyes = expected.sum(0)
-        counts, present = (eyes > 0) * 1.0, (there & expected).sum(0) >= np.clip(eyes, 1, MIN_VIEWS)
+        expected = sought & (self._rate > MIN_USUAL_RATE) & (self._counts >= MIN_LANDMARK_SETS)
+        found_expected = found & expected
+        expected &= (found_expected.sum(1) >= MIN_PICTURE_SHARE * expected.sum(1))[:, None]
+        views = expected.sum(0)
+        counts, present = (views > 0) * 1.0, (found_expected & expected).sum(0) >= np.clip(views, 1, MIN_VIEWS)
         self.present = np.where(counts > 0, present, self.present)
-        if (
-            len(asked_of := self._asked[0]) != len(counts)
-            or (asked_of != counts).any()
-            or len(self._asked[1]) != len(bell)
-        ):
-            whole = np.maximum(bell @ counts, 1e-9)
-            self._asked = counts, whole, whole**2 / np.maximum(squares @ counts, 1e-9)
-        _, asked, weight = self._asked
-        missing = 1 - bell @ (counts * present) / asked
-        known = weight >= MIN_MISSING_LANDMARKS
-        lost = known & (missing >= MIN_MISSING_SHARE)
+        if not np.array_equal(self._bell_sums[0], counts) or len(self._bell_sums[1]) != len(bell):
+            total = np.maximum(bell @ counts, 1e-9)
+            self._bell_sums = counts, total, total**2 / np.maximum(squares @ counts, 1e-9)
+        _, sums, weight = self._bell_sums
+        missing = 1 - bell @ (counts * present) / sums
+        judged = weight >= MIN_MISSING_LANDMARKS
+        lost = judged & (missing >= MIN_MISSING_SHARE)
         if lost.any():
             lost &= weight * self._surprise(missing) > MISSING_SURPRISE
-        self._lost = np.where(lost, self._lost + 1, np.where(known, 0, self._lost))
-        self._supported = np.where(self._lost > 0, self._supported, fit.stamp)
-        self._learn(found, sought, missing, known & ~lost, bell)
+        self._lost_sets = np.where(lost, self._lost_sets + 1, np.where(judged, 0, self._lost_sets))
+        self._supported = np.where(self._lost_sets > 0, self._supported, fit.stamp)
+        self._learn(found, sought, missing, judged & ~lost, bell)
         unseen = BEYOND_REACH_MM + TISSUE_SPEED * (fit.stamp - self._supported)
-        return np.where(self._lost >= MISSING_SETS, np.minimum(unseen, MAX_UNSEEN_MM), 0.0)
+        return np.where(self._lost_sets >= MISSING_SETS, np.minimum(unseen, MAX_UNSEEN_MM), 0.0)
 
     def _extend(self, count: int, landmarks: int, stamp: float) -> None:
-        more, bells_more = landmarks - self._rate.shape[1], count - len(self._usual)
-        if more > 0:
-            wider = np.zeros((len(self._rate), more))
-            self.present = np.append(self.present, np.ones(more))
-            self._rate, self._looks = np.hstack([self._rate, wider]), np.hstack([self._looks, wider])
-        if bells_more > 0:
-            self._usual = np.append(self._usual, np.zeros(bells_more))
-            self._lost = np.append(self._lost, np.zeros(bells_more, np.int64))
-            self._supported = np.append(self._supported, np.full(bells_more, stamp))
+        new_landmarks, new_bells = landmarks - self._rate.shape[1], count - len(self._usual)
+        if new_landmarks > 0:
+            wider = np.zeros((len(self._rate), new_landmarks))
+            self.present = np.append(self.present, np.ones(new_landmarks))
+            self._rate, self._counts = np.hstack([self._rate, wider]), np.hstack([self._counts, wider])
+        if new_bells > 0:
+            self._usual = np.append(self._usual, np.zeros(new_bells))
+            self._lost_sets = np.append(self._lost_sets, np.zeros(new_bells, np.int64))
+            self._supported = np.append(self._supported, np.full(new_bells, stamp))
 
     def _sights(self, observations: Observations, fit: FrameFit) -> tuple[Mask, Mask]:
         """Which landmarks each camera (C, N) has found where the pose puts them, and has looked for."""
@@ -314,11 +310,11 @@ class SupportedPlaces:
         camera, track = (contiguous(a, np.int64) for a in (observations.camera, observations.track))
         jacobian = contiguous(fit.solution.jacobians)
         residual = contiguous(fit.solution.residuals)
-        there = fit.inlier if fit.lit is None else fit.inlier | fit.lit
-        found, sought = landmark_sights(shape[0], shape[1], camera, track, jacobian, residual, there, NEAR_MM)
+        agrees = fit.inlier if fit.shadowed is None else fit.inlier | fit.shadowed
+        found, sought = landmark_sights(shape[0], shape[1], camera, track, jacobian, residual, agrees, NEAR_MM)
         sought[missed.camera, missed.track] = True
-        out = list(fit.outliers)
-        found[out], sought[out] = False, False
+        outliers = list(fit.outliers)
+        found[outliers], sought[outliers] = False, False
         return found, sought
 
     def _surprise(self, missing: Array) -> Array:
@@ -329,13 +325,13 @@ class SupportedPlaces:
 
     def _learn(self, found: Mask, sought: Mask, missing: Array, usual: Mask, bell: Array) -> None:
         """Learn which landmarks are usually found, except where they are missing now."""
-        lost = self._lost > 0
+        lost = self._lost_sets > 0
         if lost.any():
-            sought = sought & (found | (bell[lost].max(0) < STILL_BELL))
-        self._looks += sought
-        known = np.where(self._looks > PLACED_SETS, FOUND_MEMORY_SETS, np.maximum(self._looks, 1.0))
-        self._rate += sought * (found - self._rate) / known
-        self._usual += usual * (missing - self._usual) / FOUND_MEMORY_SETS
+            sought = sought & (found | (bell[lost].max(0) < MIN_BELL_VALUE))
+        self._counts += sought
+        memory = np.where(self._counts > PLACE_SETS, RATE_MEMORY_SETS, np.maximum(self._counts, 1.0))
+        self._rate += sought * (found - self._rate) / memory
+        self._usual += usual * (missing - self._usual) / RATE_MEMORY_SETS
 
 
 def rigid_part(points: Array, change: Array, gate: float) -> Array:
@@ -344,14 +340,14 @@ def rigid_part(points: Array, change: Array, gate: float) -> Array:
     gate: mm, at which a landmark is an outlier: as in the fit of the pose, which takes that part up.
     """
     jacobian = se3.point_jacobians(points)  # (N, 3, 6)
-    moved = np.zeros_like(change)
+    rigid = np.zeros_like(change)
     for _ in range(RIGID_STEPS):
-        weight = 1 / (1 + ((change - moved) ** 2).sum(1) / gate**2) ** 2  # Geman-McClure's
+        weight = 1 / (1 + ((change - rigid) ** 2).sum(1) / gate**2) ** 2  # Geman-McClure's
         weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
-        whole = jacobian.reshape(-1, 6)
-        step = np.linalg.solve(weighted.T @ whole + 1e-9 * np.eye(6), weighted.T @ change.ravel())
-        moved = (whole @ step).reshape(-1, 3)
-    return moved
+        rows = jacobian.reshape(-1, 6)
+        step = np.linalg.solve(weighted.T @ rows + 1e-9 * np.eye(6), weighted.T @ change.ravel())
+        rigid = (rows @ step).reshape(-1, 3)
+    return rigid
 
 
 def bell_reaches(points: Array, centres: Array) -> Array:
@@ -366,11 +362,11 @@ def bell_centres(points: Array, centres: Array) -> Array:
     away = np.full(len(points), np.inf)
     for centre in centres:
         away = np.minimum(away, np.linalg.norm(points - centre, axis=1))
-    chosen = list(centres)
-    while len(chosen) < MAX_BELLS and away.max(initial=0.0) > BELL_SIGMA_MM:
-        chosen.append(points[int(np.argmax(away))])
-        away = np.minimum(away, np.linalg.norm(points - chosen[-1], axis=1))
-    return np.array(chosen).reshape(-1, 3)
+    spread = list(centres)
+    while len(spread) < MAX_BELLS and away.max(initial=0.0) > BELL_SIGMA_MM:
+        spread.append(points[int(np.argmax(away))])
+        away = np.minimum(away, np.linalg.norm(points - spread[-1], axis=1))
+    return np.array(spread).reshape(-1, 3)
 
 
 @compiled("Tuple((b1[:,::1], b1[:,::1]))(i8, i8, i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], b1[::1], f8)")
@@ -388,13 +384,13 @@ def landmark_sights(
 
     camera, track: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. agrees: (N,). near: mm off that count as found.
     """
-    found, seen = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
+    found, sought = np.zeros((cameras, landmarks), np.bool_), np.zeros((cameras, landmarks), np.bool_)
     for i in range(len(camera)):
-        away, by_point = 0.0, 0.0
+        square, by_point = 0.0, 0.0
         for k in range(2):
-            away += residual[i, k] * residual[i, k]
+            square += residual[i, k] * residual[i, k]
             for b in range(3):
                 by_point += jacobian[i, k, 3 + b] * jacobian[i, k, 3 + b]
-        seen[camera[i], track[i]] = True
-        found[camera[i], track[i]] = agrees[i] or 2 * away < near * near * by_point
-    return found, seen
+        sought[camera[i], track[i]] = True
+        found[camera[i], track[i]] = agrees[i] or 2 * square < near * near * by_point
+    return found, sought

@@ -1,10 +1,10 @@
 """Reported covariance of a pose: the window's marginal for the noise known now, and what a window cannot average.
 
-The window holds what is new in each frame set, with the noise that was believed when it came. The estimator's decisions
-(which camera is an outlier, where a landmark is searched, what enters the window) use its marginal as it is: wide, and
-good for deciding. What is reported is the same marginal, for the noise known now, of the newest pose and of the first
-one, in which the path is placed, and all that does not average out: late exposures, map and lenses, the lasting part of
-the tracks' errors, the drift of the images' shifts.
+The window holds the noise that is new in each frame set, as it was estimated then. The estimator's decisions (which
+camera is an outlier, where a landmark is searched, what enters the window) use its marginal unchanged: wide, and safe
+for deciding. The reported covariance is the sum of this marginal, rescaled to the noise estimated now, of the newest
+pose and of the first one, in which the path is placed, and of all errors that do not average out: late exposures, map
+and lenses, the lasting part of the tracks' errors, the drift of the images' shifts.
 """
 
 from __future__ import annotations
@@ -75,10 +75,10 @@ class TrackNoise:
 
     def learn(self, observations: Observations, solution: PoseFit, sigma: Array) -> None:
         """Take the residuals of one fit. sigma: (N,) px as claimed."""
-        good = solution.weights > INLIER_WEIGHT
-        key = observations.track[good] * self._cameras + observations.camera[good]
-        pull = solution.weights[good] / (sigma[good] * solution.scale)
-        now = _TrackResiduals(observations.stamp, key, solution.residuals[good] * pull[:, None])
+        inlier = solution.weights > INLIER_WEIGHT
+        key = observations.track[inlier] * self._cameras + observations.camera[inlier]
+        pull = solution.weights[inlier] / (sigma[inlier] * solution.scale)
+        now = _TrackResiduals(observations.stamp, key, solution.residuals[inlier] * pull[:, None])
         if not self._past:
             self._past = [now] * 3
             return
@@ -96,12 +96,12 @@ def _squared_changes(now: _TrackResiduals, then: _TrackResiduals) -> Array:
     return np.array([(value**2).sum(), (change**2).sum() / 2]) / 2
 
 
-def rescaling(believed: Array, known: Array) -> Array:
-    """S (6, 6): S @ M @ S.T is a marginal M of the window where the noise is `known` (6, 6), not what was believed.
+def rescaling(assumed: Array, current: Array) -> Array:
+    """S (6, 6): S @ M @ S.T is the window's marginal M for the `current` noise (6, 6) instead of the `assumed` one.
 
-    In axes in which both noises are independent the marginal is a part of the noise, whatever its size.
+    In axes in which both noises are independent the marginal is a fixed part of the noise, whatever its size.
     """
-    return np.asarray(np.linalg.cholesky(known) @ np.linalg.inv(np.linalg.cholesky(believed)))
+    return np.asarray(np.linalg.cholesky(current) @ np.linalg.inv(np.linalg.cholesky(assumed)))
 
 
 class ImageShiftDrift:
@@ -120,18 +120,18 @@ class ImageShiftDrift:
         self._start = shift.T.ravel(), _shift_information(fit)
         self.variance, self._count = 0.0, 0
 
-    def learn(self, fit: SharedFit, shift: Array, alike: float) -> None:
+    def learn(self, fit: SharedFit, shift: Array, lasting: float) -> None:
         """Take the shifts (C, 2), px, after one more fit.
 
-        alike: the part of the variance claimed of tracks that lasts from one frame set to the next.
+        lasting: the part of the tracks' stated variance that lasts from one frame set to the next.
         """
         if self._start is None:
             return
-        before, then = self._start
-        both = np.linalg.inv(np.linalg.inv(_shift_information(fit)) + np.linalg.inv(then))
-        both = both / max(alike, MIN_LASTING_SHARE)
+        before, start_information = self._start
+        information = np.linalg.inv(np.linalg.inv(_shift_information(fit)) + np.linalg.inv(start_information))
+        information = information / max(lasting, MIN_LASTING_SHARE)
         self._count = min(self._count + 1, DRIFT_MEMORY_SETS)
-        self.variance += (_mean_square(both, shift.T.ravel() - before) - self.variance) / self._count
+        self.variance += (_mean_square(information, shift.T.ravel() - before) - self.variance) / self._count
 
 
 def _shift_information(fit: SharedFit) -> Array:
@@ -146,11 +146,11 @@ def _mean_square(information: Array, shift: Array) -> float:
 
     Three cameras show three of six shifts: one sigma of what so few may be off by is added.
     """
-    known, axes = np.linalg.eigh(information)
+    eigenvalues, axes = np.linalg.eigh(information)
     square = (axes.T @ shift) ** 2
-    weight = (CLEAR_SHIFT_PX**2 + 1 / known) ** -2
+    weight = (CLEAR_SHIFT_PX**2 + 1 / eigenvalues) ** -2
     weight = weight / weight.sum()
-    return float(weight @ np.maximum(square - 1 / known, 0.0) * (1 + (2 * (weight @ weight)) ** 0.5))
+    return float(weight @ np.maximum(square - 1 / eigenvalues, 0.0) * (1 + (2 * (weight @ weight)) ** 0.5))
 
 
 class CalibrationError:
@@ -175,7 +175,7 @@ class ReportedCovariance:
         self._tracks, self._drift = TrackNoise(cameras), ImageShiftDrift()
         # the first pose given out: the window's marginal, the fit's parts, the clocks' corrections (C,) s, all as then
         self._first: tuple[Array, FitCovariance, Array] | None = None
-        self._added = np.zeros((6, 6))  # the last pose's lasting errors beyond its own covariance
+        self._lasting = np.zeros((6, 6))  # the last pose's lasting errors beyond its own covariance
 
     def learn(self, observations: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
         """Take the residuals of an accepted fit, after the cameras did. seen.sigma: as claimed."""
@@ -193,10 +193,10 @@ class ReportedCovariance:
         """
         parts = fit.parts
         rescaled = rescaling(parts.noise, self._noise(parts, cameras))
-        own = self.error(window.covariance, parts, cameras.offset, cameras, rescaled)
+        current = self.error(window.covariance, parts, cameras.offset, cameras, rescaled)
         drifted = self._drift.variance * parts.by_shift @ parts.by_shift.T
-        self._added = self._tracks.lasting * parts.scatter * parts.tracks + drifted
-        change = own - window.covariance - parts.smear + drifted
+        self._lasting = self._tracks.lasting * parts.scatter * parts.tracks + drifted
+        change = current - window.covariance - parts.smear + drifted
         if self._first is not None and first is not None:
             change += self.error(*self._first, cameras) - first
         elif first is not None:
@@ -209,24 +209,24 @@ class ReportedCovariance:
         self,
         marginal: Array,
         parts: FitCovariance,
-        corrected: Array,
+        offsets: Array,
         cameras: CameraErrors,
         rescaled: Array | None = None,
     ) -> Array:
         """Covariance (6, 6) of a pose, map and lenses apart, by what is known of tracks, images and clocks now.
 
-        marginal: (6, 6), the window's. parts: of the newest of the fits averaged there. corrected: (C,) s, the delays
-        that were taken out of them. The error of the first pose was drawn once and stays; its size is known better
-        with every frame set. rescaled: (6, 6) from the noise believed to that known now, where it is there already.
+        marginal: (6, 6), the window's. parts: of the newest of the fits averaged there. offsets: (C,) s, the delays
+        that were corrected in them. The error of the first pose is constant; its size is known better with every frame
+        set. rescaled: (6, 6), `rescaling` from the assumed to the current noise, if it is computed already.
         """
         rescaled = rescaling(parts.noise, self._noise(parts, cameras)) if rescaled is None else rescaled
-        late = parts.by_delay @ cameras.beyond(corrected) @ parts.by_delay.T
+        delay = parts.by_delay @ cameras.delay_moments(offsets) @ parts.by_delay.T
         lasting = self._tracks.lasting * parts.scatter * parts.tracks
-        return np.asarray(rescaled @ marginal @ rescaled.T + lasting + late)
+        return np.asarray(rescaled @ marginal @ rescaled.T + lasting + delay)
 
     def _noise(self, parts: FitCovariance, cameras: CameraErrors) -> Array:
         """What is new in a frame set (6, 6), as known now."""
-        shifted = cameras.unrest * parts.by_shift @ parts.by_shift.T
+        shifted = cameras.shift_variance * parts.by_shift @ parts.by_shift.T
         return np.asarray(self._tracks.new * parts.scatter * parts.tracks + shifted)
 
     def _of_twist(self, window: WindowEstimate, parts: FitCovariance, rescaled: Array) -> Array:
@@ -234,17 +234,17 @@ class ReportedCovariance:
 
         rescaled: as `error` takes it.
         """
-        claimed = window.twist_covariance
-        by_pose = np.sqrt(np.diag(claimed) / np.diag(parts.noise))  # 1/s, of the window's noise
-        by_noise = rescaled @ claimed @ rescaled.T + by_pose[:, None] * parts.smear * by_pose
+        stated = window.twist_covariance
+        by_pose = np.sqrt(np.diag(stated) / np.diag(parts.noise))  # 1/s, of the window's noise
+        by_noise = rescaled @ stated @ rescaled.T + by_pose[:, None] * parts.smear * by_pose
         by_noise = NOISE_SHARE_OF_TWIST * by_noise
-        moved = window.revision - NOISE_REVISED * np.diag(by_noise) / np.diag(claimed)
-        by_motion = np.sqrt(np.maximum(moved, 0.0) / MOTION_REVISED)
-        return np.asarray(by_noise + by_motion[:, None] * claimed * by_motion)
+        motion_ratio = window.revision - NOISE_REVISED * np.diag(by_noise) / np.diag(stated)
+        by_motion = np.sqrt(np.maximum(motion_ratio, 0.0) / MOTION_REVISED)
+        return np.asarray(by_noise + by_motion[:, None] * stated * by_motion)
 
     def missed(self, pose: SurfacePose) -> SurfacePose:
         """A pose that is only predicted, with its reported covariance."""
-        return widened(pose, self._added)
+        return widened(pose, self._lasting)
 
 
 def widened(pose: SurfacePose, more: Array) -> SurfacePose:

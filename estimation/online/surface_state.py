@@ -54,12 +54,12 @@ class MotionDetector:
         """centre: (3,) mm, surface frame, the place whose shift counts."""
         self._centre, self._at_centre = centre.copy(), np.hstack([-se3.hat(centre), np.eye(3)])
         self._movement = np.array([MOVEMENT_RAD, MOVEMENT_MM])
-        self._least = (MIN_SIGMA_SHARE * self._movement[:, None, None]) ** 2 * np.eye(3)
+        self._floor = (MIN_SIGMA_SHARE * self._movement[:, None, None]) ** 2 * np.eye(3)
         self._anchor: Array | None = None  # the first base_from_surface, from which turns and shifts are counted
         self._stamps: deque[float] = deque(maxlen=ONSET_HISTORY)
         self._states: deque[Array] = deque(maxlen=ONSET_HISTORY)  # (2, 3) each: turn, rad, and shift, mm
         self._covariances: deque[Array] = deque(maxlen=REST_POSES)  # (2, 3, 3) each, of them
-        self._rest: Array | None = None  # (2, 3)
+        self._rest_state: Array | None = None  # (2, 3)
         self._noise = _RestNoise()
         self.motion = MotionState()  # after the last pose
 
@@ -79,7 +79,7 @@ class MotionDetector:
         both = np.stack([covariance[:3, :3], self._at_centre @ covariance @ self._at_centre.T])
         self._stamps.append(stamp)
         self._states.append(np.stack([turn, axes @ (here - there)]))
-        self._covariances.append(turned @ both @ turned.T + self._least)
+        self._covariances.append(turned @ both @ turned.T + self._floor)
         if self.motion.moving:
             self._settle()
         else:
@@ -97,62 +97,63 @@ class MotionDetector:
         if len(self._covariances) < REST_POSES:
             return self._set_motion(moving=True, onset=self.motion.onset)
         newest = _newest(self._states, REST_POSES)
-        claimed = np.array(self._covariances).mean(0)
-        rest = newest.mean(0)
-        away = newest.reshape(-1, BLOCK_POSES, 2, 3).mean(1) - rest
-        white = self._noise.white(newest, claimed)
-        spread = 3.5 * np.sqrt(white * np.trace(claimed, axis1=1, axis2=2) / BLOCK_POSES)
+        covariance = np.array(self._covariances).mean(0)
+        mean = newest.mean(0)
+        deviation = newest.reshape(-1, BLOCK_POSES, 2, 3).mean(1) - mean
+        white = self._noise.white(newest, covariance)
+        spread = 3.5 * np.sqrt(white * np.trace(covariance, axis1=1, axis2=2) / BLOCK_POSES)
         allowed = np.maximum(SETTLED_SHARE, spread / self._movement)
-        if (self._sizes(away).max(0) > allowed).any():
+        if (self._sizes(deviation).max(0) > allowed).any():
             return self._set_motion(moving=True, onset=self.motion.onset)
-        self._rest = rest
-        self._noise.begin(newest, claimed, white)
+        self._rest_state = mean
+        self._noise.begin(newest, covariance, white)
         return self._set_motion(moving=False, onset=self.motion.onset)
 
     # -- at rest: until it moves
 
     def _watch(self) -> None:
-        assert self._rest is not None
+        assert self._rest_state is not None
         newest = _newest(self._states, REST_POSES)
-        claimed = _newest(self._covariances, AVERAGED_POSES[0]).mean(0)
-        away = self._sizes(newest[-AVERAGED_POSES[0] :].mean(0) - self._rest) > FLAGGED_SHARE
-        looks = [(count, self._rest, self._noise.variance(count)) for count in AVERAGED_POSES]
-        for count, since, variance in [*looks, (AVERAGED_POSES[0], _mean_before(newest), self._noise.step)]:
+        covariance = _newest(self._covariances, AVERAGED_POSES[0]).mean(0)
+        shifted = self._sizes(newest[-AVERAGED_POSES[0] :].mean(0) - self._rest_state) > FLAGGED_SHARE
+        comparisons = [(count, self._rest_state, self._noise.variance(count)) for count in AVERAGED_POSES]
+        for count, since, variance in [*comparisons, (AVERAGED_POSES[0], _mean_before(newest), self._noise.step)]:
             part = newest[-count:] - since
-            kind = self._moved(part, claimed, variance)
-            if kind is not None and (since is self._rest or away[kind]):  # not where those before hold a wrong pose
+            kind = self._moved(part, covariance, variance)
+            if kind is not None and (since is self._rest_state or shifted[kind]):  # else those before hold a wrong pose
                 self._covariances.clear()  # rest is a second of poses that are all later
                 return self._set_motion(moving=True, onset=self._onset(since, part.mean(0), kind))
-        self._noise.learn(newest, claimed)
+        self._noise.learn(newest, covariance)
         return self._set_motion(moving=False, onset=self.motion.onset)
 
-    def _moved(self, part: Array, claimed: Array, variance: Array) -> int | None:
+    def _moved(self, part: Array, covariance: Array, variance: Array) -> int | None:
         """0 where the newest poses' mean has turned, 1 where it has shifted, None where it is at rest.
 
-        part: (count, 2, 3) since rest, or since just before. variance: (2,) of their mean, in parts of the claimed one.
+        part: (count, 2, 3) since rest, or since just before. covariance: (2, 3, 3) of one pose. variance: (2,) of their
+        mean, in parts of it.
         """
         count, mean = len(part), part.mean(0)
         sizes = self._sizes(mean)
         for kind in np.flatnonzero(sizes > FLAGGED_SHARE):
-            spread = claimed[kind] * variance[kind]
+            spread = covariance[kind] * variance[kind]
             halves = part[:, kind].reshape(2, -1, 3).sum(1) / (count / 2)
             along = halves @ mean[kind] / (mean[kind] @ mean[kind])
-            least = min(MIN_HALF_SHARE, FLAGGED_SHARE / sizes[kind])
-            if along.min() >= least and mean[kind] @ np.linalg.solve(spread, mean[kind]) > MOTION_CHI2:
+            min_along = min(MIN_HALF_SHARE, FLAGGED_SHARE / sizes[kind])
+            if along.min() >= min_along and mean[kind] @ np.linalg.solve(spread, mean[kind]) > MOTION_CHI2:
                 return int(kind)
         return None
 
-    def _onset(self, since: Array, moved: Array, kind: int) -> float:
+    def _onset(self, since: Array, change: Array, kind: int) -> float:
         """Stamp of the first pose from which on all have gone a quarter of the way; the newest one's if it is back."""
-        along = (np.array(self._states)[:, kind] - since[kind]) @ moved[kind] / (moved[kind] @ moved[kind])
+        along = (np.array(self._states)[:, kind] - since[kind]) @ change[kind] / (change[kind] @ change[kind])
         before = np.flatnonzero(along < 0.25)
         return self._stamps[min(int(before[-1]) + 1, len(along) - 1) if len(before) else 0]
 
     def _set_motion(self, moving: bool, onset: float) -> None:
-        since = np.zeros((2, 3)) if self._rest is None else self._rest
+        since = np.zeros((2, 3)) if self._rest_state is None else self._rest_state
         newest = _newest(self._states, AVERAGED_POSES[0]).mean(0) - since
-        turned, moved = np.linalg.norm(newest, axis=1).tolist()
-        self.motion = MotionState(moving, onset, moved, turned)
+        turn, shift = np.linalg.norm(newest, axis=1).tolist()
+        self.motion = MotionState(moving, onset, shift, turn)
 
 
 def _mean_before(newest: Array) -> Array:
@@ -166,11 +167,11 @@ def _newest(rows: deque[Array], count: int) -> Array:
 
 
 class _RestNoise:
-    """The variance of means of poses at rest, in parts of one pose's claimed covariance; turn and shift apart."""
+    """The variance of means of poses at rest, in parts of one pose's covariance; turn and shift apart."""
 
     POSE_COUNTS = (*AVERAGED_POSES, REST_POSES)
     FIRST_WEIGHT = 60.0  # poses that the first second's scatter is worth
-    MIN_SHARE = 0.01  # of the variance claimed; no covariance is wider than that
+    MIN_SHARE = 0.01  # of one pose's variance; no covariance is wider than that
     MAX_RISE = 4.0  # times the noise known: a movement that is not yet flagged must not pass for noise
 
     def __init__(self) -> None:
@@ -179,34 +180,34 @@ class _RestNoise:
         self._weight = 0.0
         self._mean = np.zeros((2, 3))  # of the last seconds: noise is counted from here, not from the place of rest
 
-    def white(self, states: Array, claimed: Array) -> Array:
-        """Variance (2,) of single poses (N, 2, 3) by second differences, in parts of the claim (2, 3, 3)."""
-        change = np.diff(states, 2, axis=0)
-        return self._parts(change, claimed) / 6
+    def white(self, states: Array, covariance: Array) -> Array:
+        """Variance (2,) of single poses (N, 2, 3) by second differences, in parts of their covariance (2, 3, 3)."""
+        second_differences = np.diff(states, 2, axis=0)
+        return self._parts(second_differences, covariance) / 6
 
-    def begin(self, states: Array, claimed: Array, white: Array) -> None:
+    def begin(self, states: Array, covariance: Array, white: Array) -> None:
         """The surface has come to rest: poses (REST_POSES, 2, 3) of it, and their white noise (2,)."""
         self._mean = states.mean(0)
         if self._weight:
             return
-        both = np.maximum(white, self._parts(states - self._mean, claimed))
-        self._sum = np.maximum(both, self.MIN_SHARE) / np.array(self.POSE_COUNTS)[:, None]
-        self._step = np.maximum(both, self.MIN_SHARE) * (1 / AVERAGED_POSES[0] + 1 / POSES_BEFORE)
+        noise = np.maximum(white, self._parts(states - self._mean, covariance))
+        self._sum = np.maximum(noise, self.MIN_SHARE) / np.array(self.POSE_COUNTS)[:, None]
+        self._step = np.maximum(noise, self.MIN_SHARE) * (1 / AVERAGED_POSES[0] + 1 / POSES_BEFORE)
         self._weight = self.FIRST_WEIGHT
 
-    def learn(self, newest: Array, claimed: Array) -> None:
+    def learn(self, newest: Array, covariance: Array) -> None:
         """Take the newest poses (REST_POSES, 2, 3) at rest."""
         self._mean = self._mean + (newest[-1] - self._mean) / DRIFT_MEMORY_POSES
-        away = np.stack([newest[-count:].sum(0) / count for count in self.POSE_COUNTS]) - self._mean
-        square = np.einsum("nki,kij,nkj->nk", away, np.linalg.inv(claimed), away) / 3
+        deviation = np.stack([newest[-count:].sum(0) / count for count in self.POSE_COUNTS]) - self._mean
+        square = np.einsum("nki,kij,nkj->nk", deviation, np.linalg.inv(covariance), deviation) / 3
         square = np.minimum(square, self.MAX_RISE * self._sum)
         self._weight = min(self._weight + 1, NOISE_MEMORY_POSES)
         self._sum = self._sum + (square - self._sum) / self._weight
-        step = self._parts((newest[-AVERAGED_POSES[0] :].mean(0) - _mean_before(newest))[None], claimed)
+        step = self._parts((newest[-AVERAGED_POSES[0] :].mean(0) - _mean_before(newest))[None], covariance)
         self._step = self._step + (np.minimum(step, self.MAX_RISE * self._step) - self._step) / self._weight
 
     def variance(self, count: int) -> Array:
-        """(2,) of a mean of `count` poses against the place of rest, in parts of one pose's claimed covariance."""
+        """(2,) of a mean of `count` poses against the place of rest, in parts of one pose's covariance."""
         return np.asarray(self._sum[self.POSE_COUNTS.index(count)] + self._sum[-1])
 
     @property
@@ -215,9 +216,10 @@ class _RestNoise:
         return self._step
 
     @staticmethod
-    def _parts(away: Array, claimed: Array) -> Array:
-        """Mean square (2,) of deviations (N, 2, 3) in parts of their claimed covariance (2, 3, 3)."""
-        return np.asarray(np.einsum("nki,kij,nkj->k", away, np.linalg.inv(claimed), away) / (3 * len(away)))
+    def _parts(deviation: Array, covariance: Array) -> Array:
+        """Mean square (2,) of deviations (N, 2, 3) in parts of their covariance (2, 3, 3)."""
+        square = np.einsum("nki,kij,nkj->k", deviation, np.linalg.inv(covariance), deviation)
+        return np.asarray(square / (3 * len(deviation)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +233,7 @@ class StateSettings:
     leave_sigma: float = 2.5
     enter_deformation: float = 0.2  # mm, RMS over the landmarks
     leave_deformation: float = 0.3  # a rigid pose alone is then off by half a bead in places
-    first: int = 4  # poses that are averaged before one is given out: what that is off by, all later ones are
+    averaged_poses: int = 4  # poses that are averaged before one is given out: what that is off by, all later ones are
     settle: float = 0.06  # s without a fault until TRACKING again: the second frame set of 30 a second
     coast: float = 0.5  # s without a measurement until LOST
 
@@ -243,13 +245,13 @@ Region = Literal["drawn", "found", "none"]  # who says what the surface is: an o
 class EstimatorSettings:
     """When a fit counts as a measurement."""
 
-    least_tracks: int = 10  # six unknowns need three tracks; ten leave room to see an outlier
-    least_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
-    camera_tracks: int = 6  # fewer say nothing of that camera,
-    camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
-    disorder: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
-    sigma_measured: float = 50.0  # mm: a pose less certain than this is no measurement
-    floor_sigma: float = 0.1  # px: alignment claims less on clean images, but interpolation and lens model err by it
+    min_tracks: int = 10  # six unknowns need three tracks; ten leave room to see an outlier
+    min_inlier_share: float = 0.4  # of the tracks found: with fewer in agreement the surface is not what is seen
+    min_camera_tracks: int = 6  # fewer say nothing of that camera,
+    min_camera_share: float = 0.1  # nor does a smaller part of the map's landmarks: so many agree by chance
+    max_incoherence: float = 3.0  # px, median, within a camera whatever its own pose: matches by chance, not a surface
+    max_sigma: float = 50.0  # mm: a pose less certain than this is no measurement
+    min_track_sigma: float = 0.1  # px: alignment states less on clean images, but interpolation and lens err by it
     states: StateSettings = field(default_factory=StateSettings)  # what a measured pose is called
 
 
@@ -292,9 +294,9 @@ class PoseStateMachine:
             fault = f"seen well again for {stamp - self._bad_stamp:.2f} s, {self.settings.settle:.2f} s wanted"
         self._measured_stamp = stamp
         self._poses += 1
-        if self._poses < self.settings.first:
+        if self._poses < self.settings.averaged_poses:
             self.state = TrackState.INITIALISING
-            return self.state, f"pose {self._poses} of {self.settings.first} that are averaged into the first"
+            return self.state, f"pose {self._poses} of {self.settings.averaged_poses} that are averaged into the first"
         self.state = TrackState.DEGRADED if fault else TrackState.TRACKING
         return self.state, fault
 
@@ -302,8 +304,8 @@ class PoseStateMachine:
         """What speaks against TRACKING, or ''."""
         s, inside = self.settings, self.state is TrackState.TRACKING
         if len(basis.cameras) < s.enter_cameras:
-            alone = f"one camera alone carries the pose: {', '.join(basis.cameras) or 'none clearly'}"
-            return f"{alone}; {basis.trouble}" if basis.trouble else alone
+            single = f"one camera alone carries the pose: {', '.join(basis.cameras) or 'none clearly'}"
+            return f"{single}; {basis.trouble}" if basis.trouble else single
         if basis.sigma > (s.leave_sigma if inside else s.enter_sigma):
             return f"the pose is uncertain to {basis.sigma:.1f} mm"
         if basis.tracks < (s.leave_tracks if inside else s.enter_tracks):
@@ -316,10 +318,10 @@ class PoseStateMachine:
 
     def missed(self, stamp: float, why: str) -> tuple[TrackState, str]:
         """State and reason of a pose that is only predicted."""
-        away = stamp - self._measured_stamp
+        seconds = stamp - self._measured_stamp
         self._bad_stamp = stamp
-        self.state = TrackState.LOST if away > self.settings.coast else TrackState.COASTING
-        return self.state, f"{why}; {away:.2f} s since the last measurement"
+        self.state = TrackState.LOST if seconds > self.settings.coast else TrackState.COASTING
+        return self.state, f"{why}; {seconds:.2f} s since the last measurement"
 
 
 class MappedSurface:
@@ -327,26 +329,26 @@ class MappedSurface:
 
     pose: SurfacePose  # the last one, with the covariance that decisions are made by
     reported_pose: SurfacePose  # the same with the reported covariance
-    measured: SurfacePose  # the last one that was measured
+    measured_pose: SurfacePose  # the last one that was measured
 
     def __init__(self, surface_map: SurfaceMap, rig: Rig, region: Region, caveat: str) -> None:
         self.map, self.map_error, self.warp = surface_map, MapError(surface_map), WarpFilter(surface_map)
         self.caveat, self.first_view = caveat, len(surface_map)  # what is added later is not all seen at once
         self.detector, self.predictor = MotionDetector(surface_map.points.mean(0)), Predictor(surface_map.points)
-        self.local = LocalMotion(len(rig), region != "none")
+        self.local_motion = LocalMotion(len(rig), region != "none")
         self.parted = PartedTexture(rig, len(surface_map), region == "drawn")
-        self.reported, self.calibration = ReportedCovariance(len(rig)), CalibrationError()
+        self.reported_covariance, self.calibration_error = ReportedCovariance(len(rig)), CalibrationError()
         self.psd = np.zeros(6)  # of the acceleration from pose to pose
-        self.first: Array | None = None  # (6, 6) covariance of the first pose given out, in which the path is placed
+        self.first_covariance: Array | None = None  # (6, 6) of the first pose given out, in which the path is placed
         # the fit that cameras' errors are to be learned from, its tracks, s since the one before, whether clocks may
-        self.unlearned: tuple[FrameFit, Observations, float, bool] | None = None
+        self.pending_fit: tuple[FrameFit, Observations, float, bool] | None = None
         # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
-        self.accepted, self.map_held = 0, False
+        self.fit_count, self.clocks_frozen = 0, False
         self.displaced = NOTHING_DISPLACED  # by their colours, in the last frame set that was measured
 
     @property
     def local_error(self) -> LocalError | None:
         """By how much single places may be off, by displaced landmarks, groups of them, and colours."""
-        error = self.parted.at_its_places(self.local.error, self.map.points)
+        error = self.parted.local_error(self.local_motion.error, self.map.points)
         places = self.displaced
         return error and error.with_bells(places.centres, places.sizes**2, places.reach)

@@ -63,34 +63,34 @@ class AccelerationPsd:
         weight = weight / weight.sum(1, keepdims=True)
         return np.asarray((weight * self._grid).sum(1))
 
-    def add(self, moved: Array, seconds: float, variance: Array) -> None:
+    def add(self, change: Array, seconds: float, variance: Array) -> None:
         """Take a measured pose: moved (6,) from the measured pose before it, variance (6,) of the new one."""
         if np.isinf(self._var).any():
             self._var = np.tile(variance[:, None], (1, self._grid.shape[1]))
         filters = self._off, self._rate, self._var, self._cross, self._rate_var
         keep = float(np.exp(-seconds / PSD_MEMORY_S))
-        _update_filters(self._grid, self._score, filters, moved, variance.copy(), float(seconds), keep)
+        _update_filters(self._grid, self._score, filters, change, variance.copy(), float(seconds), keep)
 
 
 @compiled("void(f8[:,::1], f8[:,::1], UniTuple(f8[:,::1], 5), f8[::1], f8[::1], f8, f8)")
 def _update_filters(
-    grid: Array, score: Array, filters: tuple[Array, ...], moved: Array, variance: Array, dt: float, keep: float
+    grid: Array, score: Array, filters: tuple[Array, ...], change: Array, variance: Array, dt: float, keep: float
 ) -> None:
     """Predict all filters (6, K) by dt, s, score them by the pose that was measured, and update them, in place."""
     off, rate, var, cross, rate_var = filters
     for i in range(grid.shape[0]):
         for k in range(grid.shape[1]):
             q = grid[i, k]
-            ahead = off[i, k] + rate[i, k] * dt - moved[i]  # predicted minus measured
-            spread = var[i, k] + 2 * dt * cross[i, k] + dt**2 * rate_var[i, k] + q * dt**3 / 3
-            both = cross[i, k] + dt * rate_var[i, k] + q * dt**2 / 2
-            total = spread + variance[i]
-            one = -0.5 * (np.log(total) + (STUDENT_DOF + 1) * np.log1p(ahead**2 / (STUDENT_DOF * total)))
-            score[i, k] = keep * score[i, k] + one
-            gain, gain_rate = spread / total, both / total
-            off[i, k], rate[i, k] = ahead * (1 - gain), rate[i, k] - gain_rate * ahead
-            rate_var[i, k] += q * dt - gain_rate * both
-            var[i, k], cross[i, k] = spread * (1 - gain), both * (1 - gain)
+            innovation = off[i, k] + rate[i, k] * dt - change[i]  # predicted minus measured
+            predicted = var[i, k] + 2 * dt * cross[i, k] + dt**2 * rate_var[i, k] + q * dt**3 / 3
+            predicted_cross = cross[i, k] + dt * rate_var[i, k] + q * dt**2 / 2
+            total = predicted + variance[i]
+            likelihood = -0.5 * (np.log(total) + (STUDENT_DOF + 1) * np.log1p(innovation**2 / (STUDENT_DOF * total)))
+            score[i, k] = keep * score[i, k] + likelihood
+            gain, gain_rate = predicted / total, predicted_cross / total
+            off[i, k], rate[i, k] = innovation * (1 - gain), rate[i, k] - gain_rate * innovation
+            rate_var[i, k] += q * dt - gain_rate * predicted_cross
+            var[i, k], cross[i, k] = predicted * (1 - gain), predicted_cross * (1 - gain)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,8 +149,8 @@ class Smoother:
         if self.newest is not None and measured.stamp - self.newest.stamp > WINDOW_LAG_S:
             self.reset()
         if self._last is not None:
-            moved = se3.log(se3.inverse(self._last.pose) @ measured.pose)
-            self._motion.add(moved, measured.stamp - self._last.stamp, np.diag(measured.covariance))
+            change = se3.log(se3.inverse(self._last.pose) @ measured.pose)
+            self._motion.add(change, measured.stamp - self._last.stamp, np.diag(measured.covariance))
         self._last, self._psd = measured, self._motion.psd
         try:
             self.newest = self._extend(measured)
@@ -178,10 +178,10 @@ class Smoother:
         """Take an estimate as the first pose and twist of an empty window; their correlation is left out."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
-        known = gtsam.noiseModel.Gaussian.Covariance(last.covariance)
-        graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(last.pose), known))
-        known = gtsam.noiseModel.Gaussian.Covariance(last.twist_covariance)
-        graph.add(gtsam.PriorFactorVector(twist, last.twist, known))
+        noise = gtsam.noiseModel.Gaussian.Covariance(last.covariance)
+        graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(last.pose), noise))
+        noise = gtsam.noiseModel.Gaussian.Covariance(last.twist_covariance)
+        graph.add(gtsam.PriorFactorVector(twist, last.twist, noise))
         values.insert(pose, gtsam.Pose3(last.pose))
         values.insert(twist, last.twist)
         self._window.update(graph, values, {pose: last.stamp, twist: last.stamp})
@@ -192,24 +192,24 @@ class Smoother:
         """Density (6,) of the acceleration since the last pose: the recent motion's, or that of a sudden jerk."""
         assert self.newest is not None
         psd, dt = self._psd.copy(), measured.stamp - self.newest.stamp
-        off = se3.log(se3.inverse(self.newest.pose @ se3.exp(self.newest.twist * dt)) @ measured.pose)
+        innovation = se3.log(se3.inverse(self.newest.pose @ se3.exp(self.newest.twist * dt)) @ measured.pose)
         expected = self.newest.covariance + measured.covariance + dt**2 * self.newest.twist_covariance
         variance = np.diag(expected) + psd * dt**3 / 3
         for group in (slice(0, 3), slice(3, 6)):
-            if np.mean(off[group] ** 2 / variance[group]) > MAX_PRIOR_CHI2:
-                psd[group] = np.maximum(psd[group], np.mean(off[group] ** 2) * 3 / dt**3)
+            if np.mean(innovation[group] ** 2 / variance[group]) > MAX_PRIOR_CHI2:
+                psd[group] = np.maximum(psd[group], np.mean(innovation[group] ** 2) * 3 / dt**3)
         return psd
 
     def _extend(self, measured: MeasuredPose) -> WindowEstimate:
         """Add one pose and twist, with the motion prior to those before, and the measurement."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose, twist = gtsam.symbol("x", self._key), gtsam.symbol("v", self._key)
-        start = np.zeros(6)
+        initial_twist = np.zeros(6)
         if self.newest is None:
-            wide = gtsam.noiseModel.Diagonal.Sigmas(np.array([2.0] * 3 + [300.0] * 3))
-            graph.add(gtsam.PriorFactorVector(twist, start, wide))
+            prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([2.0] * 3 + [300.0] * 3))
+            graph.add(gtsam.PriorFactorVector(twist, initial_twist, prior))
         else:
-            start = self.newest.twist
+            initial_twist = self.newest.twist
             old_pose, old_twist = gtsam.symbol("x", self._key - 1), gtsam.symbol("v", self._key - 1)
             before = gtsam.StateData(old_pose, old_twist, self.newest.stamp)
             now = gtsam.StateData(pose, twist, measured.stamp)
@@ -217,7 +217,7 @@ class Smoother:
         noise = gtsam.noiseModel.Gaussian.Covariance(_symmetric(measured.covariance))
         graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(measured.pose), noise))
         values.insert(pose, gtsam.Pose3(measured.pose))
-        values.insert(twist, start)
+        values.insert(twist, initial_twist)
         self._window.update(graph, values, {pose: measured.stamp, twist: measured.stamp})
         self._revise(measured.stamp)
         window = WindowEstimate(
@@ -264,7 +264,7 @@ FACTOR_NAMES = {
 def dot(factors: gtsam.NonlinearFactorGraph, stamps: Mapping[int, float]) -> str:
     """A factor graph in Graphviz's language: variables as ellipses, factors as boxes. stamps: s, of the variables."""
     lines = ["graph window {"]
-    for key, stamp in sorted(stamps.items(), key=lambda each: (each[1], each[0])):
+    for key, stamp in sorted(stamps.items(), key=lambda item: (item[1], item[0])):
         symbol = gtsam.Symbol(key)
         name = VARIABLE_NAMES[chr(symbol.chr())]
         lines.append(f'  {chr(symbol.chr())}{symbol.index()} [label="{name}\\n{stamp:.3f} s"];')

@@ -22,7 +22,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array, Mask
 from estimation.synthetic.world import SYNTHETIC_WORLD, World
 
-MIN_FRAME_SETS = StateSettings().first + 3  # the map's, those averaged into the first pose, and two to be judged
+MIN_FRAME_SETS = StateSettings().averaged_poses + 3  # the map's, those averaged into the first pose, two to be judged
 Mapping = Literal["told", "seen"]  # the world's own map, or one triangulated from the first frame set and refined
 
 

@@ -186,7 +186,7 @@ class Mapping:
         """
         health, pose = self._estimator.health, self._estimator.pose
         young = pose is not None and not self._checked and pose.stamp < self._mapped + CHECKED_S
-        if young and (health.at_odds or health.left_out):
+        if young and (health.contradictory or health.left_out):
             self._doubt(images)
         unseen = frozenset(health.unseen & images.keys()) if self._estimator.confirmed else frozenset()
         if unseen and unseen != self._unseen and not self._doubted:

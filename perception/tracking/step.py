@@ -260,7 +260,7 @@ class TrackingStep:
             self._searched = {c: pyramids[c] for c in self._lost_cameras(tracked)}
             self._absent = 0
             exposed = estimator.as_exposed(fit.solution.base_from_surface, fit.twist)
-            fit = replace(fit, lit=matcher.lit(pyramids, exposed, observations, ~fit.inlier))
+            fit = replace(fit, shadowed=matcher.lit(pyramids, exposed, observations, ~fit.inlier))
             away = estimator.elsewhere(fit, observations)
             place = fit.solution.base_from_surface
             apart = None if away is None else matcher.align_at(stamp, pyramids, place, away.rows, away.points)
