@@ -178,7 +178,7 @@ class ReportedCovariance:
         self._lasting = np.zeros((6, 6))  # the last pose's lasting errors beyond its own covariance
 
     def learn(self, observations: Observations, fit: FrameFit, cameras: CameraErrors) -> None:
-        """Take the residuals of an accepted fit, after the cameras did. seen.sigma: as claimed."""
+        """Take the residuals of an accepted fit, after the cameras did. observations.sigma: as claimed."""
         assert fit.solution.shared is not None
         self._tracks.learn(observations, fit.solution, observations.sigma)
         self._drift.learn(fit.solution.shared, cameras.shift, self._tracks.lasting * fit.parts.scatter)
