@@ -741,6 +741,17 @@ def test_what_is_wrong_is_told_before_a_scenario_is_rendered_and_takes_nothing_a
     assert not (tmp_path / "cache" / "stillbed").exists() and files.progress.read_text() == "an earlier place"
 
 
+def test_nothing_of_an_earlier_run_stays_beside_the_recording_of_a_new_one(tmp_path: Path) -> None:
+    settings = dispensing(tmp_path)
+    assert settings.record is not None
+    files = RunFiles(settings.record)
+    of_a_run = (files.progress, files.surface, files.executed, files.report, files.summary)
+    for file in (files.record, *of_a_run):
+        file.write_text("earlier")
+    prepare(settings, "here", True)
+    assert files.record.exists() and not any(file.exists() for file in of_a_run)
+
+
 @pytest.mark.parametrize("number", slowly(signal.SIGINT, signal.SIGTERM))
 def test_a_signal_while_a_scene_is_rendered_ends_it_at_once_and_leaves_nothing(tmp_path: Path, number: int) -> None:
     cache = tmp_path / "stillbed"

@@ -193,8 +193,8 @@ def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fa
     if not settings.record.parent.is_dir():
         raise InputError(where, "record.file", settings.record, "a file in a folder that exists")
     prepared = _prepared(settings, files, None, faults, where)
-    for file in (files.progress, files.surface):
-        file.unlink(missing_ok=True)
+    for file in (files.progress, files.surface, files.executed, files.report, files.summary):
+        file.unlink(missing_ok=True)  # an earlier run's, which nobody is to take for this one's
     return prepared
 
 
