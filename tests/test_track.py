@@ -60,7 +60,9 @@ def film(folder: Path, name: str) -> None:
 def tracked(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `stillbed track --record --graph` made of it."""
     out = tmp_path_factory.mktemp("tracked") / "out"
-    also = ["--record", str(out.parent / "run.mcap"), "--graph", str(out.parent / "window.dot")]
+    out.mkdir()
+    (out / "wound.csv").write_text("of an earlier run")
+    also = ["--force", "--record", str(out.parent / "run.mcap"), "--graph", str(out.parent / "window.dot")]
     assert main(["track", str(session), "-o", str(out), *also]) == 0
     return out
 

@@ -236,7 +236,7 @@ def run_track(
     into wound.csv. graph: the file that the factor graph is written into as it is at the end, by `MAP_METHOD` only.
     An early end, by an error of the input or Ctrl-C, leaves poses and a report of all frame sets until then.
     """
-    from hardware.files.pose_file import PoseWriter, WoundFile
+    from hardware.files.pose_file import WOUND_FILE_NAME, PoseWriter, WoundFile
     from hardware.offline.convert import TrackRecorder
     from hardware.process.clock import WallClock
     from hardware.recording.session_reader import open_session
@@ -250,6 +250,8 @@ def run_track(
             check_apart(option, file, path)
             _check_file(option, file, force)
     prepare_out(out, force)
+    for stale in ("report.html", "summary.json", WOUND_FILE_NAME):  # an earlier run's
+        (out / stale).unlink(missing_ok=True)
     clock = WallClock()
     complete = False
     with ExitStack() as stack:
