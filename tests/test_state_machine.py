@@ -111,7 +111,7 @@ def look(
     odd: frozenset[int] = frozenset(),
 ) -> str:
     away = np.array(off)
-    health.update(k * STEP, np.array(used), 9.0, away, health.allowed(np.zeros(3)), odd)
+    health.update(k * STEP, np.array(used), 9.0, away, health.offset_sigma(np.zeros(3)), odd)
     return health.trouble(k * STEP)
 
 
@@ -160,11 +160,13 @@ def test_a_camera_that_stands_off_is_left_out_until_it_agrees_twice() -> None:
 
 def test_what_a_camera_usually_stands_off_is_learned() -> None:
     health = healthy()
-    narrow = health.allowed(np.zeros(3))[2]
+    narrow = health.offset_sigma(np.zeros(3))[2]
     for k in range(10, 100):
         look(health, k, off=(0.1, 0.1, 0.9))
-    assert health.allowed(np.zeros(3))[2] > 2 * narrow and health.allowed(np.zeros(3))[0] == pytest.approx(narrow)
-    assert health.allowed(np.full(3, 2.0)).min() > 2.0
+    assert health.offset_sigma(np.zeros(3))[2] > 2 * narrow and health.offset_sigma(np.zeros(3))[0] == pytest.approx(
+        narrow
+    )
+    assert health.offset_sigma(np.full(3, 2.0)).min() > 2.0
 
 
 RATE = 30.0
