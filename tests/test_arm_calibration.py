@@ -181,7 +181,7 @@ def test_a_lagged_set_point_is_where_the_simulated_servo_is(seed: int, dead: flo
         line.append(float(instant), at, slope)
     stamps = np.sort(draw.uniform(instants[0], instants[-1] + 0.3, 200))
     now = float(instants[-1] + 0.4)
-    assert np.allclose(point.lagged(stamps, dead, lag), Servo(line, dead, lag, None).at(stamps, now), atol=2e-5)
+    assert np.allclose(point.lagged(stamps, dead, lag), Servo(line, dead, lag).at(stamps, now), atol=2e-5)
 
 
 def test_places_are_where_the_set_point_has_rested_long_enough() -> None:
