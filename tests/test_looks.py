@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from concurrent.futures import wait
 from contextlib import ExitStack
@@ -451,20 +452,32 @@ def test_relief_is_what_pictures_resolve(size: tuple[int, int], found: bool) -> 
 
 
 def test_a_look_that_fails_says_so_and_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited_for = threading.Event()
+
     def failing(*_: object) -> None:
+        waited_for.wait(30)  # else it may be over, and taken, before the last view is there
         raise ValueError("no such surface")
 
     monkeypatch.setattr("hardware.offline.looks.dense_heights", failing)
     rig, scene = arc_rig(focal=275.0, size=(320, 180)), Scene(body("chest", None, 1), Appearance(), seed=1)
     seen = views(scene, rig, np.random.default_rng(4))
-    looks, done = looked_live(rig, layers(1, 2), seen, seen, landmarks(scene))
+    looks, done = looked_live(rig, layers(1, 2), seen, seen, landmarks(scene), waited_for)
     assert not done and looks.count == 1 and "goes on as planned (ValueError: no such surface)" in looks.text
 
 
 def looked_live(
-    rig: Rig, path: Path, bare: Sequence[SurfaceView], printed: Sequence[SurfaceView], places: Array
+    rig: Rig,
+    path: Path,
+    bare: Sequence[SurfaceView],
+    printed: Sequence[SurfaceView],
+    places: Array,
+    waited_for: threading.Event | None = None,
 ) -> tuple[LiveLooks, list[Look]]:
-    """The looks of a live run at views of the bare surface and of what was printed; places: its landmarks."""
+    """The looks of a live run at views of the bare surface and of what was printed; places: its landmarks.
+
+    waited_for: is set while the job of a round of views is waited for.
+    """
+    waited_for = waited_for or threading.Event()
     held, done, now = Hold(0.0, 0.1, LOOKS), list[Look](), 100.0
     begun = PrintProgress(PrintPhase.PRINTING, 1, len(path), 0.0, 30.0, 0.0, "")
     aside = replace(begun, phase=PrintPhase.RETREATING, fraction=len(path) - 1.0, wanted=LOOK)
@@ -482,9 +495,11 @@ def looked_live(
         for view in [*bare, *bare]:
             seen(view, None, None)
         for shown, progress in ((bare, begun), ([*printed] * 4, aside)):
+            waited_for.clear()
             for view in shown:
                 seen(view, progress, np.eye(4))
             assert looks.busy is not None
+            waited_for.set()
             wait([looks.busy])
         for _ in range(3):
             seen(printed[0], aside, np.eye(4))
