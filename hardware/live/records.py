@@ -98,14 +98,14 @@ class CommandedHead:
 
     def __init__(self, reports: SharedLatest[LiveMotionReport], profile: ArmProfile) -> None:
         self._reports, self._commanded = reports, CommandedPose(profile)
-        self._last_bin = -np.inf
+        self._last_tick = -np.inf
 
     def at(self, stamp: float) -> PrintHead | None:
         """The head at `stamp`, s; commands between two looks are on a straight line, 40 ms at most."""
         report = self._reports.get()
-        if report is not None and report.tick.stamp > self._last_bin and report.progress is not None:
-            self._last_bin = report.tick.stamp
-            self._commanded.add(report.tick.command, self._last_bin)
+        if report is not None and report.tick.stamp > self._last_tick and report.progress is not None:
+            self._last_tick = report.tick.stamp
+            self._commanded.add(report.tick.command, self._last_tick)
         return self._commanded.at(stamp)
 
 
