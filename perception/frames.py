@@ -150,8 +150,8 @@ def parallel_map(function: Callable[..., Result], *arguments: Iterable[object]) 
     The calling thread does the first: what it hands over may have to wait for a core.
     """
     calls = list(zip(*arguments, strict=True))
-    waiting = [_POOL.submit(function, *each) for each in calls[1:]]
-    return [*(function(*first) for first in calls[:1]), *(each.result() for each in waiting)]
+    futures = [_POOL.submit(function, *call) for call in calls[1:]]
+    return [*(function(*first) for first in calls[:1]), *(call.result() for call in futures)]
 
 
 # Height above the tip and radius, mm: a luer needle of half an inch on a 5 ml cartridge in its holder.
@@ -160,8 +160,8 @@ SYRINGE = np.array([[0, 0.5], [12.7, 0.5], [13.6, 2.5], [23, 3.6], [27, 4.8], [5
 
 def check_profile(where: object, what: str, profile: Array) -> None:
     """InputError unless a profile (K, 2) of [height, radius], mm, is that of a tool."""
-    rising = profile.ndim == 2 and profile.shape[1:] == (2,) and len(profile) > 1
-    if not (rising and np.isfinite(profile).all() and (np.diff(profile[:, 0]) > 0).all() and (profile >= 0).all()):
+    well_shaped = profile.ndim == 2 and profile.shape[1:] == (2,) and len(profile) > 1
+    if not (well_shaped and np.isfinite(profile).all() and (np.diff(profile[:, 0]) > 0).all() and (profile >= 0).all()):
         allowed = "two or more [height, radius] in mm, none negative, heights rising"
         raise InputError(where, what, profile.tolist(), allowed)
 
@@ -259,7 +259,7 @@ class Pairing:
         """cameras: number of them in the rig. period: s, of their frames."""
         self.late = 0
         self.retime(period)
-        self._open: list[_OpenSet] = []  # oldest first
+        self._open_sets: list[_OpenSet] = []  # oldest first
         self._last_stamp = [-math.inf] * cameras
         self._last_arrival: list[float | None] = [None] * cameras  # s
         self._last_set: _OpenSet | None = None  # that was given out
@@ -268,27 +268,27 @@ class Pairing:
     def retime(self, period: float) -> None:
         """The cameras' frames come every `period` s from now on."""
         self.patience = pairing_tolerance(period)
-        self._period, self._tolerance, self._silent = period, pairing_tolerance(period), SILENT_PERIODS * period
+        self._period, self._tolerance, self._silence_limit = period, pairing_tolerance(period), SILENT_PERIODS * period
 
     def add(self, frame: Frame, now: float) -> list[FrameSet]:
         """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
         self._last_stamp[frame.camera], self._last_arrival[frame.camera] = frame.stamp, now
         last = self._last_set
-        belongs_to_last = last is not None and last.takes(frame, self._tolerance)
+        belongs_to_last = last is not None and last.accepts(frame, self._tolerance)
         if last is not None and (belongs_to_last or frame.stamp <= last.last):
             self.late += 1
             if belongs_to_last:
-                self._add_delay(frame.camera, now - last.arrived)
+                self._add_delay(frame.camera, now - last.arrival)
         else:
-            self._place(frame, now)
+            self._insert(frame, now)
         return self.due(now)
 
     def due(self, now: float) -> list[FrameSet]:
         """The sets that are complete, or must not be waited for any longer, at `now`, s."""
         self._last_arrival = [now if arrival is None else arrival for arrival in self._last_arrival]
         # with a set that is finished all before it are given out, so that stamps rise
-        count = max((i for i, group in enumerate(self._open, 1) if self._is_finished(group, now)), default=0)
-        out, self._open = self._open[:count], self._open[count:]
+        count = max((i for i, group in enumerate(self._open_sets, 1) if self._is_finished(group, now)), default=0)
+        out, self._open_sets = self._open_sets[:count], self._open_sets[count:]
         if out:
             self._last_set = out[-1]
         return [frame_set(list(group.frames.values())) for group in out]
@@ -300,26 +300,26 @@ class Pairing:
         longest = min(max(usual, default=0.0), self._period)
         self.patience = self._tolerance + (longest if longest > self._tolerance else 0.0)
 
-    def _place(self, frame: Frame, now: float) -> None:
-        for i, group in enumerate(self._open):
-            rises = all(frame.stamp < later.last for later in self._open[i + 1 :])
-            if rises and group.takes(frame, self._tolerance):
+    def _insert(self, frame: Frame, now: float) -> None:
+        for i, group in enumerate(self._open_sets):
+            in_order = all(frame.stamp < later.last for later in self._open_sets[i + 1 :])
+            if in_order and group.accepts(frame, self._tolerance):
                 group.frames[frame.camera] = frame
-                self._add_delay(frame.camera, now - group.arrived)
+                self._add_delay(frame.camera, now - group.arrival)
                 return
-        if any(group.first <= frame.stamp <= group.last for group in self._open):  # amid a set that it is no part of
+        if any(group.first <= frame.stamp <= group.last for group in self._open_sets):  # within another set
             self.late += 1
             return
-        self._open.append(_OpenSet(now, now + self.patience, {frame.camera: frame}))
-        self._open.sort(key=lambda group: group.first)
+        self._open_sets.append(_OpenSet(now, now + self.patience, {frame.camera: frame}))
+        self._open_sets.sort(key=lambda group: group.first)
 
     def _is_finished(self, group: _OpenSet, now: float) -> bool:
         missing = [camera for camera in range(len(self._last_stamp)) if camera not in group.frames]
-        return now >= group.until or not any(self._may_come(group, camera, now) for camera in missing)
+        return now >= group.deadline or not any(self._may_come(group, camera, now) for camera in missing)
 
     def _may_come(self, group: _OpenSet, camera: int, now: float) -> bool:
         arrival = self._last_arrival[camera]
-        alive = arrival is not None and now - arrival <= self._silent
+        alive = arrival is not None and now - arrival <= self._silence_limit
         return alive and self._last_stamp[camera] < group.first + self._tolerance
 
 
@@ -327,8 +327,8 @@ class Pairing:
 class _OpenSet:
     """A set that is being gathered."""
 
-    arrived: float  # s, when its first frame came
-    until: float  # s, waited for
+    arrival: float  # s, when its first frame came
+    deadline: float  # s, waited for
     frames: dict[int, Frame]  # by camera
 
     @property
@@ -339,7 +339,7 @@ class _OpenSet:
     def last(self) -> float:
         return max(frame.stamp for frame in self.frames.values())
 
-    def takes(self, frame: Frame, tolerance: float) -> bool:
+    def accepts(self, frame: Frame, tolerance: float) -> bool:
         """Whether a frame belongs here: its camera is not there yet, and no two stamps are further than `tolerance`."""
         near = max(frame.stamp, self.last) - min(frame.stamp, self.first) <= tolerance
         return near and frame.camera not in self.frames

@@ -154,7 +154,7 @@ class CameraMatches:
     camera: int
     points: Array  # (N, 3) mm, surface frame
     pixels: Array  # (N, 2) px, ideal
-    alone: Array | None  # (4, 4) base_from_surface by this camera alone
+    own_pose: Array | None  # (4, 4) base_from_surface by this camera alone
 
 
 class Relocaliser:
@@ -207,11 +207,11 @@ class Relocaliser:
 
     def _make_room(self) -> None:
         counts = np.bincount(self._view)
-        most = int(counts.max(initial=0))
-        while np.minimum(counts, most).sum() > MAX_DESCRIPTORS:
-            most -= 1 + most // 100
+        limit = int(counts.max(initial=0))
+        while np.minimum(counts, limit).sum() > MAX_DESCRIPTORS:
+            limit -= 1 + limit // 100
         rank = np.concatenate([np.arange(n) for n in counts]) if len(counts) else np.zeros(0, int)
-        keep = rank < most
+        keep = rank < limit
         self._points, self.descriptors, self._view = self._points[keep], self.descriptors[keep], self._view[keep]
 
     def reframe(self, new_from_old: Array) -> None:
@@ -261,12 +261,12 @@ class Relocaliser:
         if len(pairs) < MIN_MATCHES:
             return None
         points, pixels = self._points[pairs[:, 1]], undistort(lens, keypoints[pairs[:, 0]])
-        alone = _pnp(points, pixels, lens.matrix)
-        return CameraMatches(camera, points, pixels, None if alone is None else lens.base_from_camera @ alone)
+        pose = _pnp(points, pixels, lens.matrix)
+        return CameraMatches(camera, points, pixels, None if pose is None else lens.base_from_camera @ pose)
 
     def _joint_pose(self, views: list[CameraMatches]) -> RelocalisedPose | None:
         """The pose, of those begun at each camera's own, with which most features agree; None where too few do."""
-        single = {view.camera: view.alone for view in views if view.alone is not None}
+        single = {view.camera: view.own_pose for view in views if view.own_pose is not None}
         if not single:
             return None
         rig = self.lenses.rig
@@ -275,22 +275,22 @@ class Relocaliser:
         pixels = np.concatenate([view.pixels for view in views])
         sigma = np.full(len(camera), 3.0)  # px: SIFT on half-size images, cameras not exposed together
         tracks = PointTracks(camera, points, pixels, sigma)
-        best, most = np.eye(4), MIN_MATCHES - 1
+        best, best_count = np.eye(4), MIN_MATCHES - 1
         for start in single.values():
             pose = solve_pose(rig, tracks, start, scales=(4.0, 2.0)).base_from_surface
-            away = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
-            agreeing = int((away < 4 * sigma).sum())
-            if agreeing > most:
-                best, most = pose, agreeing
-        if most < MIN_MATCHES:
+            residual = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
+            count = int((residual < 4 * sigma).sum())
+            if count > best_count:
+                best, best_count = pose, count
+        if best_count < MIN_MATCHES:
             return None
-        return RelocalisedPose(best, {c: pose for c, pose in single.items() if _same_surface(pose, best)}, most)
+        return RelocalisedPose(best, {c: pose for c, pose in single.items() if _same_surface(pose, best)}, best_count)
 
 
 def _same_surface(a: Array, b: Array) -> bool:
     """Whether two poses could be one surface at two cameras' instants, one camera's depth being what it is."""
-    apart = se3.inverse(a) @ b
-    return bool(se3.angle_of(apart) < 0.35 and np.linalg.norm(apart[:3, 3]) < 60.0)
+    difference = se3.inverse(a) @ b
+    return bool(se3.angle_of(difference) < 0.35 and np.linalg.norm(difference[:3, 3]) < 60.0)
 
 
 def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
@@ -311,8 +311,8 @@ MAX_HINT_DISTANCE_PX = 3.0  # px from the epipolar line: nothing but the right p
 MIN_HINT_SHARE = 0.5  # of the matches must be, where a tenth is near by chance, and at least so many:
 MIN_HINT_MATCHES = 60  # unlike pictures have up to sixty-five matches, and few of them near
 HINT_RATIO = 2.0  # times the matches that agree as the pictures are
-MIN_MATCHES_AGAINST = 100  # twice what unlike pictures have; more of them show the same spots,
-AGAINST_PX = 40.0  # and contradict the calibration so far from the epipolar line: no surface moves that far
+MIN_CONTRADICTING_MATCHES = 100  # twice what unlike pictures have; more of them show the same spots,
+CONTRADICTION_PX = 40.0  # and contradict the calibration so far from the epipolar line: no surface moves that far
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,14 +332,15 @@ class _Arrangement:
 
 def _arrangements(names: Sequence[str], suspects: frozenset[int]) -> list[_Arrangement]:
     """Guesses about suspects, each by itself, all of them together, and any two exchanged."""
-    found = []
+    arrangements = []
     for group in [frozenset([c]) for c in sorted(suspects)] + [suspects] * (len(suspects) > 1):
         text = f"{names[min(group)]} looks" if len(group) == 1 else "all cameras look"
-        found.append(_Arrangement(f"{text} mirrored", group, mirrored=group))
-        found.append(_Arrangement(f"{text} upside down", group, turned=group))
+        arrangements.append(_Arrangement(f"{text} mirrored", group, mirrored=group))
+        arrangements.append(_Arrangement(f"{text} upside down", group, turned=group))
     for a, b in combinations(sorted(suspects), 2):
-        found.append(_Arrangement(f"{names[a]} and {names[b]} look exchanged", frozenset([a, b]), exchanged=(a, b)))
-    return found
+        text = f"{names[a]} and {names[b]} look exchanged"
+        arrangements.append(_Arrangement(text, frozenset([a, b]), exchanged=(a, b)))
+    return arrangements
 
 
 def calibration_hint(
@@ -359,35 +360,37 @@ def calibration_hint(
     }
     last = {c: np.array(rig.cameras[c].size) - 1.0 for c in cameras}
     pairs = [(a, b) for a, b in combinations(cameras, 2) if suspects & {a, b}]
-    alike = {(a, b): matched_spots(plain[a], plain[b]) for a, b in pairs}
-    unlike = {(a, b): matched_spots(plain[a], flipped[b]) for a, b in pairs}
+    plain_matches = {(a, b): matched_spots(plain[a], plain[b]) for a, b in pairs}
+    flipped_matches = {(a, b): matched_spots(plain[a], flipped[b]) for a, b in pairs}
 
     def distances(a: int, b: int, guess: _Arrangement) -> Array:
         same = (a in guess.mirrored) == (b in guess.mirrored)
-        at = dict(zip((a, b), (alike if same else unlike)[a, b], strict=True))
+        spots = dict(zip((a, b), (plain_matches if same else flipped_matches)[a, b], strict=True))
         sides = {a: False, b: not same}  # whether the pixels are those of the flipped picture
         for c in (a, b):
             if sides[c] != (c in guess.mirrored):
-                at[c] = np.column_stack([last[c][0] - at[c][:, 0], at[c][:, 1]])
-            at[c] = last[c] - at[c] if c in guess.turned else at[c]
-        seen = {guess.camera(c): undistort(rig.cameras[guess.camera(c)], at[c]) for c in (a, b)}
+                spots[c] = np.column_stack([last[c][0] - spots[c][:, 0], spots[c][:, 1]])
+            spots[c] = last[c] - spots[c] if c in guess.turned else spots[c]
+        pixels = {guess.camera(c): undistort(rig.cameras[guess.camera(c)], spots[c]) for c in (a, b)}
         first, second = guess.camera(a), guess.camera(b)
-        return np.abs(epipolar_distance(rig, first, second, seen[first], seen[second]))
+        return np.abs(epipolar_distance(rig, first, second, pixels[first], pixels[second]))
 
-    def near(guess: _Arrangement) -> tuple[int, int]:
-        away = np.concatenate([distances(a, b, guess) for a, b in pairs])
-        return int((away < MAX_HINT_DISTANCE_PX).sum()), len(away)
+    def count_near(guess: _Arrangement) -> tuple[int, int]:
+        distance = np.concatenate([distances(a, b, guess) for a, b in pairs])
+        return int((distance < MAX_HINT_DISTANCE_PX).sum()), len(distance)
 
     if not pairs:
         return frozenset(), ""
     as_is = _Arrangement("", suspects)
     sizes = {rig.cameras[c].size for c in cameras}
     guesses = [g for g in _arrangements([c.name for c in rig.cameras], suspects) if not g.exchanged or len(sizes) == 1]
-    best = max(guesses, key=near)
-    agreeing, known = near(best)
-    if agreeing >= max(MIN_HINT_MATCHES, MIN_HINT_SHARE * known, HINT_RATIO * near(as_is)[0]):
+    best = max(guesses, key=count_near)
+    count, total = count_near(best)
+    if count >= max(MIN_HINT_MATCHES, MIN_HINT_SHARE * total, HINT_RATIO * count_near(as_is)[0]):
         return best.cameras, best.text
-    against = {c: np.concatenate([distances(a, b, as_is) for a, b in pairs if c in (a, b)]) for c in suspects}
-    wrong = [c for c, away in against.items() if len(away) >= MIN_MATCHES_AGAINST and np.median(away) > AGAINST_PX]
-    names = ", ".join(rig.cameras[c].name for c in wrong)
-    return frozenset(wrong), f"the matches of {names} contradict the calibration: calibrate again" if wrong else ""
+    errors = {c: np.concatenate([distances(a, b, as_is) for a, b in pairs if c in (a, b)]) for c in suspects}
+    enough = [c for c, error in errors.items() if len(error) >= MIN_CONTRADICTING_MATCHES]
+    outliers = [c for c in enough if np.median(errors[c]) > CONTRADICTION_PX]
+    names = ", ".join(rig.cameras[c].name for c in outliers)
+    text = f"the matches of {names} contradict the calibration: calibrate again"
+    return frozenset(outliers), text if outliers else ""

@@ -65,8 +65,8 @@ class Ink:
         fresh = np.searchsorted(self._stamps, stamp - GEL_TIME_S)
         if fresh == len(self._points):
             return np.zeros(len(points), bool)
-        away, _ = cKDTree(np.array(self._points[fresh:])).query(points)
-        return np.asarray(away < BEAD_REACH_MM + reach)
+        distance, _ = cKDTree(np.array(self._points[fresh:])).query(points)
+        return np.asarray(distance < BEAD_REACH_MM + reach)
 
 
 def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
@@ -75,7 +75,7 @@ def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
 
 
 RING_ANGLES = np.linspace(0, 2 * np.pi, 13)[:-1]
-MIN_DRAWN_DEPTH_MM = 20.0  # mm: what is nearer to a lens than that is not drawn, as its picture has no bounds
+MIN_DEPTH_MM = 20.0  # mm: what is nearer to a lens than that is not drawn, as its picture has no bounds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,12 +99,12 @@ class Tool:
         rings = np.concatenate([radii[:, None, None] * ring, levels], -1)
         camera_from_nozzle = lenses.rig.camera_from_base[camera] @ base_from_nozzle
         x, y, depth = np.moveaxis(se3.transform_points(camera_from_nozzle, rings.reshape(-1, 3)), -1, 0)
-        safe = np.maximum(depth, MIN_DRAWN_DEPTH_MM)
-        imaged, visible = lenses.bend(camera, x / safe, y / safe, depth)
-        visible = (visible & (depth > MIN_DRAWN_DEPTH_MM)).reshape(len(radii), -1)
+        safe_depth = np.maximum(depth, MIN_DEPTH_MM)
+        imaged, visible = lenses.bend(camera, x / safe_depth, y / safe_depth, depth)
+        visible = (visible & (depth > MIN_DEPTH_MM)).reshape(len(radii), -1)
         spots = imaged.T.reshape(len(radii), -1, 2)
-        drawn = [ring_spots[shown] for ring_spots, shown in zip(spots, visible, strict=True)]
-        parts = (np.concatenate(pair) for pair in pairwise(drawn))
+        visible_spots = [ring_spots[mask] for ring_spots, mask in zip(spots, visible, strict=True)]
+        parts = (np.concatenate(pair) for pair in pairwise(visible_spots))
         return [cv2.convexHull(p.astype(np.float32))[:, 0].astype(float) for p in parts if len(p) >= 3]
 
 
@@ -184,22 +184,22 @@ CELL_MM = 1.2  # of the surface that one value averages: noise of the pixels, an
 BELL_MM = 7.0  # one sigma: places that move together, and as far apart
 DARK_LEVELS = 8.0  # grey levels added to each channel: ratios of darker ones are noise
 LIGHT_SIGMA = 0.5  # of the logarithm of a place's brightness, by which those levels change a ratio: shadows, shading
-CLIPPED = 245.0  # grey level at which a channel may be clipped: a highlight
+CLIPPING_GREY = 245.0  # grey level at which a channel may be clipped: a highlight
 MIN_NOISE = 0.01  # one sigma of a ratio's logarithm: the first picture's own, and light that is never quite the same
 FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
 SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference no longer grows with the displacement
 MIN_SHIFT_MM = 0.6  # that is told: a bit more than the guard allows
 MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
-MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
-MIN_SEEN_SHARE = 0.5  # of a bell's places
+MIN_EXPLAINED_SHARE = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
+MIN_VISIBLE_SHARE = 0.5  # of a bell's places
 MIN_SECOND_SHARE = 0.1  # of what a displacement explains, that is the share of a second camera
 MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
 MIN_COSINE = 0.7  # of the angle between one displacement and all
 USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
-MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
+OBSERVABLE_SIGMA_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
 WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
 MIN_PLACES = 20  # of a camera, to compare its picture
-AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
+NEIGHBOUR_OFFSETS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
 # of `Colours`' sums: normal equations, the places of their (3, 3); energy and number; three pulls of each camera
 NORMAL_COLUMNS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 ENERGY_COLUMN, COUNT_COLUMN, PULL_COLUMNS = 6, 7, 8
@@ -229,8 +229,8 @@ def place_pixels(camera_from_surface: Array, points: Array, model: Array, radius
         depth = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
         x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / max(depth, 1.0)
         y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / max(depth, 1.0)
-        pixels[n, 0], pixels[n, 1], seen = bend_one(x, y, depth, model, radius)
-        if not seen:
+        pixels[n, 0], pixels[n, 1], visible = bend_one(x, y, depth, model, radius)
+        if not visible:
             pixels[n, 0] = pixels[n, 1] = UNSEEN_PX
     return pixels
 
@@ -261,13 +261,13 @@ def colour_ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array
         blue, green, red = levels[0], levels[1], levels[2]
         ratios[0, n], ratios[1, n] = np.log(red / green), np.log(blue / green)
         dark[0, n], dark[1, n] = DARK_LEVELS * (1 / green - 1 / red), DARK_LEVELS * (1 / green - 1 / blue)
-        free[n] = max(blue, green, red) < CLIPPED + DARK_LEVELS
+        free[n] = max(blue, green, red) < CLIPPING_GREY + DARK_LEVELS
     return ratios, dark, free
 
 
 @compiled("void(f8[:,::1], i8, b1[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[::1])")
 def add_equations(
-    sums: Array, pull: int, free: Mask, now: Array, dark: Array, before: Array, slopes: Array, noise: Array
+    sums: Array, pull: int, free: Mask, current: Array, dark: Array, first: Array, slopes: Array, noise: Array
 ) -> None:
     """Add one camera's normal equations at P places to `sums`, in columns as `Colours` keeps them; learn its noise.
 
@@ -275,22 +275,22 @@ def add_equations(
     picture and the first. dark: (2, P) how fast they change with light. slopes: (2, P, 3), noise: (2,), of the first.
     """
     for k in range(2):
-        away = now[k] - before[k]
-        away -= median_of(away, free)
-        noise[k] += (1.4826 * median_of(np.abs(away), free) - noise[k]) / NOISE_MEMORY_SETS
+        difference = current[k] - first[k]
+        difference -= median_of(difference, free)
+        noise[k] += (1.4826 * median_of(np.abs(difference), free) - noise[k]) / NOISE_MEMORY_SETS
         variance = max(noise[k], MIN_NOISE) ** 2
-        for p in range(len(away)):
+        for p in range(len(difference)):
             if not free[p]:
                 continue
             light = LIGHT_SIGMA * dark[k, p]
             precision, slope, column = 1 / (variance + light * light), slopes[k, p], 0
-            pulls = precision * away[p]
+            pulls = precision * difference[p]
             for i in range(3):
                 sums[p, pull + i] -= pulls * slope[i]
                 for j in range(i, 3):
                     sums[p, column] += precision * (slope[i] * slope[j])
                     column += 1
-            sums[p, ENERGY_COLUMN] += pulls * away[p]
+            sums[p, ENERGY_COLUMN] += pulls * difference[p]
             sums[p, COUNT_COLUMN] += 1.0
 
 
@@ -315,7 +315,7 @@ class Colours:
             return
         self._bells = bells(self._points, self._centres, BELL_MM).T
         self._bell_sizes = self._bells.sum(1)
-        self._inked = np.zeros(len(self._points), bool)
+        self._ink_mask = np.zeros(len(self._points), bool)
         self._sizes = np.zeros(len(self._centres))  # mm, of each bell while it is displaced, the largest since; else 0
         for camera, image in images.items():
             if camera in poses and image.ndim == 3:
@@ -324,7 +324,7 @@ class Colours:
     def cover(self, bead: Array) -> None:
         """A bead (M, 3) mm, surface frame, lies on the surface: the colours there are its own from now on."""
         if self._first:
-            self._inked |= near_bead(self._points, bead, np.full(len(self._points), CELL_MM))
+            self._ink_mask |= near_bead(self._points, bead, np.full(len(self._points), CELL_MM))
 
     def __call__(
         self, images: Mapping[int, Image], poses: Mapping[int, Array], warp: Warp | None = None
@@ -334,62 +334,63 @@ class Colours:
             return NOTHING_DISPLACED
         points = self._points if warp is None else warp.apply(self._points)
         cameras = [camera for camera in self._first if camera in images and camera in poses]
-        sums, told = np.zeros((len(points), PULL_COLUMNS + 3 * len(cameras))), 0
+        sums, count = np.zeros((len(points), PULL_COLUMNS + 3 * len(cameras))), 0
         for camera in cameras:
             first, pixels = self._first[camera], self._pixels(camera, poses[camera], points)
-            now, dark, free = colour_ratios(contiguous(images[camera], np.uint8), first.scale, pixels)
-            free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
+            current, dark, free = colour_ratios(contiguous(images[camera], np.uint8), first.scale, pixels)
+            free &= first.free & ~self._ink_mask & ~self._masks.hides(camera, pixels)
             if np.count_nonzero(free) < MIN_PLACES:
                 continue
-            pull, told = PULL_COLUMNS + 3 * told, told + 1
-            add_equations(sums, pull, free, now, dark, first.ratios, first.slopes, first.noise)
-        if not told:
+            pull, count = PULL_COLUMNS + 3 * count, count + 1
+            add_equations(sums, pull, free, current, dark, first.ratios, first.slopes, first.noise)
+        if not count:
             return NOTHING_DISPLACED
-        summed = self._bells @ sums
-        pulls = summed[:, PULL_COLUMNS : PULL_COLUMNS + 3 * told].reshape(-1, told, 3).swapaxes(0, 1)
-        enough = summed[:, COUNT_COLUMN] > MIN_SEEN_SHARE * 2 * told * self._bell_sizes
-        known = np.where(enough, summed[:, COUNT_COLUMN], np.inf)  # else its edge looks displaced
-        return self._judge(summed[:, NORMAL_COLUMNS], pulls, summed[:, ENERGY_COLUMN], known)
+        bell_sums = self._bells @ sums
+        pulls = bell_sums[:, PULL_COLUMNS : PULL_COLUMNS + 3 * count].reshape(-1, count, 3).swapaxes(0, 1)
+        enough = bell_sums[:, COUNT_COLUMN] > MIN_VISIBLE_SHARE * 2 * count * self._bell_sizes
+        expected_energy = np.where(enough, bell_sums[:, COUNT_COLUMN], np.inf)  # else its edge looks displaced
+        return self._judge(bell_sums[:, NORMAL_COLUMNS], pulls, bell_sums[:, ENERGY_COLUMN], expected_energy)
 
-    def _judge(self, normal: Array, pulls: Array, energy: Array, known: Array) -> DisplacedPlaces:
+    def _judge(self, normal: Array, pulls: Array, energy: Array, expected_energy: Array) -> DisplacedPlaces:
         """By normal equations (K, 3, 3), (C, K, 3) of each camera and bell, squared sigmas and how many are usual."""
         pull = pulls.sum(0)
         shift = solve_symmetric3(contiguous(normal + np.eye(3) / SHIFT_PRIOR_MM**2), contiguous(pull))
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
-        begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
-        if not (begins.any() or self._sizes.any()):
+        new = np.isfinite(expected_energy) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
+        if not (new.any() or self._sizes.any()):
             return NOTHING_DISPLACED
-        begins &= explained > MIN_EXPLAINED * (energy - known)
+        new &= explained > MIN_EXPLAINED_SHARE * (energy - expected_energy)
         if len(pulls) > 1:  # else it may be what one camera sees there: a print head that its first picture showed
-            begins &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
-        way = (explained * begins) @ shift  # what moves goes one way; highlights go theirs
-        begins &= shift @ way > MIN_COSINE * size * np.linalg.norm(way)
-        begins &= begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))
-        lasts = (self._sizes > 0) & (np.isinf(known) | (energy > USUAL_RATIO * known))
-        self._sizes = np.where(begins | lasts, np.maximum(self._sizes, np.where(begins, size, 0.0)), 0.0)
-        apart = self._sizes > 0
-        if not apart.any():
+            new &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
+        direction = (explained * new) @ shift  # what moves goes one way; highlights go theirs
+        new &= shift @ direction > MIN_COSINE * size * np.linalg.norm(direction)
+        new &= new.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(new))
+        lasting = (self._sizes > 0) & (np.isinf(expected_energy) | (energy > USUAL_RATIO * expected_energy))
+        self._sizes = np.where(new | lasting, np.maximum(self._sizes, np.where(new, size, 0.0)), 0.0)
+        displaced = self._sizes > 0
+        if not displaced.any():
             return NOTHING_DISPLACED
-        tells = np.linalg.eigvalsh(normal)[:, 1] > MIN_TOLD_MM**-2.0
-        whole = int((apart & tells).sum()) > WHOLE_SHARE * int(tells.sum())
-        return DisplacedPlaces(self._centres[apart], self._sizes[apart], BELL_MM, whole)
+        observable = np.linalg.eigvalsh(normal)[:, 1] > OBSERVABLE_SIGMA_MM**-2.0
+        whole = int((displaced & observable).sum()) > WHOLE_SHARE * int(observable.sum())
+        return DisplacedPlaces(self._centres[displaced], self._sizes[displaced], BELL_MM, whole)
 
     def _picture(self, camera: int, image: Image, pose: Array) -> _FirstPicture:
         image, pixels = contiguous(image, np.uint8), self._pixels(camera, pose, self._points)
-        beside = self._pixels(camera, pose, self._points + self._axes[0])
-        scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(beside - pixels, axis=1)))))
+        neighbours = self._pixels(camera, pose, self._points + self._axes[0])
+        scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(neighbours - pixels, axis=1)))))
         ratios, _, free = colour_ratios(image, scale, pixels)
         places = (self._points + side * axis for axis in self._axes for side in (1, -1))
         ends = [colour_ratios(image, scale, self._pixels(camera, pose, at))[0] for at in places]
         slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
-        for around in 2 * scale * AROUND:  # what an average or a slope reaches must be the surface's as well
-            free &= ~self._masks.hides(camera, pixels + around)
+        for offset in 2 * scale * NEIGHBOUR_OFFSETS:  # what an average or a slope reaches must be the surface's as well
+            free &= ~self._masks.hides(camera, pixels + offset)
         return _FirstPicture(scale, ratios, slopes, free, np.full(2, FIRST_NOISE))
 
     def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
         """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px, far off for those unseen."""
-        lens = self._lenses.models[camera], self._lenses.radius[camera]
-        return place_pixels(self._lenses.rig.camera_from_base[camera] @ pose, contiguous(points), *lens)
+        camera_from_surface = self._lenses.rig.camera_from_base[camera] @ pose
+        model, radius = self._lenses.models[camera], self._lenses.radius[camera]
+        return place_pixels(camera_from_surface, contiguous(points), model, radius)
 
 
 def _spread(plane: TangentPlane, step: float) -> Array:

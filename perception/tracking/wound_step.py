@@ -53,32 +53,32 @@ class WoundFilter:
         self._size = size
         self._mask: WoundMask = np.zeros(size[::-1], bool)
         self._box: Box | None = None
-        self._elsewhere: Box | None = None  # where another place was seen once
-        self._missed = 0
+        self._other_box: Box | None = None  # where another place was seen once
+        self._missed_looks = 0
 
     def take(self, look: Segmentation) -> WoundEstimate:
         """Add one look. A wound that jumps is accepted at the second look that shows it there; one that is not seen
         stays for a few looks; the region holds both where it is and where it was (thesis Fig. 3.4)."""
-        before = self._box
+        last_box = self._box
         mask = largest_part(look.mask)
         box = box_of(mask)
-        known = [place for place in (before, self._elsewhere) if place is not None]
-        if box is None or (before is not None and all(overlap(box, place) <= SAME_WOUND_OVERLAP for place in known)):
-            self._missed += 1
-            if self._missed > MAX_MISSED_LOOKS:
+        places = [place for place in (last_box, self._other_box) if place is not None]
+        if box is None or (last_box is not None and all(overlap(box, place) <= SAME_WOUND_OVERLAP for place in places)):
+            self._missed_looks += 1
+            if self._missed_looks > MAX_MISSED_LOOKS:
                 self._box, self._mask = None, np.zeros_like(self._mask)
         else:
-            self._box, self._mask, self._missed = box, mask, 0
-        self._elsewhere = box
-        roi = region(None if self._missed else self._box, before, self._size)
-        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), look.confidence, self._missed)
+            self._box, self._mask, self._missed_looks = box, mask, 0
+        self._other_box = box
+        roi = region(None if self._missed_looks else self._box, last_box, self._size)
+        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), look.confidence, self._missed_looks)
 
 
 def overlap(a: Box, b: Box) -> float:
     """Area of two boxes' intersection over that of their union."""
     width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    both = max(0, width) * max(0, height)
-    return both / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both)
+    intersection = max(0, width) * max(0, height)
+    return intersection / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - intersection)
 
 
 SEGMENTATION_DELAY_SETS = 3  # until a result counts: three cameras take 60 ms of one core, a set comes every 33 ms
@@ -98,17 +98,17 @@ class AsyncSegmentation:
         self._segmenter = segmenter
         self._filters = [WoundFilter(camera.size) for camera in rig.cameras]
         self._job: DelayedJob[dict[int, Segmentation]] = DelayedJob(executor, delay)
-        self.looked: FrameSet | None = None  # the pictures that the last job was given
+        self.job_frames: FrameSet | None = None  # the pictures that the last job was given
 
     def __call__(self, frames: FrameSet) -> tuple[float, dict[int, WoundEstimate]] | None:
         """Once a frame set: what is due, as the stamp of the pictures and what each camera sees; None: nothing is."""
-        looks, due = self._job.poll(), None
-        if looks is not None and self.looked is not None:
-            due = self.looked.stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
+        looks, result = self._job.poll(), None
+        if looks is not None and self.job_frames is not None:
+            result = self.job_frames.stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
         if not self._job.busy and frames.frames:
-            self.looked = frames
+            self.job_frames = frames
             self._job.submit(segment_all, self._segmenter, {f.camera: f.image for f in frames.frames})
-        return due
+        return result
 
 
 def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, Segmentation]:
@@ -120,7 +120,7 @@ MAX_EMPTY_LOOKS = 2  # without a wound in two cameras; then the whole pictures a
 MAX_PARTIAL_LOOKS = 5  # at a frame or patch that some camera does not see, as the first sets lack cameras
 SKIN_MARGIN_SHARE = 0.6  # of the wound's box on every side: the skin beside it moves with it, and has more to track
 WHOLE_PICTURES = "no region and no wound: whole pictures are tracked as one surface; better draw a region"
-WOUND_SOUGHT, PATCH_SOUGHT = "the wound is being looked for", "the coloured frame is being looked for"
+WOUND_SEARCH_TEXT, PATCH_SEARCH_TEXT = "the wound is being looked for", "the coloured frame is being looked for"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,35 +153,35 @@ class RegionSearch:
 
     def __call__(self, frames: FrameSet) -> Sequence[Roi] | str:
         """The region in each camera; two cameras or more see it."""
-        looked = self._segmentation.looked  # what the next result is of
-        due = self._segmentation(frames)
-        if due is None:
-            return self._sought
+        source = self._segmentation.job_frames  # what the next result is of
+        result = self._segmentation(frames)
+        if result is None:
+            return self._search_text
         self._looks += 1
-        stamp, sights = due
-        seen = sum(sight.box is not None for sight in sights.values())
-        enough = seen == len(self._rig) or (seen >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS))
+        stamp, wounds = result
+        count = sum(wound.box is not None for wound in wounds.values())
+        enough = count == len(self._rig) or (count >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS))
         if not enough and (self._patch or self._looks < MAX_EMPTY_LOOKS):
-            return self._sought
-        if looked is not None and not self._patch:
-            self.sight = WoundSight(looked, {c: sight.mask for c, sight in sights.items() if sight.box is not None})
+            return self._search_text
+        if source is not None and not self._patch:
+            self.sight = WoundSight(source, {c: wound.mask for c, wound in wounds.items() if wound.box is not None})
         if enough:
-            return self._rois(stamp, sights)
+            return self._rois(stamp, wounds)
         return whole_pictures([camera.size for camera in self._rig.cameras], stamp)
 
     @property
-    def _sought(self) -> str:
-        return PATCH_SOUGHT if self._patch else WOUND_SOUGHT
+    def _search_text(self) -> str:
+        return PATCH_SEARCH_TEXT if self._patch else WOUND_SEARCH_TEXT
 
-    def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> Sequence[Roi]:
+    def _rois(self, stamp: float, wounds: dict[int, WoundEstimate]) -> Sequence[Roi]:
         """Round each camera's wound, the whole picture of a camera that sees none; or round the patch where it is."""
         if self._patch:
-            return [Roi(c, stamp, hull_of(sight.mask)) for c, sight in sights.items() if sight.box is not None]
+            return [Roi(c, stamp, hull_of(wound.mask)) for c, wound in wounds.items() if wound.box is not None]
         rois = []
-        for camera, sight in sights.items():
+        for camera, wound in wounds.items():
             size = self._rig.cameras[camera].size
-            side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
-            shape = polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))
+            side = 0 if wound.box is None else max(wound.box[2] - wound.box[0], wound.box[3] - wound.box[1])
+            shape = polygon(region(wound.box, None, size, SKIN_MARGIN_SHARE * side))
             rois.append(Roi(camera, stamp, shape, found=True))
         return rois
 
@@ -200,12 +200,12 @@ class RegionTrackingStep:
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp`; INITIALISING while the region is looked for."""
         if self._step is None:
-            found = self._find(frames)
-            if isinstance(found, str):
+            regions = self._find(frames)
+            if isinstance(regions, str):
                 self.last = empty_report(frames.stamp, len(self._rig), np.zeros(len(STAGES)))
-                return identity_pose(frames.stamp, found)
-            self._step = self._make_step(found)
-            whole = of_whole_pictures(found, [camera.size for camera in self._rig.cameras])
+                return identity_pose(frames.stamp, regions)
+            self._step = self._make_step(regions)
+            whole = of_whole_pictures(regions, [camera.size for camera in self._rig.cameras])
             self._caveat = WHOLE_PICTURES if whole else ""
         pose = self._step(frames)
         self.last = self._step.last
