@@ -1,10 +1,10 @@
-"""New landmarks where the surface has come into view and the map knows little of it.
+"""New landmarks where the surface has come into view with few landmarks.
 
-Two cameras find them as the first map was found, begun at the landmarks that both see. Cameras stand 36 to 84 degrees
-apart, so a steep side, or anything while the others are covered, is seen by one camera: there landmarks are put where
-its rays meet the known surface, continued by the local fit (`estimation.mapping.triangulation`). What that fit does not
-know of a depth is in the covariance, and later views from elsewhere reduce it. All stay on probation until a later
-frame set shows that they move with the surface: a drape beside a wound looks as good, but stays where it is.
+Two cameras find them as the first map was found, with the landmarks in both as seeds. Cameras stand 36 to 84 degrees
+apart, so one alone sees a steep side, or the surface while the others are covered: there landmarks are put where its
+rays meet the known surface, extrapolated by the local fit (`estimation.mapping.triangulation`). The fit's depth error
+is in the covariance; later views from other angles reduce it. All are on probation until a later frame set shows that
+they move with the surface: a drape beside a wound matches as well, but does not move.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ from perception.mapping.scan_map import REFERENCE_SIGMA_PX, as_at_one_instant
 
 MIN_MATCHING_FACING = 0.35  # cosine of the viewing angle, from which two cameras can match
 MIN_SPACING_PX = 8  # px between landmarks
-MAX_PLACE_SIGMA_MM = 2.0  # mm across the surface: a place less certain than this is none
+MAX_PLACE_SIGMA_MM = 2.0  # mm across the surface: less certain places are dropped
 
 
-TARGET_PER_CAMERA = 120  # landmarks that a camera should see at least
-GROWTH_SHARE = 0.7  # of it, and of what the camera saw at first, below which more are looked for
-SEARCH_MARGIN_SHARE = 0.35  # of the known part's size in an image: how far beyond it new ones are sought
-MIN_NEW_LANDMARKS = 8  # new landmarks: fewer are not worth a change of the map
-GROWTH_FEATURES = 300  # a camera, for the first matches on what nobody knows yet
-MAX_NEW_RESIDUAL_PX = 2.0  # px between a new landmark and where the surface's motion puts it
-MIN_PROOF_MOTION_PX = 4.0  # px by which the surface's motion must have moved it: then what stands still is told apart
-MAX_GAP_SHARE = 0.04  # of the distance to the cameras: what lies so near to known landmarks,
-MAX_HEIGHT_SHARE = 0.004  # and so near to their surface, is part of it without such proof
-MAX_MISSES = 4  # looks in which a new landmark was in view and not found
+TARGET_PER_CAMERA = 120  # landmarks, at least
+GROWTH_SHARE = 0.7  # of it, and of the camera's first number, below which more are searched for
+SEARCH_MARGIN_SHARE = 0.35  # of the mapped part's size in an image: search range beyond it
+MIN_NEW_LANDMARKS = 8  # new landmarks: with fewer the map is not changed
+GROWTH_FEATURES = 300  # a camera, for the first matches on the unmapped part
+MAX_NEW_RESIDUAL_PX = 2.0  # px of a new landmark from its prediction by the surface's motion
+MIN_PROOF_MOTION_PX = 4.0  # px of motion, which discriminates the surface from what stands still
+MAX_GAP_SHARE = 0.04  # of the distance to the cameras: landmarks so near to known ones,
+MAX_HEIGHT_SHARE = 0.004  # and so near to their surface, need no such proof
+MAX_MISSES = 4  # looks with a new landmark in view but not measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSnapshot:
-    """One frame set in which the surface is known."""
+    """One frame set with known pose of the surface."""
 
     images: dict[int, Image]  # grey, by camera
     base_from_surface: Array  # (4, 4), of all cameras together
@@ -79,8 +79,8 @@ class NewLandmarks:
     snapshot: SurfaceSnapshot
     map: SurfaceMap
     templates: Templates
-    level: Array  # (N,) mm across the surface, where neighbours give the place; inf where two cameras do
-    features: dict[int, Features]  # of the part of each image that they are in
+    level: Array  # (N,) mm across the surface, of places by neighbours; inf: by two cameras
+    features: dict[int, Features]  # by camera, around them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,18 +94,18 @@ class NewPart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GrowthSearch:
-    """One frame set that is searched for new landmarks."""
+    """Inputs of the search for new landmarks in one frame set."""
 
-    lenses: Lenses  # of the rig as it stands to the surface at one instant
+    lenses: Lenses  # of the rig relative to the surface at one instant
     snapshot: SurfaceSnapshot
-    map: SurfaceMap  # known, surface frame, warped as the surface is
+    map: SurfaceMap  # so far, surface frame, with the warp applied
     pyramids: dict[int, Pyramid]  # images by camera
     masks: dict[int, ImageMask]  # (H, W) by camera, where new landmarks may be
 
 
 def find_new_landmarks(rig: Rig, snapshot: SurfaceSnapshot, surface_map: SurfaceMap) -> NewLandmarks | None:
-    """Landmarks beside the known ones: by two cameras, or on the surface where one alone sees it; None if too few."""
-    if snapshot.warp is not None:  # as it is now
+    """New landmarks: by two cameras, or on the extrapolated surface by one; None if too few."""
+    if snapshot.warp is not None:
         surface_map = replace(surface_map, points=snapshot.warp.apply(surface_map.points))
     lenses = Lenses(as_at_one_instant(rig, snapshot.base_from_surface, snapshot.single))
     pyramids = {c: Pyramid(image) for c, image in snapshot.images.items()}
@@ -123,14 +123,14 @@ def find_new_landmarks(rig: Rig, snapshot: SurfaceSnapshot, surface_map: Surface
     if sum(len(part.map) for part in new) < MIN_NEW_LANDMARKS:
         return None
     new_map = reduce(joined_map, [part.map for part in new])
-    covariance = new_map.covariance + of_frame(new_map.points, snapshot.covariance)  # all share the pose they hang on
+    covariance = new_map.covariance + of_frame(new_map.points, snapshot.covariance)  # all share the pose's error
     templates, level = join([part.templates for part in new]), np.concatenate([part.sigma for part in new])
     points = new_map.points if snapshot.warp is None else snapshot.warp.undo(new_map.points)
     return NewLandmarks(snapshot, SurfaceMap(points, new_map.normals, covariance), templates, level, features)
 
 
 def _monocular_parts(search: GrowthSearch, missing: dict[int, int], parts: list[Landmarks]) -> list[NewPart]:
-    """Landmarks that one camera alone sees, camera by camera."""
+    """Landmarks that only one camera sees, by camera."""
     lenses, tracks = search.lenses, search.snapshot.tracks
     cameras = [c for c in sorted(search.pyramids) if (tracks.camera == c).sum() >= MIN_NEW_LANDMARKS]
     matched = np.concatenate([np.zeros((0, 3)), *[p.points for p in parts]])
@@ -149,9 +149,9 @@ def _monocular_parts(search: GrowthSearch, missing: dict[int, int], parts: list[
 def _monocular_landmarks(
     search: GrowthSearch, camera: int, others: list[int], occupied_pixels: Array, count: int
 ) -> NewPart | None:
-    """Up to `count` corners of one camera that none of the `others` sees well, on the surface through the known map.
+    """Up to `count` corners of one camera that none of the `others` sees well, on the extrapolated surface.
 
-    occupied: (N, 2) px as imaged, where there are new landmarks already.
+    occupied_pixels: (N, 2) px as imaged, of new landmarks found before.
     """
     mask = search.masks[camera].copy()
     for spot in np.round(occupied_pixels).astype(np.int32):
@@ -179,7 +179,7 @@ def _monocular_landmarks(
 def _visible_to_others(
     lenses: Lenses, others: list[int], base_from_surface: Array, camera: int, points: Array, normals: Array
 ) -> NDArray[np.bool_]:
-    """Which points (N, 3) one of the other cameras sees well enough for a match."""
+    """Which points (N, 3) another camera sees well enough for a match."""
     visible = np.zeros(len(points), bool)
     axes = square_axes(lenses, camera, base_from_surface, points, normals)
     for other in others if len(points) else []:
@@ -189,7 +189,7 @@ def _visible_to_others(
 
 
 def _unmapped_mask(lenses: Lenses, camera: int, snapshot: SurfaceSnapshot) -> ImageMask:
-    """Where in an image the surface may go on without landmarks: around and between those tracked."""
+    """Mask (H, W) of an image around and between the tracked landmarks."""
     size = lenses.rig.cameras[camera].size
     mask = np.zeros((size[1], size[0]), np.uint8)
     of_camera = snapshot.tracks.camera == camera
@@ -207,7 +207,7 @@ def _unmapped_mask(lenses: Lenses, camera: int, snapshot: SurfaceSnapshot) -> Im
 
 
 def _seeds(search: GrowthSearch, a: int, b: int, features: dict[int, Features]) -> Seeds | None:
-    """What is known of the surface between two cameras: landmarks that both see, and matches in the unknown part."""
+    """Seeds between two cameras: landmarks that both see, and matches on the unmapped part."""
     new_seeds = find_seeds(search.lenses, a, b, features, np.random.default_rng(0))
     tracks = search.snapshot.tracks
     in_a, in_b = tracks.only(tracks.camera == a), tracks.only(tracks.camera == b)
@@ -222,11 +222,11 @@ def _seeds(search: GrowthSearch, a: int, b: int, features: dict[int, Features]) 
 
 @dataclass(slots=True, eq=False)
 class Probation:
-    """New landmarks that wait for proof that they move with the surface; counts are of looks, (N,)."""
+    """New landmarks until they are proven to move with the surface; looks are counts (N,)."""
 
     new: NewLandmarks
     between_known: NDArray[np.bool_]  # (N,)
-    map: SurfaceMap = field(init=False)  # of the new landmarks, as known by now
+    map: SurfaceMap = field(init=False)  # of the new landmarks, updated
     moved_looks: NDArray[np.int64] = field(init=False)  # measured as the motion predicts, far from its rest place
     still_looks: NDArray[np.int64] = field(init=False)  # measured as the motion predicts, near its rest place
     missed_looks: NDArray[np.int64] = field(init=False)  # not measured there
@@ -243,9 +243,9 @@ class Probation:
         single: dict[int, Array],
         covariance: Array | None = None,
     ) -> None:
-        """Measure them again at each camera's own pose of the surface, known to a covariance (6, 6).
+        """Measure them again at each camera's own pose of the surface, with its covariance (6, 6).
 
-        Landmarks of one camera alone are improved by it: where the surface has turned, in depth.
+        It updates landmarks of one camera alone: in depth where the surface has turned.
         """
         tracks = Matcher(lenses, self.map, self.new.templates).align(stamp, pyramids, single)
         projected, rest_pixels = np.zeros((2, len(tracks), 2))
@@ -254,16 +254,17 @@ class Probation:
             of_camera = tracks.camera == c
             points = self.map.points[tracks.track[of_camera]]
             rest_pose = self.new.snapshot.single.get(int(c), self.new.snapshot.base_from_surface)
-            camera, pose = tracks.camera[of_camera], single[int(c)]
-            projected[of_camera], _, jacobians[of_camera] = project(lenses.rig, camera, pose, points)
+            camera = tracks.camera[of_camera]
+            projected[of_camera], _, jacobians[of_camera] = project(lenses.rig, camera, single[int(c)], points)
             rest_pixels[of_camera] = project(lenses.rig, camera, rest_pose, points)[0]
         good = np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_NEW_RESIDUAL_PX
-        monocular = good & np.isfinite(self.new.level[tracks.track])
-        if covariance is not None and monocular.any():
-            looks, residuals = tracks.only(monocular), projected[monocular] - tracks.pixels[monocular]
+        mono = good & np.isfinite(self.new.level[tracks.track])
+        if covariance is not None and mono.any():
+            looks, residuals = tracks.only(mono), projected[mono] - tracks.pixels[mono]
             sigma = np.maximum(looks.sigma, MIN_TRACK_SIGMA_PX)
-            part = jacobians[monocular]
-            self.map, good[monocular] = updated_by_looks(self.map, looks.track, residuals, part, sigma, covariance)
+            self.map, good[mono] = updated_by_looks(
+                self.map, looks.track, residuals, jacobians[mono], sigma, covariance
+            )
         far = np.linalg.norm(rest_pixels - projected, axis=1) > MIN_PROOF_MOTION_PX
         np.add.at(self.moved_looks, tracks.track[good & far], 1)
         np.add.at(self.still_looks, tracks.track[good & ~far], 1)
@@ -271,7 +272,7 @@ class Probation:
 
     @property
     def level(self) -> Array:
-        """How well (N,) mm each is known across the surface that tells its place; inf where two cameras see it."""
+        """(N,) mm, one sigma across the surface of places by neighbours; inf: by two cameras."""
         count, normals = len(self.map), self.map.normals
         blocks = np.einsum("ninj->nij", self.map.covariance.reshape(count, 3, count, 3))
         sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", normals, blocks, normals), 0.0))
@@ -279,20 +280,20 @@ class Probation:
 
     @property
     def proven(self) -> NDArray[np.bool_]:
-        """Which (N,) belong to the surface."""
+        """(N,), which belong to the surface."""
         enough = (self.moved_looks >= 1) | (self.between_known & (self.still_looks >= 1))
         return np.asarray(enough & (self.moved_looks + self.still_looks > self.missed_looks))
 
     @property
     def finished(self) -> bool:
-        """Whether each is either proven or missed too often."""
+        """Whether each is proven or missed MAX_MISSES times."""
         return bool((self.proven | (self.missed_looks >= MAX_MISSES)).all())
 
 
 def between_known(new: NewLandmarks, surface_map: SurfaceMap, distance: float) -> NDArray[np.bool_]:
     """Which new landmarks (N,) lie between known ones and on their surface. distance: mm to the cameras.
 
-    Only of those that two cameras see: the others were put on that surface.
+    False for landmarks of one camera, which were put on that surface.
     """
     offsets = new.map.points[:, None] - surface_map.points
     gap = np.linalg.norm(offsets, axis=2)
