@@ -251,20 +251,17 @@ class Probation:
         projected, rest_pixels = np.zeros((2, len(tracks), 2))
         jacobians = np.zeros((len(tracks), 2, 6))
         for c in np.unique(tracks.camera):
-            of_camera = tracks.camera == c
-            points = self.map.points[tracks.track[of_camera]]
+            rows = tracks.camera == c
+            points = self.map.points[tracks.track[rows]]
             rest_pose = self.new.snapshot.single.get(int(c), self.new.snapshot.base_from_surface)
-            camera = tracks.camera[of_camera]
-            projected[of_camera], _, jacobians[of_camera] = project(lenses.rig, camera, single[int(c)], points)
-            rest_pixels[of_camera] = project(lenses.rig, camera, rest_pose, points)[0]
+            projected[rows], _, jacobians[rows] = project(lenses.rig, tracks.camera[rows], single[int(c)], points)
+            rest_pixels[rows] = project(lenses.rig, tracks.camera[rows], rest_pose, points)[0]
         good = np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_NEW_RESIDUAL_PX
         mono = good & np.isfinite(self.new.level[tracks.track])
         if covariance is not None and mono.any():
-            looks, residuals = tracks.only(mono), projected[mono] - tracks.pixels[mono]
+            looks, offsets = tracks.only(mono), projected[mono] - tracks.pixels[mono]
             sigma = np.maximum(looks.sigma, MIN_TRACK_SIGMA_PX)
-            self.map, good[mono] = updated_by_looks(
-                self.map, looks.track, residuals, jacobians[mono], sigma, covariance
-            )
+            self.map, good[mono] = updated_by_looks(self.map, looks.track, offsets, jacobians[mono], sigma, covariance)
         far = np.linalg.norm(rest_pixels - projected, axis=1) > MIN_PROOF_MOTION_PX
         np.add.at(self.moved_looks, tracks.track[good & far], 1)
         np.add.at(self.still_looks, tracks.track[good & ~far], 1)
