@@ -247,7 +247,7 @@ class _GroundView:
 
     image: Picture
     pixels: NDArray[np.float32]  # (H, W, 2) px of the ground,
-    rise: NDArray[np.float32]  # (H, W, 2) px/mm, their change with height, which is small relative to the distance
+    rise: NDArray[np.float32]  # (H, W, 2) px/mm, their derivative by height, small to the distance
     inside: NDArray[np.bool_]  # (H, W) whether they are in the picture
     towards: Array  # (H, W, 3) unit, to the camera, surface frame
 
@@ -315,7 +315,7 @@ class _SweepLattice:
         return np.stack([self._alike(views, visible, heights) for heights in candidates])
 
     def _alike(self, views: dict[int, _GroundView], visible: dict[int, _VisibleNodes], heights: Array) -> Array:
-        """Mean correlation (S,) of the cameras' pictures, sampled `heights` (H, W) above the ground, over each piece."""
+        """Mean correlation (S,) of the cameras' pictures, at `heights` (H, W) above the ground, over each piece."""
         inside, evening = self.station >= 0, EVENING / self.ground.step
         number, grey, masks = self.station[inside], {}, {}
         for camera, view in views.items():
