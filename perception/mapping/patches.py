@@ -274,8 +274,8 @@ def cut_templates(
 
 
 MIN_ALIGNMENT_SIGMA_PX = 0.05  # px
-# Height of the surface over a patch's plane, px: an oblique view shifts the patch by the angle's tangent, and the same in
-# every image, so residuals do not show it. Measured on simulated skin with a wound of 2.4 mm and on a roof's edge:
+# Height of the surface over a patch's plane, px: in an oblique view it shifts the patch by the angle's tangent in every
+# image alike, so residuals do not show it. Measured on simulated skin with a wound of 2.4 mm and on a roof's edge:
 # 0.06 px in a frontal view, 0.1 at 60 degrees, 0.2-0.3 at 70, 0.4-0.5 at 75; twice the sigma of alignment alone.
 RELIEF_PX, MIN_FACING = 0.1, 0.1  # px; cosine: smaller ones are not visible
 MAX_COARSE_STEPS, MAX_FINE_STEPS = 4, 6  # on the half-size image and the full one; from near, mostly three

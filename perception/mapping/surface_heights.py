@@ -247,12 +247,12 @@ class _GroundView:
 
     image: Picture
     pixels: NDArray[np.float32]  # (H, W, 2) px of the ground,
-    rise: NDArray[np.float32]  # (H, W, 2) px/mm, their derivative by height, small to the distance
+    rise: NDArray[np.float32]  # (H, W, 2) px/mm, their derivative by height above the ground
     inside: NDArray[np.bool_]  # (H, W) whether they are in the picture
     towards: Array  # (H, W, 3) unit, to the camera, surface frame
 
     def even(self, heights: Array, evening: float, visible: _VisibleNodes) -> NDArray[np.float32]:
-        """Grey levels (H, W) at `heights` (H, W) mm above the ground, normalised over `evening` visible nodes; about 0."""
+        """Grey levels (H, W) at `heights` (H, W) mm above the ground, normalised over `evening` nodes; about 0."""
         where = self.pixels + heights[..., None].astype(np.float32) * self.rise
         grey = np.asarray(cv2.remap(self.image, where[..., 0], where[..., 1], cv2.INTER_CUBIC), np.float32)
         centred = grey - cv2.GaussianBlur(visible.weight * grey, (0, 0), evening) / visible.total
