@@ -1,8 +1,8 @@
 """A printed calibration board, and its corners in pictures.
 
-A chessboard, with markers in its white squares (ChArUco) or without; each corner with its sigma and its blur; those of
-a recording, for calibration. And undistorted pictures for reports (thesis 4.2): every pixel kept, black where there is
-none.
+A chessboard, with markers in its white squares (ChArUco) or without; each corner with its sigma and its blur; tables of
+a recording's corners for calibration. Also undistorted pictures for reports (thesis 4.2): with every pixel, black where
+there is none.
 """
 
 from __future__ import annotations
@@ -125,18 +125,18 @@ def thumbnail(image: Image, width: int) -> bytes:
     return data.tobytes()
 
 
-MIN_CORNERS = 4  # that fix a homography
+MIN_CORNERS = 4  # that determine a homography
 REFINE_STEPS, REFINE_TOLERANCE = 10, 1e-3  # iterations; px of the last step
-HALF_WINDOWS = (2, 9)  # px, half the window: smaller holds no edge, larger reaches the next corner of a far board
+HALF_WINDOWS = (2, 9)  # px, half the window: smaller contains no edge, larger the next corner of a far board
 EDGE_REACH = 0.4  # of a square, used along an edge: beyond half, the next corner's edges begin
 HALF_SQUARES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])  # to both sides along both axes
-BLUR_FRINGE, MIN_EDGE_BAND = 2.0, 1.5  # px: blurred rim of a marker that is left out; least width of an edge's band
-MIN_CORNER_SIGMA = 0.01  # px: what rendered pictures without noise leave
+BLUR_FRINGE, MIN_EDGE_BAND = 2.0, 1.5  # px: excluded blurred rim of a marker; least width of an edge's band
+MIN_CORNER_SIGMA = 0.01  # px: as in rendered pictures without noise
 BLURRED_STEP_SLOPE = 2.5066  # sqrt(2 pi): a step blurred by sigma has a slope of 1 / (2.5066 sigma) per pixel
 MAX_BLUR = 4.0  # px, one sigma of an edge: beyond it the edges of two corners overlap
 MAX_BLUR_RATIO, MIN_BLUR_LIMIT = 2.5, 1.5  # a view is blurred beyond so many times the camera's median, and so many px
-MIN_CORNER_SPREAD = 0.02  # ratio of the corners' spread across and along: collinear ones fix no plane
-MAX_INSTANTS = 250  # taken evenly from longer recordings: more would cost minutes and add nothing
+MIN_CORNER_SPREAD = 0.02  # ratio of the corners' spread across and along: collinear ones determine no plane
+MAX_INSTANTS = 250  # evenly from longer recordings: more take minutes without gain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,8 +220,8 @@ def _chessboard(board: Board, grey: Image) -> Array:
 def _refine(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
     """The corners to fractions of a pixel, and half the window, px.
 
-    All gradients about a corner are perpendicular to the way there (Foerstner and Guelch 1987), as in OpenCV's
-    cornerSubPix, but only gradients of the two edges count: a window along the board's axes avoids the markers.
+    All gradients about a corner are perpendicular to the vector from it (Foerstner and Guelch 1987), as in OpenCV's
+    cornerSubPix, but only gradients of the two edges are used: a window along the board's axes avoids the markers.
     """
     rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     half = int(np.clip(EDGE_REACH * _spacing(board, pixels), *HALF_WINDOWS))
@@ -269,7 +269,7 @@ def _weights(board: Board, offsets: Array, squares_from_pixels: Array, half: int
 
 
 def _squares_from_pixels(board: Board, pixels: Array) -> Array:
-    """Squares along the board's axes per pixel (N, 2, 2) at each corner seen, by a homography; nan if there is none."""
+    """Squares along the board's axes per pixel (N, 2, 2) at each visible corner, by a homography; nan without one."""
     visible = np.isfinite(pixels[:, 0])
     squares = board.corners[visible, :2] / board.square
     plane = cv2.findHomography(squares, pixels[visible])[0]
@@ -361,7 +361,7 @@ def empty_table(board: Board, cameras: int) -> CornerTable:
 def usable_views(
     table: CornerTable, board: Board, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]
 ) -> tuple[BoardViews, Counter[tuple[str, str]]]:
-    """The views that are good enough, and the number of others by camera and reason."""
+    """The usable views, and the number of others by camera and reason."""
     reasons = [_reason(table, row) for row in range(len(table))]
     usable = np.array([not reason for reason in reasons], bool)
     dropped = Counter((names[c], reason) for c, reason in zip(table.camera, reasons, strict=True) if reason)
@@ -373,7 +373,7 @@ def usable_views(
 
 
 def _reason(table: CornerTable, row: int) -> str:
-    """Why a view is useless, or ''."""
+    """Why a view is not usable, or ''."""
     pixels = table.pixels[row]
     pixels = pixels[np.isfinite(pixels[:, 0])]
     if len(pixels) < MIN_VIEW_CORNERS:
@@ -388,7 +388,7 @@ def _reason(table: CornerTable, row: int) -> str:
 
 
 def thin_instants(instant: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V,) the rows of at most MAX_INSTANTS of the usable instants: runs of neighbours, which show the motion."""
+    """(V,) the rows of at most MAX_INSTANTS usable instants, in runs of neighbours, which show the motion."""
     instants = np.unique(instant[usable])
     if len(instants) <= MAX_INSTANTS:
         return usable
