@@ -130,9 +130,9 @@ def surface_picture(
 
 
 def self_correlation(picture: Array, visible: Mask, quarters: int = 0) -> tuple[Array, Array]:
-    """Correlation of a picture (V, U) with itself at every shift, and the share of overlap there, 0 to 1.
+    """Correlation of a picture (V, U) with itself at every shift, and the overlap there, 0 to 1.
 
-    Both (2V - 1, 2U - 1); zero shift in the middle. quarters: turns by 90 degrees before the shift, of a square picture.
+    Both (2V - 1, 2U - 1); zero shift in the middle. quarters: turns by 90 degrees before the shift, if square.
 
     Masked by `visible` (V, U) (Padfield 2012, Eq. 14-19); 0 where the overlap is too small.
     """
