@@ -1,7 +1,7 @@
-"""Images with their stamps, the print head as the arm reports it, and which frames belong to one instant: grouped by
-stamp, as they arrive or over a recording.
+"""Images with their stamps, the print head as the arm reports it, and frames of one instant grouped by stamp, live or
+over a recording.
 
-Light to import: the motion process needs the tool's profile, and must not load OpenCV.
+Must not import OpenCV: the motion process needs the tool's profile.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintHead:
-    """Where the print head is, by the arm."""
+    """Pose and state of the print head, by the arm."""
 
     base_from_nozzle: Array  # (4, 4) mm, z from the tip up into the head
     extruding: bool  # whether ink flows
@@ -51,7 +51,7 @@ class FrameSet:
 
     stamp: float  # s
     frames: tuple[Frame, ...]
-    head: PrintHead | None = None  # the print head at that instant, where an arm is known
+    head: PrintHead | None = None  # at that instant, with an arm
 
     def __repr__(self) -> str:
         return f"FrameSet(cameras {', '.join(str(frame.camera) for frame in self.frames)} at {self.stamp:.3f} s)"
@@ -64,27 +64,27 @@ class Roi:
     camera: int  # number in the rig
     stamp: float  # s
     polygon: Array  # (N, 2) px, may reach beyond the image
-    found: bool = False  # by a network, which may take another thing for the wound; else by an operator or its mark
+    found: bool = False  # by a network, which may be wrong; else by an operator or a mark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlinedPicture:
-    """One camera's picture, and where the wound is in it as somebody says."""
+    """One camera's picture, and the outline of the wound in it."""
 
     camera: int  # number in the rig
-    stamp: float  # s, when it was said
+    stamp: float  # s, of the outline
     taken: float  # s, stamp of the picture
     image: Image  # (H, W) grey or (H, W, 3) BGR
     polygon: Array  # (N, 2) px, round the wound
-    by: str  # who says so: "operator"
+    by: str  # author of the outline: "operator"
 
 
-ROI_LEAD = 0.1  # s before the stamp of a region from which it counts: cameras that run freely are less out of step
-ROI_SLACK = 1e-3  # s by which the set that a region counts from is safely later than that
+ROI_LEAD = 0.1  # s before a region's stamp, from which it is used: more than the offset of free-running cameras
+ROI_SLACK = 1e-3  # s of margin by which the first frame set of a region is later than that
 
 
 def region_since(roi: Roi, stamp: float) -> Roi:
-    """The region with the stamp by which it counts from the frame set at `stamp`, s, on, and from none before."""
+    """The region with a stamp such that it is used from the frame set at `stamp`, s, on, and not before."""
     return replace(roi, stamp=stamp + ROI_LEAD - ROI_SLACK)
 
 
@@ -95,7 +95,7 @@ def whole_pictures(sizes: Sequence[tuple[int, int]], stamp: float) -> tuple[Roi,
 
 
 def of_whole_pictures(roi: Sequence[Roi], sizes: Sequence[tuple[int, int]]) -> bool:
-    """Whether regions, if any, leave out nothing of any picture, and so do not tell what the surface is."""
+    """Whether regions, if any, contain the whole pictures, and so do not specify the surface."""
     for region in roi:
         low, high = region.polygon.min(0), region.polygon.max(0)
         if (low > 0).any() or (high < sizes[region.camera]).any() or len(region.polygon) != 4:
@@ -104,9 +104,9 @@ def of_whole_pictures(roi: Sequence[Roi], sizes: Sequence[tuple[int, int]]) -> b
 
 
 def region_polygons(roi: Sequence[Roi], frames: FrameSet, sizes: Sequence[tuple[int, int]]) -> dict[int, Array] | str:
-    """The region of interest (N, 2) px in each image of the set, by camera, or why it is not known yet.
+    """The region of interest (N, 2) px in each image of the set, by camera, or why there is none yet.
 
-    Without any the whole images are taken. sizes: (W, H) px by camera.
+    Without regions: the whole images. sizes: (W, H) px by camera.
     """
     roi = roi or whole_pictures(sizes, frames.stamp)
     start = max(r.stamp for r in roi)
@@ -128,8 +128,8 @@ class DuplicateFilter:
     def __call__(self, camera: int, image: Image) -> bool:
         """Whether a camera's image (H, W) differs from its last one in a single bit.
 
-        A sensor's noise never repeats. A picture without noise of a scene at rest counts as repeated, too: a scene that
-        stands still and a camera that hangs then look the same.
+        A sensor's noise never repeats. A picture without noise, of a scene at rest, counts as repeated too: it cannot
+        be distinguished from that of a camera that hangs.
         """
         last = self._last.get(camera)
         self._last[camera] = image
@@ -140,18 +140,18 @@ class DuplicateFilter:
 
 Result = TypeVar("Result")
 
-MAX_THREADS = 3  # that a rig usually has; more of them wait for each other
+MAX_THREADS = 3  # cameras of a usual rig; more threads would wait for each other
 _POOL = ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="camera")
 
 
 def parallel_map(function: Callable[..., Result], *arguments: Iterable[object]) -> list[Result]:
-    """As list(map(function, *arguments)); the function must not call this itself.
+    """As list(map(function, *arguments)); the function must not call `parallel_map`.
 
-    The calling thread does the first: what it hands over may have to wait for a core.
+    The calling thread makes the first call: a submitted one may wait for a core.
     """
     calls = list(zip(*arguments, strict=True))
-    waiting = [_POOL.submit(function, *each) for each in calls[1:]]
-    return [*(function(*first) for first in calls[:1]), *(each.result() for each in waiting)]
+    futures = [_POOL.submit(function, *call) for call in calls[1:]]
+    return [*(function(*first) for first in calls[:1]), *(call.result() for call in futures)]
 
 
 # Height above the tip and radius, mm: a luer needle of half an inch on a 5 ml cartridge in its holder.
@@ -160,20 +160,20 @@ SYRINGE = np.array([[0, 0.5], [12.7, 0.5], [13.6, 2.5], [23, 3.6], [27, 4.8], [5
 
 def check_profile(where: object, what: str, profile: Array) -> None:
     """InputError unless a profile (K, 2) of [height, radius], mm, is that of a tool."""
-    rising = profile.ndim == 2 and profile.shape[1:] == (2,) and len(profile) > 1
-    if not (rising and np.isfinite(profile).all() and (np.diff(profile[:, 0]) > 0).all() and (profile >= 0).all()):
+    well_shaped = profile.ndim == 2 and profile.shape[1:] == (2,) and len(profile) > 1
+    if not (well_shaped and np.isfinite(profile).all() and (np.diff(profile[:, 0]) > 0).all() and (profile >= 0).all()):
         allowed = "two or more [height, radius] in mm, none negative, heights rising"
         raise InputError(where, what, profile.tolist(), allowed)
 
 
 DEFAULT_PERIOD = 1 / 30  # s, of the thesis's cameras: for recordings in which no camera has two frames
 TOLERANCE_PERIODS = 0.5  # see `pairing_tolerance`
-DELAY_SAMPLES = 5  # frames of a camera, whose median delay behind the first one of their sets is its usual delay
-SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost in a row are rare
+DELAY_SAMPLES = 5  # frames of a camera: its usual delay is their median delay from the first frame of their sets
+SILENT_PERIODS = 5.0  # without a frame, after which no set waits for a camera: four lost frames in a row are rare
 
 
 class Stamped(Protocol):
-    """Anything that a camera took at a stamp."""
+    """An item of a camera at a stamp."""
 
     @property
     def camera(self) -> int:
@@ -207,10 +207,10 @@ def pairing_tolerance(period: float) -> float:
 
 
 def pair(items: Iterable[StampedItem], tolerance: float, cameras: int) -> Iterator[tuple[StampedItem, ...]]:
-    """Sets of items, each in the rig's order, from items in order of stamp; every item comes out exactly once.
+    """Sets of items, each in the rig's order, from items in order of stamp; every item is in exactly one set.
 
-    A set ends when it holds all `cameras`, when a camera would come a second time, or when an item is more than
-    `tolerance` (s) younger than the set's first. It comes out as early as possible, without looking ahead.
+    A set ends when it has all `cameras`, before a camera's second item, and before an item more than `tolerance` (s)
+    later than the set's first. It is yielded as early as possible, without looking ahead.
     """
     current: dict[int, StampedItem] = {}
     first = 0.0
@@ -233,7 +233,7 @@ def _in_rig_order(by_camera: dict[int, StampedItem]) -> tuple[StampedItem, ...]:
 
 
 def mean_stamp(items: Sequence[Stamped]) -> float:
-    """Mean of the stamps, s, taken about the first so that a large epoch costs no digits."""
+    """Mean of the stamps, s, computed relative to the first so that a large epoch costs no digits."""
     first = items[0].stamp
     return first + sum(item.stamp - first for item in items) / len(items)
 
@@ -246,89 +246,89 @@ def frame_set(frames: Sequence[Frame]) -> FrameSet:
 class Pairing:
     """Frame sets from live frames, which arrive in any order between cameras, some late, some never.
 
-    A set is complete when every camera that is alive is in it, or has since delivered a younger frame. An incomplete
-    set is given out `patience` s after the arrival of its first frame. The patience is half a period. Where a camera's
-    usual delay is longer, it is added, at most one period: else the frames of a camera that is always late would never
-    be used. A camera that is silent for SILENT_PERIODS is not waited for.
+    A set is complete when every active camera is in it or has since delivered a later frame. An incomplete set is
+    output `patience` s after the arrival of its first frame. The patience is half a period. A camera's usual delay is
+    added if longer, at most one period: else the frames of a camera that is always late would never be used. A camera
+    silent for SILENT_PERIODS is not waited for.
 
-    Sets come out in order of stamp; a frame that is too late for that is dropped and counted in `late`. The frames of
-    one camera are assumed to arrive in order.
+    Sets are output in order of stamp; a frame too late for that is dropped and counted in `late`. The frames of one
+    camera are assumed to arrive in order.
     """
 
     def __init__(self, cameras: int, period: float) -> None:
         """cameras: number of them in the rig. period: s, of their frames."""
         self.late = 0
         self.retime(period)
-        self._open: list[_OpenSet] = []  # oldest first
+        self._open_sets: list[_OpenSet] = []  # oldest first
         self._last_stamp = [-math.inf] * cameras
         self._last_arrival: list[float | None] = [None] * cameras  # s
-        self._last_set: _OpenSet | None = None  # that was given out
+        self._last_set: _OpenSet | None = None  # the last output
         self._delays: list[deque[float]] = [deque(maxlen=DELAY_SAMPLES) for _ in range(cameras)]  # s, see `_add_delay`
 
     def retime(self, period: float) -> None:
         """The cameras' frames come every `period` s from now on."""
         self.patience = pairing_tolerance(period)
-        self._period, self._tolerance, self._silent = period, pairing_tolerance(period), SILENT_PERIODS * period
+        self._period, self._tolerance, self._silence_limit = period, pairing_tolerance(period), SILENT_PERIODS * period
 
     def add(self, frame: Frame, now: float) -> list[FrameSet]:
-        """The sets that can be given out once a frame has arrived; now: s, rising from call to call."""
+        """The sets to output after the arrival of a frame; now: s, rising from call to call."""
         self._last_stamp[frame.camera], self._last_arrival[frame.camera] = frame.stamp, now
         last = self._last_set
-        belongs_to_last = last is not None and last.takes(frame, self._tolerance)
+        belongs_to_last = last is not None and last.accepts(frame, self._tolerance)
         if last is not None and (belongs_to_last or frame.stamp <= last.last):
             self.late += 1
             if belongs_to_last:
-                self._add_delay(frame.camera, now - last.arrived)
+                self._add_delay(frame.camera, now - last.arrival)
         else:
-            self._place(frame, now)
+            self._insert(frame, now)
         return self.due(now)
 
     def due(self, now: float) -> list[FrameSet]:
-        """The sets that are complete, or must not be waited for any longer, at `now`, s."""
+        """The sets that are complete or past their deadline at `now`, s."""
         self._last_arrival = [now if arrival is None else arrival for arrival in self._last_arrival]
-        # with a set that is finished all before it are given out, so that stamps rise
-        count = max((i for i, group in enumerate(self._open, 1) if self._is_finished(group, now)), default=0)
-        out, self._open = self._open[:count], self._open[count:]
+        # a finished set is output with all before it, so that stamps rise
+        count = max((i for i, group in enumerate(self._open_sets, 1) if self._is_finished(group, now)), default=0)
+        out, self._open_sets = self._open_sets[:count], self._open_sets[count:]
         if out:
             self._last_set = out[-1]
         return [frame_set(list(group.frames.values())) for group in out]
 
     def _add_delay(self, camera: int, delay: float) -> None:
-        """Take a frame's delay, s, behind the first one of its set; a camera's usual delay is the median of them."""
+        """Add a frame's delay, s, from the first one of its set; a camera's usual delay is their median."""
         self._delays[camera].append(delay)
         usual = [float(np.median(d)) for d in self._delays if len(d) == DELAY_SAMPLES]
         longest = min(max(usual, default=0.0), self._period)
         self.patience = self._tolerance + (longest if longest > self._tolerance else 0.0)
 
-    def _place(self, frame: Frame, now: float) -> None:
-        for i, group in enumerate(self._open):
-            rises = all(frame.stamp < later.last for later in self._open[i + 1 :])
-            if rises and group.takes(frame, self._tolerance):
+    def _insert(self, frame: Frame, now: float) -> None:
+        for i, group in enumerate(self._open_sets):
+            in_order = all(frame.stamp < later.last for later in self._open_sets[i + 1 :])
+            if in_order and group.accepts(frame, self._tolerance):
                 group.frames[frame.camera] = frame
-                self._add_delay(frame.camera, now - group.arrived)
+                self._add_delay(frame.camera, now - group.arrival)
                 return
-        if any(group.first <= frame.stamp <= group.last for group in self._open):  # amid a set that it is no part of
+        if any(group.first <= frame.stamp <= group.last for group in self._open_sets):  # within another set
             self.late += 1
             return
-        self._open.append(_OpenSet(now, now + self.patience, {frame.camera: frame}))
-        self._open.sort(key=lambda group: group.first)
+        self._open_sets.append(_OpenSet(now, now + self.patience, {frame.camera: frame}))
+        self._open_sets.sort(key=lambda group: group.first)
 
     def _is_finished(self, group: _OpenSet, now: float) -> bool:
         missing = [camera for camera in range(len(self._last_stamp)) if camera not in group.frames]
-        return now >= group.until or not any(self._may_come(group, camera, now) for camera in missing)
+        return now >= group.deadline or not any(self._may_come(group, camera, now) for camera in missing)
 
     def _may_come(self, group: _OpenSet, camera: int, now: float) -> bool:
         arrival = self._last_arrival[camera]
-        alive = arrival is not None and now - arrival <= self._silent
+        alive = arrival is not None and now - arrival <= self._silence_limit
         return alive and self._last_stamp[camera] < group.first + self._tolerance
 
 
 @dataclass(slots=True)
 class _OpenSet:
-    """A set that is being gathered."""
+    """An incomplete set."""
 
-    arrived: float  # s, when its first frame came
-    until: float  # s, waited for
+    arrival: float  # s, when its first frame came
+    deadline: float  # s, of its output
     frames: dict[int, Frame]  # by camera
 
     @property
@@ -339,7 +339,7 @@ class _OpenSet:
     def last(self) -> float:
         return max(frame.stamp for frame in self.frames.values())
 
-    def takes(self, frame: Frame, tolerance: float) -> bool:
-        """Whether a frame belongs here: its camera is not there yet, and no two stamps are further than `tolerance`."""
+    def accepts(self, frame: Frame, tolerance: float) -> bool:
+        """Whether a frame belongs to the set: of a new camera, with all stamps within `tolerance`, s."""
         near = max(frame.stamp, self.last) - min(frame.stamp, self.first) <= tolerance
         return near and frame.camera not in self.frames

@@ -1,4 +1,4 @@
-"""Between the pixels that a lens images and the ideal pixels that the estimator works in; filters before detection."""
+"""Conversion between imaged pixels and the ideal pixels of the estimator; filters before detection."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def undistort(camera: Camera, pixels: Array) -> Array:
 def imaged_radius(camera: Camera) -> float:
     """Largest tangent of the angle to the axis at which the lens model can be trusted.
 
-    That is the image's own corner with a tenth to spare, or where the radial polynomial stops growing, if sooner:
-    beyond, a point far outside the view would be imaged back into it.
+    That of the image's corner plus a tenth, or where the radial polynomial stops growing, if smaller: beyond, a point
+    far outside the view would be imaged into it.
     """
     w, h = camera.size
     corners = undistort(camera, np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
@@ -44,7 +44,7 @@ def imaged_radius(camera: Camera) -> float:
 
 
 class Lenses:
-    """The rig's lenses, with what each needs worked out once.
+    """The rig's lenses with their precomputed parameters.
 
     sizes: (C, 2) px, width and height. radius: (C,) as `imaged_radius`. models: (C, 9) distortion, focal lengths and
     principal point, px.
@@ -55,8 +55,8 @@ class Lenses:
         self.radius = np.array([imaged_radius(c) for c in rig.cameras])
         self.sizes = np.array([c.size for c in rig.cameras], float)
         self._focal, self._centre = rig.matrices[:, [0, 1], [0, 1]], rig.matrices[:, :2, 2]
-        bends = np.array([c.distortion for c in rig.cameras], float)
-        self.models = np.ascontiguousarray(np.hstack([bends, self._focal, self._centre]))
+        distortion = np.array([c.distortion for c in rig.cameras], float)
+        self.models = np.ascontiguousarray(np.hstack([distortion, self._focal, self._centre]))
 
     def image(self, camera: int | NDArray[np.int64], ideal: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Imaged pixels (..., 2) of ideal ones, and whether each is in front of and inside the lens's field (...).
@@ -72,20 +72,20 @@ class Lenses:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """As `image`, of tangents x, y (...) of the angles to the axis; pixels (2, ...). camera: broadcast to them."""
         shape = np.broadcast_shapes(x.shape, depth.shape)
-        which = contiguous(np.broadcast_to(camera, shape).ravel(), np.int64)
-        parts = _flat(x, shape), _flat(y, shape), _flat(depth, shape)
-        imaged, visible = bend_each(which, *parts, self.models, self.radius)
+        cameras = contiguous(np.broadcast_to(camera, shape).ravel(), np.int64)
+        x, y, depth = _flat(x, shape), _flat(y, shape), _flat(depth, shape)
+        imaged, visible = bend_each(cameras, x, y, depth, self.models, self.radius)
         return imaged.reshape(2, *shape), visible.reshape(shape)
 
 
 def _flat(values: Array, shape: tuple[int, ...]) -> Array:
-    """Values broadcast to a shape, in one row that compiled loops take."""
+    """Values broadcast to a shape, flat and contiguous for compiled loops."""
     return contiguous((values if values.shape == shape else np.broadcast_to(values, shape)).ravel())
 
 
 @compiled("Tuple((f8, f8, b1))(f8, f8, f8, f8[::1], f8)")
 def bend_one(x: float, y: float, depth: float, model: Array, radius: float) -> tuple[float, float, bool]:
-    """The pixel of tangents x, y at a depth, mm, and whether it is seen. model (9,), radius: as `Lenses` keeps them."""
+    """The pixel of tangents x, y at a depth, mm, and whether it is in view. model (9,), radius: as in `Lenses`."""
     r2 = x * x + y * y
     visible = (depth > 1.0) and (r2 < radius**2)
     if not visible:
@@ -101,7 +101,7 @@ def bend_one(x: float, y: float, depth: float, model: Array, radius: float) -> t
 def bend_each(
     camera: NDArray[np.int64], x: Array, y: Array, depth: Array, models: Array, radius: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """`bend_one` of N: pixels (2, N), and which are seen (N,). camera: (N,). models (C, 9), radius (C,)."""
+    """`bend_one` of N: pixels (2, N), and which are in view (N,). camera: (N,). models (C, 9), radius (C,)."""
     imaged, visible = np.empty((2, len(x))), np.empty(len(x), np.bool_)
     for n in range(len(x)):
         c = camera[n]
@@ -113,13 +113,13 @@ BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX = 10, 75.0, 750.0  
 
 
 def bilateral(image: Image) -> Image:
-    """The picture, its reflections filtered out and its contours kept (thesis 4.6, Fig. 4.9)."""
+    """The picture without reflections, with contours preserved (thesis 4.6, Fig. 4.9)."""
     smooth = cv2.bilateralFilter(image, BILATERAL_DIAMETER, BILATERAL_SIGMA_GREY, BILATERAL_SIGMA_PX)
     return np.asarray(smooth, np.uint8)
 
 
 def unfiltered(image: Image) -> Image:
-    """The picture as it is."""
+    """The picture unchanged."""
     return image
 
 

@@ -405,7 +405,7 @@ MUTANTS = (
     Mutant(
         "the colours of ink are the tissue's",
         "perception/mapping/masks.py",
-        "first.free & ~self._inked &",
+        "first.free & ~self._ink_mask &",
         "first.free &",
         ("test_colours.py::test_ink_has_its_own_colours",),
     ),
@@ -433,8 +433,8 @@ MUTANTS = (
     Mutant(
         "displaced colours are forgotten while they stand apart",
         "perception/mapping/masks.py",
-        "np.isinf(known) | (energy > USUAL_RATIO * known)",
-        "np.isinf(known)",
+        "np.isinf(expected_energy) | (energy > USUAL_RATIO * expected_energy)",
+        "np.isinf(expected_energy)",
         ("test_colours.py::test_what_is_told_is_remembered_until_the_colours_are_back",),
     ),
     Mutant(
@@ -454,8 +454,8 @@ MUTANTS = (
     Mutant(
         "a repeat that the pictures do not rule out is dropped",
         "perception/mapping/verification.py",
-        "alive = evidence < (ODD",
-        "alive = evidence < -(ODD",
+        "possible = evidence < (ODD",
+        "possible = evidence < -(ODD",
         ("test_verification.py::test_where_the_marks_are_hidden_nothing_is_sure",),
     ),
     Mutant(

@@ -134,7 +134,7 @@ def test_what_stands_still_while_the_surface_moves_is_never_proven() -> None:
     new = waiting()
     for _ in range(4):
         new.look(LENSES, 1.0, images(False), at(MOVED))
-    assert new.proven.mean() < 0.05 and new.over
+    assert new.proven.mean() < 0.05 and new.finished
 
 
 @pytest.mark.parametrize("amid_others", [False, True])

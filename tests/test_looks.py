@@ -559,7 +559,7 @@ def test_a_camera_does_not_see_what_a_bead_stands_before() -> None:
     blank = np.zeros((60, 50, 2), np.float32)
     seen = _GroundView(
         np.zeros((2, 2), np.uint8), blank, blank, np.ones((60, 50), bool), np.broadcast_to(aslant, (60, 50, 3))
-    ).unhidden(surface, 0.2)
+    ).in_line_of_sight(surface, 0.2)
     hidden = y[~seen[:, 25]]
     assert hidden.min() == pytest.approx(4.7, abs=0.25) and hidden.max() == pytest.approx(6.0, abs=0.25)
     assert len(hidden) == pytest.approx(7, abs=1)

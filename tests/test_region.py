@@ -32,7 +32,7 @@ from hardware.operator.shared_state import DrawnRegion
 from hardware.process.system import SharedLatest
 from perception.frames import FrameSet, Roi, region_polygons, region_since
 from perception.tracking.step import TrackingStep
-from perception.tracking.wound_step import PATCH_SOUGHT, RegionSearch, RegionTrackingStep
+from perception.tracking.wound_step import PATCH_SEARCH_TEXT, RegionSearch, RegionTrackingStep
 from perception.wound.segmentation import ColourSegmenter
 from tests.printed_sheet import FPS, FRAME_RGB, SIZE, corners_at, displacement_errors, pictures, region, rig
 from tests.uptime import DAY
@@ -211,7 +211,7 @@ def test_a_sheet_on_a_table_is_followed_inside_its_coloured_frame() -> None:
     step = RegionTrackingStep(rig(), made, RegionSearch(rig(), ColourSegmenter(FRAME_RGB), patch=True))
     poses = followed(step, step.idle)
     off = errors_of(poses)
-    assert poses[0].reason == PATCH_SOUGHT and len(off) > 12 and off.max() < MAX_ERROR
+    assert poses[0].reason == PATCH_SEARCH_TEXT and len(off) > 12 and off.max() < MAX_ERROR
     (rois,) = asked
     for roi, camera in zip(rois, rig().cameras, strict=True):
         outline = corners_at(0.0, camera)
@@ -234,7 +234,7 @@ def test_a_frame_is_looked_for_until_all_cameras_have_shown_it() -> None:
 
 def test_a_frame_of_another_colour_is_waited_for() -> None:
     search = RegionSearch(rig(), ColourSegmenter((0, 60, 220)), patch=True)
-    assert {str(search(frames)) for frames in sets()} == {PATCH_SOUGHT}
+    assert {str(search(frames)) for frames in sets()} == {PATCH_SEARCH_TEXT}
 
 
 def test_a_drawn_region_is_waited_for_and_taken_once_it_is_there() -> None:

@@ -171,7 +171,7 @@ def test_a_board_that_was_turned_while_it_was_hidden_is_doubted() -> None:
     looks = pictures(board(12.0), np.eye(4), 1)
 
     def turned(gap: float) -> int:
-        alive = learned(board(12.0))(gap, looks, poses(np.eye(4))).alive
+        alive = learned(board(12.0))(gap, looks, poses(np.eye(4))).motions
         return int((np.abs(alive[:, 0, 0] - 1) > 0.5).sum())
 
     assert turned(2.0) > turned(1.0) >= 2 and not turned(0.5)
@@ -187,7 +187,7 @@ def test_the_operator_is_told_of_a_surface_that_repeats_and_has_no_marks() -> No
     assert plain.message == "" and "repeats every 16.9 mm; its own marks tell" in own.message
     assert "repeats every 16.9 mm" in none.message and "hardly a mark" in none.message
     for verification in (own, none):
-        verification.take(1.1, poses(np.eye(4)))
+        verification.confirm(1.1, poses(np.eye(4)))
     assert not own.message and none.message
 
 
@@ -199,31 +199,31 @@ def test_marks_of_its_own_tell_a_board_that_jumped(jump: tuple[float, float]) ->
     x, y = jump
     texture = marked(board(12.0))
     verdict = learned(texture)(FRAME_S, pictures(texture, shifted(x, y), 1), poses(np.eye(4)))
-    assert verdict.rivals and verdict.alive[0, :3, 3] == pytest.approx([x, y, 0.0], abs=0.5)
+    assert verdict.rivals and verdict.motions[0, :3, 3] == pytest.approx([x, y, 0.0], abs=0.5)
     right = learned(texture)(FRAME_S, pictures(texture, shifted(x, y), 1), poses(shifted(x, y)))
-    assert right.likeness > verdict.likeness + 0.02 and not len(right.alive)
+    assert right.likeness > verdict.likeness + 0.02 and not len(right.motions)
 
 
 def test_where_the_marks_are_hidden_nothing_is_sure() -> None:
     texture, verification = marked(board(12.0)), learned(marked(board(12.0)))
     looks = pictures(board(12.0), np.eye(4), 1)  # as if each mark were covered by its surroundings
     reach = 12.0 * np.sqrt(2) / MAX_TISSUE_SPEED
-    assert not len(learned(board(12.0))(0.9 * reach, looks, poses(np.eye(4))).alive)  # too far for the tissue
+    assert not len(learned(board(12.0))(0.9 * reach, looks, poses(np.eye(4))).motions)  # too far for the tissue
     sizes = learned(board(12.0))(1.1 * reach, looks, poses(np.eye(4))).sizes
     assert sizes.min() == pytest.approx(12.0 * np.sqrt(2), abs=0.4)
-    assert not len(verification(0.001, pictures(texture, np.eye(4), 2), poses(np.eye(4))).alive)
+    assert not len(verification(0.001, pictures(texture, np.eye(4), 2), poses(np.eye(4))).motions)
 
 
 def test_a_sure_pose_rules_out_what_is_too_far_from_it() -> None:
     verification, looks = learned(board(12.0)), pictures(board(12.0), np.eye(4), 1)
-    assert len(verification(1.0, looks, poses(np.eye(4))).alive)
-    verification.take(1.0, poses(np.eye(4)))
-    assert not len(verification(1.0 + FRAME_S, looks, poses(np.eye(4))).alive)
+    assert len(verification(1.0, looks, poses(np.eye(4))).motions)
+    verification.confirm(1.0, poses(np.eye(4)))
+    assert not len(verification(1.0 + FRAME_S, looks, poses(np.eye(4))).motions)
 
 
 def test_ordinary_skin_is_sure_without_a_look() -> None:
     verification = learned(skin(1))
-    assert not len(verification(9.0, {}, poses(shifted(50.0, 0.0))).alive)
+    assert not len(verification(9.0, {}, poses(shifted(50.0, 0.0))).motions)
 
 
 # -- grain

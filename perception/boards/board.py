@@ -1,8 +1,8 @@
 """A printed calibration board, and its corners in pictures.
 
-A chessboard, with markers in its white squares (ChArUco) or without; each corner with its sigma and its blur; those of
-a recording, for calibration. And undistorted pictures for reports (thesis 4.2): every pixel kept, black where there is
-none.
+A chessboard, with markers in its white squares (ChArUco) or without; each corner with its sigma and its blur; tables of
+a recording's corners for calibration. Also undistorted pictures for reports (thesis 4.2): with every pixel, black where
+there is none.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def _add_markers(board: Board, ink: NDArray[np.bool_], per_square: int) -> None:
     bits = int(board.dictionary[0]) + 2
     cell = round(board.marker * per_square) // bits
     margin = (per_square - cell * bits) // 2
-    whites = np.argwhere(~ink[::per_square, ::per_square])  # row by row, as the markers are counted
-    for number, (row, column) in enumerate(whites):
+    white_squares = np.argwhere(~ink[::per_square, ::per_square])  # row by row, as the markers are counted
+    for number, (row, column) in enumerate(white_squares):
         picture = cv2.aruco.generateImageMarker(dictionary, number, bits)
         y, x = row * per_square + margin, column * per_square + margin
         ink[y : y + cell * bits, x : x + cell * bits] = np.kron(picture == 0, np.ones((cell, cell))).astype(bool)
@@ -125,18 +125,18 @@ def thumbnail(image: Image, width: int) -> bytes:
     return data.tobytes()
 
 
-MIN_CORNERS = 4  # that fix a homography
+MIN_CORNERS = 4  # that determine a homography
 REFINE_STEPS, REFINE_TOLERANCE = 10, 1e-3  # iterations; px of the last step
-HALF_WINDOWS = (2, 9)  # px, half the window: smaller holds no edge, larger reaches the next corner of a far board
+HALF_WINDOWS = (2, 9)  # px, half the window: smaller contains no edge, larger the next corner of a far board
 EDGE_REACH = 0.4  # of a square, used along an edge: beyond half, the next corner's edges begin
 HALF_SQUARES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])  # to both sides along both axes
-BLUR_FRINGE, MIN_EDGE_BAND = 2.0, 1.5  # px: blurred rim of a marker that is left out; least width of an edge's band
-MIN_CORNER_SIGMA = 0.01  # px: what rendered pictures without noise leave
+BLUR_FRINGE, MIN_EDGE_BAND = 2.0, 1.5  # px: excluded blurred rim of a marker; least width of an edge's band
+MIN_CORNER_SIGMA = 0.01  # px: as in rendered pictures without noise
 BLURRED_STEP_SLOPE = 2.5066  # sqrt(2 pi): a step blurred by sigma has a slope of 1 / (2.5066 sigma) per pixel
 MAX_BLUR = 4.0  # px, one sigma of an edge: beyond it the edges of two corners overlap
 MAX_BLUR_RATIO, MIN_BLUR_LIMIT = 2.5, 1.5  # a view is blurred beyond so many times the camera's median, and so many px
-MIN_CORNER_SPREAD = 0.02  # ratio of the corners' spread across and along: collinear ones fix no plane
-MAX_INSTANTS = 250  # taken evenly from longer recordings: more would cost minutes and add nothing
+MIN_CORNER_SPREAD = 0.02  # ratio of the corners' spread across and along: collinear ones determine no plane
+MAX_INSTANTS = 250  # evenly from longer recordings: more take minutes without gain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,21 +179,21 @@ class CornerFinder:
         """Corners to a pixel, the markers' size ratio, and unknown markers."""
         if self._charuco is None:
             return _chessboard(self.board, grey), float("nan"), ()
-        at, number, squares, ids = self._charuco.detectBoard(grey)
+        corners, numbers, squares, ids = self._charuco.detectBoard(grey)
         pixels = np.full((len(self.board.corners), 2), np.nan)
-        if number is not None and len(number) >= MIN_CORNERS:
-            pixels[np.ravel(number)] = np.asarray(at, float).reshape(-1, 2)
-        known = self.board.markers()
-        strangers = () if ids is None else tuple(sorted({int(i) for i in np.ravel(ids) if i >= known}))
+        if numbers is not None and len(numbers) >= MIN_CORNERS:
+            pixels[np.ravel(numbers)] = np.asarray(corners, float).reshape(-1, 2)
+        count = self.board.markers()
+        strangers = () if ids is None else tuple(sorted({int(i) for i in np.ravel(ids) if i >= count}))
         return pixels, _marker_size(self.board, pixels, squares), strangers
 
 
 def _marker_size(board: Board, pixels: Array, squares: object) -> float:
     """Median edge of the markers in the plane of the corners, relative to a square's; nan if undetermined."""
-    seen = np.isfinite(pixels[:, 0])
-    if seen.sum() < 6 or squares is None or not len(squares):  # type: ignore[arg-type]
+    visible = np.isfinite(pixels[:, 0])
+    if visible.sum() < 6 or squares is None or not len(squares):  # type: ignore[arg-type]
         return float("nan")
-    plane, _ = cv2.findHomography(pixels[seen], board.corners[seen, :2] / board.square)
+    plane, _ = cv2.findHomography(pixels[visible], board.corners[visible, :2] / board.square)
     if plane is None:
         return float("nan")
     corners = np.asarray(squares, float).reshape(-1, 4, 2)
@@ -220,20 +220,20 @@ def _chessboard(board: Board, grey: Image) -> Array:
 def _refine(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
     """The corners to fractions of a pixel, and half the window, px.
 
-    All gradients about a corner are perpendicular to the way there (Foerstner and Guelch 1987), as in OpenCV's
-    cornerSubPix, but only gradients of the two edges count: a window along the board's axes avoids the markers.
+    All gradients about a corner are perpendicular to the vector from it (Foerstner and Guelch 1987), as in OpenCV's
+    cornerSubPix, but only gradients of the two edges are used: a window along the board's axes avoids the markers.
     """
-    seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
     half = int(np.clip(EDGE_REACH * _spacing(board, pixels), *HALF_WINDOWS))
     turn = _squares_from_pixels(board, pixels)
-    out, known = np.full_like(pixels, np.nan), np.isfinite(turn).all((1, 2))
-    seen, at, turn = seen[known], pixels[seen[known]], turn[known]
+    out, valid = np.full_like(pixels, np.nan), np.isfinite(turn).all((1, 2))
+    rows, at, turn = rows[valid], pixels[rows[valid]], turn[valid]
     size = np.array(grey.shape[::-1])
     for _ in range(REFINE_STEPS):
         near = np.round(at).astype(int)
         inside = (near >= half + 1).all(1) & (near <= size - half - 2).all(1)
-        seen, at, near, turn = seen[inside], at[inside], near[inside], turn[inside]
-        if not len(seen):
+        rows, at, near, turn = rows[inside], at[inside], near[inside], turn[inside]
+        if not len(rows):
             break
         slopes, places = _slopes(grey, near, half)
         weight = _weights(board, places - at[:, None], turn, half)
@@ -241,11 +241,11 @@ def _refine(board: Board, grey: Image, pixels: Array) -> tuple[Array, int]:
         pull = np.einsum("np,npi,np->ni", weight, slopes, (slopes * (places - at[:, None])).sum(-1))
         step = np.linalg.solve(tensor, pull[..., None])[..., 0]
         at = at + step
-        near_start = np.linalg.norm(at - pixels[seen], axis=1) < max(half / 2, 1.5)
-        seen, at, turn, step = seen[near_start], at[near_start], turn[near_start], step[near_start]
+        near_start = np.linalg.norm(at - pixels[rows], axis=1) < max(half / 2, 1.5)
+        rows, at, turn, step = rows[near_start], at[near_start], turn[near_start], step[near_start]
         if np.abs(step).max(initial=0.0) < REFINE_TOLERANCE:
             break
-    out[seen] = at
+    out[rows] = at
     return out, half
 
 
@@ -258,21 +258,21 @@ def _slopes(grey: Image, near: NDArray[np.int64], half: int) -> tuple[Array, Arr
     return np.stack([gx, gy], -1).reshape(len(near), -1, 2), places
 
 
-def _weights(board: Board, away: Array, squares_from_pixels: Array, half: int) -> Array:
-    """Weights (N, K) of gradients `away` (N, K, 2), px, from a corner: of its own edges, decreasing outwards."""
-    along = np.abs(away @ np.swapaxes(squares_from_pixels, 1, 2))  # in squares, along the board's two axes
+def _weights(board: Board, offsets: Array, squares_from_pixels: Array, half: int) -> Array:
+    """Weights (N, K) of gradients at offsets (N, K, 2), px, from a corner: of its own edges, decreasing outwards."""
+    along = np.abs(offsets @ np.swapaxes(squares_from_pixels, 1, 2))  # in squares, along the board's two axes
     per_pixel = np.linalg.norm(squares_from_pixels, axis=-1)[:, None]  # (N, 1, 2) squares, square to the edges
     white = (1 - board.marker) / 2 if board.kind == "charuco" else EDGE_REACH
-    room = np.maximum(white / per_pixel - BLUR_FRINGE, MIN_EDGE_BAND)
-    edges = (along / per_pixel < room).any(-1) & (along < EDGE_REACH).all(-1)
-    return np.where(edges, np.exp(-(away**2).sum(-1) / half**2), 0.0)
+    band = np.maximum(white / per_pixel - BLUR_FRINGE, MIN_EDGE_BAND)
+    edges = (along / per_pixel < band).any(-1) & (along < EDGE_REACH).all(-1)
+    return np.where(edges, np.exp(-(offsets**2).sum(-1) / half**2), 0.0)
 
 
 def _squares_from_pixels(board: Board, pixels: Array) -> Array:
-    """Squares along the board's axes per pixel (N, 2, 2) at each corner seen, by a homography; nan if there is none."""
-    seen = np.isfinite(pixels[:, 0])
-    squares = board.corners[seen, :2] / board.square
-    plane = cv2.findHomography(squares, pixels[seen])[0]
+    """Squares along the board's axes per pixel (N, 2, 2) at each visible corner, by a homography; nan without one."""
+    visible = np.isfinite(pixels[:, 0])
+    squares = board.corners[visible, :2] / board.square
+    plane = cv2.findHomography(squares, pixels[visible])[0]
     if plane is None:
         return np.full((len(squares), 2, 2), np.nan)
     ends = [cv2.perspectiveTransform((squares + e)[:, None], plane)[:, 0] for e in HALF_SQUARES]
@@ -291,10 +291,10 @@ def _spacing(board: Board, pixels: Array) -> float:
 
 def _quality(board: Board, grey: Image, pixels: Array, half: int) -> tuple[float, float]:
     """sigma and blur as `BoardCorners` has them."""
-    seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    if len(seen) < MIN_CORNERS:
+    rows = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    if len(rows) < MIN_CORNERS:
         return 0.0, 0.0
-    at = pixels[seen]
+    at = pixels[rows]
     near = np.round(at).astype(int)
     slopes, places = _slopes(grey, near, half)
     weight = _weights(board, places - at[:, None], _squares_from_pixels(board, pixels), half)
@@ -315,8 +315,8 @@ def _axes(board: Board, pixels: Array) -> Array:
     for axis in (0, 1):
         steps = np.diff(grid, axis=axis).reshape(-1, 2)
         steps = steps[np.isfinite(steps[:, 0])]
-        way = steps.sum(0) if len(steps) else np.eye(2)[axis]
-        normal = np.array([-way[1], way[0]])
+        direction = steps.sum(0) if len(steps) else np.eye(2)[axis]
+        normal = np.array([-direction[1], direction[0]])
         out.append(normal / max(float(np.linalg.norm(normal)), 1e-9))
     return np.array(out)
 
@@ -353,27 +353,27 @@ class CornerTable:
 
 def empty_table(board: Board, cameras: int) -> CornerTable:
     """The table of a recording that has not been searched yet."""
-    none, whole = np.zeros(0), np.zeros(0, np.int64)
+    none, index = np.zeros(0), np.zeros(0, np.int64)
     pixels = np.zeros((0, len(board.corners), 2))
-    return CornerTable(whole, whole, none, pixels, none, none, none, np.zeros(cameras, np.int64), whole, 0)
+    return CornerTable(index, index, none, pixels, none, none, none, np.zeros(cameras, np.int64), index, 0)
 
 
 def usable_views(
     table: CornerTable, board: Board, names: tuple[str, ...], sizes: tuple[tuple[int, int], ...]
 ) -> tuple[BoardViews, Counter[tuple[str, str]]]:
-    """The views that are good enough, and the number of others by camera and reason."""
+    """The usable views, and the number of others by camera and reason."""
     reasons = [_reason(table, row) for row in range(len(table))]
     usable = np.array([not reason for reason in reasons], bool)
     dropped = Counter((names[c], reason) for c, reason in zip(table.camera, reasons, strict=True) if reason)
-    chosen = thin_instants(table.instant, usable)
-    dropped.update((names[c], "more than are needed") for c in table.camera[usable & ~chosen])
+    rows = thin_instants(table.instant, usable)
+    dropped.update((names[c], "more than are needed") for c in table.camera[usable & ~rows])
     points, sigma = board.corners, np.maximum(table.sigma, 1e-3)
     views = BoardViews(names, sizes, points, table.camera, table.instant, table.stamp, table.pixels, sigma)
-    return views.only(chosen), dropped
+    return views.only(rows), dropped
 
 
 def _reason(table: CornerTable, row: int) -> str:
-    """Why a view is useless, or ''."""
+    """Why a view is not usable, or ''."""
     pixels = table.pixels[row]
     pixels = pixels[np.isfinite(pixels[:, 0])]
     if len(pixels) < MIN_VIEW_CORNERS:
@@ -388,9 +388,9 @@ def _reason(table: CornerTable, row: int) -> str:
 
 
 def thin_instants(instant: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V,) the rows of at most MAX_INSTANTS of the usable instants: runs of neighbours, which show the motion."""
+    """(V,) the rows of at most MAX_INSTANTS usable instants, in runs of neighbours, which show the motion."""
     instants = np.unique(instant[usable])
     if len(instants) <= MAX_INSTANTS:
         return usable
-    chosen = np.concatenate([run[:10] for run in np.array_split(instants, MAX_INSTANTS // 10)])
-    return np.asarray(usable & np.isin(instant, chosen))
+    selection = np.concatenate([run[:10] for run in np.array_split(instants, MAX_INSTANTS // 10)])
+    return np.asarray(usable & np.isin(instant, selection))

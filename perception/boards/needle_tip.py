@@ -111,17 +111,17 @@ def _thin_end(mask: Mask, radius: int) -> tuple[Array, Array] | None:
         return None
     near = cv2.dilate(thick, np.ones((3, 3), np.uint8))
     count, labels = cv2.connectedComponents(np.asarray((mask > 0) & (near == 0), np.uint8), connectivity=8)
-    touching = cv2.dilate(near, np.ones((5, 5), np.uint8))
+    contact = cv2.dilate(near, np.ones((5, 5), np.uint8))
     best: tuple[float, Array, Array] | None = None
     for part in range(1, count):
         rows, columns = np.nonzero(labels == part)
         points = np.column_stack([columns, rows]).astype(float)
-        joint = points[touching[rows, columns] > 0]
+        joint = points[contact[rows, columns] > 0]
         if len(points) < MIN_NEEDLE_LENGTH or not len(joint):
             continue
         root = joint.mean(0)
-        away = points - root
-        tip = points[np.linalg.norm(away, axis=1).argmax()]
+        offsets = points - root
+        tip = points[np.linalg.norm(offsets, axis=1).argmax()]
         length = float(np.linalg.norm(tip - root))
         if length >= MIN_NEEDLE_LENGTH and (best is None or length > best[0]):
             best = length, tip, (root - tip) / length
@@ -147,8 +147,8 @@ def _measure_tip(change: Light, behind: Light, tip: Array, towards: Array) -> Ti
         if end is None or abs(end) > END_BEYOND:
             return None
         tip = tip + end * towards + (offset + slope * end) * side
-        turned = towards + slope * side
-        towards = turned / np.linalg.norm(turned)
+        direction = towards + slope * side
+        towards = direction / np.linalg.norm(direction)
     return _tip(along, across, amount, inner, tip, towards, contrast)
 
 
@@ -181,27 +181,27 @@ def _strip(change: Light, behind: Light, tip: Array, towards: Array) -> tuple[Ar
         cv2.remap(light, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
         for light in (change, behind)
     )
-    added, own = (
+    added, colour = (
         np.median(light[(along > 2.5) & (along < 10.0)][:, np.abs(across) < 0.6].reshape(-1, 3), axis=0)
         for light in (patch, patch + back)
     )
     contrast = float(np.linalg.norm(added))
-    own = own / max(float(np.linalg.norm(own)), 1e-9)
-    left = np.eye(3) - np.outer(own, own)  # projects a light onto what is not of the needle's colour
-    foreign = back @ left
+    colour = colour / max(float(np.linalg.norm(colour)), 1e-9)
+    projector = np.eye(3) - np.outer(colour, colour)  # onto light that is not of the needle's colour
+    foreign = back @ projector
     size = np.sum(foreign**2, axis=-1)
     usual = float(np.median(size))
     if usual < (MIN_COLOUR_CONTRAST * contrast) ** 2:
         return along, across, patch @ added / max(contrast**2, 1e-12), contrast
-    return along, across, -np.sum(patch @ left * foreign, axis=-1) / np.maximum(size, usual / 4), contrast
+    return along, across, -np.sum(patch @ projector * foreign, axis=-1) / np.maximum(size, usual / 4), contrast
 
 
 def _reach(amount: Array, along: Array) -> float:
     """Length, px, over which the needle's width stays constant from its end."""
     profile = amount.sum(1) * SAMPLE_STEP
     usual = float(np.median(profile[(along > 2.5) & (along < 8.0)]))
-    wrong = np.flatnonzero((along > 8.0) & (np.abs(profile - usual) > 0.5 * usual))
-    return float(along[wrong[0]]) - 1.5 if len(wrong) else AXIS_LENGTH
+    outside = np.flatnonzero((along > 8.0) & (np.abs(profile - usual) > 0.5 * usual))
+    return float(along[outside[0]]) - 1.5 if len(outside) else AXIS_LENGTH
 
 
 def _end(along: Array, profile: Array, inner: NDArray[np.bool_]) -> float | None:
@@ -217,9 +217,9 @@ def _end(along: Array, profile: Array, inner: NDArray[np.bool_]) -> float | None
         step, bell = ndtr((s - e) / w), np.exp(-0.5 * ((s - e) / w) ** 2) / np.sqrt(2 * np.pi)
         line = a + b * s
         slopes = np.column_stack([step, s * step, -line * bell / w, -line * bell * (s - e) / w**2])
-        left = y - line * step
-        held = slopes.T @ slopes + np.diag(_WEAK_PRIOR)
-        change = np.linalg.solve(held, slopes.T @ left - _WEAK_PRIOR * np.array([a - 1.0, b, 0.0, w - 1.0]))
+        residual = y - line * step
+        normal = slopes.T @ slopes + np.diag(_WEAK_PRIOR)
+        change = np.linalg.solve(normal, slopes.T @ residual - _WEAK_PRIOR * np.array([a - 1.0, b, 0.0, w - 1.0]))
         a, b, e = a + change[0], b + change[1], e + float(np.clip(change[2], -1.0, 1.0))
         w = float(np.clip(w + change[3], 0.3, 3.0))
     return e if a > 0.3 and abs(e) <= END_BEYOND else None

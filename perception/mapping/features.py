@@ -1,5 +1,4 @@
-"""Corners and SIFT features: where tracks can begin, which features of two images match, relocalisation by them, and a
-hint at a camera's calibration."""
+"""Corners to start tracks, SIFT features, their matches, relocalisation by them, and a hint at calibration errors."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from perception.mapping.patches import Pyramid
 
 ImageMask = NDArray[np.uint8]
 Features = tuple[Array, NDArray[np.float32]]  # (N, 2) px and descriptors (N, 128)
-SIFT_OFFSET_PX = 0.25  # cv2's SIFT doubles the image and does not take the half pixel back (measured: 0.26)
+SIFT_OFFSET_PX = 0.25  # cv2's SIFT doubles the image and does not correct the half-pixel shift (measured: 0.26)
 MAX_BRUTE_FORCE_DISTANCES = 12_000_000  # above which FLANN's trees are quicker
 SAME_SPOT_PX = 2.0  # px: features closer than this show one spot
 FLANN_KD_TREE = 1  # OpenCV's number for that index
@@ -90,8 +89,8 @@ def sift(image: Image, mask: ImageMask | None = None, count: int = 1500, tilted:
 def match(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float = 0.8) -> NDArray[np.int64]:
     """Pairs (M, 2) of rows of a and b that choose each other and pass Lowe's ratio test (thesis 4.4: 0.8).
 
-    All distances are compared, which numpy does four times quicker than OpenCV's brute force, as long as they are not
-    too many; beyond that FLANN's trees are asked, which miss one pair in 500 and give the same answer every time.
+    Up to MAX_BRUTE_FORCE_DISTANCES all distances are compared (numpy is four times faster than OpenCV's brute force);
+    beyond, FLANN's trees, which miss one pair in 500 and are deterministic.
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
@@ -106,7 +105,7 @@ def matched_spots(a: Features, b: Features) -> tuple[Array, Array]:
     """Pixels (N, 2) of each of two images, as imaged, whose features match."""
     pairs = match(a[1], b[1], 0.85)
     both = np.concatenate([a[0][pairs[:, 0]], b[0][pairs[:, 1]]], 1)
-    _, first = np.unique(np.round(both / SAME_SPOT_PX), axis=0, return_index=True)  # several tilts show one spot
+    _, first = np.unique(np.round(both / SAME_SPOT_PX), axis=0, return_index=True)  # tilts may repeat a spot
     return both[first, :2], both[first, 2:]
 
 
@@ -125,7 +124,7 @@ def _by_all_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> Nearest
 
 def _by_trees(a: NDArray[np.float32], b: NDArray[np.float32]) -> NearestRows:
     """As `_by_all_distances`, nearly always."""
-    cv2.setRNGSeed(0)  # of this thread; the trees are cut at random
+    cv2.setRNGSeed(0)  # of this thread; the trees are random
     trees: dict[str, bool | int | float | str] = {"algorithm": FLANN_KD_TREE, "trees": 4}
     checks: dict[str, bool | int | float | str] = {"checks": 32}
     rows, distances = cv2.flann.Index(b, trees).knnSearch(a, 2, params=checks)
@@ -140,25 +139,25 @@ MIN_MATCHES = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelocalisedPose:
-    """Where the surface was found again."""
+    """The pose of the surface by relocalisation."""
 
     base_from_surface: Array  # (4, 4), of all cameras together
     single: dict[int, Array]  # (4, 4) by camera, its own: cameras are seldom exposed together
-    matches: int  # features that agree
+    matches: int  # inliers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMatches:
-    """The features of one camera that match known ones."""
+    """The features of one camera that match learned ones."""
 
     camera: int
     points: Array  # (N, 3) mm, surface frame
     pixels: Array  # (N, 2) px, ideal
-    alone: Array | None  # (4, 4) base_from_surface by this camera alone
+    own_pose: Array | None  # (4, 4) base_from_surface by this camera only
 
 
 class Relocaliser:
-    """Descriptors of the surface, and the pose they give in new images."""
+    """Descriptors of the surface; gives its pose in new images."""
 
     def __init__(self, lenses: Lenses) -> None:
         self.lenses = lenses
@@ -167,7 +166,7 @@ class Relocaliser:
         self._view = np.zeros(0, np.int64)  # (N,) which view each is from
 
     def learn(self, camera: int, image: Image, base_from_surface: Array, surface_map: SurfaceMap) -> None:
-        """Add the features of one image in which the surface's pose is known: each is put on the landmarks' surface."""
+        """Add the features of one image with known pose of the surface, placed on the landmarks' surface."""
         lens = self.lenses.rig.cameras[camera]
         _, imaged, visible = self._landmark_pixels(camera, base_from_surface, surface_map)
         if visible.sum() < 8:
@@ -179,9 +178,9 @@ class Relocaliser:
         self.add(camera, sift(image, mask, 500, tilted=True), base_from_surface, surface_map)
 
     def add(self, camera: int, features: Features, base_from_surface: Array, surface_map: SurfaceMap) -> None:
-        """Take the features of one image, px as imaged, best first, in which the surface's pose is known.
+        """Add the features of one image, px as imaged, best first, with known pose of the surface.
 
-        Each view keeps its best: an equal share of what there is room for, so that no new one drives out an old one.
+        Of MAX_DESCRIPTORS each view keeps an equal share, its best, so that new views do not replace old ones.
         """
         ideal, _, visible = self._landmark_pixels(camera, base_from_surface, surface_map)
         keypoints, descriptors = features
@@ -207,15 +206,15 @@ class Relocaliser:
 
     def _make_room(self) -> None:
         counts = np.bincount(self._view)
-        most = int(counts.max(initial=0))
-        while np.minimum(counts, most).sum() > MAX_DESCRIPTORS:
-            most -= 1 + most // 100
+        limit = int(counts.max(initial=0))
+        while np.minimum(counts, limit).sum() > MAX_DESCRIPTORS:
+            limit -= 1 + limit // 100
         rank = np.concatenate([np.arange(n) for n in counts]) if len(counts) else np.zeros(0, int)
-        keep = rank < most
+        keep = rank < limit
         self._points, self.descriptors, self._view = self._points[keep], self.descriptors[keep], self._view[keep]
 
     def reframe(self, new_from_old: Array) -> None:
-        """The surface frame is another from now on: new_from_old (4, 4)."""
+        """Change the surface frame: new_from_old (4, 4)."""
         self._points = se3.transform_points(new_from_old, self._points)
 
     def _on_surface(
@@ -261,36 +260,36 @@ class Relocaliser:
         if len(pairs) < MIN_MATCHES:
             return None
         points, pixels = self._points[pairs[:, 1]], undistort(lens, keypoints[pairs[:, 0]])
-        alone = _pnp(points, pixels, lens.matrix)
-        return CameraMatches(camera, points, pixels, None if alone is None else lens.base_from_camera @ alone)
+        pose = _pnp(points, pixels, lens.matrix)
+        return CameraMatches(camera, points, pixels, None if pose is None else lens.base_from_camera @ pose)
 
     def _joint_pose(self, views: list[CameraMatches]) -> RelocalisedPose | None:
-        """The pose, of those begun at each camera's own, with which most features agree; None where too few do."""
-        single = {view.camera: view.alone for view in views if view.alone is not None}
+        """The pose with most inliers, of those fitted from each camera's own; None with too few."""
+        single = {view.camera: view.own_pose for view in views if view.own_pose is not None}
         if not single:
             return None
         rig = self.lenses.rig
         camera = np.concatenate([np.full(len(view.points), view.camera) for view in views])
         points = np.concatenate([view.points for view in views])
         pixels = np.concatenate([view.pixels for view in views])
-        sigma = np.full(len(camera), 3.0)  # px: SIFT on half-size images, cameras not exposed together
+        sigma = np.full(len(camera), 3.0)  # px: half-size images, cameras not exposed together
         tracks = PointTracks(camera, points, pixels, sigma)
-        best, most = np.eye(4), MIN_MATCHES - 1
+        best, best_count = np.eye(4), MIN_MATCHES - 1
         for start in single.values():
             pose = solve_pose(rig, tracks, start, scales=(4.0, 2.0)).base_from_surface
-            away = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
-            agreeing = int((away < 4 * sigma).sum())
-            if agreeing > most:
-                best, most = pose, agreeing
-        if most < MIN_MATCHES:
+            residual = np.linalg.norm(project(rig, camera, pose, points)[0] - pixels, axis=1)
+            count = int((residual < 4 * sigma).sum())
+            if count > best_count:
+                best, best_count = pose, count
+        if best_count < MIN_MATCHES:
             return None
-        return RelocalisedPose(best, {c: pose for c, pose in single.items() if _same_surface(pose, best)}, most)
+        return RelocalisedPose(best, {c: pose for c, pose in single.items() if _same_surface(pose, best)}, best_count)
 
 
 def _same_surface(a: Array, b: Array) -> bool:
-    """Whether two poses could be one surface at two cameras' instants, one camera's depth being what it is."""
-    apart = se3.inverse(a) @ b
-    return bool(se3.angle_of(apart) < 0.35 and np.linalg.norm(apart[:3, 3]) < 60.0)
+    """Whether two poses could be one surface at two cameras' instants, given one camera's depth error."""
+    difference = se3.inverse(a) @ b
+    return bool(se3.angle_of(difference) < 0.35 and np.linalg.norm(difference[:3, 3]) < 60.0)
 
 
 def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
@@ -307,20 +306,20 @@ def _pnp(points: Array, pixels: Array, matrix: Array) -> Array | None:
 
 
 HINT_FEATURES = 400  # SIFT features of a picture, before they are tilted
-MAX_HINT_DISTANCE_PX = 3.0  # px from the epipolar line: nothing but the right picture puts many matches so near
-MIN_HINT_SHARE = 0.5  # of the matches must be, where a tenth is near by chance, and at least so many:
-MIN_HINT_MATCHES = 60  # unlike pictures have up to sixty-five matches, and few of them near
-HINT_RATIO = 2.0  # times the matches that agree as the pictures are
-MIN_MATCHES_AGAINST = 100  # twice what unlike pictures have; more of them show the same spots,
-AGAINST_PX = 40.0  # and contradict the calibration so far from the epipolar line: no surface moves that far
+MAX_HINT_DISTANCE_PX = 3.0  # px from the epipolar line, of an inlier: only the right guess has many
+MIN_HINT_SHARE = 0.5  # inliers of a guess among its matches (0.1 by chance),
+MIN_HINT_MATCHES = 60  # and their number: unlike pictures have up to 65 matches, and few inliers
+HINT_RATIO = 2.0  # and ratio of their number to that without a change
+MIN_CONTRADICTING_MATCHES = 100  # about twice those of unlike pictures: more show the same spots,
+CONTRADICTION_PX = 40.0  # and contradict the calibration so far from the epipolar line: no surface moves so far
 
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """A guess at how pictures really belong to the rig's cameras."""
+    """A guess at how the pictures belong to the rig's cameras."""
 
     text: str
-    cameras: frozenset[int]  # those that it is about
+    cameras: frozenset[int]  # that it concerns
     mirrored: frozenset[int] = frozenset()
     turned: frozenset[int] = frozenset()  # by half a turn
     exchanged: tuple[int, ...] = ()  # two cameras
@@ -331,23 +330,24 @@ class _Arrangement:
 
 
 def _arrangements(names: Sequence[str], suspects: frozenset[int]) -> list[_Arrangement]:
-    """Guesses about suspects, each by itself, all of them together, and any two exchanged."""
-    found = []
+    """Guesses: each suspect alone or all of them mirrored or turned, and any two exchanged."""
+    arrangements = []
     for group in [frozenset([c]) for c in sorted(suspects)] + [suspects] * (len(suspects) > 1):
         text = f"{names[min(group)]} looks" if len(group) == 1 else "all cameras look"
-        found.append(_Arrangement(f"{text} mirrored", group, mirrored=group))
-        found.append(_Arrangement(f"{text} upside down", group, turned=group))
+        arrangements.append(_Arrangement(f"{text} mirrored", group, mirrored=group))
+        arrangements.append(_Arrangement(f"{text} upside down", group, turned=group))
     for a, b in combinations(sorted(suspects), 2):
-        found.append(_Arrangement(f"{names[a]} and {names[b]} look exchanged", frozenset([a, b]), exchanged=(a, b)))
-    return found
+        text = f"{names[a]} and {names[b]} look exchanged"
+        arrangements.append(_Arrangement(text, frozenset([a, b]), exchanged=(a, b)))
+    return arrangements
 
 
 def calibration_hint(
     rig: Rig, images: dict[int, Image], polygons: dict[int, Array], suspects: frozenset[int]
 ) -> tuple[frozenset[int], str]:
-    """Which of the suspects' pictures look mirrored, turned or exchanged, and that in words; nothing without a clue.
+    """Suspects whose pictures look mirrored, turned or exchanged, and a text; empty without evidence.
 
-    images: by camera, as they come. polygons: by camera, (N, 2) px, where the surface is in them.
+    images: by camera, as imaged. polygons: by camera, (N, 2) px, around the surface.
     """
     cameras = sorted(set(images) & set(polygons))
     suspects = suspects & frozenset(cameras)
@@ -359,35 +359,36 @@ def calibration_hint(
     }
     last = {c: np.array(rig.cameras[c].size) - 1.0 for c in cameras}
     pairs = [(a, b) for a, b in combinations(cameras, 2) if suspects & {a, b}]
-    alike = {(a, b): matched_spots(plain[a], plain[b]) for a, b in pairs}
-    unlike = {(a, b): matched_spots(plain[a], flipped[b]) for a, b in pairs}
+    plain_matches = {(a, b): matched_spots(plain[a], plain[b]) for a, b in pairs}
+    flipped_matches = {(a, b): matched_spots(plain[a], flipped[b]) for a, b in pairs}
 
     def distances(a: int, b: int, guess: _Arrangement) -> Array:
         same = (a in guess.mirrored) == (b in guess.mirrored)
-        at = dict(zip((a, b), (alike if same else unlike)[a, b], strict=True))
+        spots = dict(zip((a, b), (plain_matches if same else flipped_matches)[a, b], strict=True))
         sides = {a: False, b: not same}  # whether the pixels are those of the flipped picture
         for c in (a, b):
             if sides[c] != (c in guess.mirrored):
-                at[c] = np.column_stack([last[c][0] - at[c][:, 0], at[c][:, 1]])
-            at[c] = last[c] - at[c] if c in guess.turned else at[c]
-        seen = {guess.camera(c): undistort(rig.cameras[guess.camera(c)], at[c]) for c in (a, b)}
+                spots[c] = np.column_stack([last[c][0] - spots[c][:, 0], spots[c][:, 1]])
+            spots[c] = last[c] - spots[c] if c in guess.turned else spots[c]
+        pixels = {guess.camera(c): undistort(rig.cameras[guess.camera(c)], spots[c]) for c in (a, b)}
         first, second = guess.camera(a), guess.camera(b)
-        return np.abs(epipolar_distance(rig, first, second, seen[first], seen[second]))
+        return np.abs(epipolar_distance(rig, first, second, pixels[first], pixels[second]))
 
-    def near(guess: _Arrangement) -> tuple[int, int]:
-        away = np.concatenate([distances(a, b, guess) for a, b in pairs])
-        return int((away < MAX_HINT_DISTANCE_PX).sum()), len(away)
+    def count_near(guess: _Arrangement) -> tuple[int, int]:
+        distance = np.concatenate([distances(a, b, guess) for a, b in pairs])
+        return int((distance < MAX_HINT_DISTANCE_PX).sum()), len(distance)
 
     if not pairs:
         return frozenset(), ""
     as_is = _Arrangement("", suspects)
     sizes = {rig.cameras[c].size for c in cameras}
     guesses = [g for g in _arrangements([c.name for c in rig.cameras], suspects) if not g.exchanged or len(sizes) == 1]
-    best = max(guesses, key=near)
-    agreeing, known = near(best)
-    if agreeing >= max(MIN_HINT_MATCHES, MIN_HINT_SHARE * known, HINT_RATIO * near(as_is)[0]):
+    best = max(guesses, key=count_near)
+    count, total = count_near(best)
+    if count >= max(MIN_HINT_MATCHES, MIN_HINT_SHARE * total, HINT_RATIO * count_near(as_is)[0]):
         return best.cameras, best.text
-    against = {c: np.concatenate([distances(a, b, as_is) for a, b in pairs if c in (a, b)]) for c in suspects}
-    wrong = [c for c, away in against.items() if len(away) >= MIN_MATCHES_AGAINST and np.median(away) > AGAINST_PX]
-    names = ", ".join(rig.cameras[c].name for c in wrong)
-    return frozenset(wrong), f"the matches of {names} contradict the calibration: calibrate again" if wrong else ""
+    errors = {c: np.concatenate([distances(a, b, as_is) for a, b in pairs if c in (a, b)]) for c in suspects}
+    outliers = [c for c, e in errors.items() if len(e) >= MIN_CONTRADICTING_MATCHES and np.median(e) > CONTRADICTION_PX]
+    names = ", ".join(rig.cameras[c].name for c in outliers)
+    text = f"the matches of {names} contradict the calibration: calibrate again"
+    return frozenset(outliers), text if outliers else ""

@@ -1,8 +1,8 @@
 """The first map: landmarks by triangulation across the cameras that see the region of interest.
 
-Cameras stand 36 to 84 degrees apart, so corners do not look alike from one to the next. SIFT seeds give the surface's
-rough shape; every corner is then put on that shape, its patch warped into the other view and aligned there.
-Cameras are seldom exposed together: all epipolar distances of a moving surface share an offset, found by consensus.
+Cameras stand 36 to 84 degrees apart, so a corner looks different in each. SIFT seeds give the surface's rough shape;
+every corner is projected onto that shape, and its patch warped into the other view and aligned there. Cameras are
+seldom exposed together: the epipolar distances of a moving surface share an offset, estimated by consensus.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def consensus(
 
 
 def _smooth(points: Array, neighbours: int = 8) -> NDArray[np.bool_]:
-    """Which points (N, 3) lie near the surface of their neighbours: a wrong match along its epipolar line does not."""
+    """Which points (N, 3) lie near the surface of their neighbours: wrong matches do not."""
     keep = np.ones(len(points), bool)
     for _ in range(2):
         index = np.nonzero(keep)[0]
@@ -104,9 +104,9 @@ def _smooth(points: Array, neighbours: int = 8) -> NDArray[np.bool_]:
             return keep
         distance, near = cKDTree(points[index]).query(points[index], k=neighbours + 1)
         median = np.median(points[index][near[:, 1:]], axis=1)
-        away = np.linalg.norm(points[index] - median, axis=1)
+        deviation = np.linalg.norm(points[index] - median, axis=1)
         limit = 3.0 * np.median(distance[:, -1]) + 1e-6
-        keep[index[away > limit]] = False
+        keep[index[deviation > limit]] = False
     return keep
 
 
@@ -138,10 +138,10 @@ def _pair_points(rig: Rig, a: int, b: int, pixels_a: Array, pixels_b: Array) -> 
 def _meet_seed_surface(
     rig: Rig, seeds: Seeds, camera: int, pixels: Array, outward: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Where rays of pixels (N, 2) meet the seeds' surface: points (N, 3) and normals (N, 3), base frame.
+    """Intersections of rays of pixels (N, 2) with the seeds' surface: points (N, 3) and normals (N, 3), base frame.
 
-    With them the mean offset (N, 2), px, in the other camera of nearby seeds from the projection of their own rays'
-    points, and whether seeds are near (N,).
+    Also the mean offset (N, 2) px of nearby seeds in the other camera from the projection of their points on their own
+    rays, and whether seeds are near (N,).
     """
     own, other = (seeds.pixels_a, seeds.pixels_b) if camera == seeds.a else (seeds.pixels_b, seeds.pixels_a)
     target = seeds.b if camera == seeds.a else seeds.a
@@ -153,8 +153,8 @@ def _meet_seed_surface(
     origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
     anchor = seeds.points[near].mean(1)
     slope = np.einsum("ni,ni->n", directions, normals)
-    safe = np.where(np.abs(slope) < 0.05, -0.05, slope)
-    reach = np.einsum("ni,ni->n", anchor - origins, normals) / safe
+    divisor = np.where(np.abs(slope) < 0.05, -0.05, slope)
+    reach = np.einsum("ni,ni->n", anchor - origins, normals) / divisor
     points = origins + reach[:, None] * directions
     on_ray = on_rays(rig, camera, own, seeds.points)
     offset = (other - ideal_pixels(rig.cameras[target], on_ray)[0])[near].mean(1)
@@ -187,7 +187,7 @@ def find_landmarks(
 
     # on the seeds' surface
     points, normals, offset, near = _meet_seed_surface(rig, seeds, camera, pixels, outward)
-    matches, good = pair.align(points, normals, offset, least=0.8)
+    matches, good = pair.align(points, normals, offset, min_score=0.8)
     good &= near
     if good.sum() >= 4:
         surface = _pair_points(rig, camera, other, pixels[good], matches[good])[0]
@@ -196,11 +196,11 @@ def find_landmarks(
     # where that fails, along the rays
     missing = np.nonzero(~good)[0]
     if len(missing):
-        swept, sure = pair.sweep(pixels[missing], normals[missing], offset[missing], seeds)
-        matches[missing], aligned = pair.align(swept, normals[missing], offset[missing], least=0.85)
-        good[missing] = aligned & sure
+        sweep_points, distinct = pair.sweep(pixels[missing], normals[missing], offset[missing], seeds)
+        matches[missing], fit_good = pair.align(sweep_points, normals[missing], offset[missing], min_score=0.85)
+        good[missing] = fit_good & distinct
 
-    # twice without outliers, on the surface of what is left
+    # twice without outliers, on the surface of the inliers
     for _ in range(2):
         pixels, matches = pixels[good], matches[good]
         if len(pixels) < 6:
@@ -213,7 +213,7 @@ def find_landmarks(
         normals = smooth_normals(points, outward)
         on_ray = on_rays(rig, camera, pixels, points)
         offset = matches - ideal_pixels(rig.cameras[other], on_ray)[0]
-        matches, good = pair.align(on_ray, normals, offset, least=0.8)
+        matches, good = pair.align(on_ray, normals, offset, min_score=0.8)
     points = _pair_points(rig, camera, other, pixels[good], matches[good])[0]
     return Landmarks(camera, other, pixels[good], matches[good], points, normals[good])
 
@@ -243,7 +243,7 @@ def best_landmarks(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CameraPair:
-    """Images (by camera) of a reference camera and of another one, in which its patches are looked for."""
+    """Images (by camera) of a reference camera, and of another one in which its patches are aligned."""
 
     lenses: Lenses
     pyramids: dict[int, Pyramid]
@@ -251,15 +251,15 @@ class _CameraPair:
     other: int
 
     def _cut(self, points: Array, normals: Array) -> tuple[Templates, Projection]:
-        """The patches of points (N, 3), base frame, and where they fall in the other camera."""
+        """The patches of points (N, 3), base frame, and their projection into the other camera."""
         templates = cut_templates(self.lenses, self.pyramids[self.camera], self.camera, np.eye(4), points, normals)
         return templates, project_squares(self.lenses, self.other, np.eye(4), points, normals, templates.axes)
 
-    def align(self, points: Array, normals: Array, offset: Array, least: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Ideal pixels (N, 2) in the other camera where the patches of points (N, 3), base frame, fit, and whether."""
+    def align(self, points: Array, normals: Array, offset: Array, min_score: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Ideal pixels (N, 2) in the other camera of the patches of points (N, 3), base frame; and which fit (N,)."""
         templates, where = self._cut(points, normals)
         start = where.centre + offset
-        result = align(templates, self.pyramids[self.other], where, start, least)
+        result = align(templates, self.pyramids[self.other], where, start, min_score)
         near = np.linalg.norm(result.pixels - start, axis=1) < 10
         good = result.found & near & (templates.contrast > MIN_PATCH_CONTRAST)
         return undistort(self.lenses.rig.cameras[self.other], result.pixels), good
@@ -276,29 +276,29 @@ class _CameraPair:
         scores = np.full((len(pixels), steps), -1.0)
         for k, value in enumerate(inverse):
             templates, where = self._cut(origins + directions / value, normals)
-            current = coarse_score(templates, self.pyramids[self.other], where, where.centre + offset)
-            scores[:, k] = np.where(where.visible, current, -1.0)
+            score = coarse_score(templates, self.pyramids[self.other], where, where.centre + offset)
+            scores[:, k] = np.where(where.visible, score, -1.0)
         best = scores.argmax(1)
-        beside = np.abs(np.arange(steps) - best[:, None]) <= 3
-        rival = np.where(beside, -1.0, scores).max(1)
+        neighbour = np.abs(np.arange(steps) - best[:, None]) <= 3
+        rival = np.where(neighbour, -1.0, scores).max(1)
         peak = scores[np.arange(len(pixels)), best]
         return origins + directions / inverse[best][:, None], (peak > 0.7) & (rival < peak - 0.1)
 
 
 def on_rays(rig: Rig, camera: int, pixels: Array, points: Array) -> Array:
-    """The spots (N, 3) on the pixels' own rays nearest to points: a landmark stands exactly where its camera saw it."""
+    """The spots (N, 3) on the pixels' rays nearest to points: a landmark lies exactly on its camera's ray."""
     origins, directions = rays(rig, np.full(len(pixels), camera), pixels)
     return np.asarray(origins + np.einsum("ni,ni->n", points - origins, directions)[:, None] * directions)
 
 
 def _affine_consistent(pixels: Array, residual: Array) -> NDArray[np.bool_]:
-    """Whether each residual (N, 2) agrees with an affine field over the image, as a common capture offset makes."""
+    """Whether each residual (N, 2) fits an affine field over the image, as by a common exposure offset."""
     design = np.c_[np.ones(len(pixels)), (pixels - pixels.mean(0)) / np.maximum(pixels.std(0), 1.0)]
     keep = np.ones(len(pixels), bool)
     for _ in range(4):
         model = np.linalg.lstsq(design[keep], residual[keep], rcond=None)[0]
-        away = np.linalg.norm(residual - design @ model, axis=1)
-        keep = away < max(3 * 1.48 * np.median(away[keep]), 0.6)
+        deviation = np.linalg.norm(residual - design @ model, axis=1)
+        keep = deviation < max(3 * 1.48 * np.median(deviation[keep]), 0.6)
         if keep.sum() < 6:
             return np.zeros(len(pixels), bool)
     return keep
@@ -310,7 +310,7 @@ def build_first_map(
     """The map of what lies inside the polygons at this instant, or the reason why there is none.
 
     pyramids: by camera, the images. polygons: by camera, (N, 2) px as imaged; at least two cameras. heads: by camera,
-    where the print head is.
+    the print head's masks.
     """
     rig, rng = lenses.rig, np.random.default_rng(0)
     cameras = sorted(set(pyramids) & set(polygons))
@@ -343,8 +343,8 @@ def assemble(
     for p, (i, j) in zip(parts, pairwise(np.cumsum([0, *(len(p.points) for p in parts)])), strict=True):
         images = pyramids[p.camera]
         pictures.append(cut_templates(lenses, images, p.camera, base_from_surface, points[i:j], normals[i:j]))
-        own = _pair_points(rig, p.camera, p.other, p.pixels, p.pixels_other)[1]
-        blocks.extend(surface_from_base[:3, :3] @ own @ surface_from_base[:3, :3].T * 0.2**2)
+        covariances = _pair_points(rig, p.camera, p.other, p.pixels, p.pixels_other)[1]
+        blocks.extend(surface_from_base[:3, :3] @ covariances @ surface_from_base[:3, :3].T * 0.2**2)
     templates, covariance = join(pictures), block_diag(*blocks)
     good = templates.contrast > MIN_PATCH_CONTRAST
     rows = np.repeat(good, 3)

@@ -1,10 +1,10 @@
-"""New landmarks where the surface has come into view and the map knows little of it.
+"""New landmarks where the surface has come into view with few landmarks.
 
-Two cameras find them as the first map was found, begun at the landmarks that both see. Cameras stand 36 to 84 degrees
-apart, so a steep side, or anything while the others are covered, is seen by one camera: there landmarks are put where
-its rays meet the known surface, continued by the local fit (`estimation.mapping.triangulation`). What that fit does not
-know of a depth is in the covariance, and later views from elsewhere reduce it. All stay on probation until a later
-frame set shows that they move with the surface: a drape beside a wound looks as good, but stays where it is.
+Two cameras find them as the first map was found, with the landmarks in both as seeds. Cameras stand 36 to 84 degrees
+apart, so one alone sees a steep side, or the surface while the others are covered: there landmarks are put where its
+rays meet the known surface, extrapolated by the local fit (`estimation.mapping.triangulation`). The fit's depth error
+is in the covariance; later views from other angles reduce it. All are on probation until a later frame set shows that
+they move with the surface: a drape beside a wound matches as well, but does not move.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ from perception.mapping.scan_map import REFERENCE_SIGMA_PX, as_at_one_instant
 
 MIN_MATCHING_FACING = 0.35  # cosine of the viewing angle, from which two cameras can match
 MIN_SPACING_PX = 8  # px between landmarks
-MAX_PLACE_SIGMA_MM = 2.0  # mm across the surface: a place less certain than this is none
+MAX_PLACE_SIGMA_MM = 2.0  # mm across the surface: less certain places are dropped
 
 
-WANTED_PER_CAMERA = 120  # landmarks that a camera should see at least
-GROWTH_SHARE = 0.7  # of it, and of what the camera saw at first, below which more are looked for
-SEARCH_MARGIN_SHARE = 0.35  # of the known part's size in an image: how far beyond it new ones are sought
-MIN_NEW_LANDMARKS = 8  # new landmarks: fewer are not worth a change of the map
-GROWTH_FEATURES = 300  # a camera, for the first matches on what nobody knows yet
-MAX_NEW_RESIDUAL_PX = 2.0  # px between a new landmark and where the surface's motion puts it
-MIN_PROOF_MOTION_PX = 4.0  # px by which the surface's motion must have moved it: then what stands still is told apart
-MAX_GAP_SHARE = 0.04  # of the distance to the cameras: what lies so near to known landmarks,
-MAX_HEIGHT_SHARE = 0.004  # and so near to their surface, is part of it without such proof
-MAX_MISSES = 4  # looks in which a new landmark was in view and not found
+TARGET_PER_CAMERA = 120  # landmarks, at least
+GROWTH_SHARE = 0.7  # of it, and of the camera's first number, below which more are searched for
+SEARCH_MARGIN_SHARE = 0.35  # of the mapped part's size in an image: search range beyond it
+MIN_NEW_LANDMARKS = 8  # new landmarks: with fewer the map is not changed
+GROWTH_FEATURES = 300  # a camera, for the first matches on the unmapped part
+MAX_NEW_RESIDUAL_PX = 2.0  # px of a new landmark from its prediction by the surface's motion
+MIN_PROOF_MOTION_PX = 4.0  # px of motion, which discriminates the surface from what stands still
+MAX_GAP_SHARE = 0.04  # of the distance to the cameras: landmarks so near to known ones,
+MAX_HEIGHT_SHARE = 0.004  # and so near to their surface, need no such proof
+MAX_MISSES = 4  # looks with a new landmark in view but not measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSnapshot:
-    """One frame set in which the surface is known."""
+    """One frame set with known pose of the surface."""
 
     images: dict[int, Image]  # grey, by camera
     base_from_surface: Array  # (4, 4), of all cameras together
@@ -79,8 +79,8 @@ class NewLandmarks:
     snapshot: SurfaceSnapshot
     map: SurfaceMap
     templates: Templates
-    level: Array  # (N,) mm across the surface, where neighbours give the place; inf where two cameras do
-    features: dict[int, Features]  # of the part of each image that they are in
+    level: Array  # (N,) mm across the surface, of places by neighbours; inf: by two cameras
+    features: dict[int, Features]  # by camera, around them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,92 +94,92 @@ class NewPart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GrowthSearch:
-    """One frame set that is searched for new landmarks."""
+    """Inputs of the search for new landmarks in one frame set."""
 
-    lenses: Lenses  # of the rig as it stands to the surface at one instant
+    lenses: Lenses  # of the rig relative to the surface at one instant
     snapshot: SurfaceSnapshot
-    map: SurfaceMap  # known, surface frame, warped as the surface is
+    map: SurfaceMap  # so far, surface frame, with the warp applied
     pyramids: dict[int, Pyramid]  # images by camera
     masks: dict[int, ImageMask]  # (H, W) by camera, where new landmarks may be
 
 
 def find_new_landmarks(rig: Rig, snapshot: SurfaceSnapshot, surface_map: SurfaceMap) -> NewLandmarks | None:
-    """Landmarks beside the known ones: by two cameras, or on the surface where one alone sees it; None if too few."""
-    if snapshot.warp is not None:  # as it is now
+    """New landmarks: by two cameras, or on the extrapolated surface by one; None if too few."""
+    if snapshot.warp is not None:
         surface_map = replace(surface_map, points=snapshot.warp.apply(surface_map.points))
     lenses = Lenses(as_at_one_instant(rig, snapshot.base_from_surface, snapshot.single))
     pyramids = {c: Pyramid(image) for c, image in snapshot.images.items()}
-    lacking = {c: WANTED_PER_CAMERA - int((snapshot.tracks.camera == c).sum()) for c in sorted(pyramids)}
-    masks = {c: trackable(pyramids[c][0], _unmapped_mask(lenses, c, snapshot), snapshot.heads.get(c)) for c in lacking}
+    missing = {c: TARGET_PER_CAMERA - int((snapshot.tracks.camera == c).sum()) for c in sorted(pyramids)}
+    masks = {c: trackable(pyramids[c][0], _unmapped_mask(lenses, c, snapshot), snapshot.heads.get(c)) for c in missing}
     search = GrowthSearch(lenses, snapshot, surface_map, pyramids, masks)
-    features = {c: sift(pyramids[c][0], masks[c], GROWTH_FEATURES, tilted=True) for c in lacking}
-    counts = {c: count if count >= MIN_NEW_LANDMARKS else 0 for c, count in lacking.items()}
+    features = {c: sift(pyramids[c][0], masks[c], GROWTH_FEATURES, tilted=True) for c in missing}
+    counts = {c: count if count >= MIN_NEW_LANDMARKS else 0 for c, count in missing.items()}
     parts = best_landmarks(lenses, pyramids, masks, counts, lambda a, b: _seeds(search, a, b, features))
     new = list[NewPart]()
     if sum(len(p.points) for p in parts) >= MIN_NEW_LANDMARKS:
-        grown = assemble(lenses, pyramids, parts, snapshot.base_from_surface)
-        new.append(NewPart(grown.map, grown.templates, np.full(len(grown.map), np.inf)))
-    new += _monocular_parts(search, lacking, parts)
+        stereo = assemble(lenses, pyramids, parts, snapshot.base_from_surface)
+        new.append(NewPart(stereo.map, stereo.templates, np.full(len(stereo.map), np.inf)))
+    new += _monocular_parts(search, missing, parts)
     if sum(len(part.map) for part in new) < MIN_NEW_LANDMARKS:
         return None
-    whole = reduce(joined_map, [part.map for part in new])
-    joint = whole.covariance + of_frame(whole.points, snapshot.covariance)  # all share the pose they hang on
+    new_map = reduce(joined_map, [part.map for part in new])
+    covariance = new_map.covariance + of_frame(new_map.points, snapshot.covariance)  # all share the pose's error
     templates, level = join([part.templates for part in new]), np.concatenate([part.sigma for part in new])
-    points = whole.points if snapshot.warp is None else snapshot.warp.undo(whole.points)
-    return NewLandmarks(snapshot, SurfaceMap(points, whole.normals, joint), templates, level, features)
+    points = new_map.points if snapshot.warp is None else snapshot.warp.undo(new_map.points)
+    return NewLandmarks(snapshot, SurfaceMap(points, new_map.normals, covariance), templates, level, features)
 
 
-def _monocular_parts(search: GrowthSearch, lacking: dict[int, int], parts: list[Landmarks]) -> list[NewPart]:
-    """Landmarks that one camera alone sees, camera by camera."""
+def _monocular_parts(search: GrowthSearch, missing: dict[int, int], parts: list[Landmarks]) -> list[NewPart]:
+    """Landmarks that only one camera sees, by camera."""
     lenses, tracks = search.lenses, search.snapshot.tracks
-    sighted = [c for c in sorted(search.pyramids) if (tracks.camera == c).sum() >= MIN_NEW_LANDMARKS]
+    cameras = [c for c in sorted(search.pyramids) if (tracks.camera == c).sum() >= MIN_NEW_LANDMARKS]
     matched = np.concatenate([np.zeros((0, 3)), *[p.points for p in parts]])
     new = []
-    for c in sighted:
-        occupied, _ = lenses.image(c, *ideal_pixels(lenses.rig.cameras[c], matched))
-        inside = ((occupied > 0) & (occupied < lenses.rig.cameras[c].size)).all(1)
-        more = lacking[c] - int(inside.sum())
-        if more >= MIN_NEW_LANDMARKS:
-            part = _monocular_landmarks(search, c, [o for o in sighted if o != c], occupied[inside], more)
+    for c in cameras:
+        pixels, _ = lenses.image(c, *ideal_pixels(lenses.rig.cameras[c], matched))
+        inside = ((pixels > 0) & (pixels < lenses.rig.cameras[c].size)).all(1)
+        count = missing[c] - int(inside.sum())
+        if count >= MIN_NEW_LANDMARKS:
+            part = _monocular_landmarks(search, c, [o for o in cameras if o != c], pixels[inside], count)
             if part is not None:
                 new.append(part)
     return new
 
 
 def _monocular_landmarks(
-    search: GrowthSearch, camera: int, others: list[int], occupied: Array, count: int
+    search: GrowthSearch, camera: int, others: list[int], occupied_pixels: Array, count: int
 ) -> NewPart | None:
-    """Up to `count` corners of one camera that none of the `others` sees well, on the surface through the known map.
+    """Up to `count` corners of one camera that none of the `others` sees well, on the extrapolated surface.
 
-    occupied: (N, 2) px as imaged, where there are new landmarks already.
+    occupied_pixels: (N, 2) px as imaged, of new landmarks found before.
     """
     mask = search.masks[camera].copy()
-    for spot in np.round(occupied).astype(np.int32):
+    for spot in np.round(occupied_pixels).astype(np.int32):
         cv2.circle(mask, spot.tolist(), MIN_SPACING_PX, 0, -1)
-    lenses, known, pose = search.lenses, search.map, search.snapshot.base_from_surface
+    lenses, surface_map, pose = search.lenses, search.map, search.snapshot.base_from_surface
     lens, images = lenses.rig.cameras[camera], search.pyramids[camera]
     pixels = undistort(lens, corners(images[0], mask, count))
     origins, directions = rays(lenses.rig, np.full(len(pixels), camera), pixels)
     surface_from_base = se3.inverse(pose)
     origins, directions = se3.transform_points(surface_from_base, origins), directions @ surface_from_base[:3, :3].T
     angle = np.full(len(pixels), REFERENCE_SIGMA_PX / float(lens.matrix[0, 0]))
-    met = meet_rays(known.points, known.covariance, origins, directions, angle)
-    good = np.flatnonzero(met.good & (met.sigma < MAX_PLACE_SIGMA_MM))
-    good = good[~_visible_to_others(lenses, others, pose, camera, met.points[good], met.normals[good])]
-    points, normals = met.points[good], met.normals[good]
+    hits = meet_rays(surface_map.points, surface_map.covariance, origins, directions, angle)
+    good = np.flatnonzero(hits.good & (hits.sigma < MAX_PLACE_SIGMA_MM))
+    good = good[~_visible_to_others(lenses, others, pose, camera, hits.points[good], hits.normals[good])]
+    points, normals = hits.points[good], hits.normals[good]
     if not len(good):
         return None
     templates = cut_templates(lenses, images, camera, pose, points, normals)
     sharp = templates.contrast > MIN_PATCH_CONTRAST
     rows = (3 * good[sharp][:, None] + np.arange(3)).ravel()
-    new = SurfaceMap(points[sharp], normals[sharp], met.covariance[np.ix_(rows, rows)])
-    return NewPart(new, templates.take(sharp), met.sigma[good[sharp]])
+    new = SurfaceMap(points[sharp], normals[sharp], hits.covariance[np.ix_(rows, rows)])
+    return NewPart(new, templates.take(sharp), hits.sigma[good[sharp]])
 
 
 def _visible_to_others(
     lenses: Lenses, others: list[int], base_from_surface: Array, camera: int, points: Array, normals: Array
 ) -> NDArray[np.bool_]:
-    """Which points (N, 3) one of the other cameras sees well enough for a match."""
+    """Which points (N, 3) another camera sees well enough for a match."""
     visible = np.zeros(len(points), bool)
     axes = square_axes(lenses, camera, base_from_surface, points, normals)
     for other in others if len(points) else []:
@@ -189,51 +189,51 @@ def _visible_to_others(
 
 
 def _unmapped_mask(lenses: Lenses, camera: int, snapshot: SurfaceSnapshot) -> ImageMask:
-    """Where in an image the surface may go on without landmarks: around and between those tracked."""
+    """Mask (H, W) of an image around and between the tracked landmarks."""
     size = lenses.rig.cameras[camera].size
     mask = np.zeros((size[1], size[0]), np.uint8)
-    mine = snapshot.tracks.camera == camera
-    if mine.sum() < 6:
+    of_camera = snapshot.tracks.camera == camera
+    if of_camera.sum() < 6:
         return mask
-    imaged, _ = lenses.image(camera, snapshot.tracks.pixels[mine], np.full(int(mine.sum()), 1e3))
+    imaged, _ = lenses.image(camera, snapshot.tracks.pixels[of_camera], np.full(int(of_camera.sum()), 1e3))
     spots = np.round(imaged).astype(np.int32)
     cv2.fillConvexPoly(mask, cv2.convexHull(spots), 255)
-    across = float(np.sqrt(cv2.countNonZero(mask)))
-    reach = 2 * int(SEARCH_MARGIN_SHARE * across) + 1
+    diameter = float(np.sqrt(cv2.countNonZero(mask)))
+    reach = 2 * int(SEARCH_MARGIN_SHARE * diameter) + 1
     mask = np.asarray(cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))), np.uint8)
     for spot in spots:
-        cv2.circle(mask, spot.tolist(), max(6, int(0.6 * across / np.sqrt(WANTED_PER_CAMERA))), 0, -1)
+        cv2.circle(mask, spot.tolist(), max(6, int(0.6 * diameter / np.sqrt(TARGET_PER_CAMERA))), 0, -1)
     return mask
 
 
 def _seeds(search: GrowthSearch, a: int, b: int, features: dict[int, Features]) -> Seeds | None:
-    """What is known of the surface between two cameras: landmarks that both see, and matches in the unknown part."""
-    fresh = find_seeds(search.lenses, a, b, features, np.random.default_rng(0))
+    """Seeds between two cameras: landmarks that both see, and matches on the unmapped part."""
+    new_seeds = find_seeds(search.lenses, a, b, features, np.random.default_rng(0))
     tracks = search.snapshot.tracks
     in_a, in_b = tracks.only(tracks.camera == a), tracks.only(tracks.camera == b)
     rows, at_a, at_b = np.intersect1d(in_a.track, in_b.track, return_indices=True)
     pixels_a, pixels_b = in_a.pixels[at_a], in_b.pixels[at_b]
     points = se3.transform_points(search.snapshot.base_from_surface, search.map.points[rows])
-    if fresh is None:
+    if new_seeds is None:
         return Seeds(a, b, pixels_a, pixels_b, points) if len(rows) >= 6 else None
-    pixels_a, pixels_b = np.concatenate([pixels_a, fresh.pixels_a]), np.concatenate([pixels_b, fresh.pixels_b])
-    return Seeds(a, b, pixels_a, pixels_b, np.concatenate([points, fresh.points]))
+    pixels_a, pixels_b = np.concatenate([pixels_a, new_seeds.pixels_a]), np.concatenate([pixels_b, new_seeds.pixels_b])
+    return Seeds(a, b, pixels_a, pixels_b, np.concatenate([points, new_seeds.points]))
 
 
 @dataclass(slots=True, eq=False)
 class Probation:
-    """New landmarks that wait for proof that they move with the surface; counts are of looks, (N,)."""
+    """New landmarks until they are proven to move with the surface; looks are counts (N,)."""
 
     new: NewLandmarks
     between_known: NDArray[np.bool_]  # (N,)
-    map: SurfaceMap = field(init=False)  # of the new landmarks, as known by now
-    moved: NDArray[np.int64] = field(init=False)  # measured where the surface's motion puts it, far from its rest place
-    stayed: NDArray[np.int64] = field(init=False)  # measured where the motion puts it, near its rest place
-    missed: NDArray[np.int64] = field(init=False)  # not measured there
+    map: SurfaceMap = field(init=False)  # of the new landmarks, updated
+    moved_looks: NDArray[np.int64] = field(init=False)  # measured as the motion predicts, far from its rest place
+    still_looks: NDArray[np.int64] = field(init=False)  # measured as the motion predicts, near its rest place
+    missed_looks: NDArray[np.int64] = field(init=False)  # not measured there
 
     def __post_init__(self) -> None:
         self.map = self.new.map
-        self.moved, self.stayed, self.missed = np.zeros((3, len(self.map)), np.int64)
+        self.moved_looks, self.still_looks, self.missed_looks = np.zeros((3, len(self.map)), np.int64)
 
     def look(
         self,
@@ -243,59 +243,59 @@ class Probation:
         single: dict[int, Array],
         covariance: Array | None = None,
     ) -> None:
-        """Measure them again at each camera's own pose of the surface, known to a covariance (6, 6).
+        """Measure them again at each camera's own pose of the surface, with its covariance (6, 6).
 
-        Landmarks of one camera alone are improved by it: where the surface has turned, in depth.
+        It updates landmarks of one camera alone: in depth where the surface has turned.
         """
         tracks = Matcher(lenses, self.map, self.new.templates).align(stamp, pyramids, single)
-        where, rest = np.zeros((2, len(tracks), 2))
+        projected, rest_pixels = np.zeros((2, len(tracks), 2))
         jacobians = np.zeros((len(tracks), 2, 6))
         for c in np.unique(tracks.camera):
-            mine = tracks.camera == c
-            points = self.map.points[tracks.track[mine]]
-            before = self.new.snapshot.single.get(int(c), self.new.snapshot.base_from_surface)
-            where[mine], _, jacobians[mine] = project(lenses.rig, tracks.camera[mine], single[int(c)], points)
-            rest[mine] = project(lenses.rig, tracks.camera[mine], before, points)[0]
-        good = np.linalg.norm(tracks.pixels - where, axis=1) < MAX_NEW_RESIDUAL_PX
-        lone = good & np.isfinite(self.new.level[tracks.track])
-        if covariance is not None and lone.any():
-            looks, away = tracks.only(lone), where[lone] - tracks.pixels[lone]
+            rows = tracks.camera == c
+            points = self.map.points[tracks.track[rows]]
+            rest_pose = self.new.snapshot.single.get(int(c), self.new.snapshot.base_from_surface)
+            projected[rows], _, jacobians[rows] = project(lenses.rig, tracks.camera[rows], single[int(c)], points)
+            rest_pixels[rows] = project(lenses.rig, tracks.camera[rows], rest_pose, points)[0]
+        good = np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_NEW_RESIDUAL_PX
+        mono = good & np.isfinite(self.new.level[tracks.track])
+        if covariance is not None and mono.any():
+            looks, offsets = tracks.only(mono), projected[mono] - tracks.pixels[mono]
             sigma = np.maximum(looks.sigma, MIN_TRACK_SIGMA_PX)
-            self.map, good[lone] = updated_by_looks(self.map, looks.track, away, jacobians[lone], sigma, covariance)
-        far = np.linalg.norm(rest - where, axis=1) > MIN_PROOF_MOTION_PX
-        np.add.at(self.moved, tracks.track[good & far], 1)
-        np.add.at(self.stayed, tracks.track[good & ~far], 1)
-        self.missed[np.setdiff1d(np.arange(len(self.missed)), tracks.track[good])] += 1
+            self.map, good[mono] = updated_by_looks(self.map, looks.track, offsets, jacobians[mono], sigma, covariance)
+        far = np.linalg.norm(rest_pixels - projected, axis=1) > MIN_PROOF_MOTION_PX
+        np.add.at(self.moved_looks, tracks.track[good & far], 1)
+        np.add.at(self.still_looks, tracks.track[good & ~far], 1)
+        self.missed_looks[np.setdiff1d(np.arange(len(self.missed_looks)), tracks.track[good])] += 1
 
     @property
     def level(self) -> Array:
-        """How well (N,) mm each is known across the surface that tells its place; inf where two cameras see it."""
+        """(N,) mm, one sigma across the surface of places by neighbours; inf: by two cameras."""
         count, normals = len(self.map), self.map.normals
         blocks = np.einsum("ninj->nij", self.map.covariance.reshape(count, 3, count, 3))
-        now = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", normals, blocks, normals), 0.0))
-        return np.where(np.isfinite(self.new.level), now, np.inf)
+        sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", normals, blocks, normals), 0.0))
+        return np.where(np.isfinite(self.new.level), sigma, np.inf)
 
     @property
     def proven(self) -> NDArray[np.bool_]:
-        """Which (N,) belong to the surface."""
-        enough = (self.moved >= 1) | (self.between_known & (self.stayed >= 1))
-        return np.asarray(enough & (self.moved + self.stayed > self.missed))
+        """(N,), which belong to the surface."""
+        enough = (self.moved_looks >= 1) | (self.between_known & (self.still_looks >= 1))
+        return np.asarray(enough & (self.moved_looks + self.still_looks > self.missed_looks))
 
     @property
-    def over(self) -> bool:
-        """Whether each is either proven or missed too often."""
-        return bool((self.proven | (self.missed >= MAX_MISSES)).all())
+    def finished(self) -> bool:
+        """Whether each is proven or missed MAX_MISSES times."""
+        return bool((self.proven | (self.missed_looks >= MAX_MISSES)).all())
 
 
 def between_known(new: NewLandmarks, surface_map: SurfaceMap, distance: float) -> NDArray[np.bool_]:
     """Which new landmarks (N,) lie between known ones and on their surface. distance: mm to the cameras.
 
-    Only of those that two cameras see: the others were put on that surface.
+    False for landmarks of one camera, which were put on that surface.
     """
-    away = new.map.points[:, None] - surface_map.points
-    gap = np.linalg.norm(away, axis=2)
+    offsets = new.map.points[:, None] - surface_map.points
+    gap = np.linalg.norm(offsets, axis=2)
     near = np.argsort(gap, axis=1)[:, :4]
     rows = np.arange(len(near))[:, None]
-    height = np.abs(np.einsum("nki,nki->nk", away[rows, near], surface_map.normals[near])).min(1)
-    there = (gap[rows, near].max(1) < MAX_GAP_SHARE * distance) & (height < MAX_HEIGHT_SHARE * distance)
-    return np.asarray(there & ~np.isfinite(new.level))
+    height = np.abs(np.einsum("nki,nki->nk", offsets[rows, near], surface_map.normals[near])).min(1)
+    between = (gap[rows, near].max(1) < MAX_GAP_SHARE * distance) & (height < MAX_HEIGHT_SHARE * distance)
+    return np.asarray(between & ~np.isfinite(new.level))

@@ -1,10 +1,10 @@
-"""What is not the surface: the print head, fresh ink and highlights, which are not tracked; and what colours tell.
+"""Masks of the print head, fresh ink and highlights, which are not tracked; and displacement of the tissue by colour.
 
-Hairs, a film, gauze carry more texture than the tissue under them, and tracks that follow them agree with each other.
-The tissue has its colours: a wound, its rim, the edge of a cloth. Shadows and shading change all channels of a picture
-by one factor, so the ratios of channels are compared with those of the first pictures. All cameras together tell by
-which displacement of the tissue the difference is explained (Lucas and Kanade 1981, on the surface, in three
-dimensions). Uniform skin tells nothing, nor does what a print head, ink or a highlight hides; grey cameras neither.
+Hairs, a film or gauze have more texture than the tissue under them, and tracks that follow them are consistent. The
+tissue has its own colours: a wound, its rim, the edge of a cloth. Shadows and shading change all channels of a picture
+by one factor, so ratios of channels are compared with those of the first pictures. All cameras together give the
+displacement of the tissue that explains the difference (Lucas and Kanade 1981, on the surface, in three dimensions).
+Uniform skin, grey cameras, and what a print head, ink or a highlight hides give no information.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from perception.mapping.aliases import TangentPlane
 from perception.mapping.alignment_kernels import PATCH_RADIUS, median_of
 from perception.mapping.features import ImageMask
 
-BEAD_REACH_MM = 1.0  # mm from the bead's middle: half of a wide bead, as it spreads
-BEAD_STEP_MM = 0.5  # mm between the points that stand for a bead
-GEL_TIME_S = 60.0  # s that gelling takes; what has set may carry landmarks of its own
+BEAD_REACH_MM = 1.0  # mm from the bead's centre line: half a wide bead, which spreads
+BEAD_STEP_MM = 0.5  # mm between the points of a bead
+GEL_TIME_S = 60.0  # s; gelled ink may carry landmarks of its own
 
 
 class Ink:
-    """The beads laid so far, in the surface frame."""
+    """The beads printed so far, surface frame."""
 
     def __init__(self) -> None:
         self._points: list[Array] = []
@@ -47,11 +47,11 @@ class Ink:
         return len(self._points)
 
     def lift(self) -> None:
-        """The nozzle no longer extrudes: the next bead begins anew."""
+        """End the bead."""
         self._tip = None
 
     def lay(self, stamp: float, tip: Array) -> Array:
-        """The bead goes on to the tip (3,) mm at `stamp`, s; the points (M, 3) that are new."""
+        """Extend the bead to the tip (3,) mm at `stamp`, s; gives the new points (M, 3)."""
         start = tip if self._tip is None else self._tip
         pieces = max(1, int(np.ceil(float(np.linalg.norm(tip - start)) / BEAD_STEP_MM)))
         new = start + (tip - start) * (np.arange(1, pieces + 1) / pieces)[:, None]
@@ -65,8 +65,8 @@ class Ink:
         fresh = np.searchsorted(self._stamps, stamp - GEL_TIME_S)
         if fresh == len(self._points):
             return np.zeros(len(points), bool)
-        away, _ = cKDTree(np.array(self._points[fresh:])).query(points)
-        return np.asarray(away < BEAD_REACH_MM + reach)
+        distance, _ = cKDTree(np.array(self._points[fresh:])).query(points)
+        return np.asarray(distance < BEAD_REACH_MM + reach)
 
 
 def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
@@ -75,12 +75,12 @@ def near_bead(points: Array, bead: Array, reach: Array) -> NDArray[np.bool_]:
 
 
 RING_ANGLES = np.linspace(0, 2 * np.pi, 13)[:-1]
-MIN_DRAWN_DEPTH_MM = 20.0  # mm: what is nearer to a lens than that is not drawn, as its picture has no bounds
+MIN_DEPTH_MM = 20.0  # mm from a lens: nearer points are not drawn, as their projection is unbounded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tool:
-    """The print head's shape, round about the nozzle's z."""
+    """The print head's shape, of revolution about the nozzle's z."""
 
     profile: Array  # (K, 2) mm, K > 1: height above the tip, rising, and radius there
 
@@ -99,24 +99,24 @@ class Tool:
         rings = np.concatenate([radii[:, None, None] * ring, levels], -1)
         camera_from_nozzle = lenses.rig.camera_from_base[camera] @ base_from_nozzle
         x, y, depth = np.moveaxis(se3.transform_points(camera_from_nozzle, rings.reshape(-1, 3)), -1, 0)
-        safe = np.maximum(depth, MIN_DRAWN_DEPTH_MM)
-        imaged, visible = lenses.bend(camera, x / safe, y / safe, depth)
-        visible = (visible & (depth > MIN_DRAWN_DEPTH_MM)).reshape(len(radii), -1)
+        safe_depth = np.maximum(depth, MIN_DEPTH_MM)
+        imaged, visible = lenses.bend(camera, x / safe_depth, y / safe_depth, depth)
+        visible = (visible & (depth > MIN_DEPTH_MM)).reshape(len(radii), -1)
         spots = imaged.T.reshape(len(radii), -1, 2)
-        drawn = [ring_spots[shown] for ring_spots, shown in zip(spots, visible, strict=True)]
-        parts = (np.concatenate(pair) for pair in pairwise(drawn))
+        visible_spots = [ring_spots[mask] for ring_spots, mask in zip(spots, visible, strict=True)]
+        parts = (np.concatenate(pair) for pair in pairwise(visible_spots))
         return [cv2.convexHull(p.astype(np.float32))[:, 0].astype(float) for p in parts if len(p) >= 3]
 
 
-MASK_SCALE = 0.25  # of the masks to the images: to a landmark's patch four pixels are nothing
-PRINT_HEAD_MARGIN_MM = 1.5  # mm: to which an arm is registered to the cameras, and its lag known
-HIGHLIGHT_GREY = 250  # grey levels, at which a pixel is taken for a highlight,
-MAX_HIGHLIGHT_SHARE = 0.2  # of the region; where more is as bright, the tissue or paper is overexposed
-HIGHLIGHT_HALO_PX = 5  # px around a highlight that still belong to it
+MASK_SCALE = 0.25  # of the masks to the images: four pixels are few for a landmark's patch
+PRINT_HEAD_MARGIN_MM = 1.5  # mm: error of the arm's registration to the cameras, and of its lag
+HIGHLIGHT_GREY = 250  # grey levels, from which a pixel is a highlight,
+MAX_HIGHLIGHT_SHARE = 0.2  # of the region; with more, the tissue or paper is overexposed
+HIGHLIGHT_HALO_PX = 5  # px around a highlight that are part of it
 
 
 class TrackingMasks:
-    """Where in the newest frame set nothing may be tracked, and what the ink on the surface covers."""
+    """Masks of the newest frame set, and the ink on the surface: nothing is tracked there."""
 
     def __init__(self, lenses: Lenses, tool: Tool | None = None) -> None:
         self._lenses, self._tool = lenses, tool or Tool(SYRINGE)
@@ -124,7 +124,7 @@ class TrackingMasks:
         self.ink = Ink()
 
     def set_print_head(self, head: PrintHead | None, cameras: Iterable[int]) -> None:
-        """Take where the print head is now; None where no arm is known."""
+        """Set the print head's masks; None: no arm."""
         self.print_head = {}
         if head is None:
             return
@@ -148,8 +148,7 @@ class TrackingMasks:
         return np.asarray(mask[y, x] > 0)
 
     def lay_ink(self, head: PrintHead | None, stamp: float, base_from_surface: Array) -> Array | None:
-        """Take what the head has laid until `stamp`, s, on a surface that is there: the new bead's points (M, 3), mm,
-        surface frame."""
+        """Add the ink extruded until `stamp`, s; gives the bead's new points (M, 3) mm, surface frame."""
         if head is None or not head.extruding:
             self.ink.lift()
             return None
@@ -157,7 +156,7 @@ class TrackingMasks:
 
 
 def patch_reach(axes: Array) -> Array:
-    """From the middle of patches with sides (N, 3, 2) mm per sample to their edges, (N,) mm."""
+    """Distance (N,) mm from the centres of patches with axes (N, 3, 2) mm per sample to their edges."""
     return np.asarray(PATCH_RADIUS * np.linalg.norm(axes, axis=1).mean(1))
 
 
@@ -179,47 +178,47 @@ def highlights(image: Image, region: ImageMask) -> ImageMask:
     return np.asarray(cv2.dilate(bright, around), np.uint8)
 
 
-PLACE_STEP_MM = 2.0  # between the places that are looked at: a wound's rim is as wide
-CELL_MM = 1.2  # of the surface that one value averages: noise of the pixels, and chroma that cameras subsample
-BELL_MM = 7.0  # one sigma: places that move together, and as far apart
+PLACE_STEP_MM = 2.0  # between the compared places: the width of a wound's rim
+CELL_MM = 1.2  # of the surface, averaged to one value: against pixel noise and subsampled chroma
+BELL_MM = 7.0  # one sigma of a bell, whose places move together, and spacing of bells
 DARK_LEVELS = 8.0  # grey levels added to each channel: ratios of darker ones are noise
-LIGHT_SIGMA = 0.5  # of the logarithm of a place's brightness, by which those levels change a ratio: shadows, shading
-CLIPPED = 245.0  # grey level at which a channel may be clipped: a highlight
-MIN_NOISE = 0.01  # one sigma of a ratio's logarithm: the first picture's own, and light that is never quite the same
-FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams, until it is learned
-SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference no longer grows with the displacement
-MIN_SHIFT_MM = 0.6  # that is told: a bit more than the guard allows
+LIGHT_SIGMA = 0.5  # of the logarithm of a place's brightness (shadows, shading), by which those levels change a ratio
+CLIPPING_GREY = 245.0  # grey level from which a channel may be clipped
+MIN_NOISE = 0.01  # one sigma of a ratio's logarithm, at least: noise of the first picture, changes of light
+FIRST_NOISE, NOISE_MEMORY_SETS = 0.03, 20.0  # of webcams; initial value and memory
+SHIFT_PRIOR_MM = 3.0  # one sigma: beyond a wound's rim the difference stops growing with the displacement
+MIN_SHIFT_MM = 0.6  # of a reported displacement: slightly more than the guard allows
 MIN_EVIDENCE = 100.0  # squared sigmas that a displacement must explain,
-MIN_EXPLAINED = 0.6  # and of all that is there beyond noise: a hand over a place looks like no displacement
-MIN_SEEN_SHARE = 0.5  # of a bell's places
-MIN_SECOND_SHARE = 0.1  # of what a displacement explains, that is the share of a second camera
-MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # that must tell a displacement: the edge of a hand can look like one here or there
-MIN_COSINE = 0.7  # of the angle between one displacement and all
-USUAL_RATIO = 1.5  # times the noise, below which colours are again what they were
-MIN_TOLD_MM = 0.3  # one sigma along the surface, to which colours must tell a place for it to count
-WHOLE_SHARE = 0.2  # of these places: with more of them displaced nobody knows which of both is the tissue
+MIN_EXPLAINED_SHARE = 0.6  # and their share of the energy beyond noise: small for a hand over a place
+MIN_VISIBLE_SHARE = 0.5  # of a bell's places
+MIN_SECOND_SHARE = 0.1  # of a second camera in what a displacement explains
+MIN_BELLS, MIN_BELL_SHARE = 3, 0.03  # with a displacement: the edge of a hand can look like one in a few
+MIN_COSINE = 0.7  # of the angle between one displacement and the sum of all
+USUAL_RATIO = 1.5  # times the noise, below which colours are as usual again
+OBSERVABLE_SIGMA_MM = 0.3  # along the surface, of a bell's displacement by colours: beyond, it is not observable
+WHOLE_SHARE = 0.2  # of the observable bells: with more displaced, the tissue may be either of both
 MIN_PLACES = 20  # of a camera, to compare its picture
-AROUND = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
+NEIGHBOUR_OFFSETS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], float)
 # of `Colours`' sums: normal equations, the places of their (3, 3); energy and number; three pulls of each camera
 NORMAL_COLUMNS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 ENERGY_COLUMN, COUNT_COLUMN, PULL_COLUMNS = 6, 7, 8
-UNSEEN_PX = -1e6  # where a place is said to be that a camera cannot see: out of every picture
+UNSEEN_PX = -1e6  # of a place that a camera cannot see: outside every picture
 
 
 @dataclass(slots=True, eq=False)
 class _FirstPicture:
-    """How one camera first saw P places."""
+    """P places in one camera's first picture."""
 
-    scale: int  # pixels of the picture to one of its averages
+    scale: int  # px, side of an averaged cell
     ratios: Array  # (2, P) logarithms, red and blue to green
-    slopes: Array  # (2, P, 3) by a displacement of the surface, 1/mm, along both tangents and the normal
-    free: Mask  # (P,) places that are seen, and not clipped
+    slopes: Array  # (2, P, 3) 1/mm, by displacement of the surface along both tangents and the normal
+    free: Mask  # (P,) places in view and not clipped
     noise: Array  # (2,) one sigma
 
 
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1], f8[::1], f8)")
 def place_pixels(camera_from_surface: Array, points: Array, model: Array, radius: float) -> Array:
-    """Where a camera images points (N, 3) mm, surface frame: (N, 2) px, UNSEEN_PX for those that it does not see.
+    """Where a camera images points (N, 3) mm, surface frame: (N, 2) px, UNSEEN_PX for those out of view.
 
     camera_from_surface: (4, 4). model (9,), radius: of the camera, as `Lenses` has them.
     """
@@ -229,18 +228,18 @@ def place_pixels(camera_from_surface: Array, points: Array, model: Array, radius
         depth = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
         x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / max(depth, 1.0)
         y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / max(depth, 1.0)
-        pixels[n, 0], pixels[n, 1], seen = bend_one(x, y, depth, model, radius)
-        if not seen:
+        pixels[n, 0], pixels[n, 1], visible = bend_one(x, y, depth, model, radius)
+        if not visible:
             pixels[n, 0] = pixels[n, 1] = UNSEEN_PX
     return pixels
 
 
 @compiled("Tuple((f8[:,::1], f8[:,::1], b1[::1]))(u1[:,:,::1], i8, f8[:,::1])")
 def colour_ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array, Mask]:
-    """Logarithms (2, N) of red and blue to green at pixels (N, 2), averaged over `scale` of them; how fast each changes
-    (2, N) with the logarithm of the brightness, where a channel is dark; and which (N,) are in view and not clipped.
+    """Logarithms (2, N) of red and blue to green at pixels (N, 2), averaged over cells of `scale` px; their derivatives
+    (2, N) by the logarithm of the brightness, due to DARK_LEVELS; and which (N,) are in view and not clipped.
 
-    Averages lie on a grid, and are interpolated linearly. image: (H, W, 3) BGR.
+    Cells are on a grid, interpolated linearly. image: (H, W, 3) BGR.
     """
     right, low, area = image.shape[1] // scale - 1, image.shape[0] // scale - 1, float(scale * scale)
     ratios, dark = np.zeros((2, len(pixels))), np.zeros((2, len(pixels)))
@@ -261,41 +260,41 @@ def colour_ratios(image: Image, scale: int, pixels: Array) -> tuple[Array, Array
         blue, green, red = levels[0], levels[1], levels[2]
         ratios[0, n], ratios[1, n] = np.log(red / green), np.log(blue / green)
         dark[0, n], dark[1, n] = DARK_LEVELS * (1 / green - 1 / red), DARK_LEVELS * (1 / green - 1 / blue)
-        free[n] = max(blue, green, red) < CLIPPED + DARK_LEVELS
+        free[n] = max(blue, green, red) < CLIPPING_GREY + DARK_LEVELS
     return ratios, dark, free
 
 
 @compiled("void(f8[:,::1], i8, b1[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[::1])")
 def add_equations(
-    sums: Array, pull: int, free: Mask, now: Array, dark: Array, before: Array, slopes: Array, noise: Array
+    sums: Array, pull: int, free: Mask, current: Array, dark: Array, first: Array, slopes: Array, noise: Array
 ) -> None:
-    """Add one camera's normal equations at P places to `sums`, in columns as `Colours` keeps them; learn its noise.
+    """Add one camera's normal equations at P places to `sums`, in the columns of `Colours`; update its noise.
 
-    pull: first of the camera's own three columns. free: (P,) places that count. now, before: (2, P) logarithms, of this
-    picture and the first. dark: (2, P) how fast they change with light. slopes: (2, P, 3), noise: (2,), of the first.
+    pull: first of the camera's own three columns. free: (P,) places used. current, first: (2, P) logarithms, of this
+    picture and the first. dark: (2, P) their derivatives by light. slopes: (2, P, 3), noise: (2,), of the first.
     """
     for k in range(2):
-        away = now[k] - before[k]
-        away -= median_of(away, free)
-        noise[k] += (1.4826 * median_of(np.abs(away), free) - noise[k]) / NOISE_MEMORY_SETS
+        difference = current[k] - first[k]
+        difference -= median_of(difference, free)
+        noise[k] += (1.4826 * median_of(np.abs(difference), free) - noise[k]) / NOISE_MEMORY_SETS
         variance = max(noise[k], MIN_NOISE) ** 2
-        for p in range(len(away)):
+        for p in range(len(difference)):
             if not free[p]:
                 continue
             light = LIGHT_SIGMA * dark[k, p]
             precision, slope, column = 1 / (variance + light * light), slopes[k, p], 0
-            pulls = precision * away[p]
+            pulls = precision * difference[p]
             for i in range(3):
                 sums[p, pull + i] -= pulls * slope[i]
                 for j in range(i, 3):
                     sums[p, column] += precision * (slope[i] * slope[j])
                     column += 1
-            sums[p, ENERGY_COLUMN] += pulls * away[p]
+            sums[p, ENERGY_COLUMN] += pulls * difference[p]
             sums[p, COUNT_COLUMN] += 1.0
 
 
 class Colours:
-    """Remembers the colours of one surface, and where they stand off its texture."""
+    """Finds where the colours of one surface are displaced from its tracked texture."""
 
     def __init__(self, lenses: Lenses, masks: TrackingMasks) -> None:
         """masks: where the print head hides the surface."""
@@ -315,81 +314,81 @@ class Colours:
             return
         self._bells = bells(self._points, self._centres, BELL_MM).T
         self._bell_sizes = self._bells.sum(1)
-        self._inked = np.zeros(len(self._points), bool)
-        self._sizes = np.zeros(len(self._centres))  # mm, of each bell while it is displaced, the largest since; else 0
+        self._ink_mask = np.zeros(len(self._points), bool)
+        self._sizes = np.zeros(len(self._centres))  # mm, each bell's largest displacement while it lasts; else 0
         for camera, image in images.items():
             if camera in poses and image.ndim == 3:
                 self._first[camera] = self._picture(camera, image, poses[camera])
 
     def cover(self, bead: Array) -> None:
-        """A bead (M, 3) mm, surface frame, lies on the surface: the colours there are its own from now on."""
+        """Exclude places under a bead (M, 3) mm, surface frame: the colours there are the ink's."""
         if self._first:
-            self._inked |= near_bead(self._points, bead, np.full(len(self._points), CELL_MM))
+            self._ink_mask |= near_bead(self._points, bead, np.full(len(self._points), CELL_MM))
 
     def __call__(
         self, images: Mapping[int, Image], poses: Mapping[int, Array], warp: Warp | None = None
     ) -> DisplacedPlaces:
-        """Where colours contradict a pose: `poses` (4, 4) at each camera's exposure, of those that carry it."""
+        """Where colours contradict a pose: `poses` (4, 4) at the exposures of the cameras that carry it."""
         if not self._first:
             return NOTHING_DISPLACED
         points = self._points if warp is None else warp.apply(self._points)
         cameras = [camera for camera in self._first if camera in images and camera in poses]
-        sums, told = np.zeros((len(points), PULL_COLUMNS + 3 * len(cameras))), 0
+        sums, count = np.zeros((len(points), PULL_COLUMNS + 3 * len(cameras))), 0
         for camera in cameras:
             first, pixels = self._first[camera], self._pixels(camera, poses[camera], points)
-            now, dark, free = colour_ratios(contiguous(images[camera], np.uint8), first.scale, pixels)
-            free &= first.free & ~self._inked & ~self._masks.hides(camera, pixels)
+            current, dark, free = colour_ratios(contiguous(images[camera], np.uint8), first.scale, pixels)
+            free &= first.free & ~self._ink_mask & ~self._masks.hides(camera, pixels)
             if np.count_nonzero(free) < MIN_PLACES:
                 continue
-            pull, told = PULL_COLUMNS + 3 * told, told + 1
-            add_equations(sums, pull, free, now, dark, first.ratios, first.slopes, first.noise)
-        if not told:
+            pull, count = PULL_COLUMNS + 3 * count, count + 1
+            add_equations(sums, pull, free, current, dark, first.ratios, first.slopes, first.noise)
+        if not count:
             return NOTHING_DISPLACED
-        summed = self._bells @ sums
-        pulls = summed[:, PULL_COLUMNS : PULL_COLUMNS + 3 * told].reshape(-1, told, 3).swapaxes(0, 1)
-        enough = summed[:, COUNT_COLUMN] > MIN_SEEN_SHARE * 2 * told * self._bell_sizes
-        known = np.where(enough, summed[:, COUNT_COLUMN], np.inf)  # else its edge looks displaced
-        return self._judge(summed[:, NORMAL_COLUMNS], pulls, summed[:, ENERGY_COLUMN], known)
+        bell_sums = self._bells @ sums
+        pulls = bell_sums[:, PULL_COLUMNS : PULL_COLUMNS + 3 * count].reshape(-1, count, 3).swapaxes(0, 1)
+        enough = bell_sums[:, COUNT_COLUMN] > MIN_VISIBLE_SHARE * 2 * count * self._bell_sizes
+        expected_energy = np.where(enough, bell_sums[:, COUNT_COLUMN], np.inf)  # else a mask's edge looks displaced
+        return self._judge(bell_sums[:, NORMAL_COLUMNS], pulls, bell_sums[:, ENERGY_COLUMN], expected_energy)
 
-    def _judge(self, normal: Array, pulls: Array, energy: Array, known: Array) -> DisplacedPlaces:
-        """By normal equations (K, 3, 3), (C, K, 3) of each camera and bell, squared sigmas and how many are usual."""
+    def _judge(self, normal: Array, pulls: Array, energy: Array, expected_energy: Array) -> DisplacedPlaces:
+        """From normal equations (K, 3, 3), (C, K, 3) of each camera and bell, energy and its expected value, (K,)."""
         pull = pulls.sum(0)
         shift = solve_symmetric3(contiguous(normal + np.eye(3) / SHIFT_PRIOR_MM**2), contiguous(pull))
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
-        begins = np.isfinite(known) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
-        if not (begins.any() or self._sizes.any()):
+        new = np.isfinite(expected_energy) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
+        if not (new.any() or self._sizes.any()):
             return NOTHING_DISPLACED
-        begins &= explained > MIN_EXPLAINED * (energy - known)
-        if len(pulls) > 1:  # else it may be what one camera sees there: a print head that its first picture showed
-            begins &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
-        way = (explained * begins) @ shift  # what moves goes one way; highlights go theirs
-        begins &= shift @ way > MIN_COSINE * size * np.linalg.norm(way)
-        begins &= begins.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(begins))
-        lasts = (self._sizes > 0) & (np.isinf(known) | (energy > USUAL_RATIO * known))
-        self._sizes = np.where(begins | lasts, np.maximum(self._sizes, np.where(begins, size, 0.0)), 0.0)
-        apart = self._sizes > 0
-        if not apart.any():
+        new &= explained > MIN_EXPLAINED_SHARE * (energy - expected_energy)
+        if len(pulls) > 1:  # else it may be one camera's error: a print head in its first picture
+            new &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
+        direction = (explained * new) @ shift  # tissue moves one way; highlights do not
+        new &= shift @ direction > MIN_COSINE * size * np.linalg.norm(direction)
+        new &= new.sum() >= max(MIN_BELLS, MIN_BELL_SHARE * len(new))
+        lasting = (self._sizes > 0) & (np.isinf(expected_energy) | (energy > USUAL_RATIO * expected_energy))
+        self._sizes = np.where(new | lasting, np.maximum(self._sizes, np.where(new, size, 0.0)), 0.0)
+        displaced = self._sizes > 0
+        if not displaced.any():
             return NOTHING_DISPLACED
-        tells = np.linalg.eigvalsh(normal)[:, 1] > MIN_TOLD_MM**-2.0
-        whole = int((apart & tells).sum()) > WHOLE_SHARE * int(tells.sum())
-        return DisplacedPlaces(self._centres[apart], self._sizes[apart], BELL_MM, whole)
+        observable = np.linalg.eigvalsh(normal)[:, 1] > OBSERVABLE_SIGMA_MM**-2.0
+        whole = int((displaced & observable).sum()) > WHOLE_SHARE * int(observable.sum())
+        return DisplacedPlaces(self._centres[displaced], self._sizes[displaced], BELL_MM, whole)
 
     def _picture(self, camera: int, image: Image, pose: Array) -> _FirstPicture:
         image, pixels = contiguous(image, np.uint8), self._pixels(camera, pose, self._points)
-        beside = self._pixels(camera, pose, self._points + self._axes[0])
-        scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(beside - pixels, axis=1)))))
+        neighbours = self._pixels(camera, pose, self._points + self._axes[0])
+        scale = max(1, round(CELL_MM * float(np.median(np.linalg.norm(neighbours - pixels, axis=1)))))
         ratios, _, free = colour_ratios(image, scale, pixels)
         places = (self._points + side * axis for axis in self._axes for side in (1, -1))
         ends = [colour_ratios(image, scale, self._pixels(camera, pose, at))[0] for at in places]
         slopes = np.stack([(ends[2 * i] - ends[2 * i + 1]) / 2 for i in range(3)], -1)
-        for around in 2 * scale * AROUND:  # what an average or a slope reaches must be the surface's as well
-            free &= ~self._masks.hides(camera, pixels + around)
+        for offset in 2 * scale * NEIGHBOUR_OFFSETS:  # pixels of averages and slopes must be of the surface too
+            free &= ~self._masks.hides(camera, pixels + offset)
         return _FirstPicture(scale, ratios, slopes, free, np.full(2, FIRST_NOISE))
 
     def _pixels(self, camera: int, pose: Array, points: Array) -> Array:
-        """Where a camera images points (N, 3) mm of a surface at a pose (4, 4): (N, 2) px, far off for those unseen."""
-        lens = self._lenses.models[camera], self._lenses.radius[camera]
-        return place_pixels(self._lenses.rig.camera_from_base[camera] @ pose, contiguous(points), *lens)
+        """Pixels (N, 2) of points (N, 3) mm of a surface at a pose (4, 4); UNSEEN_PX for those out of view."""
+        camera_from_surface, lenses = self._lenses.rig.camera_from_base[camera] @ pose, self._lenses
+        return place_pixels(camera_from_surface, contiguous(points), lenses.models[camera], lenses.radius[camera])
 
 
 def _spread(plane: TangentPlane, step: float) -> Array:

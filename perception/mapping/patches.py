@@ -1,7 +1,7 @@
-"""Small textured patches of the surface: what each looks like, where it falls in a camera, and its alignment there.
+"""Small textured patches of the surface: templates, projection into a camera, and alignment there.
 
-Each landmark keeps the picture of a small square of the surface's tangent plane, cut once from its reference image. In
-a later image the square is projected with the predicted pose and shifted until the picture fits (inverse compositional
+Each landmark has a picture of a small square of the surface's tangent plane, cut once from its reference image. In a
+later image the square is projected with the predicted pose and shifted until the picture fits (inverse compositional
 Lucas-Kanade, Baker and Matthews 2004, on pictures normalised for brightness and contrast). A track does not drift: it
 is always compared with its reference picture, never with the previous frame.
 """
@@ -30,11 +30,11 @@ from perception.mapping.alignment_kernels import (
     sample_grids,
 )
 
-MIN_PATCH_CONTRAST = 3.0  # grey levels: a patch with less contrast is not worth a track
+MIN_PATCH_CONTRAST = 3.0  # grey levels: a patch with less contrast is not tracked
 
 
 class Pyramid:
-    """An image, level 0, and its half-size version, level 1, made when it is first asked for: most frames need none."""
+    """An image, level 0, and its half-size version, level 1, computed on first use: most frames need none."""
 
     __slots__ = ("_half", "_image")
 
@@ -54,10 +54,10 @@ class Pyramid:
 class Templates:
     """Reference pictures as parallel arrays, one per landmark; coarse_*: the same at twice the spacing."""
 
-    camera: NDArray[np.int64]  # (N,) that took it
+    camera: NDArray[np.int64]  # (N,) of the reference image
     axes: Array  # (N, 3, 2) mm per sample, the square's two sides in the surface frame
     picture: Float32  # (N, S) of zero mean and unit contrast
-    steepest: Float32  # (N, 2, S) its gradient a sample, freed of brightness and contrast
+    steepest: Float32  # (N, 2, S) its gradient per sample, orthogonal to brightness and contrast
     inverse_hessian: Array  # (N, 2, 2)
     coarse_picture: Float32
     coarse_steepest: Float32
@@ -68,7 +68,7 @@ class Templates:
         return len(self.camera)
 
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Templates:
-        """The chosen ones."""
+        """The rows of an index or mask."""
         return Templates(*(getattr(self, name)[index] for name in self.__slots__))
 
 
@@ -92,27 +92,27 @@ def sample_each(images: Mapping[int, Pyramid], number: NDArray[np.int64], centre
     """Grey levels (N, S) as `sample`, each of the full image of its own number (N,)."""
     levels = np.zeros((len(number), PATCH_SAMPLES), np.float32)
     for i, pyramid in images.items():
-        mine = np.flatnonzero(number == i)
-        if len(mine):
-            levels[mine] = sample(pyramid[0], centre[mine], per_sample[mine])
+        rows = np.flatnonzero(number == i)
+        if len(rows):
+            levels[rows] = sample(pyramid[0], centre[rows], per_sample[rows])
     return levels
 
 
 def on_level(centre: Array, half: bool) -> Array:
     """Centres (N, 2) px of an image in the pixels of the image or of its half-size version."""
-    # A quarter pixel beside the half-size grid bilinear sampling blurs the image, which widens the reach: on the grid
-    # tests/test_patches.py finds fewer from 5 px away. Templates are cut alike, so what is compared is not shifted.
+    # Bilinear sampling a quarter pixel off the half-size grid blurs the image, which widens the reach: on the grid
+    # tests/test_patches.py finds fewer from 5 px away. Templates are cut the same way, so there is no relative shift.
     return centre * 0.5 - 0.25 if half else contiguous(centre)
 
 
 def normalise(pictures: Float32) -> tuple[Float32, Float32]:
-    """Pictures (N, S) freed of mean and contrast, and the contrast (N,), grey levels (standard deviation)."""
+    """Pictures (N, S) of zero mean and unit contrast, and the contrast (N,), grey levels (standard deviation)."""
     centred = pictures - pictures.mean(1, keepdims=True)
     contrast = np.sqrt(np.square(centred).mean(1))
     return centred / np.maximum(contrast, 1e-3)[:, None], contrast
 
 
-GRAIN_ORDER = 5  # of the polynomial over a patch that is taken out: shading and soft edges
+GRAIN_ORDER = 5  # of the polynomial over a patch that is subtracted: shading and soft edges
 
 
 def _coarse_basis() -> Float32:
@@ -126,13 +126,13 @@ _COARSE = _coarse_basis()
 
 
 def grain_of(pictures: Float32) -> Float32:
-    """Pictures (N, S) without what polynomials explain."""
+    """Pictures (N, S) minus their polynomial fit."""
     return np.asarray(pictures - (pictures @ _COARSE) @ _COARSE.T, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Where squares fall in one camera, or in several one after the other."""
+    """Squares projected into one camera, or into several one after the other."""
 
     centre: Array  # (N, 2) px as imaged
     per_sample: Array  # (N, 2, 2) px
@@ -140,7 +140,7 @@ class Projection:
     facing: Array  # (N,) cosine of the viewing angle
 
     def take(self, index: NDArray[np.int64]) -> Projection:
-        """The chosen ones."""
+        """The rows of an index."""
         return Projection(self.centre[index], self.per_sample[index], self.visible[index], self.facing[index])
 
 
@@ -155,20 +155,20 @@ def project_into(
     lenses: Lenses, cameras: Sequence[int], base_from_surface: Array, points: Array, normals: Array, axes: Array
 ) -> Projection:
     """Squares projected into cameras, each with its base_from_surface (C, 4, 4); row c N + i: square i of camera c."""
-    count, each = len(points), np.arange(len(cameras))
-    which = np.asarray(cameras, np.int64), np.repeat(each, count), np.tile(np.arange(count), len(each))
-    return _projected(lenses, *which, base_from_surface, points, normals, axes)
+    count, index = len(points), np.arange(len(cameras))
+    place, square = np.repeat(index, count), np.tile(np.arange(count), len(index))
+    return _project(lenses, np.asarray(cameras, np.int64), place, square, base_from_surface, points, normals, axes)
 
 
 def project_tracks_into(
     lenses: Lenses, camera: NDArray[np.int64], base_from_surface: Array, points: Array, normals: Array, axes: Array
 ) -> Projection:
     """Squares (N,), each into its own camera (N,). base_from_surface: (C, 4, 4), of all cameras of the rig."""
-    every = np.arange(len(lenses.rig)), contiguous(camera, np.int64), np.arange(len(points))
-    return _projected(lenses, *every, base_from_surface, points, normals, axes)
+    cameras, square = np.arange(len(lenses.rig)), np.arange(len(points))
+    return _project(lenses, cameras, contiguous(camera, np.int64), square, base_from_surface, points, normals, axes)
 
 
-def _projected(
+def _project(
     lenses: Lenses,
     cameras: NDArray[np.int64],
     place: NDArray[np.int64],
@@ -178,14 +178,14 @@ def _projected(
     normals: Array,
     axes: Array,
 ) -> Projection:
-    """Each of R rows: its square (R,) in the camera whose place (R,) among `cameras` (C,) it has."""
+    """R projections, each of its square (R,) into the camera at its place (R,) in `cameras` (C,)."""
     camera_from_surface = lenses.rig.camera_from_base[cameras] @ base_from_surface
     step = 2.0  # samples: wide enough that the difference is the patch's own scale, not rounding
     corners = np.concatenate([points, points + step * axes[:, :, 0], points + step * axes[:, :, 1]])
     in_camera = camera_from_surface[:, :3, :3] @ corners.T + camera_from_surface[:, :3, 3:]  # (C, 3, 3N)
-    turned = camera_from_surface[:, :3, :3] @ normals.T  # (C, 3, N)
+    camera_normals = camera_from_surface[:, :3, :3] @ normals.T  # (C, 3, N)
     models, radius, sizes = lenses.models[cameras], lenses.radius[cameras], lenses.sizes[cameras]
-    return Projection(*project_corners(place, square, in_camera, turned, models, radius, sizes, step))
+    return Projection(*project_corners(place, square, in_camera, camera_normals, models, radius, sizes, step))
 
 
 @compiled(
@@ -196,7 +196,7 @@ def project_corners(
     place: NDArray[np.int64],
     square: NDArray[np.int64],
     in_camera: Array,
-    turned: Array,
+    normals: Array,
     models: Array,
     radius: Array,
     sizes: Array,
@@ -204,29 +204,29 @@ def project_corners(
 ) -> tuple[Array, Array, NDArray[np.bool_], Array]:
     """The parts of a `Projection` of R rows: squares (R,) of N, in the cameras at places (R,) of C.
 
-    in_camera: (C, 3, 3N) mm, their places, and what lies `step` samples along both sides. turned: (C, 3, N) normals.
-    models, radius, sizes: of the cameras, as `Lenses` has them.
+    in_camera: (C, 3, 3N) mm, their centres, and points `step` samples along both sides. normals: (C, 3, N). models,
+    radius, sizes: of the cameras, as in `Lenses`.
     """
-    count, squares = len(square), turned.shape[2]
+    count, squares = len(square), normals.shape[2]
     centre, per_sample = np.empty((count, 2)), np.empty((count, 2, 2))
     visible, facing = np.empty(count, np.bool_), np.empty(count)
     for row in range(count):
         c, n = place[row], square[row]
-        seen, across, down = True, 0.0, 0.0
+        in_view, across, down = True, 0.0, 0.0
         for corner in range(3):
             k = corner * squares + n
             depth = in_camera[c, 2, k]
             inverse = 1 / (1e-6 if abs(depth) < 1e-6 else depth)
             x, y = in_camera[c, 0, k] * inverse, in_camera[c, 1, k] * inverse
             u, v, in_lens = bend_one(x, y, depth, models[c], radius[c])
-            seen = seen and in_lens
+            in_view = in_view and in_lens
             if corner == 0:
                 across, down = u, v
             else:
                 per_sample[row, 0, corner - 1] = (u - across) / step
                 per_sample[row, 1, corner - 1] = (v - down) / step
-        along = turned[c, 0, n] * in_camera[c, 0, n] + turned[c, 1, n] * in_camera[c, 1, n]
-        along += turned[c, 2, n] * in_camera[c, 2, n]
+        along = normals[c, 0, n] * in_camera[c, 0, n] + normals[c, 1, n] * in_camera[c, 1, n]
+        along += normals[c, 2, n] * in_camera[c, 2, n]
         far = in_camera[c, 0, n] * in_camera[c, 0, n] + in_camera[c, 1, n] * in_camera[c, 1, n]
         far += in_camera[c, 2, n] * in_camera[c, 2, n]
         facing[row] = -along / max(np.sqrt(far), 1e-9)
@@ -234,8 +234,8 @@ def project_corners(
         for axis in range(2):
             reach = PATCH_RADIUS * (abs(per_sample[row, axis, 0]) + abs(per_sample[row, axis, 1])) + 2
             limit = sizes[c, axis] - 1 - reach
-            seen = seen and centre[row, axis] >= reach and centre[row, axis] < limit
-        visible[row] = seen and facing[row] > 0.15
+            in_view = in_view and centre[row, axis] >= reach and centre[row, axis] < limit
+        visible[row] = in_view and facing[row] > 0.15
     return centre, per_sample, visible, facing
 
 
@@ -274,16 +274,16 @@ def cut_templates(
 
 
 MIN_ALIGNMENT_SIGMA_PX = 0.05  # px
-# Height of the surface over a patch's plane, px: seen from the side it shifts all that shows it, by the angle's
-# tangent, and does so in every image, so no residual tells. Measured on simulated skin with a wound of 2.4 mm and on a
-# roof's edge: 0.06 px seen squarely, 0.1 at 60 degrees, 0.2-0.3 at 70, 0.4-0.5 at 75; alignment alone claimed half.
-RELIEF_PX, MIN_FACING = 0.1, 0.1  # px; cosine beyond which nothing is visible anyway
-MAX_COARSE_STEPS, MAX_FINE_STEPS = 4, 6  # on the half-size image and the full one; from near, three are the rule
+# Height of the surface over a patch's plane, px: in an oblique view it shifts the patch by the angle's tangent in every
+# image alike, so residuals do not show it. Measured on simulated skin with a wound of 2.4 mm and on a roof's edge:
+# 0.06 px in a frontal view, 0.1 at 60 degrees, 0.2-0.3 at 70, 0.4-0.5 at 75; twice the sigma of alignment alone.
+RELIEF_PX, MIN_FACING = 0.1, 0.1  # px; cosine: smaller ones are not visible
+MAX_COARSE_STEPS, MAX_FINE_STEPS = 4, 6  # on the half-size image and the full one; from near, mostly three
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Where templates fit in one image, or in several one after the other."""
+    """Aligned templates in one image, or in several one after the other."""
 
     pixels: Array  # (N, 2) px as imaged
     sigma: Array  # (N,) px
@@ -292,10 +292,10 @@ class Alignment:
 
 
 def align(
-    templates: Templates, images: Pyramid, where: Projection, start: Array, least: float = 0.75, coarse: bool = True
+    templates: Templates, images: Pyramid, where: Projection, start: Array, min_score: float = 0.75, coarse: bool = True
 ) -> Alignment:
     """Shift each template until it fits one image: `align_in` of one camera."""
-    return align_in(templates, [images], [len(templates)], where, start, least, coarse)
+    return align_in(templates, [images], [len(templates)], where, start, min_score, coarse)
 
 
 def align_in(
@@ -304,28 +304,29 @@ def align_in(
     counts: Sequence[int],
     where: Projection,
     start: Array,
-    least: float = 0.75,
+    min_score: float = 0.75,
     coarse: bool = True,
 ) -> Alignment:
     """Shift each template until it fits.
 
-    One camera after the other: a landmark takes microseconds, and on a busy machine other threads take milliseconds to
-    begin. counts: how many of the rows belong to each of the images, one after the other. start: (N, 2) px as imaged,
-    where to begin. least: the correlation below which a landmark is not found. coarse: begin on the half-size images,
-    which reaches twice as far (5 px surely, 8 mostly) and costs as much again.
+    Without threads: a landmark takes microseconds, starting a thread on a busy machine milliseconds. counts: number of
+    rows of each image, one after the other. start: (N, 2) px as imaged. min_score: correlation below which a landmark
+    is not found. coarse: begin on the half-size images, which doubles the reach (5 px always, 8 mostly) and the time.
     """
     t, begin, per_sample = templates, contiguous(start), contiguous(where.per_sample)
-    shift, ended = np.zeros((len(t), 2)), np.zeros((len(t), 3))  # shifts in samples of the template
+    shift, results = np.zeros((len(t), 2)), np.zeros((len(t), 3))  # shifts in samples of the template
     for image, (first, last) in zip(images, pairwise(np.cumsum([0, *counts]).tolist()), strict=True):
-        mine = slice(first, last)
-        at, steps, visible = begin[mine], per_sample[mine], where.visible[mine]
+        rows = slice(first, last)
+        at, steps, visible = begin[rows], per_sample[rows], where.visible[rows]
         if coarse:
-            looks = t.coarse_picture[mine], t.coarse_steepest[mine], t.coarse_inverse_hessian[mine]
-            descend(image[1], on_level(at, True), steps, visible, *looks, shift[mine], 0.5, 2.0, MAX_COARSE_STEPS)
-        looks = t.picture[mine], t.steepest[mine], t.inverse_hessian[mine]
-        ended[mine] = descend(image[0], at, steps, visible, *looks, shift[mine], 1.0, 1.0, MAX_FINE_STEPS)
+            template = t.coarse_picture[rows], t.coarse_steepest[rows], t.coarse_inverse_hessian[rows]
+            descend(image[1], on_level(at, True), steps, visible, *template, shift[rows], 0.5, 2.0, MAX_COARSE_STEPS)
+        template = t.picture[rows], t.steepest[rows], t.inverse_hessian[rows]
+        results[rows] = descend(image[0], at, steps, visible, *template, shift[rows], 1.0, 1.0, MAX_FINE_STEPS)
     hessian = contiguous(t.inverse_hessian)
-    return Alignment(*_accepted(begin, per_sample, where.visible, where.facing, hessian, shift, ended, least))
+    return Alignment(
+        *_alignment_parts(begin, per_sample, where.visible, where.facing, hessian, shift, results, min_score)
+    )
 
 
 def coarse_score(templates: Templates, images: Pyramid, where: Projection, centre: Array) -> Array:
@@ -338,21 +339,21 @@ def coarse_score(templates: Templates, images: Pyramid, where: Projection, centr
     "Tuple((f8[:,::1], f8[::1], f8[::1], b1[::1]))"
     "(f8[:,::1], f8[:,:,::1], b1[::1], f8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], f8)"
 )
-def _accepted(
+def _alignment_parts(
     start: Array,
     per_sample: Array,
     visible: NDArray[np.bool_],
     facing: Array,
     inverse_hessian: Array,
     shift: Array,
-    ended: Array,
-    least: float,
+    results: Array,
+    min_score: float,
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """The parts of an `Alignment`, of where shifts (N, 2), samples, have ended (N, 3), as `descend` answers."""
+    """The parts of an `Alignment`, of shifts (N, 2), samples, and the results (N, 3) of `descend`."""
     pixels, sigma, found = np.empty_like(start), np.empty(len(start)), np.zeros(len(start), np.bool_)
     for n in range(len(start)):
         step, inverse = per_sample[n], inverse_hessian[n]
-        score, contrast, rest = ended[n, 0], ended[n, 1], ended[n, 2]
+        score, contrast, residual = results[n, 0], results[n, 1], results[n, 2]
         across = step[0, 0] * shift[n, 0] + step[0, 1] * shift[n, 1]
         down = step[1, 0] * shift[n, 0] + step[1, 1] * shift[n, 1]
         pixels[n, 0], pixels[n, 1] = start[n, 0] + across, start[n, 1] + down
@@ -361,10 +362,10 @@ def _accepted(
         for i in range(2):
             for j in range(2):
                 per_pixel += (step[i, 0] * inverse[0, j] + step[i, 1] * inverse[1, j]) * step[i, j]
-        sidelong = min(max(facing[n], MIN_FACING), 1.0)
-        bent = RELIEF_PX**2 * (1 / sidelong**2 - 1)  # the tangent's square
-        white = max(noise * per_pixel / 2, MIN_ALIGNMENT_SIGMA_PX**2)
-        sigma[n] = np.sqrt(white + rest**2 + bent)
+        cosine = min(max(facing[n], MIN_FACING), 1.0)
+        relief = RELIEF_PX**2 * (1 / cosine**2 - 1)  # the tangent's square
+        alignment = max(noise * per_pixel / 2, MIN_ALIGNMENT_SIGMA_PX**2)
+        sigma[n] = np.sqrt(alignment + residual**2 + relief)
         near = np.sqrt(across * across + down * down) < 3 * PATCH_SIDE  # false where it is not finite
-        found[n] = visible[n] and score > least and contrast > MIN_PATCH_CONTRAST and near
-    return pixels, sigma, ended[:, 0].copy(), found
+        found[n] = visible[n] and score > min_score and contrast > MIN_PATCH_CONTRAST and near
+    return pixels, sigma, results[:, 0].copy(), found

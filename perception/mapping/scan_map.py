@@ -1,8 +1,8 @@
-"""Where a scan lies in the pictures, and the landmarks on it.
+"""Registration of a scan to pictures, and the landmarks on it.
 
-First the scan is registered to the surface's depth map. Then the pictures are matched densely on the scan itself: where
-it lies right they look alike, where it lies wrong they differ, by as much as its relief rises or falls along the error.
-That needs no estimate of the relief, so the last steps are free of the error that flat patches make on a wound's walls.
+First the scan is registered to the surface's depth map. Then the pictures are matched densely on the scan itself: a
+pose error shifts them against each other by the change of the scan's relief along it. That needs no estimate of the
+relief, so the last steps are free of the error of flat patches on a wound's walls.
 
 Dense matching: cameras stand 36 to 84 degrees apart, but resampled on a surface that is right to a millimetre pictures
 look alike, and a shift of a node or two is left. On the true surface thousands of points came out to 0.02 mm (skin) and
@@ -34,13 +34,13 @@ from perception.lens import Lenses
 from perception.mapping.features import polygon_mask
 from perception.mapping.first_map import FirstMap
 
-NODE_PIXELS = 1.1  # of the cameras, a node: a finer lattice shows nothing more
+NODE_PIXELS = 1.1  # of the cameras, a node: a finer lattice adds nothing
 FLOW_PATCH_NODES, FLOW_STRIDE_NODES, FLOW_STEPS = 12, 3, 25  # nodes, nodes and steps of the flow
-EVENING_SIGMA_NODES = 6.0  # over which brightness and contrast are evened out: glare and light differ by camera
+EVENING_SIGMA_NODES = 6.0  # over which brightness and contrast are normalised: glare and light differ by camera
 EVENED_CONTRAST = 40.0  # grey levels
-MIN_EVENED_VARIANCE = 100.0  # grey levels squared, below which a correlation tells nothing
-MIN_MATCH_CORRELATION = 0.6  # correlation below which a match is not believed
-MAX_EPIPOLAR_ERROR_PX = 0.5  # px off the epipolar line, or three times the median, beyond which it is not
+MIN_EVENED_VARIANCE = 100.0  # grey levels squared: regularises the correlation
+MIN_MATCH_CORRELATION = 0.6  # correlation, from which a match is used
+MAX_EPIPOLAR_ERROR_PX = 0.5  # px from the epipolar line, or three times the median if larger
 MIN_NODE_FACING = 0.2  # cosine of the viewing angle below which a camera sees too little of a node
 
 Float32 = NDArray[np.float32]
@@ -52,53 +52,53 @@ class DenseMatch:
     """The surface at the nodes of a lattice."""
 
     points: Array  # (H, W, 3) mm, base frame
-    sure: NDArray[np.bool_]  # (H, W) whether to believe it
+    sure: NDArray[np.bool_]  # (H, W) whether the match is reliable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticeImage:
     """One camera's picture on the lattice."""
 
-    even: Image  # (H, W) brightness and contrast evened out
+    even: Image  # (H, W) of normalised brightness and contrast
     pixels: Array  # (H, W, 2) px, ideal
     visible: NDArray[np.bool_]  # (H, W)
 
 
 def node_size(lenses: Lenses, cameras: list[int], centre: Array) -> float:
-    """A good distance, mm, between nodes about `centre` (3,), base frame: what the sharpest camera resolves."""
-    own = [lenses.rig.cameras[c] for c in cameras]
-    away = [float(np.linalg.norm(centre - camera.base_from_camera[:3, 3])) for camera in own]
-    focal = [float(camera.matrix[[0, 1], [0, 1]].mean()) for camera in own]
-    return min(NODE_PIXELS * a / f for a, f in zip(away, focal, strict=True))
+    """Distance, mm, between nodes about `centre` (3,), base frame: the resolution of the sharpest camera."""
+    rig_cameras = [lenses.rig.cameras[c] for c in cameras]
+    distance = [float(np.linalg.norm(centre - camera.base_from_camera[:3, 3])) for camera in rig_cameras]
+    focal = [float(camera.matrix[[0, 1], [0, 1]].mean()) for camera in rig_cameras]
+    return min(NODE_PIXELS * a / f for a, f in zip(distance, focal, strict=True))
 
 
 def match_near(
-    lenses: Lenses, images: Mapping[int, Picture], nodes: Array, reference: int, every: int = 1
+    lenses: Lenses, images: Mapping[int, Picture], nodes: Array, reference: int, stride: int = 1
 ) -> DenseMatch | None:
-    """Where the surface near `nodes` (H, W, 3), base frame, really is; None where no two cameras see any of it.
+    """Where the surface near `nodes` (H, W, 3), base frame, is; None where no two cameras see any of it.
 
-    None, too, of nodes that are too few for the flow, as pictures of few pixels make them of a small surface.
-    Each node's ray in the reference camera is intersected with those of the other cameras at the places that match.
-    every: step in rows and columns between the nodes given, (H', W', 3).
+    None also for too few nodes for the flow, as for a small surface in pictures of few pixels.
+    Each node's ray in the reference camera is intersected with the rays of matching pixels in the other cameras.
+    stride: step in rows and columns between the nodes of the result, (H', W', 3).
     """
     if min(nodes.shape[:2]) <= FLOW_PATCH_NODES:
         return None
-    towards = lattice_normals(nodes)
-    first = lattice_image(lenses, reference, images[reference], nodes, towards)
+    normals = lattice_normals(nodes)
+    first = lattice_image(lenses, reference, images[reference], nodes, normals)
     flow = _flow()
-    pixels, camera, used = [first.pixels], [reference], [first.visible]
+    pixels, camera, masks = [first.pixels], [reference], [first.visible]
     for c in sorted(set(images) - {reference}):
-        other = lattice_image(lenses, c, images[c], nodes, towards)
-        matches, correlation = _matched(flow, first, other)
+        other = lattice_image(lenses, c, images[c], nodes, normals)
+        matches, correlation = _match_images(flow, first, other)
         pixels.append(matches)
         camera.append(c)
-        used.append(first.visible & other.visible & (correlation > MIN_MATCH_CORRELATION))
-    if len(used) < 2:
+        masks.append(first.visible & other.visible & (correlation > MIN_MATCH_CORRELATION))
+    if len(masks) < 2:
         return None
-    chosen = (slice(None), slice(None, None, every), slice(None, None, every))
-    looks, where = np.stack(used)[chosen], np.stack(pixels)[chosen]
-    both = np.asarray(looks[1:].any(axis=0), bool)
-    return _triangulated(lenses, nodes[chosen[1:]], where, np.array(camera), looks & both, both) if both.any() else None
+    part = (slice(None), slice(None, None, stride), slice(None, None, stride))
+    mask, where = np.stack(masks)[part], np.stack(pixels)[part]
+    valid = np.asarray(mask[1:].any(axis=0), bool)
+    return _triangulate(lenses, nodes[part[1:]], where, np.array(camera), mask & valid, valid) if valid.any() else None
 
 
 def middle_camera(lenses: Lenses, cameras: list[int], centre: Array) -> int:
@@ -108,38 +108,38 @@ def middle_camera(lenses: Lenses, cameras: list[int], centre: Array) -> int:
     return cameras[int(np.argmax(views @ views.sum(0)))]
 
 
-def _triangulated(
+def _triangulate(
     lenses: Lenses,
     nodes: Array,
     pixels: Array,
     camera: NDArray[np.int64],
-    used: NDArray[np.bool_],
-    both: NDArray[np.bool_],
+    mask: NDArray[np.bool_],
+    shared: NDArray[np.bool_],
 ) -> DenseMatch:
-    """The points where rays (K, H, W, 2) meet, K cameras, of those `used` (K, H, W), at nodes seen by `both` (H, W)."""
-    number = np.cumsum(both.ravel()).reshape(both.shape) - 1
-    which, row, column = np.nonzero(used)
+    """Triangulated points of pixels (K, H, W, 2) of K cameras where `mask` (K, H, W), at `shared` nodes (H, W)."""
+    number = np.cumsum(shared.ravel()).reshape(shared.shape) - 1
+    which, row, column = np.nonzero(mask)
     point, looks = number[row, column], pixels[which, row, column]
-    met, _, residual = triangulate(lenses.rig, point, camera[which], looks, int(both.sum()), iterations=2)
-    aside = np.zeros(len(met))
-    np.maximum.at(aside, point, np.linalg.norm(residual, axis=1))
-    points, sure = nodes.copy(), both.copy()
-    points[both] = met
-    sure[both] = (aside < max(MAX_EPIPOLAR_ERROR_PX, 3 * float(np.median(aside)))) & np.isfinite(met).all(1)
+    intersections, _, residual = triangulate(lenses.rig, point, camera[which], looks, int(shared.sum()), iterations=2)
+    error = np.zeros(len(intersections))
+    np.maximum.at(error, point, np.linalg.norm(residual, axis=1))
+    points, sure = nodes.copy(), shared.copy()
+    points[shared] = intersections
+    sure[shared] = (error < max(MAX_EPIPOLAR_ERROR_PX, 3 * float(np.median(error)))) & np.isfinite(intersections).all(1)
     return DenseMatch(points, sure)
 
 
 def lattice_normals(nodes: Array) -> Array:
     """Unit normals (H, W, 3) of the surface through nodes (H, W, 3)."""
     down, right = np.gradient(nodes, axis=(0, 1))
-    across = np.cross(right, down)
-    return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
+    normals = np.cross(right, down)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12))
 
 
 def lattice_image(
     lenses: Lenses, camera: int, image: Picture, nodes: Array, normals: Array, evening: float = EVENING_SIGMA_NODES
 ) -> LatticeImage:
-    """A picture laid on nodes (H, W, 3), base frame, with normals; evened over `evening` nodes."""
+    """A picture resampled at nodes (H, W, 3), base frame, with normals; normalised over `evening` nodes."""
     lens = lenses.rig.cameras[camera]
     ideal, depth = ideal_pixels(lens, nodes.reshape(-1, 3))
     imaged, in_lens = lenses.image(camera, ideal, depth)
@@ -156,7 +156,7 @@ def lattice_image(
 
 
 def _flow() -> cv2.DISOpticalFlow:
-    """Dense inverse search (Kroeger et al. 2016); patches do not ask neighbours: threads would change the results."""
+    """Dense inverse search (Kroeger et al. 2016); no spatial propagation, whose results depend on threads."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setPatchSize(FLOW_PATCH_NODES)
     flow.setPatchStride(FLOW_STRIDE_NODES)
@@ -167,10 +167,10 @@ def _flow() -> cv2.DISOpticalFlow:
     return flow
 
 
-def _matched(flow: cv2.DISOpticalFlow, first: LatticeImage, other: LatticeImage) -> tuple[Array, Float32]:
-    """Ideal pixels (H, W, 2) in the other camera of what the first sees at each node, and their correlation (H, W)."""
-    still = np.zeros((*first.even.shape, 2), np.float32)
-    shift = np.asarray(flow.calc(first.even, other.even, still))
+def _match_images(flow: cv2.DISOpticalFlow, first: LatticeImage, other: LatticeImage) -> tuple[Array, Float32]:
+    """Ideal pixels (H, W, 2) in the other camera that match the first at each node, and their correlation (H, W)."""
+    zero_flow = np.zeros((*first.even.shape, 2), np.float32)
+    shift = np.asarray(flow.calc(first.even, other.even, zero_flow))
     y, x = np.mgrid[: shift.shape[0], : shift.shape[1]].astype(np.float32)
     x, y = x + shift[..., 0], y + shift[..., 1]
     pixels, picture = (
@@ -185,9 +185,9 @@ def _matched(flow: cv2.DISOpticalFlow, first: LatticeImage, other: LatticeImage)
 GUESS_SIGMA_MM = 6.0  # mm over which landmarks are averaged for the first guess: about the distance between them
 LATTICE_MARGIN_MM = 3.0  # mm that the lattice reaches beyond the landmarks
 NODE_WIDTHS = (2.0, 2.0, 1.0, 1.0)  # widths of a node, in its finest size
-CORRECTION_SIGMA_NODES = 1.2  # over which corrections are averaged: neighbours share their matches anyway
+CORRECTION_SIGMA_NODES = 1.2  # over which corrections are averaged: neighbours share their matches
 MAX_JUMP_MM = 0.5  # mm: a correction this far from its neighbours' is a wrong match
-POINT_STEP_NODES = 6  # nodes from one point given out to the next: half a matched patch, so they share little
+POINT_STEP_NODES = 6  # nodes between points of the result: half a matched patch, so they share little
 
 
 def relief_points(
@@ -226,26 +226,26 @@ def lattice_nodes(low: Array, high: Array, step: float) -> Array:
 def initial_heights(points: Array, low: Array, high: Array) -> Float32:
     """Heights on a coarse lattice by a plane through the landmarks (N, 3) around each node, the nearer the more."""
     flat = lattice_nodes(low, high, GUESS_SIGMA_MM / 2)
-    away = points[None, :, :2] - flat.reshape(-1, 1, 2)
-    weight = np.exp(-(away**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
-    design = np.concatenate([np.ones((*away.shape[:2], 1)), away / GUESS_SIGMA_MM], 2)
+    offsets = points[None, :, :2] - flat.reshape(-1, 1, 2)
+    weight = np.exp(-(offsets**2).sum(2) / (2 * GUESS_SIGMA_MM**2)) + 1e-6
+    design = np.concatenate([np.ones((*offsets.shape[:2], 1)), offsets / GUESS_SIGMA_MM], 2)
     normal = np.einsum("nmi,nm,nmj->nij", design, weight, design, optimize=True) + 1e-4 * np.eye(3)
     right = np.einsum("nmi,nm->ni", design, weight * points[:, 2])
     return np.linalg.solve(normal, right[..., None])[:, 0, 0].reshape(flat.shape[:2]).astype(np.float32)
 
 
 def transformed_nodes(transform: Array, nodes: Array) -> Array:
-    """Nodes (H, W, 3) carried by a transform (4, 4)."""
+    """Nodes (H, W, 3) in another frame, by a transform (4, 4)."""
     return se3.transform_points(transform, nodes.reshape(-1, 3)).reshape(nodes.shape)
 
 
 def corrected_heights(nodes: Array, matches: Array, sure: NDArray[np.bool_], step: float) -> Float32:
     """New heights (H, W) from the points (H, W, 3) matched at the nodes (H, W, 3), in the surface frame."""
-    heights, off = nodes[..., 2], matches - nodes
+    heights, offset = nodes[..., 2], matches - nodes
     down, right = np.gradient(heights, step)
-    up = np.where(sure, off[..., 2] - right * off[..., 0] - down * off[..., 1], 0).astype(np.float32)
-    around = np.asarray(cv2.medianBlur(up, 5))
-    up = np.where(np.abs(up - around) < MAX_JUMP_MM, up, around)
+    up = np.where(sure, offset[..., 2] - right * offset[..., 0] - down * offset[..., 1], 0).astype(np.float32)
+    median = np.asarray(cv2.medianBlur(up, 5))
+    up = np.where(np.abs(up - median) < MAX_JUMP_MM, up, median)
     weight = sure.astype(np.float32) + 1e-6
     total, weights = (cv2.GaussianBlur(values, (0, 0), CORRECTION_SIGMA_NODES) for values in (up * weight, weight))
     return np.asarray(heights + total / weights, np.float32)
@@ -263,18 +263,18 @@ def _inside(lenses: Lenses, camera: int, points: Array, polygons: dict[int, Arra
 
 
 RELIEF_SIGMA_MM = 0.1  # mm: of matched relief across the surface; no handheld scan is better
-SEARCH_POINTS = 400  # points for the search: more take longer and find the same
+SEARCH_POINTS = 400  # points for the search: more take longer with the same result
 MATCH_SIGMA_MM = 0.03  # mm, of points matched on the scan itself
-MATCH_SPACING_NODES = 6  # nodes between points taken: half a matched patch, so neighbours share half their error,
+MATCH_SPACING_NODES = 6  # nodes between points used: half a matched patch, so neighbours share half their error,
 SHARED_ERROR_FACTOR = 2.5  # and their errors another part, as measured: each is worth a sixth of an independent one
-REFINEMENT_ROUNDS = 4  # of matching and settling: the third was measured to move by 0.01 mm, the fourth by 0.002
-SCAN_MARGIN_MM = 2.0  # mm around the part that was seen
+REFINEMENT_ROUNDS = 4  # of matching and registration: measured changes 0.01 mm in the third, 0.002 in the fourth
+SCAN_MARGIN_MM = 2.0  # mm around the measured part
 # mm rms on the scan: 0.04 on the right one, 0.19 on another; the lower limit where the relief did not fit at first
 MAX_FIT_RMS_MM, EXACT_FIT_RMS_MM = 0.15, 0.06
 
 
 class ScanPlacing:
-    """Finds one scan in pictures."""
+    """Registers one scan to pictures."""
 
     def __init__(self, scan: Scan) -> None:
         self.scan, self._index = scan, ScanIndex(scan)
@@ -283,7 +283,7 @@ class ScanPlacing:
     def search(
         self, lenses: Lenses, images: dict[int, Image], first: FirstMap, polygons: dict[int, Array]
     ) -> Registration:
-        """Where the scan lies, from pictures (grey, by camera) of one instant, without knowing where.
+        """Pose of the scan from pictures (grey, by camera) of one instant, without a start.
 
         polygons: (N, 2) px as imaged, by camera: the part of the surface that is matched with the scan.
         """
@@ -296,32 +296,32 @@ class ScanPlacing:
         return self.refine(lenses, images, place)
 
     def refine(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
-        """A place known to a millimetre, refined on pictures of one instant; if it was ambiguous, the rival as well."""
-        best = self._settled(lenses, images, near)
+        """A pose known to a millimetre, refined by pictures of one instant; if ambiguous, its rival as well."""
+        best = self._settle(lenses, images, near)
         if near.rival is None:
             return best
-        other = self._settled(lenses, images, replace(near, base_from_surface=near.rival, rival=None))
+        other = self._settle(lenses, images, replace(near, base_from_surface=near.rival, rival=None))
         return better_of(near, best, other, self._nodes[np.isfinite(self._nodes[..., 0])])
 
-    def _settled(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
-        """Matched on the scan where it lies, and registered again, repeatedly."""
+    def _settle(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
+        """Matched on the scan at its pose and registered again, REFINEMENT_ROUNDS times."""
         place, on_scan = near, np.isfinite(self._nodes[..., 0])
         for _ in range(REFINEMENT_ROUNDS):
             pose = place.base_from_surface
             nodes = se3.transform_points(pose, np.nan_to_num(self._nodes).reshape(-1, 3)).reshape(self._nodes.shape)
             reference = middle_camera(lenses, sorted(images), nodes[on_scan].mean(0)) if on_scan.any() else 0
-            matched = match_near(lenses, images, nodes, reference, MATCH_SPACING_NODES) if on_scan.any() else None
-            if matched is None:
-                unseen = f"{near.verdict}; no two cameras see the scan there"
-                return replace(near, sure=False, fits=False, verdict=unseen)
-            sure = matched.sure & on_scan[::MATCH_SPACING_NODES, ::MATCH_SPACING_NODES]
-            place = register_near(matched.points[sure], MATCH_SIGMA_MM, SHARED_ERROR_FACTOR, self._index, pose)
+            match = match_near(lenses, images, nodes, reference, MATCH_SPACING_NODES) if on_scan.any() else None
+            if match is None:
+                reason = f"{near.verdict}; no two cameras see the scan there"
+                return replace(near, sure=False, fits=False, verdict=reason)
+            sure = match.sure & on_scan[::MATCH_SPACING_NODES, ::MATCH_SPACING_NODES]
+            place = register_near(match.points[sure], MATCH_SIGMA_MM, SHARED_ERROR_FACTOR, self._index, pose)
         if place.rms > MAX_FIT_RMS_MM:
-            poor = f"poor fit: {place.rms:.3g} mm rms on the scan, {MAX_FIT_RMS_MM:g} mm at most. {place.verdict}"
-            return replace(place, sure=False, fits=False, verdict=poor)
+            reason = f"poor fit: {place.rms:.3g} mm rms on the scan, {MAX_FIT_RMS_MM:g} mm at most. {place.verdict}"
+            return replace(place, sure=False, fits=False, verdict=reason)
         if place.sure and not near.sure and place.rms > EXACT_FIT_RMS_MM:
-            doubt = f"doubtful: {place.rms:.3g} mm rms on the scan, as the relief did not fit it. {place.verdict}"
-            return replace(place, sure=False, verdict=doubt)
+            reason = f"doubtful: {place.rms:.3g} mm rms on the scan, as the relief did not fit it. {place.verdict}"
+            return replace(place, sure=False, verdict=reason)
         return place
 
     def _lattice(self, lenses: Lenses, cameras: list[int], points: Array, outward: Array, pose: Array) -> Array:
@@ -345,28 +345,28 @@ class ScanPlacing:
 
 
 def as_at_one_instant(rig: Rig, pose: Array, single: dict[int, Array]) -> Rig:
-    """The rig as it stands to a surface at `pose` (4, 4), where each camera saw it at its own pose `single[c]`.
+    """The rig relative to a surface at `pose` (4, 4), where each camera saw it at its own pose `single[c]`.
 
-    Cameras that are not exposed together see a moving surface at different places; moved by the difference they all
-    look at the same one.
+    Cameras that are not exposed together see a moving surface at different poses; each is moved by the difference, so
+    that all see the same one.
     """
-    moved = [pose @ se3.inverse(single.get(c, pose)) @ lens.base_from_camera for c, lens in enumerate(rig.cameras)]
-    return Rig(tuple(replace(lens, base_from_camera=m) for lens, m in zip(rig.cameras, moved, strict=True)))
+    poses = [pose @ se3.inverse(single.get(c, pose)) @ lens.base_from_camera for c, lens in enumerate(rig.cameras)]
+    return Rig(tuple(replace(lens, base_from_camera=m) for lens, m in zip(rig.cameras, poses, strict=True)))
 
 
 REFERENCE_SIGMA_PX = 0.2  # px, of a landmark's place in its reference picture
 MIN_SCAN_SIGMA_MM = 0.03  # mm across the surface: no scan and no match is better
-MAX_SCAN_DISTANCE_SIGMAS = 5.0  # of landmark and scan; beyond, it does not lie on the scan: a drape, a hair, a mistake
+MAX_SCAN_DISTANCE_SIGMAS = 5.0  # of landmark and scan; beyond, it is not on the scan: a drape, a hair, an error
 
 
 def landmarks_on_scan(
     surface_map: SurfaceMap, camera: NDArray[np.int64], lenses: Lenses, scan: Scan, place: Registration
 ) -> tuple[SurfaceMap, Anchors]:
-    """The map with its landmarks on the scan, and what holds them there.
+    """The map with its landmarks on the scan, and their anchors to it.
 
-    surface_map: in the scan's frame. camera: (N,) whose picture each landmark was taken from. place: of the scan where
-    the cameras of `lenses` see it. Depth is the scan's, sideways the pixel's; the place's own error is in all alike,
-    unless the shape leaves it open: that is no matter of millimetres.
+    surface_map: in the scan's frame. camera: (N,) of each landmark's reference picture. place: pose of the scan for the
+    cameras of `lenses`. Depth error is the scan's, lateral error the pixel's; the pose's covariance is common to all;
+    it is left out where the pose is ambiguous, as it does not describe that error.
     """
     points, normals = surface_map.points.copy(), surface_map.normals.copy()
     blocks = np.einsum("ninj->nij", surface_map.covariance.reshape(len(points), 3, len(points), 3)).copy()
@@ -374,22 +374,22 @@ def landmarks_on_scan(
     frame = place.covariance if place.sure else np.zeros((6, 6))
     sigma = np.full(len(points), FREE_SIGMA_MM)
     for c in np.unique(camera):
-        mine = np.flatnonzero(camera == c)
+        rows = np.flatnonzero(camera == c)
         lens = lenses.rig.cameras[c]
         surface_from_camera = se3.inverse(place.base_from_surface) @ lens.base_from_camera
-        inner = se3.transform_points(se3.inverse(surface_from_camera), points[mine])
+        inner = se3.transform_points(se3.inverse(surface_from_camera), points[rows])
         hits = cast_rays(scan, surface_from_camera[:3, 3], inner @ surface_from_camera[:3, :3].T)
-        off = np.einsum("ni,ni->n", hits.points - points[mine], hits.normals)
-        own = np.einsum("ni,nij,nj->n", hits.normals, blocks[mine], hits.normals)
-        on = hits.hit & (np.abs(off) < MAX_SCAN_DISTANCE_SIGMAS * np.sqrt(own + across**2))
-        mine, rays = mine[on], inner[on] @ surface_from_camera[:3, :3].T
-        points[mine], normals[mine], sigma[mine] = hits.points[on], hits.normals[on], across
+        height = np.einsum("ni,ni->n", hits.points - points[rows], hits.normals)
+        variance = np.einsum("ni,nij,nj->n", hits.normals, blocks[rows], hits.normals)
+        near = hits.hit & (np.abs(height) < MAX_SCAN_DISTANCE_SIGMAS * np.sqrt(variance + across**2))
+        rows, rays = rows[near], inner[near] @ surface_from_camera[:3, :3].T
+        points[rows], normals[rows], sigma[rows] = hits.points[near], hits.normals[near], across
         angle = REFERENCE_SIGMA_PX / float(lens.matrix[0, 0])
-        blocks[mine] = _intersection_covariances(rays, hits.normals[on], across, angle)
+        blocks[rows] = _intersection_covariances(rays, hits.normals[near], across, angle)
     covariance = np.zeros((len(points), 3, len(points), 3))
     covariance[np.arange(len(points)), :, np.arange(len(points))] = blocks
-    whole = covariance.reshape(3 * len(points), -1) + of_frame(points, frame)
-    return SurfaceMap(points, normals, whole), Anchors(points, normals, sigma, frame)
+    joint = covariance.reshape(3 * len(points), -1) + of_frame(points, frame)
+    return SurfaceMap(points, normals, joint), Anchors(points, normals, sigma, frame)
 
 
 def _intersection_covariances(rays: Array, normals: Array, across: float, angle: float) -> Array:

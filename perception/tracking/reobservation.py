@@ -1,9 +1,8 @@
-"""Landmarks observed anew in the pictures of a recording whose map and motion are known: before they joined the map, in
-frame sets that were not tracked, and where the surface was lost.
+"""Reobservation of a recording's landmarks, given map and motion: before they joined the map, in frame sets without
+tracks, and where the surface was lost.
 
-A landmark's picture is cut where it was first observed, and looked for wherever it should be in view. Where the motion
-is not known, the surface is followed backwards from where it is known, as a causal run follows it forwards. Earlier
-observations stay as they are.
+A landmark's template is cut at its first observation, and aligned wherever the landmark should be in view. Where the
+motion is unknown, the surface is tracked backwards from the next frame set that has it. Observations do not change.
 """
 
 from __future__ import annotations
@@ -43,14 +42,14 @@ class ExpectedSurface:
     base_from_surface: Array  # (4, 4)
     covariance: Array  # (6, 6)
     twist: Array  # (6,)
-    exposed: Array  # (C, 4, 4), base_from_surface when each camera exposes
+    camera_poses: Array  # (C, 4, 4), base_from_surface at each camera's exposure
 
 
 class KnownMotion:
     """Map and poses of a recording, and its observations by frame set (K); their tracks are rows of `map`."""
 
     def __init__(self, rig: Rig, smoothed: Smoothed, observations: Sequence[Observations]) -> None:
-        """rig: by which the observations were undistorted. observations: those that were smoothed."""
+        """rig: whose lenses undistorted the observations. observations: input of the smoother."""
         self.rig, self.smoothed = rig, smoothed
         points = smoothed.map.points
         eyes = np.mean([camera.base_from_camera[:3, 3] for camera in rig.cameras], axis=0)
@@ -58,255 +57,256 @@ class KnownMotion:
         self.map = SurfaceMap(points, smooth_normals(points, outward), smoothed.map.covariance)
         first, last = smoothed.stamps[[0, -1]]
         self.observations = [_with_map_rows(o, smoothed.tracks) for o in observations if first <= o.stamp <= last]
-        self._own = np.einsum("ninj->nij", self.map.covariance.reshape(len(points), 3, len(points), 3))  # (L, 3, 3)
+        self._blocks = np.einsum("ninj->nij", self.map.covariance.reshape(len(points), 3, len(points), 3))  # (L, 3, 3)
         self._covariance = smoothed.covariance[:, :6, :6]
-        self._apart = pairing_tolerance(frame_period([smoothed.stamps]))
+        self._tolerance = pairing_tolerance(frame_period([smoothed.stamps]))
 
     def row(self, stamp: float) -> int | None:
-        """Of the frame set at `stamp`; None where none was smoothed."""
+        """Row of the frame set at `stamp`, s; None if it was not smoothed."""
         k = self._nearest(stamp)
         return k if abs(self.smoothed.stamps[k] - stamp) < STAMP_TOLERANCE_S else None
 
     def is_in_other_set(self, stamp: float) -> bool:
-        """Whether the pictures of `stamp` are in frame sets of other stamps: a live run pairs them as they come."""
-        return self.row(stamp) is None and bool(abs(self.smoothed.stamps[self._nearest(stamp)] - stamp) < self._apart)
+        """Whether the pictures of `stamp` are in frame sets of other stamps: a live run pairs them by arrival."""
+        gap = abs(self.smoothed.stamps[self._nearest(stamp)] - stamp)
+        return self.row(stamp) is None and bool(gap < self._tolerance)
 
-    def observed_at(self, stamp: float) -> Observations:
+    def observations_at(self, stamp: float) -> Observations:
         """The observations at `stamp`, s."""
         k = self.row(stamp)
         return no_observations(stamp) if k is None else self.observations[k]
 
     def unobserved(self, stamp: float) -> NDArray[np.bool_]:
-        """(C, L), landmarks of which each camera has no observation then."""
-        out, tracks = np.ones((len(self.rig), len(self.map)), bool), self.observed_at(stamp)
+        """(C, L), the landmarks that each camera does not observe at `stamp`, s."""
+        out, tracks = np.ones((len(self.rig), len(self.map)), bool), self.observations_at(stamp)
         out[tracks.camera, tracks.track] = False
         return out
 
     def at(self, stamp: float) -> ExpectedSurface | None:
-        """The surface then; None outside of what was smoothed."""
+        """The surface at `stamp`, s; None outside the smoothed interval."""
         s, k = self.smoothed, self.row(stamp)
         if k is not None:
-            return self._exposed(s.states.poses[k], self._covariance[k], s.states.twists[k])
+            return self._expected_surface(s.states.poses[k], self._covariance[k], s.states.twists[k])
         if not s.stamps[0] < stamp < s.stamps[-1]:
             return None
-        then = s.at(np.array([stamp]))
-        return self._exposed(then.base_from_surface[0], then.covariance[0], then.twist[0])
+        state = s.at(np.array([stamp]))
+        return self._expected_surface(state.base_from_surface[0], state.covariance[0], state.twist[0])
 
     def _nearest(self, stamp: float) -> int:
         return int(np.abs(self.smoothed.stamps - stamp).argmin())
 
-    def _exposed(self, pose: Array, covariance: Array, twist: Array) -> ExpectedSurface:
-        """The surface with its poses at each camera's exposure, cameras corrected by smoothing, for the given rig."""
-        moved = pose @ se3.exp(self.smoothed.offsets[:, None] * twist)
+    def _expected_surface(self, pose: Array, covariance: Array, twist: Array) -> ExpectedSurface:
+        """The surface with its poses at each camera's exposure: by the smoothed rig, converted to the motion's."""
+        exposed = pose @ se3.exp(self.smoothed.offsets[:, None] * twist)
         rigs = self.smoothed.rig, self.rig
-        corrected, given = (np.stack([camera.base_from_camera for camera in rig.cameras]) for rig in rigs)
-        return ExpectedSurface(pose, covariance, twist, given @ se3.inverse(corrected) @ moved)
+        smoothed_poses, rig_poses = (np.stack([camera.base_from_camera for camera in rig.cameras]) for rig in rigs)
+        return ExpectedSurface(pose, covariance, twist, rig_poses @ se3.inverse(smoothed_poses) @ exposed)
 
     def poses(self, expected: ExpectedSurface, tracks: Observations) -> Array:
         """(C, 4, 4), base_from_surface at each camera's exposure: by its own tracks where it has enough."""
-        out = expected.exposed.copy()
+        out = expected.camera_poses.copy()
         for c in range(len(out)):
             if (tracks.camera == c).sum() >= MIN_OWN_TRACKS:
                 out[c] = single_fit(self.rig, self.map.points, tracks, c, out[c]).base_from_surface
         return out
 
     def image_sigmas(self, expected: ExpectedSurface) -> tuple[Array, float]:
-        """One sigma of where each landmark falls in each camera, (C, L) px; and the median of the pose's part of it."""
+        """One sigma (C, L) px of each landmark's projection in each camera; and the median of the pose's share, px."""
         count, cameras = len(self.map), len(self.rig)
         camera, points = np.repeat(np.arange(cameras), count), np.tile(self.map.points, (cameras, 1))
-        jacobian = project(self.rig, camera, expected.exposed, points)[2]
+        jacobian = project(self.rig, camera, expected.camera_poses, points)[2]
         by_pose = ((jacobian @ expected.covariance) * jacobian).sum(2).max(1)
-        across = jacobian[:, :, 3:]
-        by_place = ((across @ np.tile(self._own, (cameras, 1, 1))) * across).sum(2).max(1)
+        point_jacobian = jacobian[:, :, 3:]
+        by_place = ((point_jacobian @ np.tile(self._blocks, (cameras, 1, 1))) * point_jacobian).sum(2).max(1)
         return np.sqrt(by_pose + by_place).reshape(cameras, count), float(np.sqrt(np.median(by_pose)))
 
 
 def _with_map_rows(observations: Observations, ids: NDArray[np.int64]) -> Observations:
-    """With the landmarks' rows in place of their ids (L,), rising; without those that are not in the map."""
+    """Observations with rows in place of ids (L,), rising; without landmarks that are not in the map."""
     row = np.minimum(np.searchsorted(ids, observations.track), len(ids) - 1)
     return replace(observations, track=row).only(ids[row] == observations.track)
 
 
-MAX_RESIDUAL = 2.0  # px from the projection, and as many sigmas: what is farther off is another spot
+MAX_RESIDUAL = 2.0  # px from the projection, plus as many sigmas: beyond, it is another spot
 MIN_REOBSERVATION_SIGMA_PX = 0.1  # px: alignment reports less on clean images
-MIN_VIEW_SHARE = 0.2  # of a camera's landmarks in view: another surface has a twentieth by chance
-MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE = 10, 0.4  # of a pose, and of those measured: as many as a causal run needs
-MAX_WAITING_SETS = 60  # frame sets that are followed backwards: so many pictures are held
+MIN_VIEW_SHARE = 0.2  # of a camera's landmarks in view: on another surface 0.05 match by chance
+MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE = 10, 0.4  # of a pose, and share of those measured: as in a causal run
+MAX_WAITING_SETS = 60  # frame sets tracked backwards, whose pictures are kept in memory
 
 
 class ReferencePictures:
-    """The landmarks' pictures: `cut` is to be given the frame sets of `stamps`."""
+    """Templates of the landmarks; call `cut` with the frame sets of `stamps`."""
 
     def __init__(self, motion: KnownMotion) -> None:
         self.motion, self.lenses = motion, Lenses(motion.rig)
-        self._first = _first_views(motion)
-        self._cut: list[tuple[NDArray[np.int64], Templates]] = []
+        self._first_views = _first_views(motion)
+        self._templates: list[tuple[NDArray[np.int64], Templates]] = []
 
     @property
     def stamps(self) -> Array:
         """(M,) s, rising."""
-        return self.motion.smoothed.stamps[sorted({k for k, _ in self._first})]
+        return self.motion.smoothed.stamps[sorted({k for k, _ in self._first_views})]
 
     def cut(self, frames: FrameSet) -> None:
-        """Keep the pictures of the landmarks whose first good observation is in this frame set."""
+        """Cut the templates of the landmarks whose first good observation is in this frame set."""
         motion, k, expected = self.motion, self.motion.row(frames.stamp), self.motion.at(frames.stamp)
         for frame in frames.frames if k is not None else ():
-            first = self._first.get((k or 0, frame.camera))
-            if first is None or expected is None:
+            view = self._first_views.get((k or 0, frame.camera))
+            if view is None or expected is None:
                 continue
-            pose = motion.poses(expected, motion.observed_at(frames.stamp))[frame.camera]
-            points = se3.transform_points(pose, motion.map.points[first.track])
-            spots = on_rays(motion.rig, frame.camera, first.pixels, points)  # exactly those of the tracks
-            points, normals = se3.transform_points(se3.inverse(pose), spots), motion.map.normals[first.track]
-            pictures = cut_templates(self.lenses, Pyramid(grey(frame.image)), frame.camera, pose, points, normals)
-            sharp = pictures.contrast > MIN_PATCH_CONTRAST
-            self._cut.append((first.track[sharp], pictures.take(sharp)))
+            pose = motion.poses(expected, motion.observations_at(frames.stamp))[frame.camera]
+            points = se3.transform_points(pose, motion.map.points[view.track])
+            spots = on_rays(motion.rig, frame.camera, view.pixels, points)  # exactly those of the tracks
+            points, normals = se3.transform_points(se3.inverse(pose), spots), motion.map.normals[view.track]
+            templates = cut_templates(self.lenses, Pyramid(grey(frame.image)), frame.camera, pose, points, normals)
+            sharp = templates.contrast > MIN_PATCH_CONTRAST
+            self._templates.append((view.track[sharp], templates.take(sharp)))
 
     def matcher(self) -> tuple[NDArray[np.int64], Matcher] | None:
-        """The rows (M,) of the landmarks whose pictures were cut, and a matcher of them; None without any."""
-        rows = np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in self._cut)])
+        """The rows (M,) of the landmarks with templates, and their matcher; None without any."""
+        rows = np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in self._templates)])
         if not len(rows):
             return None
-        whole, nothing = self.motion.map, np.zeros((0, 0))  # of their covariance
-        some = SurfaceMap(whole.points[rows], whole.normals[rows], nothing)
-        return rows, Matcher(self.lenses, some, join([part for _, part in self._cut]))
+        surface_map, no_covariance = self.motion.map, np.zeros((0, 0))  # of their covariance
+        subset = SurfaceMap(surface_map.points[rows], surface_map.normals[rows], no_covariance)
+        return rows, Matcher(self.lenses, subset, join([part for _, part in self._templates]))
 
 
 class Reobserver:
-    """Looks for a recording's landmarks in its frame sets, given one after the other."""
+    """Finds a recording's landmarks in its frame sets, given in order of stamp."""
 
     def __init__(self, motion: KnownMotion, rows: NDArray[np.int64], matcher: Matcher) -> None:
-        """rows: (M,) of the motion's map, which the matcher's map has."""
+        """rows: (M,) of the motion's map, those of the matcher's map."""
         self._motion, self._rows, self._matcher = motion, rows, matcher
-        self._place_of = np.full(len(motion.map), -1)
-        self._place_of[rows] = np.arange(len(rows))
-        self._apart = np.zeros((len(motion.rig), len(motion.map), 3))  # px from tracks to pictures, summed; and count
+        self._matcher_row = np.full(len(motion.map), -1)
+        self._matcher_row[rows] = np.arange(len(rows))
+        self._offset_sums = np.zeros((len(motion.rig), len(motion.map), 3))  # sums, px, from track to template; count
         self._is_new = DuplicateFilter()
-        self._waiting: deque[tuple[float, dict[int, Pyramid]]] = deque(maxlen=MAX_WAITING_SETS)
+        self._pending_sets: deque[tuple[float, dict[int, Pyramid]]] = deque(maxlen=MAX_WAITING_SETS)
 
     def __call__(self, frames: FrameSet) -> list[Observations]:
-        """New observations of rows of the motion's map in this frame set, and in those that waited for it; by stamp."""
+        """New observations of rows of the motion's map in this frame set and in pending ones before it; by stamp."""
         motion = self._motion
-        stamp = motion.observed_at(frames.stamp).stamp  # to its last bit
+        stamp = motion.observations_at(frames.stamp).stamp  # to its last bit
         images = {f.camera: grey(f.image) for f in frames.frames}
         pyramids = {c: Pyramid(image) for c, image in images.items() if self._is_new(c, image)}
         if motion.is_in_other_set(stamp) or not pyramids:
             return []
         expected = motion.at(stamp)
         if expected is None or motion.image_sigmas(expected)[1] > COARSE_REACH_PX:
-            self._waiting.append((stamp, pyramids))
+            self._pending_sets.append((stamp, pyramids))
             return []
         new = self._new_observations(stamp, pyramids, expected)
-        out = self._backwards(stamp, pyramids, expected, joined_observations(motion.observed_at(stamp), new))
+        out = self._track_backwards(stamp, pyramids, expected, joined_observations(motion.observations_at(stamp), new))
         return [part for part in (*out, new) if len(part)]
 
     def as_tracks(self, new: Observations) -> Observations:
-        """New observations with the ids of the recording's tracks, corrected to exactly the tracks' spots.
+        """New observations with the ids of the recording's tracks, corrected for the offset between both templates.
 
-        A track is of the picture that the run had, which shows the landmark a little beside the one cut here. The
-        offset is known where a frame set has both; without it a landmark would jump where one takes over.
+        A track follows the run's own template, which is centred slightly off the one cut here. The mean offset is taken
+        from frame sets with both; without the correction a landmark would jump between track and new observation.
         """
-        apart = self._apart[new.camera, new.track]
-        pixels = new.pixels - apart[:, :2] / np.maximum(apart[:, 2:], 1.0)
+        offsets = self._offset_sums[new.camera, new.track]
+        pixels = new.pixels - offsets[:, :2] / np.maximum(offsets[:, 2:], 1.0)
         return replace(new, pixels=pixels, track=self._motion.smoothed.tracks[new.track])
 
     def _new_observations(self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface) -> Observations:
-        """Of the landmarks without an observation in this frame set, whose place in it is known well enough."""
+        """Of landmarks not observed in this frame set, whose projection is known to COARSE_REACH_PX."""
         motion, matcher = self._motion, self._matcher
-        tracks, sigma = motion.observed_at(stamp), motion.image_sigmas(expected)[0]
+        tracks, sigma = motion.observations_at(stamp), motion.image_sigmas(expected)[0]
         poses = motion.poses(expected, tracks)
         missing = (sigma < COARSE_REACH_PX) & motion.unobserved(stamp)
         missing[[c for c in range(len(missing)) if c not in pyramids]] = False
         coarse = bool(missing.any()) and float(np.median(sigma[missing])) > FINE_REACH_PX
-        new = self._of_motion(matcher.align(stamp, pyramids, {c: poses[c] for c in pyramids}, coarse=coarse))
+        new = self._as_motion_rows(matcher.align(stamp, pyramids, {c: poses[c] for c in pyramids}, coarse=coarse))
         self._add_offsets(tracks, new)
         projected = project(motion.rig, new.camera, poses, motion.map.points[new.track])[0]
         near = np.linalg.norm(new.pixels - projected, axis=1) < MAX_RESIDUAL * (1 + sigma[new.camera, new.track])
         new = new.only(near & missing[new.camera, new.track])
-        whole = joined_observations(self._of_matcher(tracks), new)
-        return new.only(np.isin(new.camera, self._showing_cameras(pyramids, expected.base_from_surface, whole)))
+        observations = joined_observations(self._as_matcher_rows(tracks), new)
+        return new.only(np.isin(new.camera, self._showing_cameras(pyramids, expected.base_from_surface, observations)))
 
     def _add_offsets(self, tracks: Observations, new: Observations) -> None:
-        """Take how far, px, observations of landmarks' pictures lie from the tracks of the same frame set."""
-        known = np.full(self._apart.shape[:2] + (2,), np.nan)
-        known[tracks.camera, tracks.track] = tracks.pixels
-        off = new.pixels - known[new.camera, new.track]
-        both = np.linalg.norm(off, axis=1) < MAX_RESIDUAL  # not where one is unknown
-        self._apart[new.camera[both], new.track[both]] += np.c_[off[both], np.ones(both.sum())]
+        """Add the offsets, px, of new observations from the tracks of the same frame set."""
+        track_pixels = np.full(self._offset_sums.shape[:2] + (2,), np.nan)
+        track_pixels[tracks.camera, tracks.track] = tracks.pixels
+        offset = new.pixels - track_pixels[new.camera, new.track]
+        close = np.linalg.norm(offset, axis=1) < MAX_RESIDUAL  # False for nan
+        self._offset_sums[new.camera[close], new.track[close]] += np.c_[offset[close], np.ones(close.sum())]
 
-    def _showing_cameras(self, pyramids: dict[int, Pyramid], pose: Array, observed: Observations) -> list[int]:
-        """The cameras with enough observations, of what is in view at a pose (4, 4), for the surface to be there."""
-        view = self._matcher.in_view(list(pyramids), pose)
-        counts = np.bincount(observed.camera, minlength=len(self._motion.rig))
-        return [c for c, count in view.items() if counts[c] >= MIN_VIEW_SHARE * count]
+    def _showing_cameras(self, pyramids: dict[int, Pyramid], pose: Array, observations: Observations) -> list[int]:
+        """The cameras that observe at least MIN_VIEW_SHARE of the landmarks in view at a pose (4, 4)."""
+        visible = self._matcher.in_view(list(pyramids), pose)
+        counts = np.bincount(observations.camera, minlength=len(self._motion.rig))
+        return [c for c, count in visible.items() if counts[c] >= MIN_VIEW_SHARE * count]
 
-    def _backwards(
-        self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface, observed: Observations
+    def _track_backwards(
+        self, stamp: float, pyramids: dict[int, Pyramid], expected: ExpectedSurface, observations: Observations
     ) -> list[Observations]:
-        """New observations of the sets that waited, followed backwards from the set after them; by stamp.
+        """New observations of the pending sets, tracked backwards from the set after them; by stamp.
 
-        observed: the observations of that set, at `stamp`, s.
+        observations: of that set, at `stamp`, s.
         """
         matcher, rig = self._matcher, self._motion.rig
         pose, twist, out = expected.base_from_surface, expected.twist, list[Observations]()
-        tracks = self._of_matcher(observed)
-        agrees = np.ones(len(tracks), bool)
-        while self._waiting:
-            matcher.remember(pyramids, tracks, agrees, pose)
-            before, pyramids = self._waiting.pop()
-            joint, single = matcher.flow(pyramids, pose @ se3.exp((before - stamp) * twist))
-            tracks = matcher.align(before, pyramids, single, coarse=True)
+        tracks = self._as_matcher_rows(observations)
+        inlier = np.ones(len(tracks), bool)
+        while self._pending_sets:
+            matcher.remember(pyramids, tracks, inlier, pose)
+            stamp_before, pyramids = self._pending_sets.pop()
+            joint, single = matcher.flow(pyramids, pose @ se3.exp((stamp_before - stamp) * twist))
+            tracks = matcher.align(stamp_before, pyramids, single, coarse=True)
             if len(tracks) < MIN_POSE_LANDMARKS:
                 break
             sigma, points = np.maximum(tracks.sigma, MIN_REOBSERVATION_SIGMA_PX), matcher.map.points[tracks.track]
-            measured = PointTracks(tracks.camera, points, tracks.pixels, sigma)
-            fit = solve_pose(rig, measured, joint, scales=ROUGH_START_SCALES)
-            agrees = fit.weights > 0.2
-            showing = self._showing_cameras(pyramids, fit.base_from_surface, tracks.only(agrees))
-            agrees &= np.isin(tracks.camera, showing)
-            if agrees.sum() < max(MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE * len(tracks)):
+            point_tracks = PointTracks(tracks.camera, points, tracks.pixels, sigma)
+            fit = solve_pose(rig, point_tracks, joint, scales=ROUGH_START_SCALES)
+            inlier = fit.weights > 0.2
+            cameras = self._showing_cameras(pyramids, fit.base_from_surface, tracks.only(inlier))
+            inlier &= np.isin(tracks.camera, cameras)
+            if inlier.sum() < max(MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE * len(tracks)):
                 break
-            twist = se3.log(se3.inverse(fit.base_from_surface) @ pose) / (stamp - before)
-            pose, stamp = fit.base_from_surface, before
-            new = self._of_motion(tracks.only(agrees))
-            out.append(new.only(self._motion.unobserved(before)[new.camera, new.track]))
-        self._waiting.clear()
+            twist = se3.log(se3.inverse(fit.base_from_surface) @ pose) / (stamp - stamp_before)
+            pose, stamp = fit.base_from_surface, stamp_before
+            new = self._as_motion_rows(tracks.only(inlier))
+            out.append(new.only(self._motion.unobserved(stamp_before)[new.camera, new.track]))
+        self._pending_sets.clear()
         return out[::-1]
 
-    def _of_motion(self, observations: Observations) -> Observations:
+    def _as_motion_rows(self, observations: Observations) -> Observations:
         """Rows of the matcher's map as the motion's."""
         return replace(observations, track=self._rows[observations.track])
 
-    def _of_matcher(self, observations: Observations) -> Observations:
-        """Rows of the motion's map as the matcher's, those that it has."""
-        observations = observations.only(self._place_of[observations.track] >= 0)
-        return replace(observations, track=self._place_of[observations.track])
+    def _as_matcher_rows(self, observations: Observations) -> Observations:
+        """Rows of the motion's map as the matcher's; without landmarks that it lacks."""
+        observations = observations.only(self._matcher_row[observations.track] >= 0)
+        return replace(observations, track=self._matcher_row[observations.track])
 
 
 def _first_views(motion: KnownMotion) -> dict[tuple[int, int], Observations]:
-    """By frame set and camera, the observations at which landmarks' pictures are to be cut.
+    """By frame set and camera, the observations at which templates are cut.
 
-    Of each landmark it is the first that lies where the motion puts it, in the camera that sees it most squarely.
+    Of each landmark: its first within MAX_RESIDUAL of the projection, in the camera that faces it most.
     """
-    whole, out = motion.map, dict[tuple[int, int], Observations]()
-    uncut = np.ones(len(whole), bool)
+    surface_map, out = motion.map, dict[tuple[int, int], Observations]()
+    pending = np.ones(len(surface_map), bool)
     eyes = np.stack([camera.base_from_camera[:3, 3] for camera in motion.rig.cameras])
-    for k, every in enumerate(motion.observations):
-        tracks = every.only(uncut[every.track])
+    for k, observations in enumerate(motion.observations):
+        tracks = observations.only(pending[observations.track])
         expected = motion.at(tracks.stamp)
         if not len(tracks) or expected is None:
             continue
-        poses = motion.poses(expected, every)
-        projected = project(motion.rig, tracks.camera, poses, whole.points[tracks.track])[0]
+        poses = motion.poses(expected, observations)
+        projected = project(motion.rig, tracks.camera, poses, surface_map.points[tracks.track])[0]
         tracks = tracks.only(np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_RESIDUAL)
-        away = se3.transform_points(se3.inverse(expected.base_from_surface), eyes)[tracks.camera]
-        away = away - whole.points[tracks.track]
-        squarely = (away * whole.normals[tracks.track]).sum(1) / np.linalg.norm(away, axis=1)
-        order = np.lexsort((-squarely, tracks.track))
+        towards = se3.transform_points(se3.inverse(expected.base_from_surface), eyes)[tracks.camera]
+        towards = towards - surface_map.points[tracks.track]
+        facing = (towards * surface_map.normals[tracks.track]).sum(1) / np.linalg.norm(towards, axis=1)
+        order = np.lexsort((-facing, tracks.track))
         best = np.zeros(len(tracks), bool)
         best[order[np.unique(tracks.track[order], return_index=True)[1]]] = True
         out |= {(k, int(c)): tracks.only(best & (tracks.camera == c)) for c in np.unique(tracks.camera[best])}
-        uncut[tracks.track] = False
+        pending[tracks.track] = False
     return out
 
 

@@ -1,8 +1,8 @@
 """TrackingStep: one frame set in, one surface pose out; no I/O and no clock of its own.
 
-The motion model predicts where each landmark is in the images; where it is too uncertain, optical flow from the last
-images does. Alignment with the landmark's reference picture measures it, and the estimator fits the pose to all. A
-camera with too few measured landmarks is relocalised by SIFT features.
+The motion model predicts where each landmark is in the images, or optical flow does where that is too uncertain.
+Alignment with its reference picture measures a landmark; the estimator fits the pose to all of them. A camera with too
+few measured landmarks is relocalised by SIFT features.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ MAX_ALIGNED_LANDMARKS = 120
 ROUGH_START_SCALES = 4.0, 1.0  # of a fit whose start may be pixels off
 # One sigma of the prediction, px: alignment reaches three of it, on the full image and on the half-size one.
 FINE_REACH_PX, COARSE_REACH_PX = 0.8, 2.5
-MAX_PROBE_OFFSET_PX = 0.5  # by which a camera may stand off the pose: beyond, its own pose is asked for
-PARALLEL_BYTES = 4e6  # of all pictures: smaller ones are grey sooner than another thread begins
-FULL_SEARCH_INTERVAL = 10  # frame sets of an absent surface between searches at full size: a far one needs it
+MAX_PROBE_OFFSET_PX = 0.5  # of a camera from the joint pose: beyond it the camera's own pose is fitted
+PARALLEL_BYTES = 4e6  # of all pictures: below it, converting them to grey takes less time than starting a thread
+FULL_SEARCH_INTERVAL = 10  # frame sets between full-size searches for a lost surface: a distant one needs full size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,12 +57,12 @@ class StepReport:
     observations: Observations
     used: NDArray[np.int64]  # (C,) tracks that carry the pose
     seconds: Array  # (len(STAGES),) s, by the step's clock
-    offsets: Array  # (C,) s, by which each camera was taken to expose later than stamped, against the mean of all
-    offset_sigmas: Array  # (C,) s, one standard deviation, nan where nothing is learned of it
+    offsets: Array  # (C,) s, exposure offset of each camera from its stamp, relative to the mean of all
+    offset_sigmas: Array  # (C,) s, one standard deviation, nan where none is estimated
 
 
 def report_without_offsets(observations: Observations, used: NDArray[np.int64], seconds: Array) -> StepReport:
-    """The report of a step that takes every stamp for the instant of its exposure."""
+    """The report of a step that assumes zero exposure offsets."""
     return StepReport(observations, used, seconds, np.zeros(len(used)), np.full(len(used), np.nan))
 
 
@@ -93,42 +93,41 @@ class TrackingStep:
         """Ready for the first frame set.
 
         roi: where the surface is when it first comes into view; without one, whatever two cameras see is the surface.
-        clock: fills `StepReport.seconds` and nothing else.
-        executor: where the map is refined; in a process of its own GTSAM does not hold up the frames. Without one the
-            map is refined in `idle`. Poses are the same either way.
-        waits: whether `idle` waits for what is due; else it counts once it is there, and poses depend on when that is.
+        clock: used for `StepReport.seconds` only.
+        executor: refines the map; in a separate process GTSAM does not delay the frames. Without one the map is refined
+            in `idle`. Poses are the same either way.
+        waits: whether `idle` waits for results that are due; else poses depend on when results arrive.
         scan: its frame is the surface frame; without one the first map defines it (origin at the landmarks' centroid, z
             out of the surface).
-        tool: shape of the print head, masked where frame sets tell its pose.
+        tool: shape of the print head, masked where frame sets contain its pose.
         prefilter: applied to each grey picture first.
         """
         self.rig, self.roi, self._clock = rig, tuple(roi), clock
         self._lenses, self._prefilter = Lenses(rig), prefilter
         whole = of_whole_pictures(self.roi, [camera.size for camera in rig.cameras])
-        found = any(roi.found for roi in self.roi)
-        self._estimator = Estimator(rig, region="none" if whole else "found" if found else "drawn")
+        detected = any(roi.found for roi in self.roi)
+        self._estimator = Estimator(rig, region="none" if whole else "found" if detected else "drawn")
         self._is_new = DuplicateFilter()
         self._search, self._masks = Relocaliser(self._lenses), TrackingMasks(self._lenses, tool)
-        how = executor, scan, waits
-        self._mapping = Mapping(self._lenses, self.roi, self._search, self._estimator, self._masks, *how)
+        self._mapping = Mapping(self._lenses, roi, self._search, self._estimator, self._masks, executor, scan, waits)
         self._matcher: Matcher | None = None
-        self._forget_looks()
-        self._unverified: TrackedSet | None = None  # by which the verification is to learn the surface
-        self._images: dict[int, Image] = {}  # of the frame set, as they came,
-        self._pictures: dict[int, Pyramid] = {}  # and of the last one
-        self._searched: dict[int, Pyramid] = {}  # images of cameras that `idle` is to search for the surface
-        self._relocalised: Array | None = None  # (4, 4), where the last search saw the surface
-        self._absent = 0  # frame sets since the surface was last measured
-        self._spent, self._lap = np.zeros(len(STAGES)), 0.0
+        self._reset_appearance()
+        self._unverified_set: TrackedSet | None = None  # from which the verification learns the surface
+        self._images: dict[int, Image] = {}  # of the frame set, as received
+        self._pictures: dict[int, Pyramid] = {}  # of the last frame set
+        self._search_pyramids: dict[int, Pyramid] = {}  # of cameras in which `idle` searches for the surface
+        self._relocalised_pose: Array | None = None  # (4, 4), by the last search
+        self._absent_sets = 0  # frame sets since the surface was last measured
+        self._stage_seconds, self._stage_start = np.zeros(len(STAGES)), 0.0
 
-    def _forget_looks(self) -> None:
-        """Know nothing of how the surface looks, as before its map."""
+    def _reset_appearance(self) -> None:
+        """Discard what is learned of the surface's appearance."""
         self._verification, self._grain = Verification(self._lenses, self._masks), Grain(self._lenses)
         self._colours = Colours(self._lenses, self._masks)
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
         """The pose at `frames.stamp` from this frame set and the ones before."""
-        self._spent, self._lap = np.zeros(len(STAGES)), self._clock()
+        self._stage_seconds, self._stage_start = np.zeros(len(STAGES)), self._clock()
         last = self._estimator.pose
         if last is not None and frames.stamp <= last.stamp:  # the same instant again
             self.last = self._report(no_observations(frames.stamp), np.zeros(len(self.rig), np.int64))
@@ -159,7 +158,7 @@ class TrackingStep:
 
     @property
     def late(self) -> int:
-        """How often a part of the map was not ready when it was due."""
+        """How often a map update was not ready when due."""
         return self._mapping.late
 
     @property
@@ -169,27 +168,27 @@ class TrackingStep:
 
     @property
     def registration(self) -> Registration | None:
-        """Where the scan lies, as of the pictures that confirmed the first map; None before, and without a scan."""
+        """Pose of the scan by the pictures that confirmed the first map; None before, and without a scan."""
         return self._mapping.registration
 
     def idle(self) -> None:
-        """Work that no pose waits for: learning, mapping, relocalisation. Call it after each pose."""
+        """Work outside the pose's latency: learning, mapping, relocalisation. Call it after each pose."""
         self._estimator.learn()
         if self._matcher is not None:
             self._mapping.update()
-        if self._unverified is not None and self._estimator.map is not None:
-            tracked, self._unverified = self._unverified, None
+        if self._unverified_set is not None and self._estimator.map is not None:
+            tracked, self._unverified_set = self._unverified_set, None
             poses = self._mapping.camera_poses(tracked)
             self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
-            carrying = {c: poses[c] for c in self._carrying_cameras(tracked) if c in poses}
-            self._colours.begin(self._images, carrying, self._estimator.map)
+            carrier_poses = {c: poses[c] for c in self._carrying_cameras(tracked) if c in poses}
+            self._colours.begin(self._images, carrier_poses, self._estimator.map)
         if self._mapping.look_for_hint(self._pictures, repeats=len(self._verification.aliases) > 0):
-            self._matcher = self._unverified = None
+            self._matcher = self._unverified_set = None
         self._relocalise()
 
     def _report(self, observations: Observations, used: NDArray[np.int64]) -> StepReport:
         cameras = self._estimator.cameras
-        return StepReport(observations, used, self._spent, cameras.offset, cameras.offset_sigma)
+        return StepReport(observations, used, self._stage_seconds, cameras.offset, cameras.offset_sigma)
 
     def _check(self, frames: FrameSet) -> None:
         for frame in frames.frames:
@@ -198,29 +197,29 @@ class TrackingStep:
                 raise InputError(f"camera {camera.name}", "image size", f"{w} x {h}", "{} x {} px".format(*camera.size))
 
     def _pyramids(self, frames: FrameSet) -> dict[int, Pyramid]:
-        """The new pictures by camera; with a repeated one the surface would seem to stand still."""
+        """The new pictures by camera, without repeated ones, in which the surface would seem to stand still."""
         pictures, cameras = [f.image for f in frames.frames], [f.camera for f in frames.frames]
-        alone = sum(image.size for image in pictures) < PARALLEL_BYTES and self._prefilter is unfiltered
-        greys = [*map(grey, pictures)] if alone else parallel_map(lambda image: self._prefilter(grey(image)), pictures)
-        fresh = {c: Pyramid(image) for c, image in zip(cameras, greys, strict=True) if self._is_new(c, image)}
-        self._estimator.health.set_pictures(fresh, set(cameras) - fresh.keys())
-        return fresh
+        small = sum(image.size for image in pictures) < PARALLEL_BYTES and self._prefilter is unfiltered
+        greys = [*map(grey, pictures)] if small else parallel_map(lambda image: self._prefilter(grey(image)), pictures)
+        pyramids = {c: Pyramid(image) for c, image in zip(cameras, greys, strict=True) if self._is_new(c, image)}
+        self._estimator.health.set_pictures(pyramids, set(cameras) - pyramids.keys())
+        return pyramids
 
     def _add_time(self, stage: str) -> None:
         now = self._clock()
-        self._spent[STAGES.index(stage)] += now - self._lap
-        self._lap = now
+        self._stage_seconds[STAGES.index(stage)] += now - self._stage_start
+        self._stage_start = now
 
     # -- the first map
 
     def _initialise(self, frames: FrameSet, pyramids: dict[int, Pyramid]) -> _StepResult:
-        started = self._mapping.start(frames, pyramids)
+        start = self._mapping.start(frames, pyramids)
         self._add_time("search")
-        if isinstance(started, str):
+        if isinstance(start, str):
             none = np.zeros(len(self.rig), np.int64)
-            return identity_pose(frames.stamp, started), no_observations(frames.stamp), none
-        self._matcher, pose, tracked = started
-        self._forget_looks()
+            return identity_pose(frames.stamp, start), no_observations(frames.stamp), none
+        self._matcher, pose, tracked = start
+        self._reset_appearance()
         return pose, tracked.observations, tracked.fit.used
 
     # -- every frame set after it
@@ -229,8 +228,8 @@ class TrackingStep:
         estimator = self._estimator
         assert estimator.map is not None
         expected = estimator.expected(stamp)
-        if self._relocalised is not None:
-            expected, self._relocalised = replace(expected, base_from_surface=self._relocalised), None
+        if self._relocalised_pose is not None:
+            expected, self._relocalised_pose = replace(expected, base_from_surface=self._relocalised_pose), None
 
         # measurement and fit, from a second start where cameras lost the surface
         joint, observations, scales = self._measure(matcher, expected, pyramids)
@@ -240,7 +239,7 @@ class TrackingStep:
             tracked = self._second_try(tracked, expected.base_from_surface)
             self._add_time("search")
 
-        # the map's confirmation, or its rebuilding on a fast surface; or else the pose's verification
+        # confirm the map, rebuild it on a fast surface, or verify the pose
         fit, aliases = tracked.fit, SURE.sizes
         if not estimator.confirmed:
             if len(self._carrying_cameras(tracked)) < 2:
@@ -248,79 +247,80 @@ class TrackingStep:
                     self._matcher = None
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.hold(stamp, reason), tracked.observations, fit.used
-            tracked = self._unverified = self._mapping.confirm(tracked)
+            tracked = self._unverified_set = self._mapping.confirm(tracked)
         elif fit.measured and not fit.outliers and estimator.too_fast_for_map(fit):
-            tracked = self._unverified = self._mapping.rebuild(tracked)
+            tracked = self._unverified_set = self._mapping.rebuild(tracked)
         elif fit.measured:
-            tracked, aliases = self._verified(tracked)
+            tracked, aliases = self._verify(tracked)
 
         # the pose
         fit, observations = tracked.fit, tracked.observations
         if fit.measured:
-            self._searched = {c: pyramids[c] for c in self._lost_cameras(tracked)}
-            self._absent = 0
+            self._search_pyramids = {c: pyramids[c] for c in self._lost_cameras(tracked)}
+            self._absent_sets = 0
             exposed = estimator.as_exposed(fit.solution.base_from_surface, fit.twist)
-            fit = replace(fit, shadowed=matcher.lit(pyramids, exposed, observations, ~fit.inlier))
-            away = estimator.elsewhere(fit, observations)
-            place = fit.solution.base_from_surface
-            apart = None if away is None else matcher.align_at(stamp, pyramids, place, away.rows, away.points)
-            there = {c: exposed[c] for c in self._carrying_cameras(tracked)}
-            displaced = self._colours(self._images, there, estimator.expected(stamp).warp)
-            pose = estimator.accept(fit, observations, apart, aliases, displaced)
+            fit = replace(fit, shadowed=matcher.shadowed_tracks(pyramids, exposed, observations, ~fit.inlier))
+            query = estimator.elsewhere(fit, observations)
+            start = fit.solution.base_from_surface
+            elsewhere = None if query is None else matcher.align_at(stamp, pyramids, start, query.rows, query.points)
+            carrier_poses = {c: exposed[c] for c in self._carrying_cameras(tracked)}
+            displaced = self._colours(self._images, carrier_poses, estimator.expected(stamp).warp)
+            pose = estimator.accept(fit, observations, elsewhere, aliases, displaced)
             if not (fit.outliers or fit.rivals or len(aliases) or displaced.whole):
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.followed, fit.solution.base_from_surface)
         else:
             pose = estimator.coast(fit)
-            self._absent += 1
-            self._searched = pyramids
+            self._absent_sets += 1
+            self._search_pyramids = pyramids
         self._add_time("pose")
         return pose, observations, fit.used
 
-    def _verified(self, tracked: TrackedSet) -> tuple[TrackedSet, Array]:
-        """The frame set at the alias that its pictures prefer, and how far (K,) mm away those are that they leave open.
+    def _verify(self, tracked: TrackedSet) -> tuple[TrackedSet, Array]:
+        """The frame set fitted at the likeliest alias, and distances (K,) mm of the aliases that are not ruled out.
 
-        It is no measurement where the surface's grain contradicts its tracks.
+        The fit counts as no measurement where the surface's grain contradicts its tracks.
         """
-        poses, verdict = self._look(tracked)
-        given, first, ruled_out = tracked, poses, list[int]()
-        for number, moved in enumerate(verdict.alive[: verdict.rivals]):
-            starts, pose = {c: pose @ moved for c, pose in first.items()}, given.fit.solution.base_from_surface
-            again = self._mapping.align_and_fit(given.fit.stamp, given.pyramids, starts, pose @ moved)
-            if not again.fit.measured:
+        poses, verdict = self._verify_pose(tracked)
+        original, original_poses, ruled_out = tracked, poses, list[int]()
+        for number, motion in enumerate(verdict.motions[: verdict.rivals]):
+            pose = original.fit.solution.base_from_surface
+            starts = {c: own @ motion for c, own in original_poses.items()}
+            retry = self._mapping.align_and_fit(original.fit.stamp, original.pyramids, starts, pose @ motion)
+            if not retry.fit.measured:
                 continue
-            there, second = self._look(again)
-            if second.likeness > verdict.likeness + BETTER_LIKENESS:
-                tracked, poses, verdict = again, there, second
-            elif second.likeness < verdict.likeness - WORSE_LIKENESS and tracked is given:
+            retry_poses, retry_verdict = self._verify_pose(retry)
+            if retry_verdict.likeness > verdict.likeness + BETTER_LIKENESS:
+                tracked, poses, verdict = retry, retry_poses, retry_verdict
+            elif retry_verdict.likeness < verdict.likeness - WORSE_LIKENESS and tracked is original:
                 ruled_out.append(number)
-        aliases = np.delete(verdict.sizes, ruled_out) if tracked is given else verdict.sizes
-        if tracked is not given:
+        aliases = np.delete(verdict.sizes, ruled_out) if tracked is original else verdict.sizes
+        if tracked is not original:
             self._estimator.forget_motion()
-        light = self._follows_light(tracked)
-        if light:
-            return replace(tracked, fit=replace(tracked.fit, reason=light)), aliases
+        reason = self._light_reason(tracked)
+        if reason:
+            return replace(tracked, fit=replace(tracked.fit, reason=reason)), aliases
         if not len(aliases):
-            self._verification.take(tracked.fit.stamp, poses)
+            self._verification.confirm(tracked.fit.stamp, poses)
             self._grain.learn()
         return tracked, aliases
 
-    def _follows_light(self, tracked: TrackedSet) -> str:
+    def _light_reason(self, tracked: TrackedSet) -> str:
         """Why the tracks that carry a fit do not show the surface, or ''."""
         assert self._matcher is not None
         fit = tracked.fit
         tracks, pose = tracked.observations.only(fit.inlier), fit.solution.base_from_surface
-        doubted = self._estimator.looks_unusual(fit)
-        return self._grain(tracked.pyramids, tracks, pose, self._matcher.map, self._matcher.templates, doubted)
+        unusual = self._estimator.looks_unusual(fit)
+        return self._grain(tracked.pyramids, tracks, pose, self._matcher.map, self._matcher.templates, unusual)
 
-    def _look(self, tracked: TrackedSet) -> tuple[dict[int, Array], Verdict]:
-        """Each trusted camera's own pose (4, 4) of a frame set, and what the pictures say of it."""
+    def _verify_pose(self, tracked: TrackedSet) -> tuple[dict[int, Array], Verdict]:
+        """Each trusted camera's own pose (4, 4) of a frame set, and the verdict on them by the pictures."""
         if not len(self._verification.aliases):
             return {}, SURE
         fit = tracked.fit
         exposed = self._estimator.as_exposed(fit.solution.base_from_surface, fit.twist)
-        apart = np.nanmax(fit.offsets, initial=0.0) > MAX_PROBE_OFFSET_PX
-        poses = self._mapping.camera_poses(tracked) if apart else {c: exposed[c] for c in tracked.pyramids}
+        cameras_differ = np.nanmax(fit.offsets, initial=0.0) > MAX_PROBE_OFFSET_PX
+        poses = self._mapping.camera_poses(tracked) if cameras_differ else {c: exposed[c] for c in tracked.pyramids}
         trusted = {c: pose for c, pose in poses.items() if c not in fit.outliers}
         return trusted, self._verification(fit.stamp, tracked.pyramids, trusted)
 
@@ -329,41 +329,40 @@ class TrackingStep:
     ) -> tuple[Array, Observations, tuple[float, ...]]:
         """A start for the fit (4, 4), the landmarks measured in the images, and the fit's scales, from coarse to fine.
 
-        Alignment begins at the predicted pose where that is known to COARSE_REACH_PX, on the half-size images unless it
-        is known to FINE_REACH_PX. Optical flow gives the start where the prediction is less certain, and where fewer
-        landmarks are measured than in the last images.
+        Alignment starts at the predicted pose where its sigma is below COARSE_REACH_PX (on half-size images above
+        FINE_REACH_PX); else, or where fewer landmarks are measured than in the last images, at that of optical flow.
         """
         stamp, predicted, observations = expected.stamp, expected.base_from_surface, None
-        late = self._estimator.cameras.delays.sigma * expected.twist  # (6,) by which an exposure may be off
-        sigma = matcher.image_sigma(predicted, expected.covariance + np.outer(late, late))
+        delay_error = self._estimator.cameras.delays.sigma * expected.twist  # (6,) one sigma, as pose
+        sigma = matcher.image_sigma(predicted, expected.covariance + np.outer(delay_error, delay_error))
         if sigma < COARSE_REACH_PX:
             exposed = self._estimator.as_exposed(predicted, expected.twist)
-            apart = self._estimator.health.rivals.own_poses(onwards=True)
-            starts, coarse = {c: apart.get(c, exposed[c]) for c in pyramids}, sigma > FINE_REACH_PX
-            observations = matcher.align(stamp, pyramids, starts, coarse=coarse, most=MAX_ALIGNED_LANDMARKS)
+            own_poses = self._estimator.health.rivals.own_poses(onwards=True)
+            starts, coarse = {c: own_poses.get(c, exposed[c]) for c in pyramids}, sigma > FINE_REACH_PX
+            observations = matcher.align(stamp, pyramids, starts, coarse=coarse, limit=MAX_ALIGNED_LANDMARKS)
             self._add_time("align")
             if matcher.is_complete(observations, pyramids):
                 return predicted, observations, ROUGH_START_SCALES if coarse else (1.0,)
         joint, single = matcher.flow(pyramids, predicted)
         self._add_time("flow")
-        again = matcher.align(stamp, pyramids, single, most=MAX_ALIGNED_LANDMARKS)
+        retry = matcher.align(stamp, pyramids, single, limit=MAX_ALIGNED_LANDMARKS)
         self._add_time("align")
-        if observations is not None and len(observations) > len(again):
+        if observations is not None and len(observations) > len(retry):
             return predicted, observations, ROUGH_START_SCALES
-        return joint, again, ROUGH_START_SCALES
+        return joint, retry, ROUGH_START_SCALES
 
     def _lost_cameras(self, tracked: TrackedSet) -> list[int]:
-        """Cameras that carried the last pose and now hardly see the surface."""
+        """Cameras that carried the last pose and now measure few landmarks."""
         assert self._matcher is not None
-        apart = {c for rival in tracked.fit.rivals if rival.inlier.any() for c in rival.cameras}
-        before = {c: self._matcher.last_count(c) for c in tracked.pyramids if c not in apart}
-        return [c for c, n in before.items() if n >= 20 and tracked.fit.used[c] < 0.3 * n]
+        rivals = {c for rival in tracked.fit.rivals if rival.inlier.any() for c in rival.cameras}
+        counts = {c: self._matcher.last_count(c) for c in tracked.pyramids if c not in rivals}
+        return [c for c, n in counts.items() if n >= 20 and tracked.fit.used[c] < 0.3 * n]
 
     def _second_try(self, tracked: TrackedSet, predicted: Array) -> TrackedSet:
         """The frame set aligned from a better start: the pose of the other cameras, or the predicted one (4, 4).
 
-        Relocalisation by SIFT takes 50 ms a camera and would delay the pose, so it runs in `idle`. Only an unconfirmed
-        first map does not wait for that: it is worth little until two cameras have seen it again.
+        Relocalisation by SIFT takes 50 ms a camera and would delay the pose, so it runs in `idle`; but at once for an
+        unconfirmed first map, which is of little use until two cameras have seen it again.
         """
         tracked = self._realign(tracked, tracked.fit.solution.base_from_surface if tracked.fit.measured else predicted)
         unsure = not self._estimator.confirmed and len(self._carrying_cameras(tracked)) < min(2, len(tracked.pyramids))
@@ -374,27 +373,27 @@ class TrackingStep:
     def _realign(self, tracked: TrackedSet, start: Array, single: dict[int, Array] | None = None) -> TrackedSet:
         """Align and fit again from a start (4, 4), or by camera from `single`; the better of both fits."""
         starts = {c: (single or {}).get(c, start) for c in tracked.pyramids}
-        again = self._mapping.align_and_fit(tracked.fit.stamp, tracked.pyramids, starts, start)
-        more = not tracked.fit.measured or again.fit.used.sum() > tracked.fit.used.sum()
-        return again if again.fit.measured and more else tracked
+        retry = self._mapping.align_and_fit(tracked.fit.stamp, tracked.pyramids, starts, start)
+        better = not tracked.fit.measured or retry.fit.used.sum() > tracked.fit.used.sum()
+        return retry if retry.fit.measured and better else tracked
 
     def _carrying_cameras(self, tracked: TrackedSet) -> list[int]:
         """The cameras that carry a fit as they carried the last one."""
         return sorted(set(self._estimator.carrying_cameras(tracked.fit).tolist()) - set(self._lost_cameras(tracked)))
 
     def _relocalise(self) -> None:
-        """Search the last images by SIFT for cameras that have lost the surface, so that the next flow begins there."""
-        pyramids, self._searched = self._searched, {}
+        """Relocalise by SIFT, in the last images, a camera that lost the surface, for the start of the next flow."""
+        pyramids, self._search_pyramids = self._search_pyramids, {}
         if not pyramids or self._matcher is None:
             return
-        camera = sorted(pyramids)[self._absent % len(pyramids)]  # one a frame set: the next set comes soon
-        place = self._search.find({camera: pyramids[camera]}, half=self._absent % FULL_SEARCH_INTERVAL != 0)
+        camera = sorted(pyramids)[self._absent_sets % len(pyramids)]  # one camera per frame set
+        place = self._search.find({camera: pyramids[camera]}, half=self._absent_sets % FULL_SEARCH_INTERVAL != 0)
         if place is None:
             return
         pose = place.base_from_surface
         starts = {c: place.single.get(c, pose) for c in pyramids}
-        again = self._mapping.align_and_fit(self.last.observations.stamp, pyramids, starts, pose)
-        if again.fit.measured:
-            pose = again.fit.solution.base_from_surface
-            self._matcher.remember(pyramids, again.observations, again.fit.inlier, pose)
-            self._relocalised = pose if self._absent else None
+        retry = self._mapping.align_and_fit(self.last.observations.stamp, pyramids, starts, pose)
+        if retry.fit.measured:
+            pose = retry.fit.solution.base_from_surface
+            self._matcher.remember(pyramids, retry.observations, retry.fit.inlier, pose)
+            self._relocalised_pose = pose if self._absent_sets else None

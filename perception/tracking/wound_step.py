@@ -1,4 +1,4 @@
-"""The wound over time in each camera, segmented beside the tracker, and a tracking step that begins where it lies."""
+"""The wound over time in each camera, segmented in parallel to the tracker; a tracking step for its region."""
 
 from __future__ import annotations
 
@@ -37,58 +37,58 @@ MAX_MISSED_LOOKS = 3  # looks without it, after which a wound is dropped
 class WoundEstimate:
     """One camera's wound, filtered over time."""
 
-    mask: WoundMask  # (H, W) of its largest part, as last seen
-    box: Box | None  # round the mask; None: no wound
-    roi: Box  # where to look for it now
+    mask: WoundMask  # (H, W) of its largest part, when last detected
+    box: Box | None  # of the mask; None: no wound
+    roi: Box  # search region of the next look
     centroid: Array  # (2,) px
     confidence: float  # of the last look
-    missed: int  # looks since it was seen
+    missed: int  # looks since the last detection
 
 
 class WoundFilter:
-    """Remembers where one camera saw the wound."""
+    """Filters one camera's detections of the wound over time."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         """size: (W, H) px of the camera's images."""
         self._size = size
         self._mask: WoundMask = np.zeros(size[::-1], bool)
         self._box: Box | None = None
-        self._elsewhere: Box | None = None  # where another place was seen once
-        self._missed = 0
+        self._other_box: Box | None = None  # of the last look's detection
+        self._missed_looks = 0
 
     def take(self, look: Segmentation) -> WoundEstimate:
-        """Add one look. A wound that jumps is accepted at the second look that shows it there; one that is not seen
-        stays for a few looks; the region holds both where it is and where it was (thesis Fig. 3.4)."""
-        before = self._box
+        """Add one look. A jump is accepted when the second look confirms it; a missed wound is kept for
+        MAX_MISSED_LOOKS; the region contains the current and the last box (thesis Fig. 3.4)."""
+        last_box = self._box
         mask = largest_part(look.mask)
         box = box_of(mask)
-        known = [place for place in (before, self._elsewhere) if place is not None]
-        if box is None or (before is not None and all(overlap(box, place) <= SAME_WOUND_OVERLAP for place in known)):
-            self._missed += 1
-            if self._missed > MAX_MISSED_LOOKS:
+        places = [place for place in (last_box, self._other_box) if place is not None]
+        if box is None or (last_box is not None and all(overlap(box, place) <= SAME_WOUND_OVERLAP for place in places)):
+            self._missed_looks += 1
+            if self._missed_looks > MAX_MISSED_LOOKS:
                 self._box, self._mask = None, np.zeros_like(self._mask)
         else:
-            self._box, self._mask, self._missed = box, mask, 0
-        self._elsewhere = box
-        roi = region(None if self._missed else self._box, before, self._size)
-        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), look.confidence, self._missed)
+            self._box, self._mask, self._missed_looks = box, mask, 0
+        self._other_box = box
+        roi = region(None if self._missed_looks else self._box, last_box, self._size)
+        return WoundEstimate(self._mask, self._box, roi, centroid(self._mask), look.confidence, self._missed_looks)
 
 
 def overlap(a: Box, b: Box) -> float:
     """Area of two boxes' intersection over that of their union."""
     width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    both = max(0, width) * max(0, height)
-    return both / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both)
+    intersection = max(0, width) * max(0, height)
+    return intersection / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - intersection)
 
 
-SEGMENTATION_DELAY_SETS = 3  # until a result counts: three cameras take 60 ms of one core, a set comes every 33 ms
+SEGMENTATION_DELAY_SETS = 3  # until a result is used: three cameras take 60 ms of one core, a frame set 33 ms
 
 
 class AsyncSegmentation:
-    """Segments pictures beside the tracker.
+    """Segments pictures in parallel to the tracker.
 
-    A result counts a fixed number of frame sets after its pictures, however soon it was ready: a recording gives the
-    same every time. Pictures that come while a job is under way are skipped; the next job takes the newest.
+    A result is used a fixed number of frame sets after its pictures, even if it was ready before: replays are
+    deterministic. Pictures that arrive during a job are skipped; the next job takes the newest.
     """
 
     def __init__(
@@ -98,17 +98,17 @@ class AsyncSegmentation:
         self._segmenter = segmenter
         self._filters = [WoundFilter(camera.size) for camera in rig.cameras]
         self._job: DelayedJob[dict[int, Segmentation]] = DelayedJob(executor, delay)
-        self.looked: FrameSet | None = None  # the pictures that the last job was given
+        self.job_frames: FrameSet | None = None  # pictures of the last job
 
     def __call__(self, frames: FrameSet) -> tuple[float, dict[int, WoundEstimate]] | None:
-        """Once a frame set: what is due, as the stamp of the pictures and what each camera sees; None: nothing is."""
-        looks, due = self._job.poll(), None
-        if looks is not None and self.looked is not None:
-            due = self.looked.stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
+        """Once a frame set: the due result, as the pictures' stamp, s, and each camera's wound; None: none is due."""
+        looks, result = self._job.poll(), None
+        if looks is not None and self.job_frames is not None:
+            result = self.job_frames.stamp, {camera: self._filters[camera].take(look) for camera, look in looks.items()}
         if not self._job.busy and frames.frames:
-            self.looked = frames
+            self.job_frames = frames
             self._job.submit(segment_all, self._segmenter, {f.camera: f.image for f in frames.frames})
-        return due
+        return result
 
 
 def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, Segmentation]:
@@ -116,35 +116,35 @@ def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, 
     return {camera: segmenter(image) for camera, image in images.items()}
 
 
-MAX_EMPTY_LOOKS = 2  # without a wound in two cameras; then the whole pictures are taken for the surface
-MAX_PARTIAL_LOOKS = 5  # at a frame or patch that some camera does not see, as the first sets lack cameras
-SKIN_MARGIN_SHARE = 0.6  # of the wound's box on every side: the skin beside it moves with it, and has more to track
+MAX_EMPTY_LOOKS = 2  # without a wound in two cameras, after which whole pictures are the region
+MAX_PARTIAL_LOOKS = 5  # at a frame or patch not seen by all cameras: some may lack in the first frame sets
+SKIN_MARGIN_SHARE = 0.6  # of the wound's box, on every side: the skin there moves with it and has more texture
 WHOLE_PICTURES = "no region and no wound: whole pictures are tracked as one surface; better draw a region"
-WOUND_SOUGHT, PATCH_SOUGHT = "the wound is being looked for", "the coloured frame is being looked for"
+WOUND_SEARCH_TEXT, PATCH_SEARCH_TEXT = "the wound is being looked for", "the coloured frame is being looked for"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WoundSight:
-    """The pictures by which the region was found, and the wound that was seen in them."""
+    """The pictures from which the region was derived, and the wound's masks in them."""
 
     frames: FrameSet
-    masks: Mapping[int, WoundMask]  # (H, W) by camera; none of a camera that saw no wound
+    masks: Mapping[int, WoundMask]  # (H, W) by camera; cameras without a wound are left out
 
 
-FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, known from this frame set on, or why it is not
+FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, from this frame set on, or why there is none
 
 
 class RegionSearch:
-    """Looks for the region by a segmenter, once a frame set, until it is found.
+    """Searches for the region by a segmenter, once a frame set.
 
-    sight: what it was found by; None until then, and of a frame or patch.
+    sight: source of the region; None before, and for a frame or patch.
     """
 
     def __init__(self, rig: Rig, segmenter: Segmenter, executor: Executor | None = None, patch: bool = False) -> None:
         """executor: one thread, as `AsyncSegmentation` takes it.
 
-        patch: the segmenter sees a printed frame or patch, whose outline is the region, and which is waited for. Else
-        it sees a wound, the region has skin beside it, and whole pictures are the region where no wound is seen.
+        patch: the segmenter detects a printed frame or patch, whose outline is the region; the search waits for it.
+        Else it detects a wound; the region includes skin around it, or whole pictures where there is no wound.
         """
         self._rig, self._patch = rig, patch
         self._segmentation = AsyncSegmentation(rig, segmenter, executor)
@@ -152,36 +152,36 @@ class RegionSearch:
         self.sight: WoundSight | None = None
 
     def __call__(self, frames: FrameSet) -> Sequence[Roi] | str:
-        """The region in each camera; two cameras or more see it."""
-        looked = self._segmentation.looked  # what the next result is of
-        due = self._segmentation(frames)
-        if due is None:
-            return self._sought
+        """The region in each camera, once two cameras or more see it; else why there is none."""
+        source = self._segmentation.job_frames  # pictures of the next result
+        result = self._segmentation(frames)
+        if result is None:
+            return self._search_text
         self._looks += 1
-        stamp, sights = due
-        seen = sum(sight.box is not None for sight in sights.values())
-        enough = seen == len(self._rig) or (seen >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS))
+        stamp, wounds = result
+        count = sum(wound.box is not None for wound in wounds.values())
+        enough = count == len(self._rig) or (count >= 2 and not (self._patch and self._looks < MAX_PARTIAL_LOOKS))
         if not enough and (self._patch or self._looks < MAX_EMPTY_LOOKS):
-            return self._sought
-        if looked is not None and not self._patch:
-            self.sight = WoundSight(looked, {c: sight.mask for c, sight in sights.items() if sight.box is not None})
+            return self._search_text
+        if source is not None and not self._patch:
+            self.sight = WoundSight(source, {c: wound.mask for c, wound in wounds.items() if wound.box is not None})
         if enough:
-            return self._rois(stamp, sights)
+            return self._rois(stamp, wounds)
         return whole_pictures([camera.size for camera in self._rig.cameras], stamp)
 
     @property
-    def _sought(self) -> str:
-        return PATCH_SOUGHT if self._patch else WOUND_SOUGHT
+    def _search_text(self) -> str:
+        return PATCH_SEARCH_TEXT if self._patch else WOUND_SEARCH_TEXT
 
-    def _rois(self, stamp: float, sights: dict[int, WoundEstimate]) -> Sequence[Roi]:
-        """Round each camera's wound, the whole picture of a camera that sees none; or round the patch where it is."""
+    def _rois(self, stamp: float, wounds: dict[int, WoundEstimate]) -> Sequence[Roi]:
+        """Regions around each camera's wound, or whole pictures without one; or the patch's outlines."""
         if self._patch:
-            return [Roi(c, stamp, hull_of(sight.mask)) for c, sight in sights.items() if sight.box is not None]
+            return [Roi(c, stamp, hull_of(wound.mask)) for c, wound in wounds.items() if wound.box is not None]
         rois = []
-        for camera, sight in sights.items():
+        for camera, wound in wounds.items():
             size = self._rig.cameras[camera].size
-            side = 0 if sight.box is None else max(sight.box[2] - sight.box[0], sight.box[3] - sight.box[1])
-            shape = polygon(region(sight.box, None, size, SKIN_MARGIN_SHARE * side))
+            side = 0 if wound.box is None else max(wound.box[2] - wound.box[0], wound.box[3] - wound.box[1])
+            shape = polygon(region(wound.box, None, size, SKIN_MARGIN_SHARE * side))
             rois.append(Roi(camera, stamp, shape, found=True))
         return rois
 
@@ -192,20 +192,20 @@ class RegionTrackingStep:
     last: StepReport
 
     def __init__(self, rig: Rig, make_step: Callable[[Sequence[Roi]], TrackingStep], find: FindRegion) -> None:
-        """make_step: the step for a region. find: asked with each frame set until it knows the region."""
+        """make_step: the step for a region. find: called with each frame set until it returns the region."""
         self._rig, self._make_step, self._find = rig, make_step, find
         self._step: TrackingStep | None = None
-        self._caveat = ""  # of poses that nothing else is said of
+        self._caveat = ""  # reason of poses without another one
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
-        """The pose at `frames.stamp`; INITIALISING while the region is looked for."""
+        """The pose at `frames.stamp`; INITIALISING until there is a region."""
         if self._step is None:
-            found = self._find(frames)
-            if isinstance(found, str):
+            regions = self._find(frames)
+            if isinstance(regions, str):
                 self.last = empty_report(frames.stamp, len(self._rig), np.zeros(len(STAGES)))
-                return identity_pose(frames.stamp, found)
-            self._step = self._make_step(found)
-            whole = of_whole_pictures(found, [camera.size for camera in self._rig.cameras])
+                return identity_pose(frames.stamp, regions)
+            self._step = self._make_step(regions)
+            whole = of_whole_pictures(regions, [camera.size for camera in self._rig.cameras])
             self._caveat = WHOLE_PICTURES if whole else ""
         pose = self._step(frames)
         self.last = self._step.last
@@ -228,20 +228,20 @@ class RegionTrackingStep:
 
     @property
     def registration(self) -> Registration | None:
-        """Where the scan lies, as of the pictures that confirmed the first map; None before, and without a scan."""
+        """Pose of the scan by the pictures that confirmed the first map; None before, and without a scan."""
         return None if self._step is None else self._step.registration
 
     @property
     def roi(self) -> tuple[Roi, ...]:
-        """Where the surface was at the start, none before that is known."""
+        """The region of the surface at the start; empty before there is one."""
         return () if self._step is None else self._step.roi
 
     @property
     def sight(self) -> WoundSight | None:
-        """What the network saw when it found the region; None before, and where none was asked."""
+        """The network's result from which the region was derived; None before, and without a network."""
         return self._find.sight if isinstance(self._find, RegionSearch) else None
 
     def idle(self) -> None:
-        """Work that no pose waits for."""
+        """As `TrackingStep.idle`."""
         if self._step is not None:
             self._step.idle()
