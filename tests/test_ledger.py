@@ -67,12 +67,12 @@ def test_before_anything_is_commanded_there_is_no_target_and_nothing_is_extruded
     log = ledger().rows(row_instants(0.0, 0.05), at_home)
     assert np.isnan(log.base_from_target).all() and np.isnan(log.place).all() and (log.checkpoint == -1).all()
     assert not log.extrude.any() and set(log.reason) == {"no surface is followed yet"}
-    assert ledger().known_until == -np.inf
+    assert ledger().last_due == -np.inf
 
 
 def test_a_command_is_due_one_tick_and_the_known_lag_after_it() -> None:
     book = filled([0.2, 0.4, 1.0])
-    assert book.known_until == pytest.approx(1.04 + TICK + LAG)
+    assert book.last_due == pytest.approx(1.04 + TICK + LAG)
     log = book.rows(1.0 + LAG + TICK * np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5]), at_home)
     wanted = [np.nan, 0.8, 0.8, 1.2, 1.6, 2.8, 4.0, np.nan]  # mm; the first stretch has no place to come from
     assert log.place == pytest.approx(np.array(wanted), nan_ok=True, abs=1e-9)
@@ -102,7 +102,7 @@ def test_while_printing_the_place_never_goes_back(steps: list[float], lag: float
     book = TruthLog(bent(), ARM, TRUTH, TICK, lag)
     for i, fraction in enumerate(np.minimum(np.cumsum(steps), 2.0).tolist()):
         book.write(move(i * TICK), progress(fraction))
-    log = book.rows(np.append(row_instants(lag, book.known_until - 1e-9), book.known_until), at_home)
+    log = book.rows(np.append(row_instants(lag, book.last_due - 1e-9), book.last_due), at_home)
     assert np.isfinite(log.place).all() and (np.diff(log.place) >= -1e-9).all()
     assert log.place.min() >= 0 and log.place.max() <= 10.0
     assert log.place[-1] == pytest.approx(np.interp(min(sum(steps), 2.0), [0, 1, 2], PLACES))

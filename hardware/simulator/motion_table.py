@@ -78,12 +78,12 @@ def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> 
     kind = keys.word("kind", [*WAVE_KINDS, *PART_KINDS])
     rng = np.random.default_rng([seed, MOTION_STREAM, number])
     pivot = keys.vector("pivot_mm", ZERO)
-    part = _driven(keys, kind, rng, pivot) if kind in WAVE_KINDS else PART_KINDS[kind](keys, rng, pivot, folder)
+    part = _waveform_part(keys, kind, rng, pivot) if kind in WAVE_KINDS else PART_KINDS[kind](keys, rng, pivot, folder)
     keys.done()
     return part
 
 
-def _driven(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> WaveformMotion:
+def _waveform_part(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> WaveformMotion:
     wave = WAVE_KINDS[kind](keys, rng)
     direction, turn = keys.axis("direction", SURFACE_NORMAL), np.deg2rad(keys.vector("turn_deg", ZERO))
     name = "height_mm" if kind == "steps" else "amplitude_mm"
@@ -98,20 +98,20 @@ def _driven(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> Wavef
 
 
 def _breathing(keys: TableReader, rng: Generator) -> Waveform:
-    usual = BreathingSpec()
+    defaults = BreathingSpec()
     if keys.has("rate_hz") and keys.has("period_s"):
         raise InputError(keys.where, keys.prefix + "rate_hz", keys.table["rate_hz"], "one of rate_hz, period_s")
-    rate = keys.number("rate_hz", 1 / usual.period, 0.02, 5)
+    rate = keys.number("rate_hz", 1 / defaults.period, 0.02, 5)
     spec = BreathingSpec(
         period=keys.number("period_s", 1 / rate, 0.2, 50),
-        inspiration=keys.number("inspiration", usual.inspiration, 0.1, 0.9),
-        exponent=keys.number("exponent", usual.exponent, 2, 20),
-        period_spread=keys.number("period_spread", usual.period_spread, 0, MAX_SPREAD),
-        depth_spread=keys.number("depth_spread", usual.depth_spread, 0, MAX_SPREAD),
-        sighs_per_min=keys.number("sighs_per_min", usual.sighs_per_min, 0, 10),
-        sigh_factor=keys.number("sigh_factor", usual.sigh_factor, 1, 5),
-        pauses_per_min=keys.number("pauses_per_min", usual.pauses_per_min, 0, 10),
-        pause=keys.number("pause_s", usual.pause, 0, 60),
+        inspiration=keys.number("inspiration", defaults.inspiration, 0.1, 0.9),
+        exponent=keys.number("exponent", defaults.exponent, 2, 20),
+        period_spread=keys.number("period_spread", defaults.period_spread, 0, MAX_SPREAD),
+        depth_spread=keys.number("depth_spread", defaults.depth_spread, 0, MAX_SPREAD),
+        sighs_per_min=keys.number("sighs_per_min", defaults.sighs_per_min, 0, 10),
+        sigh_factor=keys.number("sigh_factor", defaults.sigh_factor, 1, 5),
+        pauses_per_min=keys.number("pauses_per_min", defaults.pauses_per_min, 0, 10),
+        pause=keys.number("pause_s", defaults.pause, 0, 60),
     )
     return movements.draw_breathing(spec, rng)
 
@@ -127,10 +127,10 @@ def _sine(keys: TableReader, rng: Generator) -> Waveform:
 
 
 def _steps(keys: TableReader, rng: Generator) -> Waveform:
-    every = keys.number("every_s", 2.0, 1e-3)
-    rise = keys.number("rise_s", min(0.05, every), 1e-3, every)
-    first = keys.number("start_s", every, 0)
-    return StepWave(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
+    period = keys.number("every_s", 2.0, 1e-3)
+    rise = keys.number("rise_s", min(0.05, period), 1e-3, period)
+    first = keys.number("start_s", period, 0)
+    return StepWave(first, period, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
 
 
 def _noise(
@@ -169,9 +169,9 @@ def _ramp(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
     back = keys.flag("back", False)
     if math.isinf(end) and back:
         raise InputError(keys.where, keys.prefix + "end_s", "missing", "this key, where back = true")
-    times, bends = [start, end, 2 * end - start], [1.0, -2.0 if back else -1.0, 1.0]
+    times, slope_changes = [start, end, 2 * end - start], [1.0, -2.0 if back else -1.0, 1.0]
     count = 1 if math.isinf(end) else 3 if back else 2
-    corners = RoundedCorners(np.array(times[:count]), np.array(bends[:count]), rounding)
+    corners = RoundedCorners(np.array(times[:count]), np.array(slope_changes[:count]), rounding)
     return WaveformMotion((corners,), speed[None], pivot)
 
 
@@ -182,11 +182,11 @@ def _constant_speed(keys: TableReader, rng: Generator, pivot: Array, folder: Pat
     """
     unit, speed = keys.number("unit_mm", THESIS_UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
     turn = math.radians(keys.number("turn_deg_s", math.degrees(0.3)))
-    along, about = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
+    direction, axis = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
     travel = keys.number("travel_s", 1.0, 1e-3)
     rounding = keys.number("round_s", min(0.2, travel), 1e-3, 2 * travel)
-    reach = np.concatenate([turn * about, unit * speed * along])[None]
-    return WaveformMotion((Zigzag(travel, rounding),), reach, pivot)
+    amplitude = np.concatenate([turn * axis, unit * speed * direction])[None]
+    return WaveformMotion((Zigzag(travel, rounding),), amplitude, pivot)
 
 
 def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
@@ -200,8 +200,8 @@ def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
     starts = start + (duration + hold) * np.arange(2.0 * len(angles))
     steps = np.stack([angles, -angles], axis=1).ravel()
     period = float(starts[-1] + duration) if keys.flag("repeat", True) else math.inf
-    reach = np.deg2rad(np.append(axis, np.zeros(3)))[None]
-    return WaveformMotion((Levels(starts, steps, duration, period),), reach, pivot)
+    amplitude = np.deg2rad(np.append(axis, np.zeros(3)))[None]
+    return WaveformMotion((Levels(starts, steps, duration, period),), amplitude, pivot)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,8 +214,8 @@ class Levels(Waveform):
     period: float = np.inf  # s after which everything repeats (from level 0), inf for never
 
     def _evaluate(self, times: Array) -> tuple[Array, Array]:
-        within = times if np.isinf(self.period) else np.where(times < 0, times, np.mod(times, self.period))
-        u = (within[:, None] - self.starts) / self.rise
+        local_times = times if np.isinf(self.period) else np.where(times < 0, times, np.mod(times, self.period))
+        u = (local_times[:, None] - self.starts) / self.rise
         rates = (ease_rate(u) * self.steps / self.rise).sum(axis=1)
         return np.asarray((ease(u) * self.steps).sum(axis=1)), np.asarray(rates)
 
@@ -225,12 +225,12 @@ class RoundedCorners(Waveform):
     """Straight lines with rounded corners; the first line has slope 0."""
 
     times: Array  # (K,) s: when the slope changes
-    bends: Array  # (K,) 1/s: change of the slope
+    slope_changes: Array  # (K,) 1/s: change of the slope
     rounding: float  # s: duration of each change, half of it before its time
 
     def _evaluate(self, times: Array) -> tuple[Array, Array]:
         x = times[:, None] - self.times
-        values, rates = corner(x, self.rounding) * self.bends, corner_rate(x, self.rounding) * self.bends
+        values, rates = corner(x, self.rounding) * self.slope_changes, corner_rate(x, self.rounding) * self.slope_changes
         return np.asarray(values.sum(axis=1)), np.asarray(rates.sum(axis=1))
 
 

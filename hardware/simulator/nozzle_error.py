@@ -126,27 +126,27 @@ def nozzle_lag(log: NozzleLog) -> NozzleLag:
     velocity = (target[rows + 1] - target[rows - 1]) / (2 * step)
     if not len(rows) or np.sqrt(np.mean(np.sum(velocity**2, axis=1))) < MIN_TARGET_SPEED:
         return unknown
-    tried = np.arange(-max_shift, max_shift + 1, stride)
-    squares = _squares(nozzle, target, rows, tried)
-    best = int(tried[np.argmin(squares)])
-    near = np.arange(max(best - stride, -max_shift), min(best + stride, max_shift) + 1)
-    around = _squares(nozzle, target, rows, near)
-    i = int(np.argmin(around))
-    shifts, distance = np.asarray(tried * step), np.asarray(np.sqrt(squares))
-    if not 0 < i < len(near) - 1:
+    offsets = np.arange(-max_shift, max_shift + 1, stride)
+    squares = _squares(nozzle, target, rows, offsets)
+    best = int(offsets[np.argmin(squares)])
+    candidates = np.arange(max(best - stride, -max_shift), min(best + stride, max_shift) + 1)
+    candidate_squares = _squares(nozzle, target, rows, candidates)
+    i = int(np.argmin(candidate_squares))
+    shifts, distance = np.asarray(offsets * step), np.asarray(np.sqrt(squares))
+    if not 0 < i < len(candidates) - 1:
         return NozzleLag(float("nan"), shifts, distance)
-    before, at, after = around[i - 1 : i + 2]
+    before, at, after = candidate_squares[i - 1 : i + 2]
     bend = before - 2 * at + after
     part = 0.5 * (before - after) / bend if bend > 0 else 0.0
-    return NozzleLag(float((near[i] + part) * step), shifts, distance)
+    return NozzleLag(float((candidates[i] + part) * step), shifts, distance)
 
 
 def _comparable_rows(log: NozzleLog, step: float, max_shift: int) -> NDArray[np.int64]:
-    known = np.isfinite(log.base_from_target[:, 0, 3])
+    due = np.isfinite(log.base_from_target[:, 0, 3])
     gaps = np.flatnonzero(np.abs(np.diff(log.stamps) - step) > 0.5 * step) + 1
     inside = np.zeros(len(log), bool)
     for first, last in zip([0, *gaps], [*gaps, len(log)], strict=True):
-        for part in stretches(known[first:last]):
+        for part in stretches(due[first:last]):
             inside[first + part.start + max_shift : max(first + part.stop - max_shift, 0)] = True
     return np.flatnonzero(inside & log.extrude)
 
@@ -251,13 +251,13 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> Nozz
 
 def _printing(log: NozzleLog, line: PlannedLine) -> tuple[NDArray[np.bool_], int, bool]:
     """(N,) rows in which material was due; the row after the last before the end of the path; if it was finished."""
-    known = np.isfinite(log.place)
-    short = known & (log.place < line.knots[-1] - END_TOLERANCE)
-    finished = bool((known & ~short).any())
-    going = np.flatnonzero(short | log.extrude)
-    end = int(going[-1]) + 1 if finished and len(going) else len(log)
+    placed = np.isfinite(log.place)
+    unfinished = placed & (log.place < line.knots[-1] - END_TOLERANCE)
+    finished = bool((placed & ~unfinished).any())
+    active = np.flatnonzero(unfinished | log.extrude)
+    end = int(active[-1]) + 1 if finished and len(active) else len(log)
     rows = np.arange(len(log))
-    last_known = np.maximum.accumulate(np.where(known, rows, -1))
+    last_known = np.maximum.accumulate(np.where(placed, rows, -1))
     place = np.where(last_known >= 0, log.place[last_known], 0.0)
     due = line.printed[line.piece(place)] & (rows < end)
     first = int(np.argmax(log.extrude)) if log.extrude.any() else len(log)
@@ -270,7 +270,7 @@ FLAT = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EndsOfBeads:
+class BeadEnds:
     """All beginnings, or all ends, of the B planned beads that the print has come past; NaN where nothing was laid."""
 
     error: Array  # (B,) mm along the path from the planned to the true one; above 0: too late, farther on
@@ -304,33 +304,33 @@ def profile_edges() -> Array:
 class MaterialFigures:
     """What was laid, and where it began and ended."""
 
-    begins: EndsOfBeads
-    stops: EndsOfBeads
-    laid: float  # mm^3 that left the nozzle
-    planned: float  # mm^3
+    beginnings: BeadEnds
+    ends: BeadEnds
+    volume: float  # mm^3 that left the nozzle
+    planned_volume: float  # mm^3
     ooze: float  # mm^3 that fell beside the beads, farther than half a width from every printed line
     flowing: float  # s in which half of what a bead needs left the nozzle, or more, while the motion did not print
-    told: float  # s in which a dispenser was open on its orders while no move that prints was sent; NaN: not known
+    open_outside: float  # s in which a dispenser was open on its orders while no move that prints was sent; NaN: not known
 
 
-def material_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors, bead: float, told: float) -> MaterialFigures:
+def material_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors, bead: float, open_outside: float) -> MaterialFigures:
     """The figures of a log; bead: width, mm. told: s, as in the figures."""
     rows = _rows(log, line, errors)
     begins, ends, _ = planned_beads(line)
-    reached = float(np.nanmax(log.place)) if np.isfinite(log.place).any() else -np.inf
+    last_place = float(np.nanmax(log.place)) if np.isfinite(log.place).any() else -np.inf
     volume = row_volumes(log)
     flat = replace(line, points=line.points * FLAT)
-    leaves = np.flatnonzero((volume > 0) & np.isfinite(log.surface_from_tip[:, 0]))
-    beside = flat.distance(log.surface_from_tip[leaves] * FLAT) > bead / 2
+    flow_rows = np.flatnonzero((volume > 0) & np.isfinite(log.surface_from_tip[:, 0]))
+    outside = flat.distance(log.surface_from_tip[flow_rows] * FLAT) > bead / 2
     lengths = np.diff(line.knots)[line.printed]
     return MaterialFigures(
-        begins=_ends(rows, log, line, np.flatnonzero(begins < reached - END_TOLERANCE), False),
-        stops=_ends(rows, log, line, np.flatnonzero(ends <= reached + END_TOLERANCE), True),
-        laid=float(volume.sum()),
-        planned=float(lengths @ line.area[line.printed]),
-        ooze=float(volume[leaves][beside].sum()),
-        flowing=float((rows.flows & ~log.extrude).sum()) * row_step(log),
-        told=told,
+        beginnings=_ends(rows, log, line, np.flatnonzero(begins < last_place - END_TOLERANCE), False),
+        ends=_ends(rows, log, line, np.flatnonzero(ends <= last_place + END_TOLERANCE), True),
+        volume=float(volume.sum()),
+        planned_volume=float(lengths @ line.area[line.printed]),
+        ooze=float(volume[flow_rows][outside].sum()),
+        flow_outside=float((rows.flowing & ~log.extrude).sum()) * row_step(log),
+        open_outside=open_outside,
     )
 
 
@@ -340,43 +340,43 @@ class _Rows:
 
     place: Array  # (N,) mm along the path of the true nozzle
     speed: Array  # (N,) mm/s, at which the path goes on
-    flows: NDArray[np.bool_]  # (N,) whether half of what a bead needs leaves, or more
+    flowing: NDArray[np.bool_]  # (N,) whether half of what a bead needs leaves, or more
 
 
 def _rows(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> _Rows:
     along = np.where(np.isfinite(log.place), log.place + np.nan_to_num(errors.split[:, 0]), np.nan)
-    known = np.flatnonzero(np.isfinite(along))
-    if not len(known):
-        nothing = np.zeros(len(log))
-        return _Rows(nothing, nothing, nothing > 0)
-    following = known[np.minimum(np.searchsorted(known, np.arange(len(log))), len(known) - 1)]
-    due = log.place[following]
+    placed = np.flatnonzero(np.isfinite(along))
+    if not len(placed):
+        zeros = np.zeros(len(log))
+        return _Rows(zeros, zeros, zeros > 0)
+    row_of = placed[np.minimum(np.searchsorted(placed, np.arange(len(log))), len(placed) - 1)]
+    due = log.place[row_of]
     step = row_step(log)
     speed = np.maximum(np.gradient(due, step), 0.0) if len(log) > 1 else np.zeros(len(log))
     needed = line.area[row_pieces(log, line)] * np.maximum(speed, MIN_FLOW_SPEED)
-    return _Rows(along[following], speed, log.flow > HALF_FLOW * needed)
+    return _Rows(along[row_of], speed, log.flow > HALF_FLOW * needed)
 
 
-def _ends(rows: _Rows, log: NozzleLog, line: PlannedLine, which: NDArray[np.int64], stop: bool) -> EndsOfBeads:
+def _ends(rows: _Rows, log: NozzleLog, line: PlannedLine, beads: NDArray[np.int64], stop: bool) -> BeadEnds:
     begins, ends, areas = planned_beads(line)
-    planned, count = ends if stop else begins, len(which)
+    planned, count = ends if stop else begins, len(beads)
     between = (ends[:-1] + begins[1:]) / 2
     low, high = np.append(-np.inf, between), np.append(between, np.inf)
     error, speed = np.full(count, np.nan), np.full(count, np.nan)
     edges, volume = profile_edges(), row_volumes(log)
     profile = np.zeros((count, len(edges) - 1))
-    for i, bead in enumerate(which.tolist()):
+    for i, bead in enumerate(beads.tolist()):
         inside = (rows.place > low[bead]) & (rows.place <= high[bead])
-        flowing = np.flatnonzero(inside & rows.flows)
+        flowing = np.flatnonzero(inside & rows.flowing)
         if len(flowing):
             error[i] = rows.place[flowing[-1 if stop else 0]] - planned[bead]
-        passed = int(np.argmax(rows.place >= planned[bead] - END_TOLERANCE))
-        around = slice(max(passed - 50, 0), passed + 50)
-        speed[i] = float(rows.speed[around].max(initial=0.0))
-        laid = np.histogram((rows.place - planned[bead])[inside], edges, weights=volume[inside])[0]
-        profile[i] = laid / (areas[bead] * PROFILE_STEP)
+        row = int(np.argmax(rows.place >= planned[bead] - END_TOLERANCE))
+        window = slice(max(row - 50, 0), row + 50)
+        speed[i] = float(rows.speed[window].max(initial=0.0))
+        volumes = np.histogram((rows.place - planned[bead])[inside], edges, weights=volume[inside])[0]
+        profile[i] = volumes / (areas[bead] * PROFILE_STEP)
     piece = np.clip(
-        np.searchsorted(line.knots, planned[which], "left" if stop else "right") - 1, 0, len(line.layer) - 1
+        np.searchsorted(line.knots, planned[beads], "left" if stop else "right") - 1, 0, len(line.layer) - 1
     )
-    at = np.stack([np.interp(planned[which], line.knots, line.points[:, axis]) for axis in (0, 1)], axis=1)
-    return EndsOfBeads(error, speed, excess_volumes(log, line, at, line.layer[piece]), profile)
+    at = np.stack([np.interp(planned[beads], line.knots, line.points[:, axis]) for axis in (0, 1)], axis=1)
+    return BeadEnds(error, speed, excess_volumes(log, line, at, line.layer[piece]), profile)

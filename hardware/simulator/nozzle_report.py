@@ -17,7 +17,7 @@ from hardware.report import page
 from hardware.report.evaluation import figure
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
-from hardware.simulator.nozzle_error import NEAR_ERROR, EndsOfBeads, NozzleLag, profile_edges
+from hardware.simulator.nozzle_error import NEAR_ERROR, BeadEnds, NozzleLag, profile_edges
 from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share
 
 PAGE_FOOTER = (
@@ -106,8 +106,8 @@ def _png(kind: NDArray[np.uint8], thickness: Array) -> bytes:
     picture = np.empty((*kind.shape, 4), np.uint8)
     picture[..., :3] = np.array(CELL_COLOURS, np.uint8)[kind][..., ::-1]
     picture[..., 3] = np.round(255 * np.clip(4 * thickness - 1.5, 0, 1)).astype(np.uint8)  # half a bead is its edge
-    done, data = cv2.imencode(".png", picture[::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    assert done
+    encoded, data = cv2.imencode(".png", picture[::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    assert encoded
     return data.tobytes()
 
 
@@ -192,8 +192,8 @@ def _figures(result: NozzleResult) -> str:
 
 def _limits(result: NozzleResult) -> str:
     rows = "".join(
-        f"<tr><td>{escape(v.bound.words)}</td><td>{escape(v.reached_text)}</td>"
-        f"<td>{escape(v.allowed_text)}</td><td>{MET_MARKS[v.met]}</td></tr>"
+        f"<tr><td>{escape(v.bound.label)}</td><td>{escape(v.value_text)}</td>"
+        f"<td>{escape(v.limit_text)}</td><td>{MET_MARKS[v.met]}</td></tr>"
         for v in result.verdicts
     )
     head = "<thead><tr><th></th><th>reached</th><th>allowed</th><th></th></tr></thead>"
@@ -325,19 +325,19 @@ MAX_DRAWN_ENDS = 200  # beads in a chart: more are no longer told apart
 def _ends(result: NozzleResult) -> str:
     """Where beads begin and end, as a table and as what was laid about there."""
     m = result.figures.material
-    if not len(m.begins.error):
+    if not len(m.beginnings.error):
         return ""
     rows, charts = [], []
-    for name, ends in (("begin", m.begins), ("end", m.stops)):
+    for name, ends in (("begin", m.beginnings), ("end", m.ends)):
         missing, excess = int(np.isnan(ends.error).sum()), float(ends.excess.mean()) if len(ends.excess) else np.nan
         values = ends.median, ends.size.p95, ends.size.max, excess, ends.blob
         rows.append([f"{name}: {len(ends.error)}, {missing} not laid", *map(figure, values)])
         charts.append(f"<div>{ends_chart(ends, f'about where beads {name}', HALF_CHART_WIDTH)}</div>")
     head = ("", "median, mm", "95 %, mm", "max, mm", "too much, mean, mm³", "most, mm³")
-    told = "not known" if np.isnan(m.told) else f"{1000 * m.told:.0f} ms"
+    open_text = "not known" if np.isnan(m.open_outside) else f"{1000 * m.open_outside:.0f} ms"
     note = (
-        f"{m.laid:.1f} of {m.planned:.1f} mm³ were laid, {figure(m.ooze)} mm³ of it beside all beads. For "
-        f"{1000 * m.flowing:.0f} ms material flowed while the motion did not print; told to was it then for {told}."
+        f"{m.volume:.1f} of {m.planned:.1f} mm³ were laid, {figure(m.ooze)} mm³ of it beside all beads. For "
+        f"{1000 * m.flow_outside:.0f} ms material flowed while the motion did not print; told to was it then for {open_text}."
     )
     text = (
         "Errors along the path: above 0, material begins or ends farther on than planned. Too much: what lies within "
@@ -347,7 +347,7 @@ def _ends(result: NozzleResult) -> str:
     return page.section("Where beads begin and end", text, body + f'<div class="two">{"".join(charts)}</div>')
 
 
-def ends_chart(ends: EndsOfBeads, label: str, width: int) -> str:
+def ends_chart(ends: BeadEnds, label: str, width: int) -> str:
     """What was laid of the planned about each bead's beginning or end, by mm along the path; and the median of all."""
     edges = profile_edges()
     at = (edges[1:] + edges[:-1]) / 2
@@ -375,5 +375,5 @@ def _holds(result: NozzleResult) -> str:
 def _camera_pictures(result: NozzleResult) -> str:
     if not result.run.pictures:
         return ""
-    shown = page.camera_pictures(result.run.pictures)
-    return page.section("What the cameras saw", "One instant of the run.", shown)
+    pictures = page.camera_pictures(result.run.pictures)
+    return page.section("What the cameras saw", "One instant of the run.", pictures)

@@ -126,9 +126,9 @@ class WatchPage:
         zoom, corner = w / width, np.zeros(2)
         if pixels is not None:
             zoom, corner = w / CLOSE_UP_PX, pixels.mean(0) - [CLOSE_UP_PX / 2, CLOSE_UP_PX * h / w / 2]
-        move = np.array([[zoom, 0, -zoom * corner[0]], [0, zoom, -zoom * corner[1]]])
+        tile_from_picture = np.array([[zoom, 0, -zoom * corner[0]], [0, zoom, -zoom * corner[1]]])
         colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-        cv2.warpAffine(colour, move, (w, h), dst=tile, flags=cv2.INTER_LINEAR)
+        cv2.warpAffine(colour, tile_from_picture, (w, h), dst=tile, flags=cv2.INTER_LINEAR)
         if pixels is not None:
             corners = [np.rint(16 * zoom * (pixels - corner)).astype(np.int32).reshape(-1, 1, 2)]
             cv2.polylines(tile, corners, False, LINE_BGR, 1, cv2.LINE_AA, 4)
@@ -174,7 +174,7 @@ def _quoted(reason: str) -> str:
     return ('"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\r') else text) + "\n"
 
 
-SHOWN_ROWS = 20  # of the nozzle's log, one of which is shown to viewers: 50 a second
+ROW_STRIDE = 20  # of the nozzle's log, one of which is shown to viewers: 50 a second
 LANDMARKS_PERIOD = 2.0  # s between two clouds of the landmarks
 STAMP_DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
 TRUTH_DELAY = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
@@ -212,36 +212,36 @@ class RunFolder:
         self._state: TrackState | None = None
         self._reason = ""
         self._pending: list[Array] = []  # s, instants whose truth is still to be written
-        self._written: list[Array] = []  # s, rising
+        self._truth_stamps: list[Array] = []  # s, rising
         self._until = -np.inf  # s, the last of them
-        self._headed = -np.inf  # s, the last frame set whose print head was written
-        self._posed = 0.0  # s, stamp of the last pose
+        self._last_head = -np.inf  # s, the last frame set whose print head was written
+        self._last_pose = 0.0  # s, stamp of the last pose
         self._tracker: TrackingStep | None = None
-        self._mapped = -np.inf  # s, when viewers were last shown its landmarks
+        self._last_map = -np.inf  # s, when viewers were last shown its landmarks
         cameras = scenario.cameras
-        self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
+        self._truth_delay = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
         shutil.copyfile(scenario.file, out / "scenario.toml")
         write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
         (out / "tracking").mkdir(exist_ok=True)
-        with ExitStack() as opening:  # what is open is closed if the next cannot be opened
+        with ExitStack() as stack:  # what is open is closed if the next cannot be opened
             names = [camera.name for camera in scenario.known_rig.cameras]
-            self._poses = opening.enter_context(PoseWriter(out / "tracking", names, STAGES))
-            self._commands = opening.enter_context(CommandWriter(out))
-            self._nozzle = opening.enter_context(NozzleWriter(out / "nozzle.csv", line))
+            self._poses = stack.enter_context(PoseWriter(out / "tracking", names, STAGES))
+            self._commands = stack.enter_context(CommandWriter(out))
+            self._nozzle = stack.enter_context(NozzleWriter(out / "nozzle.csv", line))
             self._session: tuple[SessionFolderWriter, Recorder] | None = None
-            began = round(utc_now() * 1e9)  # the time of day at which virtual time begins
+            start_ns = round(utc_now() * 1e9)  # the time of day at which virtual time begins
             if scenario.tracking.pictures:
                 self._session = (
-                    opening.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois, began)),
-                    opening.enter_context(
-                        Recorder(out / "session.mcap", scenario.known_rig, overwrite=True, began=began)
+                    stack.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois, start_ns)),
+                    stack.enter_context(
+                        Recorder(out / "session.mcap", scenario.known_rig, overwrite=True, began=start_ns)
                     ),
                 )
                 if scan is not None:
                     self._session[1].surface(scan)
                 for roi in rois:
                     self._session[1].write(roi)
-            self._files = opening.pop_all()
+            self._files = stack.pop_all()
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture has arrived, as encoded by its camera."""
@@ -256,8 +256,8 @@ class RunFolder:
 
     def head(self, stamp: float, head: PrintHead) -> None:
         """Where the print head was at the stamp of a frame set, tracked or not; an instant told again is one."""
-        if self._session is not None and stamp > self._headed:
-            self._headed = stamp
+        if self._session is not None and stamp > self._last_head:
+            self._last_head = stamp
             for container in self._session:
                 container.head_row(row_from_head(stamp, head), head.extruding)
 
@@ -268,7 +268,7 @@ class RunFolder:
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         """A pose was made of a frame set in `spent` s of real time."""
         self._poses.write(pose, len(frames.frames), report, spent)
-        self._posed = pose.stamp
+        self._last_pose = pose.stamp
         if pose.state is not self._state:
             self.event(pose.stamp, f"{pose.state.value}: {pose.reason}", INFO if pose.state.measured else WARNING)
             self._state = pose.state
@@ -278,18 +278,18 @@ class RunFolder:
             self._show_landmarks(pose.stamp)
             error, log = "not printing", self.logs[-1] if self.logs else None
             if log is not None and log.extrude.any():
-                off = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
-                error = f"{np.linalg.norm(off, axis=1).mean():.3f} mm"
+                errors = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
+                error = f"{np.linalg.norm(errors, axis=1).mean():.3f} mm"
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
             facts = [("time", time), ("arm", self._activity), ("error at the nozzle", error)]
             self.watch.show(frames, pose, self._line_points, facts)
 
     def _show_landmarks(self, stamp: float) -> None:
         """Now and then, as the map grows."""
-        if self._session is None or self._tracker is None or stamp < self._mapped + LANDMARKS_PERIOD:
+        if self._session is None or self._tracker is None or stamp < self._last_map + LANDMARKS_PERIOD:
             return
         if (surface_map := self._tracker.map) is not None:
-            self._mapped = stamp
+            self._last_map = stamp
             self._session[1].show_surface(stamp, surface_map.points)
 
     def look(self, look: Look) -> None:
@@ -298,11 +298,11 @@ class RunFolder:
         if self._session is not None:
             self._session[1].write(look)
 
-    def registered(self, truth_from_estimate: Array) -> None:
+    def registration(self, truth_from_estimate: Array) -> None:
         """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
         self._line_points = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
         if self._session is not None:
-            self._session[1].show_path(self._posed, self._line_points, self._line.knots)
+            self._session[1].show_path(self._last_pose, self._line_points, self._line.knots)
 
     @property
     def keeper(self) -> LoopKeeper | None:
@@ -316,7 +316,7 @@ class RunFolder:
         if self._session is not None:
             (self._session[1].sent if sent else self._session[1].received)(stamp, data)
 
-    def given(self, pose: SurfacePose) -> None:
+    def pose_delivery(self, pose: SurfacePose) -> None:
         """A pose has reached the motion; it is written when it is made."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
@@ -342,11 +342,11 @@ class RunFolder:
         self.logs.append(log)
         self._nozzle.write(log)
         if self._session is not None and log.extrude.any():
-            off = (log.base_from_nozzle - log.base_from_target)[:, :3, 3]
-            for k in np.flatnonzero(log.extrude)[::SHOWN_ROWS]:
-                self._session[1].error(float(log.stamps[k]), "nozzle", float(np.linalg.norm(off[k])))
+            errors = (log.base_from_nozzle - log.base_from_target)[:, :3, 3]
+            for k in np.flatnonzero(log.extrude)[::ROW_STRIDE]:
+                self._session[1].error(float(log.stamps[k]), "nozzle", float(np.linalg.norm(errors[k])))
         self._pending.append(log.stamps)
-        self._write_truth(float(log.stamps[-1]) - self._latest)
+        self._write_truth(float(log.stamps[-1]) - self._truth_delay)
 
     def event(self, stamp: float, text: str, level: int = WARNING) -> None:
         """Something that a person should know."""
@@ -362,7 +362,7 @@ class RunFolder:
         due = stamps[(stamps <= until) & (stamps > self._until)]
         if len(due):
             self._until = float(due[-1])
-            self._written.append(due)
+            self._truth_stamps.append(due)
             for row in rows_from_trajectory(self._trajectory(due)):
                 self._session[1].truth_row(row, exact=True)
 
@@ -375,5 +375,5 @@ class RunFolder:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         with self._files:
             self._write_truth(np.inf)
-            if self._session is not None and self._written:
-                self._session[0].truth(self._trajectory(np.concatenate(self._written)))
+            if self._session is not None and self._truth_stamps:
+                self._session[0].truth(self._trajectory(np.concatenate(self._truth_stamps)))

@@ -225,7 +225,7 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
         scan.parent.mkdir(exist_ok=True)
         write_ply(scan, *scene.shape.mesh(SCAN_MESH_STEP))
     folder = RunFolder(out, scenario, planned_line(path), wound_rois, truth.base_from_surface, scan)
-    complete, skipped, told_outside = False, 0, float("nan")
+    complete, skipped, open_outside = False, 0, float("nan")
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
@@ -249,10 +249,10 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
                     store.finish()
             finally:
                 skipped = world.pipeline.skipped
-                told_outside = world.told_outside
+                open_outside = world.open_outside
         complete = True
     finally:
-        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped, told_outside)
+        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped, open_outside)
     return outcome
 
 
@@ -289,7 +289,7 @@ def _write_results(
     regions: Sequence[Roi],
     complete: bool,
     skipped: int,
-    told_outside: float,
+    open_outside: float,
 ) -> SimulationResult:
     """Judge what was simulated; writes both reports and summaries. skipped: frame sets that found the tracker busy.
 
@@ -302,7 +302,7 @@ def _write_results(
     pictures = tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items()))
     files = tuple(f for f in FILE_NOTES if scenario.tracking.pictures or f[0] != "session")
     log = join_logs(folder.logs)
-    judged = scenario.limits, told_outside, tracking, complete
+    judged = scenario.limits, open_outside, tracking, complete
     run = NozzleRun(scenario.title, log, path, scenario.bead, *judged, pictures, files, tuple(folder.looks))
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
