@@ -32,9 +32,9 @@ from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.bench import figures
 from hardware.bench.fault_run import (
-    LATE_DISPENSER,
     DELAYS_KNOWN,
     DELAYS_ZERO,
+    LATE_DISPENSER,
     BeadsPrint,
     FaultRun,
     bead_figures,
@@ -316,11 +316,10 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
     if options.seed < 0:
         raise InputError("command line", "--seed", options.seed, ">= 0")
     figures.require_positive(options, "jobs")
-    cases = [(name, way) for name in options.scenario for way in MOTION_INPUTS]
+    cases, delays = [(name, way) for name in options.scenario for way in MOTION_INPUTS], (DELAYS_KNOWN, DELAYS_ZERO)
     with workers(options.jobs) as pool:
         prints = pool.map(partial(_print_case, options.seed), *zip(*cases, strict=True))
         by_case = dict(zip(cases, with_progress("loop", "prints", prints, len(cases)), strict=True))
-        delays = DELAYS_KNOWN, DELAYS_ZERO
         beads = dict(zip(delays, pool.map(partial(print_beads, options.seed), delays), strict=True))
     figures.write_page(options.out, "loop.html", lambda: loop_page(by_case, beads), "picture")
     return [*(figure for name in options.scenario for figure in _figures(name, by_case)), *bead_figures(beads)]

@@ -1,7 +1,7 @@
 """A virtual dispenser: bytes in, the true flow at any instant out, in virtual time or on a pseudo-terminal.
 
-It switches late and not at once: after a dead time the flow goes to its new value exponentially. After it is switched
-off it oozes a volume, also exponentially. Without a message for the time of its watchdog it switches itself off.
+A switch takes effect after a dead time; then the flow approaches its new value exponentially. After a switch-off a
+volume oozes out, also exponentially. Without a message for the time of its watchdog it switches itself off.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from hardware.process.clock import Clock, WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, faults_striking
 from hardware.simulator.arm.ports import open_log, served_pty
 
-DISPENSER_POLL = 0.001  # s between looks at the line
+DISPENSER_POLL = 0.001  # s between polls of the line
 DISPENSER_LOG_STEP = 0.001  # s
 DISPENSER_LOG_PERIOD = 0.1  # s between two writes of the log
-MAX_LINE = 200  # bytes: what is longer without an end is dropped
+MAX_LINE = 200  # bytes: a longer line is cut
 
 ON, OFF, RATE, KEEPALIVE, HEAT, QUERY, SETUP = "on", "off", "rate", "keepalive", "heat", "query", "setup"
 
 
 @dataclass(frozen=True, slots=True)
 class DispenserDialect:
-    """How a kind of device reads lines: patterns in order, each with what it does; their group is its number."""
+    """The language of a kind of device: patterns of lines in order, each with its action; the group is its number."""
 
     actions: tuple[tuple[str, str], ...]
     end: bytes = b"\n"
     unit: float = 1.0  # mm^3/s of a rate of 1
-    acknowledgement: str = "ok"  # answer to a line that it knows
-    temperature_answer: str = "T {0:.2f}"  # answer to a question for the temperature
+    acknowledgement: str = "ok"  # to a known line
+    temperature_answer: str = "T {0:.2f}"  # to a query
 
 
 NUMBER = r"(-?\d+\.?\d*)"
@@ -66,18 +66,18 @@ DIALECTS = {
 
 @dataclass(frozen=True, slots=True)
 class VirtualDispenserSettings:
-    """What it does. InputError names a setting that makes no sense."""
+    """The true behaviour. InputError names a setting that makes no sense."""
 
     preset: str = "arduino"
     on_dead_time: float = 0.03  # s
     on_lag: float = 0.02  # s
     off_dead_time: float = 0.02  # s
     off_lag: float = 0.04  # s
-    ooze: float = 0.0  # mm^3 that follow after off
-    ooze_lag: float = 0.5  # s in which it falls to 37 %
-    flow: float = 1.0  # mm^3/s, where it is told none
+    ooze: float = 0.0  # mm^3 after a switch-off
+    ooze_lag: float = 0.5  # s, time constant
+    flow: float = 1.0  # mm^3/s, unless commanded
     watchdog: float = 0.1  # s, infinite for none
-    ambient: float = 22.0  # degrees C at first
+    ambient: float = 22.0  # degrees C, at the start
     heat_lag: float = 5.0  # s, time constant of its temperature
 
     def __post_init__(self) -> None:
@@ -90,10 +90,10 @@ class VirtualDispenserSettings:
 
 
 class DispenserModel:
-    """One device from `start` s on; it knows the time from its caller alone, which never goes back.
+    """One device from `start` s on; its time is its caller's, which never goes back.
 
-    switches: (stamp, flow) of each, when the device obeyed: mm^3/s, 0 for off.
-    unknown: lines that it does not know. closed_itself: instants at which its watchdog switched it off.
+    switches: (stamp, flow) of each change by a command or the watchdog: mm^3/s, 0 for off.
+    watchdog_stops: instants, s, at which its watchdog switched it off.
     """
 
     def __init__(self, settings: VirtualDispenserSettings | None = None, start: float = 0.0) -> None:
@@ -111,7 +111,7 @@ class DispenserModel:
 
     @property
     def on(self) -> bool:
-        """Whether it was told last to let material out, and has not switched itself off."""
+        """Whether it is open by its last command, and has not switched itself off."""
         return self._target_flow > 0
 
     def receive(self, data: bytes, now: float) -> None:
@@ -131,13 +131,13 @@ class DispenserModel:
             self._switch(0.0, self.watchdog_stops[-1])
 
     def transmit(self, now: float) -> bytes:
-        """What it has answered since the last call."""
+        """Its answers since the last call."""
         self.advance(now)
         data, self._answers = bytes(self._answers), bytearray()
         return data
 
     def flow_at(self, instants: Array) -> Array:
-        """The true flow (N,), mm^3/s, at instants (N,), s; what is after `now` may still change."""
+        """The true flow (N,), mm^3/s, at instants (N,), s; after `now` it may still change."""
         knots = np.array(self._knots)
         knot = knots[np.maximum(np.searchsorted(knots[:, 0], instants, "right") - 1, 0)]
         since = np.maximum(instants - knot[:, 0], 0.0)
@@ -180,7 +180,7 @@ class DispenserModel:
         self._answers += text.encode("ascii") + (b"" if text.endswith("\x03") else b"\n")
 
     def _switch(self, flow: float, instant: float) -> None:
-        """Told `flow` at `instant`: it acts a dead time later, unless an earlier order would act after that."""
+        """A switch to `flow` at `instant`, effective a dead time later; it cancels switches effective after that."""
         if flow == self._target_flow:
             return
         settings, off = self.settings, flow == 0
@@ -195,10 +195,10 @@ class DispenserModel:
 
 
 class DispenserPort:
-    """A line to a model in virtual time; an opener of itself. dead: what is written to it gets nowhere."""
+    """A line to a model in virtual time; an opener of itself. disconnected: whether written bytes are lost."""
 
     def __init__(self, model: DispenserModel, clock: Clock, faults: Sequence[Fault] = ()) -> None:
-        """faults: those on a dispenser count."""
+        """faults: those of dispensers count."""
         self.model, self._clock, self.disconnected = model, clock, False
         self._faults = faults_striking(faults, FaultPart.DISPENSER)
 
@@ -221,7 +221,7 @@ class DispenserPort:
         """Nothing is held."""
 
     def write(self, data: bytes) -> int:
-        """The model has bytes at once, unless a fault takes them."""
+        """Hand bytes to the model at once, unless a fault stops them."""
         now = self._here()
         if self._has_fault(FaultKind.BLOCK, now):
             return 0
@@ -230,11 +230,11 @@ class DispenserPort:
         return len(data)
 
     def read(self) -> bytes:
-        """What the model has answered."""
+        """The model's answers."""
         return self.model.transmit(self._here())
 
     def waiting(self) -> int:
-        """Nothing is under way."""
+        """Nothing is on the wire."""
         return 0
 
     def close(self) -> None:
@@ -268,7 +268,7 @@ def run_virtual_dispenser(
 
 
 def summary_of(model: DispenserModel) -> str:
-    """What it was told and what became of it, in a few lines."""
+    """Counts of its switches, watchdog stops and unknown lines, in a few lines."""
     switched_on = sum(flow > 0 for _, flow in model.switches)
     unknown = f", the first {model.unknown_lines[0]!r}" if model.unknown_lines else ""
     return (
@@ -295,7 +295,7 @@ def _serve(port: int, model: DispenserModel, clock: Clock, stop: threading.Event
 
 
 def _log(file: TextIO, model: DispenserModel, start: float, end: float) -> float:
-    """Write the rows from `start` on and before `end`; where the next one begins. switched: 1 after an on, by then."""
+    """Write the rows from `start` on and before `end`; start of the next one. switched: 1 while on."""
     stamps = np.float64(start) + DISPENSER_LOG_STEP * np.arange(max(int((end - start) / DISPENSER_LOG_STEP), 0))
     flows = np.array([0.0, *(flow for _, flow in model.switches)])
     on = flows[np.searchsorted(np.array([stamp for stamp, _ in model.switches]), stamps, "right")] > 0

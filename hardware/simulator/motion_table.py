@@ -1,6 +1,6 @@
 """Motions and waveforms from a scenario's tables: one `[[motion]]` a part, composed in the order of the file.
 
-Every part may have `pivot_mm` (the point its rotation leaves alone) and its own `kind`:
+Every part has a `kind` and may have `pivot_mm` (the fixed point of its rotation):
 
     breathing  period_s or rate_hz, inspiration, exponent, period_spread, depth_spread, sighs_per_min, sigh_factor,
                pauses_per_min, pause_s                                        } of these four:
@@ -8,7 +8,7 @@ Every part may have `pivot_mm` (the point its rotation leaves alone) and its own
     sine       rate_hz, phase_deg; mm_per_frame and fps for amplitude_mm      } (out of the surface), turn_deg [x, y, z]
     steps      every_s, rise_s, start_s, pattern "turns" or "stairs"; its amplitude is height_mm }
     tremor     rms_mm [x, y, z], rms_deg [x, y, z], band_hz
-    hand       the same, slower and counted from where it is at 0 s
+    hand       the same, slower, with 0 at 0 s
     drift      speed_mm_s, speed_deg_s [x, y, z]; walk_mm, walk_deg: RMS of a random walk after a minute
     ramp       speed_mm_s, speed_deg_s, start_s, end_s (none: for ever), back, round_s
     constant   the thesis's cube: unit_mm, speed_units_s, turn_deg_s, direction, axis, travel_s, round_s
@@ -45,10 +45,10 @@ from hardware.process.checks import Table
 from hardware.simulator.scenario_tables import TableReader
 from hardware.simulator.trace_file import corner, corner_rate, folded, folded_rate, played_trace, read_trace
 
-MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
+MOTION_STREAM = 21  # of the scenario's seed, for motions alone
 ZERO, SURFACE_NORMAL = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 THESIS_UNIT_MM = 100.0  # edge of the thesis's cube: 282 px at 400 mm before 1109 px of focal length are 102 mm
-MAX_SPREAD = 0.9 / movements.MAX_DRAW_SIGMAS  # no breath and no beat may come out with no length
+MAX_SPREAD = 0.9 / movements.MAX_DRAW_SIGMAS  # no breath and no beat may have length 0
 
 Generator = np.random.Generator
 
@@ -56,7 +56,7 @@ Generator = np.random.Generator
 def motion_from_tables(where: object, tables: list[Table], folder: Path, seed: int) -> ComposedMotion:
     """The motion that `[[motion]]` tables describe, none for a surface at rest.
 
-    folder: what a trace's file is relative to. seed: >= 0; part i draws from it and i alone. InputError names the key.
+    folder: of relative trace files. seed: >= 0; part i draws from it and i alone. InputError names the key.
     """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise InputError(where, "motion", tables, "[[motion]] tables")
@@ -136,7 +136,7 @@ def _steps(keys: TableReader, rng: Generator) -> Waveform:
 def _noise(
     keys: TableReader, rng: Generator, pivot: Array, folder: Path, band: tuple[float, float], tilt: float
 ) -> WaveformMotion:
-    """Six noises of their own; tilt: 1 for one speed at every frequency, as of a hand, counted from its start."""
+    """Six independent noises; tilt: 1 for the same speed at every frequency, as of a hand, with 0 at its start."""
     low, high = keys.take("band_hz", checks.pair(0, rising=True), band)
     rms = _six(keys, "rms_mm", "rms_deg", 0.0)
     waves = tuple(movements.draw_noise(low, high, tilt, rng) for _ in range(6))
@@ -178,7 +178,7 @@ def _ramp(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
 def _constant_speed(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     """The thesis's cube (4.6): constant speed in all six degrees of freedom, 0.3 of both.
 
-    Its unit is the cube's edge; the rotation's is not said, rad/s are taken. It ran on for ever; here it comes back.
+    Its unit is the cube's edge; the rotation's is not given, rad/s are assumed. Its motion had no end; here it returns.
     """
     unit, speed = keys.number("unit_mm", THESIS_UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
     turn = math.radians(keys.number("turn_deg_s", math.degrees(0.3)))
@@ -225,12 +225,12 @@ class RoundedCorners(Waveform):
     """Straight lines with rounded corners; the first line has slope 0."""
 
     times: Array  # (K,) s: when the slope changes
-    slope_changes: Array  # (K,) 1/s: change of the slope
+    slope_changes: Array  # (K,) 1/s
     rounding: float  # s: duration of each change, half of it before its time
 
     def _evaluate(self, times: Array) -> tuple[Array, Array]:
         x = times[:, None] - self.times
-        values, rates = corner(x, self.rounding) * self.slope_changes, corner_rate(x, self.rounding) * self.slope_changes
+        values, rates = (curve(x, self.rounding) * self.slope_changes for curve in (corner, corner_rate))
         return np.asarray(values.sum(axis=1)), np.asarray(rates.sum(axis=1))
 
 

@@ -1,4 +1,4 @@
-"""The result of a simulated print: its limits and whether they were met, its summary as text, JSON and table.
+"""The result of a simulated print: verdicts on its limits, its summary as text, JSON and table.
 
 A scenario's table [limits] has keys of BOUNDS, all optional. Those without a unit are shares from 0 to 1.
 """
@@ -39,21 +39,21 @@ from planning.path import Path
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunFigures:
-    """All that can be bounded."""
+    """All figures that can be bounded."""
 
     nozzle: NozzleFigures
     deposit: DepositFigures
     material: MaterialFigures
-    tracking: Spread | None = None  # errors of the estimated surface, mm, from the start; None where not known
+    tracking: Spread | None = None  # errors of the estimated surface, mm, from the start; None where unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bound:
     """A figure that a scenario may bound."""
 
-    label: str  # what it is
+    label: str
     unit: str  # "" for a share
-    minimum: bool  # whether the bound must be reached; else it must not be passed
+    minimum: bool  # whether the bound is a minimum; else it is a maximum
     value_of: Callable[[RunFigures], float]  # the figure in that unit
 
 
@@ -94,7 +94,7 @@ RunLimits = dict[str, float]  # the bounds of one scenario by their key in BOUND
 
 @dataclass(frozen=True, slots=True)
 class LimitVerdict:
-    """One limit and what came of it. A NaN never meets a limit."""
+    """One limit, the run's value, and whether it meets it. A NaN never does."""
 
     name: str  # key of BOUNDS
     value: float  # in its unit
@@ -103,12 +103,12 @@ class LimitVerdict:
 
     @property
     def bound(self) -> Bound:
-        """What is bounded, and how."""
+        """The bounded figure."""
         return BOUNDS[self.name]
 
     @property
     def value_text(self) -> str:
-        """What was reached, with its unit; a share, which has none, in percent."""
+        """The value with its unit; a share, which has none, in percent."""
         return f"{figure(self.value)} {self.bound.unit}" if self.bound.unit else share(self.value)
 
     @property
@@ -127,7 +127,7 @@ def limits_from_table(where: object, table: checks.Table) -> RunLimits:
 
 
 def check_limits(limits: RunLimits, figures: RunFigures) -> list[LimitVerdict]:
-    """A verdict for each limit, in the order in which they were given."""
+    """A verdict for each limit, in their order."""
     verdicts = []
     for name, limit in limits.items():
         value = BOUNDS[name].value_of(figures)
@@ -145,12 +145,12 @@ class NozzleRun:
     path: Path  # in the true surface frame
     bead: float  # width, mm
     limits: RunLimits = field(default_factory=dict)
-    open_outside: float = math.nan  # s in which a dispenser was told to be open while no move printed
+    open_outside: float = math.nan  # s in which a dispenser was commanded open while no move printed
     tracking: Evaluation | None = None  # of the surface, where known
     complete: bool = True  # whether it ran to its end
     pictures: tuple[tuple[str, bytes], ...] = ()  # of the cameras: name, and bytes of a JPEG or PNG
-    files: tuple[tuple[str, str], ...] = ()  # beside the page: relative name, and what it holds
-    looks: tuple[Look, ...] = ()  # at what was laid
+    files: tuple[tuple[str, str], ...] = ()  # beside the page: relative name, and content
+    looks: tuple[Look, ...] = ()  # at the printed material
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,13 +166,13 @@ class NozzleResult:
 
     @property
     def met(self) -> bool:
-        """Whether the run was complete, printed something, and that only where a target was, and met all its limits."""
+        """Whether the run was complete, printed, printed only where a target was due, and met all its limits."""
         printed = self.figures.nozzle.extruding > 0 and self.figures.nozzle.without_target == 0
         return self.run.complete and printed and all(verdict.met for verdict in self.verdicts)
 
 
 def evaluate_run(run: NozzleRun) -> NozzleResult:
-    """What a run came to."""
+    """The result of a run."""
     line = planned_line(run.path)
     errors = nozzle_errors(run.log, line)
     deposit = deposit_map(run.log, line, run.bead)
@@ -187,7 +187,7 @@ SPREAD_COLUMNS = {"median": "median", "rmse": "RMS", "p95": "95 %", "p99": "99 %
 
 
 def rows_of_errors(result: NozzleResult) -> list[tuple[str, str, Spread, float]]:
-    """The table of errors: words, key in the summary, spread, and what a value in it is multiplied by for display."""
+    """The table of errors: label, key in the summary, spread, and factor of its values for display."""
     f = result.figures.nozzle
     return [
         ("position, mm", "position_mm", f.position, 1.0),
@@ -233,7 +233,7 @@ def _limit_sentences(result: NozzleResult) -> list[str]:
 
 
 def share(value: float) -> str:
-    """A share in percent, a dash for one that is not known."""
+    """A share in percent, a dash for an unknown one."""
     return percent(value) if math.isfinite(value) else "–"
 
 

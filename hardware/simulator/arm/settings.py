@@ -12,7 +12,7 @@ reply_period_s = 0.05
 seed = 0
 
 The serial line is in virtual time: bytes on the wire, frames lost on the way in, and telemetry. What each fault
-means stands in hardware/process/faults.py. Without a duration a drop or garble strikes one frame, the first one from its
+means stands in hardware/process/faults.py. Without a duration a drop or garble hits one frame, the first one from its
 start on; with one, every frame that begins within it.
 """
 
