@@ -141,7 +141,7 @@ def picture_key(shot: Shot, state: WorldState, camera: Camera, scene: Scene) -> 
         camera.base_from_camera,
         camera.matrix,
     ]
-    parts = [repr(values).encode(), scene.laid, *(b"" if array is None else array.tobytes() for array in arrays)]
+    parts = [repr(values).encode(), scene.bead_hash, *(b"" if array is None else array.tobytes() for array in arrays)]
     return hashlib.sha256(b"".join(b"%d " % len(part) + part for part in parts)).digest()
 
 

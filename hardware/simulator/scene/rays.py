@@ -104,16 +104,16 @@ class RenderView:
 
     def rays(self, box: ImageBox) -> Rays:
         """Rays (H, W) of all samples of a box."""
-        held = self._box
-        if not (held.x0 <= box.x0 and held.y0 <= box.y0 and held.x1 >= box.x1 and held.y1 >= box.y1):
+        cached = self._box
+        if not (cached.x0 <= box.x0 and cached.y0 <= box.y0 and cached.x1 >= box.x1 and cached.y1 >= box.y1):
             margin = RAY_MARGIN_PX
-            held = ImageBox(box.x0 - margin, box.y0 - margin, box.x1 + margin, box.y1 + margin)
+            cached = ImageBox(box.x0 - margin, box.y0 - margin, box.x1 + margin, box.y1 + margin)
             x, y = (
                 (np.arange((b - a) * SAMPLES_PER_PIXEL) + 0.5) / SAMPLES_PER_PIXEL + a - 0.5
-                for a, b in (held[::2], held[1::2])
+                for a, b in (cached[::2], cached[1::2])
             )
-            self._rays, self._box = Rays(*rays_at(self.camera, x, y)), held
-        return Rays(*(tangents[held.samples(box)] for tangents in self._rays))
+            self._rays, self._box = Rays(*rays_at(self.camera, x, y)), cached
+        return Rays(*(tangents[cached.samples(box)] for tangents in self._rays))
 
     def coarse(self, step: int) -> Rays:
         """Rays through the middles of squares of `step` px over the whole image."""

@@ -44,7 +44,7 @@ def render(
         skins = [pool.submit(surface_picture, s, v) for s, v in jobs]
         cloths = [pool.submit(drape_picture, s, v) for s, v in jobs]
         images = [
-            pool.submit(_finished, s, v, skin.result(), cloth.result(), sensor, rng)
+            pool.submit(_picture, s, v, skin.result(), cloth.result(), sensor, rng)
             for (s, v), skin, cloth, rng in zip(jobs, skins, cloths, rngs, strict=True)
         ]
         return [image.result() for image in images]
@@ -58,16 +58,16 @@ class StillScene:
         shared = scene_state(scene, still)
         self._scene, self._shared = scene, shared
         self._views = [scene.view(camera) for camera in cameras]
-        self._behind = [(surface_picture(shared, view), drape_picture(shared, view)) for view in self._views]
+        self._backgrounds = [(surface_picture(shared, view), drape_picture(shared, view)) for view in self._views]
 
     def __call__(self, camera: int, instant: WorldState, sensor: Sensor, rng: Generator) -> Image:
         """The image (H, W, 3) BGR of a camera by its number."""
-        skin, cloth = self._behind[camera]
-        now, fresh = replace(self._shared, instant=instant), replace(cloth, light=cloth.light.copy())
-        return _finished(now, self._views[camera], skin, fresh, sensor, rng)
+        skin, cloth = self._backgrounds[camera]
+        state, background = replace(self._shared, instant=instant), replace(cloth, light=cloth.light.copy())
+        return _picture(state, self._views[camera], skin, background, sensor, rng)
 
 
-def _finished(
+def _picture(
     now: SceneState, view: RenderView, skin: SurfacePicture | None, cloth: DrapePicture, sensor: Sensor, rng: Generator
 ) -> Image:
     light = cloth.light
@@ -77,18 +77,18 @@ def _finished(
     boxes = part_boxes(nozzle, view)
     if nozzle is not None and boxes:
         box, lit = whole_box(boxes), (now.scene.base_from_rest, now.lamps, now.scene.look.ambient)
-        blend_over(light, nozzle_picture(nozzle, *lit, view, boxes, _behind(box, skin, cloth)), box.y0, box.x0)
+        blend_over(light, nozzle_picture(nozzle, *lit, view, boxes, _depth_behind(box, skin, cloth)), box.y0, box.x0)
     return expose(light, sensor, view.fall(sensor), now.instant.gain, rng)
 
 
-def _behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> NDArray[np.float32]:
+def _depth_behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> NDArray[np.float32]:
     depth = upsample(cloth.depth[box.lattice(DRAPE_LATTICE_PX)], box.sample_size)
     if skin is None or skin.depth is None:
         return depth
-    both = ImageBox(*np.maximum(box[:2], skin.box[:2]).tolist(), *np.minimum(box[2:], skin.box[2:]).tolist())
-    if min(both.size) > 0:
-        near = skin.depth[skin.box.samples(both)]
-        np.copyto(depth[box.samples(both)], near, where=np.isfinite(near))
+    overlap = ImageBox(*np.maximum(box[:2], skin.box[:2]).tolist(), *np.minimum(box[2:], skin.box[2:]).tolist())
+    if min(overlap.size) > 0:
+        skin_depth = skin.depth[skin.box.samples(overlap)]
+        np.copyto(depth[box.samples(overlap)], skin_depth, where=np.isfinite(skin_depth))
     return depth
 
 
@@ -112,10 +112,10 @@ def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.ran
     corner = np.round(middle - half).astype(int)
     x0, y0 = np.clip(corner, 0, (w, h))
     x1, y1 = np.clip(corner + size, 0, (w, h))
-    covered = image.copy()
+    result = image.copy()
     part = cover[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]  # may be empty
-    covered[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
-    return covered
+    result[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
+    return result
 
 
 def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
@@ -194,8 +194,8 @@ def _random_pictures(rng: np.random.Generator, scene: Scene, rig: Rig) -> tuple[
     pose = BASE_FROM_REST @ se3.make(se3.exp_rotation(rng.normal(0, [0.15, 0.15, 1.5])), rng.normal(0, [12, 12, 6]))
     instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
     sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
-    draws = [rng] if len(rig) == 1 else rng.spawn(len(rig))
-    return render(scene, rig.cameras, [instant] * len(rig), sensor, draws, threads=1), pose
+    rngs = [rng] if len(rig) == 1 else rng.spawn(len(rig))
+    return render(scene, rig.cameras, [instant] * len(rig), sensor, rngs, threads=1), pose
 
 
 def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: int = 1) -> NDArray[np.bool_]:
@@ -208,8 +208,8 @@ def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: in
         inside = cv2.resize(shape.inside, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
         contours, _ = cv2.findContours((inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
-        for each in contours:
-            nodes = (each.reshape(-1, 2) + 0.5) / finer - 0.5
+        for contour in contours:
+            nodes = (contour.reshape(-1, 2) + 0.5) / finer - 0.5
             points = shape.points((nodes - middle) * shape.step)
             outlines.append(pixels_from_points(camera, se3.transform_points(base_from_surface, points))[0])
     return mask_from_outlines(outlines, camera.size, finer * MASK_SAMPLES)
@@ -250,9 +250,9 @@ class BoardView:
         self.camera, self._board = camera, board
         ink, cell = ink_cells(board)
         rim = round(PAPER_MARGIN * board.square / cell * DRAWING_SCALE)
-        drawn = np.kron(np.where(ink, INK_GREY, PAPER_GREY), np.ones((DRAWING_SCALE, DRAWING_SCALE)))
+        drawing = np.kron(np.where(ink, INK_GREY, PAPER_GREY), np.ones((DRAWING_SCALE, DRAWING_SCALE)))
         paper = INK_GREY if board.inverted else PAPER_GREY
-        self._drawing = np.pad(drawn, rim, constant_values=paper).astype(np.float32)
+        self._drawing = np.pad(drawing, rim, constant_values=paper).astype(np.float32)
         scale, shift = DRAWING_SCALE / cell, rim - 0.5  # cells' middles are whole numbers
         self._drawing_from_board = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
 

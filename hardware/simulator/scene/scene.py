@@ -59,7 +59,7 @@ class Scene:
         gel: Gel | None = None,
     ) -> None:
         self.gel = gel  # to be set before somebody looks
-        self._raised: tuple[int, HeightField] | None = None  # version of the beads, and the heights with them
+        self._bead_relief: tuple[int, HeightField] | None = None  # version of the beads, and the heights with them
         self.shape, self.look, self.deformation = shape, look or Appearance(), deformation
         self.base_from_rest = base_from_rest @ shape.surface_from_grid  # of the grid
         self._seed = seed
@@ -83,9 +83,9 @@ class Scene:
         return self._get_painted().ink
 
     @property
-    def laid(self) -> bytes:
+    def bead_hash(self) -> bytes:
         """A hash of what was printed on it, without painting it; empty before the first bead."""
-        return b"" if self._painted is None else self._painted.ink.laid
+        return b"" if self._painted is None else self._painted.ink.bead_hash
 
     def _get_painted(self) -> PaintedScene:
         with self._lock:
@@ -102,20 +102,20 @@ class Scene:
     def heights(self, amount: float) -> HeightField:
         """Heights on the nodes of material points under `amount` of the deformation, the drape's hem among them."""
         painted, shape = self._get_painted(), self.shape
-        still = self._with_beads(painted)
+        relief = self._with_beads(painted)
         if not amount * self.deformation.bulge:
-            return still
+            return relief
         lift = self.deformation.lift(np.stack(node_axes(shape.size, shape.step), -1), amount)
-        return height_field(still.height + lift.astype(np.float32))
+        return height_field(relief.height + lift.astype(np.float32))
 
     def _with_beads(self, painted: PaintedScene) -> HeightField:
         beads = painted.ink
         if beads.gel is None or not beads.version:
             return painted.relief
-        if self._raised is None or self._raised[0] != beads.version:
-            laid = beads.heights(self.shape.size, self.shape.step)
-            self._raised = beads.version, height_field(painted.node_heights + laid)
-        return self._raised[1]
+        if self._bead_relief is None or self._bead_relief[0] != beads.version:
+            bead_heights = beads.heights(self.shape.size, self.shape.step)
+            self._bead_relief = beads.version, height_field(painted.node_heights + bead_heights)
+        return self._bead_relief[1]
 
     @property
     def opening(self) -> tuple[float, float]:
@@ -183,24 +183,24 @@ class SceneState:
 
 def scene_state(scene: Scene, instant: WorldState) -> SceneState:
     """Work out what the cameras of this instant share."""
-    shape, both = scene.shape, lamps(scene.look)
+    shape, lamp_pair = scene.shape, lamps(scene.look)
     base_from_grid = instant.base_from_surface @ shape.surface_from_grid
     rest_from_grid = se3.inverse(scene.base_from_rest) @ base_from_grid
     relief = scene.heights(instant.strain)
-    towards = np.stack([lamp.towards for lamp in both]) @ rest_from_grid[:3, :3]
+    towards = np.stack([lamp.towards for lamp in lamp_pair]) @ rest_from_grid[:3, :3]
     factors = scene.deformation.factors(instant.strain)
     shadow = None
     if instant.base_from_nozzle is not None:
-        skip = max(1, round(SHADOW_STEP / shape.step))
-        z = relief.height[::skip, ::skip]
-        x = (np.arange(z.shape[1], dtype=np.float32) * skip * shape.step - shape.size[0] / 2) * factors[0]
-        y = (np.arange(z.shape[0], dtype=np.float32) * skip * shape.step - shape.size[1] / 2) * factors[1]
+        stride = max(1, round(SHADOW_STEP / shape.step))
+        z = relief.height[::stride, ::stride]
+        x = (np.arange(z.shape[1], dtype=np.float32) * stride * shape.step - shape.size[0] / 2) * factors[0]
+        y = (np.arange(z.shape[0], dtype=np.float32) * stride * shape.step - shape.size[1] / 2) * factors[1]
         nozzle_from_base = se3.inverse(instant.base_from_nozzle)
         points = transform_fields(nozzle_from_base @ base_from_grid, x[None], y[:, None], z)
         nozzle_from_rest = nozzle_from_base @ scene.base_from_rest
-        passed = [passing_light(points, nozzle_from_rest, lamp) for lamp in both]
-        shadow = np.dstack([*passed, *passed])
-    return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, both, towards, shadow)
+        shares = [passing_light(points, nozzle_from_rest, lamp) for lamp in lamp_pair]
+        shadow = np.dstack([*shares, *shares])
+    return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, lamp_pair, towards, shadow)
 
 
 def transform_fields(transform: Array, x: Field, y: Field, z: Field) -> tuple[Field, Field, Field]:

@@ -62,11 +62,11 @@ class Shape:
     def covers(self, xy: ArrayLike) -> NDArray[np.bool_]:
         """Whether (N,) there is a surface at material points (N, 2) mm: on the rectangle, and in no hole."""
         xy = np.asarray(xy, float).reshape(-1, 2)
-        on = (np.abs(xy) <= np.array(self.size) / 2 + 1e-6).all(axis=1)
+        inside = (np.abs(xy) <= np.array(self.size) / 2 + 1e-6).all(axis=1)
         if self.valid is None:
-            return np.asarray(on)
+            return np.asarray(inside)
         x, y = np.rint(self.nodes(xy)).astype(int).T
-        return np.asarray(on & self.valid[y, x])
+        return np.asarray(inside & self.valid[y, x])
 
     def grid(self, step: float, part: float = 1.0) -> Array:
         """Material points (N, 2) mm, row by row, over the central `part` of the rectangle, about `step` mm apart."""
@@ -163,8 +163,8 @@ def _mean_plane(scan: Scan) -> Array:
     flattened = (scan.vertices @ rotation[:, :2]).astype(np.float32)
     turn = np.deg2rad((cv2.minAreaRect(flattened)[2] + 45) % 90 - 45)
     rotation = rotation @ se3.exp_rotation([0.0, 0.0, turn])
-    turned = scan.vertices @ rotation  # grid axes, the scan's origin
-    middle = (turned.min(0) + turned.max(0)) / 2
+    rotated = scan.vertices @ rotation  # grid axes, the scan's origin
+    middle = (rotated.min(0) + rotated.max(0)) / 2
     middle[2] = areas @ (scan.corners.mean(1) @ rotation[:, 2]) / areas.sum()
     return se3.make(rotation, rotation @ middle)
 
@@ -289,11 +289,11 @@ def wound_distance(grid: tuple[int, int], step: float, wound: Wound, rng: np.ran
 def _wound_relief(inside: Array, step: float, wound: Wound, rng: np.random.Generator) -> Array:
     wall = 0.9 * wound.depth  # mm wide, so that its slope stays below 1
     t = np.clip((inside + 0.25 * wall) / (1.6 * wall), 0, 1)
-    sunk = t * t * (3 - 2 * t)
-    uneven = 0.22 * smooth_noise(inside.shape, 9 / step, rng) + 0.1 * smooth_noise(inside.shape, 3 / step, rng)
-    bed = wound.depth * (0.82 + 0.18 * np.clip(inside / 8, 0, 1) + np.clip(uneven, -0.5, 0.5))
-    swollen = 0.45 * np.exp(-(((inside + 2.2) / 1.9) ** 2))
-    return np.asarray(cv2.GaussianBlur(swollen - sunk * bed, (0, 0), 0.35 / step))
+    depth_share = t * t * (3 - 2 * t)
+    bed_noise = 0.22 * smooth_noise(inside.shape, 9 / step, rng) + 0.1 * smooth_noise(inside.shape, 3 / step, rng)
+    bed = wound.depth * (0.82 + 0.18 * np.clip(inside / 8, 0, 1) + np.clip(bed_noise, -0.5, 0.5))
+    rim = 0.45 * np.exp(-(((inside + 2.2) / 1.9) ** 2))
+    return np.asarray(cv2.GaussianBlur(rim - depth_share * bed, (0, 0), 0.35 / step))
 
 
 def _arch(y: Array, radius: Array | float) -> Array:
