@@ -94,7 +94,7 @@ def test_a_bead_whose_flow_was_adapted_needs_that_and_lays_it_where_no_dispenser
     planned = book.rows(times, at_home).flow
     book.adapt(FlowShares(np.array([1.4]), np.array([1.8]), np.array([1.5])))
     assert planned.min() > 0 and book.rows(times, at_home).flow == pytest.approx(planned * [1, 1.5, 1.5, 1])
-    assert book.needed(times) == pytest.approx(planned * [1, 1.5, 1.5, 1])
+    assert book.planned_flow(times) == pytest.approx(planned * [1, 1.5, 1.5, 1])
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=12), st.floats(0, 0.1))
@@ -215,7 +215,7 @@ def test_bytes_keep_their_order_and_distance(pieces: list[tuple[int, float]]) ->
         sent = wire.send(bytes(size), now)
         assert len(sent) == size and (sent >= now + 0.01 - 1e-12).all()
         arrivals = np.append(arrivals, sent)
-    assert (np.diff(arrivals) >= 0.01 - 1e-12).all() and wire.free == (arrivals[-1] if len(arrivals) else -math.inf)
+    assert (np.diff(arrivals) >= 0.01 - 1e-12).all() and wire.busy_until == (arrivals[-1] if len(arrivals) else -math.inf)
 
 
 @given(sends)

@@ -115,8 +115,7 @@ def test_a_lag_is_led_to_half_of_the_flow() -> None:
 def test_ooze_is_a_blob_behind_the_bead_and_lies_beside_the_path() -> None:
     tight, leaky = figures(led=True), figures(**OOZING)
     assert leaky.ends.excess.min() > tight.ends.excess.max() + 0.1
-    assert leaky.ooze > 0.05
-    assert leaky.volume - tight.volume == pytest.approx(0.9, abs=0.15)  # a part comes after the run
+    assert leaky.ooze > 0.05 and leaky.volume - tight.volume == pytest.approx(0.9, abs=0.15)  # the rest comes later
 
 
 def test_a_valve_gives_what_it_gives() -> None:

@@ -275,7 +275,7 @@ class LiveSession:
         self._reader.start()
 
     def wait_for(self, text: str, after: int = 0, timeout: float = START_TIMEOUT) -> int:
-        """Wait for a text beyond the first `after` characters of the output; position of its end, -1 on timeout."""
+        """Wait for a text beyond the first `after` characters of the output; position of its end, -1 if absent."""
         until = self._clock.now() + timeout
         while self._clock.now() < until:
             if (place := self.output.find(text, after)) >= 0:

@@ -232,7 +232,7 @@ class LinkRun:
         counts.refused += len(virtual.refused)
         counts.underruns += len(virtual.underruns)
         counts.queued[self.kind] = max(counts.queued.get(self.kind, 0.0), virtual.peak_work)
-        counts.commands[self.kind] = max(counts.commands.get(self.kind, 0), virtual.fullest)
+        counts.commands[self.kind] = max(counts.commands.get(self.kind, 0), virtual.peak_commands)
 
 
 ZERO = at_most(0)
