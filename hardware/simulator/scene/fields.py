@@ -4,10 +4,10 @@ Lengths of noise are in texels. Noise is drawn coarsely where it is smooth, so t
 
 Printed beads on a scene: as ink of a given width, or as gel that has a cross-section, spreads and sags.
 
-Gel: what leaves the needle over 1 mm of its way, A mm^2, lies as a parabola of width w and height k w, so that
+Gel: the volume per mm of the needle's path, A mm^2, has the cross-section of a parabola of width w and height k w, so
 A = 2/3 k w^2. k falls from FRESH_ASPECT to that of gel at rest exponentially in time. Both are drawn by the density
-3 / (2 pi R^3) sqrt(R^2 - r^2) about the tip, R = w / 2, which swept along a straight way gives just that parabola. So
-volume is kept to rounding wherever and however slowly the needle moves, and beads that touch add up.
+3 / (2 pi R^3) sqrt(R^2 - r^2) about the tip, R = w / 2, which integrates to that parabola along a straight path. So
+volume is exact to rounding at any speed of the needle, and overlapping beads add up.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def as_field(values: object) -> Field:
 
 
 def sample(source: Field, u: Field, v: Field) -> Field:
-    """The source at columns u and rows v (H, W), bilinear, beyond its edge as it is there."""
+    """The source at columns u and rows v (H, W), bilinear, constant beyond its edge."""
     return as_field(cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def sample_texture(texture: Field, u: Field, v: Field) -> Field:
-    """A texture (H, W, 4) at columns u and rows v, bilinear, nothing beyond its edge."""
+    """A texture (H, W, 4) at columns u and rows v, bilinear, zero beyond its edge."""
     return as_field(cv2.remap(texture, u, v, cv2.INTER_LINEAR))  # OpenCV's own border is zero
 
 
@@ -159,7 +159,7 @@ def wandering_line(
 
 Texture = NDArray[np.float32]  # (H, W, 4)
 PYRAMID_LEVELS = 4
-BLOCK_TEXELS = 1 << (PYRAMID_LEVELS - 1)  # texels: textures are whole blocks, so that halving them moves nothing
+BLOCK_TEXELS = 1 << (PYRAMID_LEVELS - 1)  # textures are whole blocks, so that halving them shifts nothing
 
 
 class Layers:
@@ -188,7 +188,7 @@ class Layers:
         return scale, -self.corner[0] * scale - 0.5, -self.corner[1] * scale - 0.5
 
     def refresh(self, x0: int, y0: int, x1: int, y1: int) -> None:
-        """Work a change of the finest texels x0..x1, y0..y1 (the last excluded) into the coarser levels."""
+        """Update the coarser levels from the finest texels x0..x1, y0..y1 (the last excluded)."""
         box = (x0 // BLOCK_TEXELS, y0 // BLOCK_TEXELS, -(-x1 // BLOCK_TEXELS), -(-y1 // BLOCK_TEXELS))
         for pyramid in (self.colour, self.relief):
             for k in range(1, PYRAMID_LEVELS):
@@ -216,22 +216,22 @@ GEL_ABSORBANCE = 1.7  # per mm: a bead 0.4 mm high covers half of what is below
 BEAD_HEIGHT_BY_WIDTH = 0.45
 GEL_GLOSS = 0.95
 FRESH_ASPECT = 0.55  # height by width as it leaves the needle: nearly round, pressed against the surface
-MIN_RADIUS, MAX_RADIUS = 0.15, 2.0  # mm of a bead: a hair, and a puddle under a needle that stands
-DROP_STEP = 0.08  # mm of way at most from one drop to the next: less than a texel
+MIN_RADIUS, MAX_RADIUS = 0.15, 2.0  # mm of a bead: a hair, and a puddle under a needle at rest
+DROP_STEP = 0.08  # mm between drops at most: less than a texel
 
 
 @dataclass(frozen=True, slots=True)
 class Gel:
-    """How a material lies."""
+    """The shape and look of printed gel."""
 
     aspect: float = 0.3  # height by width of a bead at rest: it meets the surface at 50 degrees
-    sag_time: float = 2.0  # s in which 63 % of the way to it is gone
+    sag_time: float = 2.0  # s, time constant of its approach
     gloss: float = GEL_GLOSS  # 0 matt, as behind crossed polarisers, to 1 wet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GelPieces:
-    """N straight pieces of the tip's way on which gel left the needle, in order of time."""
+    """N straight pieces of the tip's path with gel, in order of time."""
 
     start: Array  # (N, 2) mm, material points
     end: Array  # (N, 2) mm
@@ -240,20 +240,20 @@ class GelPieces:
 
 
 class PrintedBeads:
-    """Beads on the layers of a scene. gel: how it lies; None: as ink, which has a look but no height."""
+    """Beads on the layers of a scene. gel: its settings; None: ink, which has a look but no height."""
 
     def __init__(self, layers: Layers, gel: Gel | None = None) -> None:
         self._layers, self.gel = layers, gel
-        self._bare_layers: tuple[Field, Field] | None = None  # the finest colour and relief as they were
+        self._bare_layers: tuple[Field, Field] | None = None  # the finest colour and relief without beads
         self._height = np.zeros((0, 0), np.float32)  # mm
-        self._fresh = np.zeros((3, 0, 0))  # mm: drops as laid, and the same at rest, both fading; all at rest
-        self._box: tuple[int, int, int, int] | None = None  # x0, y0, x1, y1 texels that hold gel
+        self._fresh = np.zeros((3, 0, 0))  # mm: fresh drops, and the same at rest, both decaying; all at rest
+        self._box: tuple[int, int, int, int] | None = None  # x0, y0, x1, y1 texels with gel
         self._stamp = -math.inf  # s, of the fields
         self.version = 0  # of the heights
-        self.bead_hash = b""  # a hash of all that was laid so far, in its order
+        self.bead_hash = b""  # of all beads so far, in their order
 
     def lay(self, xy_start: ArrayLike, xy_end: ArrayLike, width: float) -> None:
-        """Lay a bead of `width` mm from one material point (2,) mm to another; off the texture nothing is laid.
+        """Lay a bead of `width` mm from one material point (2,) mm to another; none off the texture.
 
         The same bead twice is one bead, and beads that join end to end are one bead.
         """
@@ -275,7 +275,7 @@ class PrintedBeads:
         layers.refresh(x0, y0, x1, y1)
 
     def flow(self, pieces: GelPieces, now: float) -> None:
-        """Let gel leave the needle, and what lies there sag, until `now`, s; off the texture nothing is laid."""
+        """Add gel from the needle, and let printed gel sag, until `now`, s; none off the texture."""
         assert self.gel is not None
         self._update_hash(pieces.start, pieces.end, pieces.volume, pieces.area, np.array([now]))
         self._allocate()
@@ -306,7 +306,7 @@ class PrintedBeads:
         self._update_heights()
 
     def scrape(self) -> None:
-        """Take all gel away: the surface is as it was."""
+        """Remove all gel."""
         if self._box is not None:
             x0, y0, x1, y1 = self._box
             self._fresh[:, y0:y1, x0:x1] = 0.0
@@ -323,7 +323,7 @@ class PrintedBeads:
         return sample(self._height, as_field(u), as_field(v))
 
     def volume(self) -> float:
-        """All gel that lies on the scene, mm^3."""
+        """Volume of all gel on the scene, mm^3."""
         return float(self._height.sum(dtype=float)) * self._layers.texel**2
 
     def _update_hash(self, *data: Array) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a scene: what each camera's image is at each instant, the nozzle in front of what is behind it."""
+"""Pictures of a scene by each camera at each instant, the nozzle in front."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def render(
 
 
 class StillScene:
-    """Pictures of a scene that stands still, with a nozzle before it that casts no shadow: a tenth of the work."""
+    """Pictures of a scene at rest with a nozzle that casts no shadow: a tenth of the work."""
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], still: WorldState) -> None:
         """still: without a nozzle."""
@@ -93,11 +93,11 @@ def _depth_behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePictur
 
 
 WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound
-COVER_SCALE = 1.35  # a cover that lies over all of the wound is larger than it by this
+COVER_SCALE = 1.35  # size of a cover by that of the wound
 
 
 def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.random.Generator) -> Image:
-    """A blotchy, skin-toned cover over a box (low, high px); aside: by which part of its width it is drawn away."""
+    """A blotchy, skin-toned cover over a box (low, high px); aside: shift, as a share of its width."""
     low, high = box
     angle = rng.uniform(0, 2 * np.pi)
     half = COVER_SCALE * (high - low) / 2
@@ -125,7 +125,7 @@ def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: F
     return np.stack([draw_cover(image[..., k], box, 0.0, fault_rng(fault)) for k in range(image.shape[2])], -1)
 
 
-VIEW_TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own
+VIEW_TEXEL = 0.15  # mm, resolved by a camera at 350 mm; half the time of the simulator's own
 MASK_SAMPLES = 4  # samples a pixel and axis of the true mask
 FINER_OUTLINES = 3  # of pictures by which areas are judged: at 4 and 0.25 mm the outline is off by 1 % of a small wound
 IMAGE_SIZES = ((1280, 720), (640, 480), (768, 576))  # px
@@ -150,11 +150,11 @@ class WoundSet:
     wounds: tuple[NDArray[np.bool_], ...]  # (H, W), by camera
     rig: Rig
     base_from_surface: Array  # (4, 4) mm
-    area: float  # mm^2 inside the wound's edge of the skin as it would go on over the wound
+    area: float  # mm^2 of the skin inside the wound's edge, as without the wound
 
 
 def wound_view(seed: int, wounded: bool = True) -> WoundView:
-    """The picture of a seed: body, wound, tone, wetness, drape, lamps and camera are drawn from it."""
+    """The picture of a seed: random body, wound, tone, wetness, drape, lamps and camera."""
     rng = np.random.default_rng([seed, 41])
     scene, _ = _random_scene(rng, seed, wounded)
     size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
@@ -168,7 +168,7 @@ def wound_view(seed: int, wounded: bool = True) -> WoundView:
 
 
 def wound_set(seed: int) -> WoundSet:
-    """The pictures of a seed by the thesis's three cameras: drawn as in `wound_view`, and how far away they stand."""
+    """The pictures of a seed by the thesis's three cameras: random as in `wound_view`, and their distance."""
     rng = np.random.default_rng([seed, 43])
     scene, bare = _random_scene(rng, seed, True)
     size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
@@ -183,7 +183,7 @@ def wound_set(seed: int) -> WoundSet:
 
 
 def _random_scene(rng: np.random.Generator, seed: int, wounded: bool) -> tuple[Scene, Shape]:
-    """A scene, and the shape of its skin as it would be without the wound."""
+    """A scene, and the shape of its skin without the wound."""
     wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
     kind = rng.choice(list(BODIES))
     return Scene(body(kind, wound, seed), _random_appearance(rng), seed=seed), body(kind, None, seed)
@@ -199,9 +199,9 @@ def _random_pictures(rng: np.random.Generator, scene: Scene, rig: Rig) -> tuple[
 
 
 def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: int = 1) -> NDArray[np.bool_]:
-    """(H, W) what a camera sees of the wound; all False without one.
+    """(H, W) pixels of the wound in a camera; all False without one.
 
-    finer: times that the outline is drawn finer; by 1 it runs through the outermost nodes, half a node too far in.
+    finer: refinement of the outline; by 1 it runs through the outermost nodes, half a node too far in.
     """
     outlines = []
     if shape.inside is not None:
@@ -218,7 +218,7 @@ def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: in
 def mask_from_outlines(
     outlines: Sequence[Array], size: tuple[int, int], samples: int = MASK_SAMPLES
 ) -> NDArray[np.bool_]:
-    """(H, W) pixels that lie for the most part inside closed outlines (N, 2) px, in an image of `size` (W, H).
+    """(H, W) pixels more than half inside closed outlines (N, 2) px, in an image of `size` (W, H).
 
     Drawn finer, by `samples` a pixel and axis, and shrunk: OpenCV fills the outline's own pixels too, which would add
     half a pixel all round.
@@ -238,7 +238,7 @@ def _random_appearance(rng: np.random.Generator) -> Appearance:
 
 BOARD_SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel
 PAPER_MARGIN = 0.5  # of a square, white around the print
-PAPER_GREY, INK_GREY, WALL_GREY = 205.0, 38.0, 120.0  # grey levels of paper, ink and what is behind
+PAPER_GREY, INK_GREY, WALL_GREY = 205.0, 38.0, 120.0  # grey levels of paper, ink and background
 DRAWING_SCALE = 8  # parts of a cell along its edge; light between two is interpolated, so that edges do not step
 BOX_MARGIN_PX = 12  # px around the board that are drawn
 
