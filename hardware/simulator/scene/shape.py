@@ -209,7 +209,7 @@ class Deformation:
         return np.concatenate([along, self.lift(points[..., :2], amount)[..., None]], -1)
 
     def undo(self, points: ArrayLike, amount: float | Array) -> Array:
-        """Places at rest (N, 3) mm of points (N, 3) mm of the deformed shape, in the grid frame; amount: one, or (N,)."""
+        """Places at rest (N, 3) mm of points (N, 3) mm of the deformed shape, grid frame; amount: one, or (N,)."""
         points = np.asarray(points, float)
         flat = points[..., :2] / (1 + np.asarray(amount)[..., None] * np.array(self.stretch))
         return np.concatenate([flat, (points[..., 2] - self.lift(flat, amount))[..., None]], -1)
