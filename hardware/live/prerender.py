@@ -148,7 +148,7 @@ class _PictureSink:
     def _ignore(self, *arguments: object, **named: object) -> None:
         pass
 
-    pose = given = tick = wire = head = rows = registered = look = event = _ignore
+    pose = pose_delivery = tick = wire = head = rows = registration = look = event = _ignore
 
 
 BLOCK_SECONDS = 10.0  # s of rows compared at once
