@@ -115,7 +115,7 @@ def test_a_dropped_frame_is_as_if_it_had_not_been_sent() -> None:
     arm = virtual_arm(IDEAL, arm_fault("drop at 3s"))
     for now, x in [(0.0, 203.5), (3.0, 210.5), (4.0, 204.5)]:
         arm.receive(move(10.0, x=x), now)
-    assert (arm.frames, arm.struck, arm.garbage) == (2, [3.0], [])
+    assert (arm.frames, arm.faulty_frames, arm.garbage) == (2, [3.0], [])
     assert axes_at(arm, 3.9, 4.1)[:, 0] == pytest.approx([203.5, 204.5])
 
 
@@ -123,7 +123,7 @@ def test_frames_are_dropped_as_long_as_it_is_said() -> None:
     arm = virtual_arm(IDEAL, arm_fault("drop at 3s for 1s"))
     for now in np.arange(2.0, 5.0, 0.25):
         arm.receive(move(10.0, x=203.5), now)
-    assert arm.struck == [3.0, 3.25, 3.5, 3.75] and arm.frames == 8
+    assert arm.faulty_frames == [3.0, 3.25, 3.5, 3.75] and arm.frames == 8
 
 
 def test_a_frame_that_has_begun_is_not_dropped() -> None:
@@ -131,7 +131,7 @@ def test_a_frame_that_has_begun_is_not_dropped() -> None:
     arm.receive(frame[:20], 2.999)
     arm.receive(frame[20:] + frame[:5], 3.001)
     arm.receive(frame[5:] + frame, 3.01)
-    assert (arm.frames, arm.struck) == (2, [3.001])
+    assert (arm.frames, arm.faulty_frames) == (2, [3.001])
 
 
 def test_a_garbled_frame_is_garbage_or_another_command_and_costs_no_other() -> None:
@@ -140,7 +140,7 @@ def test_a_garbled_frame_is_garbage_or_another_command_and_costs_no_other() -> N
         arm = virtual_arm(ArmSettings(servo_lag=0.0, seed=seed), arm_fault("garble at 1s"))
         arm.receive(move(10.0, x=203.5), 0.0)
         arm.receive(move(10.0, x=204.5), 1.0)
-        assert arm.struck == [1.0]
+        assert arm.faulty_frames == [1.0]
         arm.receive(encode(Pause()) + move(50.0, x=210.5), 1.05)
         assert arm.frames == 3 + (not arm.garbage)
         refused += bool(arm.garbage)
@@ -246,7 +246,7 @@ def test_armed_again_it_is_no_longer_told_to_stop() -> None:
     link = linked(ANSWERING)
     assert frames_of_a_stop(link, 1.0) == 1
     assert link.arm.arm(link.clock.now()) == ""
-    assert link.follow(1.0) == [] and link.virtual.held <= 0.06
+    assert link.follow(1.0) == [] and link.virtual.queued_work <= 0.06
 
 
 @pytest.mark.parametrize("after", [0.0, 0.03, 0.25])

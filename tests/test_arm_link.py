@@ -55,7 +55,7 @@ def test_an_arm_that_answers_at_rest_from_beside_where_it_is_thought_to_be_is_be
     link.run(1.0)
     assert link.arm.arm(1.0, HOME) == "" and link.arm.target == pytest.approx(HOME + [0.5, 0, 0, 0, 0, 0], abs=0.06)
     link.run(0.5)
-    assert link.executed() == pytest.approx(HOME, abs=1e-3) and link.virtual.deepest <= 0.03
+    assert link.executed() == pytest.approx(HOME, abs=1e-3) and link.virtual.peak_work <= 0.03
 
 
 def test_disarmed_it_ends_what_is_under_way_and_no_more() -> None:
@@ -113,7 +113,7 @@ def test_however_it_is_called_no_more_is_under_way_than_may_be(waits: list[float
             link.send(axes + step)
         link.run(wait)
         assert link.arm.in_flight(link.clock.now()) <= 0.05 + 1e-9
-    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
+    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.peak_work) <= 0.05 + 1e-9
     link.run(0.3)
     assert link.executed() == pytest.approx(link.arm.target, abs=1e-3)
 
@@ -128,7 +128,7 @@ def test_what_the_link_does_not_hold_back_it_takes_and_never_has_to_stop_the_arm
         if not link.arm.hold(link.clock.now()):
             assert link.send(link.arm.target + [0.5, 0, 0, 0, 0, 0], link.arm.profile.tick) == ""
         link.run(wait)
-    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.deepest) <= 0.05 + 1e-9
+    assert link.arm.state is ArmState.ARMED and max(link.deepest, link.virtual.peak_work) <= 0.05 + 1e-9
 
 
 def test_a_motion_at_the_tick_flows_and_is_where_it_is_reckoned() -> None:
@@ -220,7 +220,7 @@ def test_home_is_reached_slowly_by_way_of_above_and_never_much_is_under_way() ->
     path = np.array(seen)
     assert np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).max() <= 20 * 0.0201
     across = np.abs(path[:, 0] - low[0]) > 1e-3
-    assert path[across, 2].min() > HOME[2] - 0.01 and max(link.deepest, link.virtual.deepest) <= 0.05
+    assert path[across, 2].min() > HOME[2] - 0.01 and max(link.deepest, link.virtual.peak_work) <= 0.05
 
 
 def test_a_place_out_of_bounds_is_not_gone_to() -> None:
@@ -270,8 +270,8 @@ def test_what_an_arm_that_stalls_has_queued_is_called_back_and_it_goes_on_by_its
     link = linked(ANSWERING, arm_fault(f"stall {1000 * seconds:g}ms at 2.01s"))
     refused = link.follow(2.01 + seconds)
     assert any("later on its way" in reason or "called back" in reason for reason in refused)
-    assert link.virtual.held <= 0.05 and link.virtual.queued <= 4
-    assert link.virtual.deepest < 0.15  # what was sent until an answer told
+    assert link.virtual.queued_work <= 0.05 and link.virtual.queued <= 4
+    assert link.virtual.peak_work < 0.15  # what was sent until an answer told
     link.follow(4.0)
     assert link.arm.state is ArmState.ARMED and link.arm.hold(link.clock.now()) == ""
     assert any("called back" in event.text for event in link.arm.events())
@@ -284,7 +284,7 @@ def test_without_a_pause_frame_an_arm_that_stalls_is_held_until_it_has_caught_up
     link = linked(ANSWERING, arm_fault("stall 600ms at 2s"), link=LinkSettings(pause_frame=False))
     refused = link.follow(6.0)
     assert any("later on its way than its lag, limit 50 ms" in reason for reason in refused)
-    assert link.virtual.deepest < 0.15 and link.arm.state is ArmState.ARMED
+    assert link.virtual.peak_work < 0.15 and link.arm.state is ArmState.ARMED
     assert link.arm.hold(6.0) == "" and link.arm.status(6.0).off < 0.2
 
 
@@ -293,7 +293,7 @@ def test_an_arm_that_stalls_on_its_way_home_gets_there() -> None:
     link = linked(ANSWERING, arm_fault("stall 600ms at 1s"), begin=low)
     assert link.arm.home(0.0) == ""
     link.run(8.0)
-    assert link.virtual.deepest < 0.16
+    assert link.virtual.peak_work < 0.16
     assert link.arm.arrived(8.0) and link.executed() == pytest.approx(HOME, abs=1e-3)
 
 
@@ -307,9 +307,9 @@ def test_an_arm_that_does_not_answer_works_off_what_a_stall_has_queued() -> None
             link.phase += 0.02
 
     link.run(1.65, each, tick=0.0201)
-    assert link.virtual.held > 0.5  # nothing can tell
+    assert link.virtual.queued_work > 0.5  # nothing can tell
     link.run(30.0, each, tick=0.0201)
-    assert link.virtual.held <= 0.05
+    assert link.virtual.queued_work <= 0.05
 
 
 def test_faults_that_pass_each_in_time_do_not_add_up_to_a_stop() -> None:
@@ -323,7 +323,7 @@ def test_faults_that_pass_each_in_time_do_not_add_up_to_a_stop() -> None:
 def test_an_arm_that_stays_behind_is_stopped() -> None:
     link = linked(ANSWERING, arm_fault("stall 5s at 1s"))
     link.follow(6.0)
-    assert link.arm.state is ArmState.STOPPED and "called back" in link.arm.reason and link.virtual.deepest < 0.15
+    assert link.arm.state is ArmState.STOPPED and "called back" in link.arm.reason and link.virtual.peak_work < 0.15
 
 
 @pytest.mark.parametrize(("share", "within"), [(50, 0.25), (70, 0.29), (80, 0.37)])

@@ -38,7 +38,7 @@ def test_a_port_that_takes_nothing_for_a_moment_is_a_hold() -> None:
     refused = link.follow(2.0)
     assert any("taken no bytes" in reason for reason in refused)
     assert link.arm.state is ArmState.ARMED and len(refused) < 12
-    assert max(link.deepest, link.virtual.deepest) <= 0.05
+    assert max(link.deepest, link.virtual.peak_work) <= 0.05
 
 
 @pytest.mark.parametrize("partial", [0.0, 0.9])
@@ -48,7 +48,7 @@ def test_a_port_that_takes_nothing_for_long_is_a_stop_and_a_torn_frame_is_comple
     assert link.arm.state is ArmState.STOPPED and "took no bytes" in link.arm.reason
     link.run(0.5)
     assert link.virtual.garbage == [] and link.arm.frames == link.virtual.frames
-    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3) and link.virtual.deepest <= 0.05
+    assert link.executed() == pytest.approx(link.arm.target, abs=1e-3) and link.virtual.peak_work <= 0.05
 
 
 def gone(data: bytes) -> int:
@@ -160,7 +160,7 @@ def test_at_9600_bits_a_second_one_frame_is_on_the_wire_and_one_move_in_the_arm(
 
     link.run(10.0, each, tick=0.05025)
     assert not refused and link.arm.state is ArmState.ARMED and link.arm.frames > 195
-    assert link.virtual.deepest <= 0.05 and link.deepest <= 0.1 + 1e-5 and link.virtual.fullest <= 2
+    assert link.virtual.peak_work <= 0.05 and link.deepest <= 0.1 + 1e-5 and link.virtual.peak_commands <= 2
     link.arm.stop("asked for", link.clock.now())
     decided, on_wire = link.arm.stops[0]
     assert on_wire - decided <= 2 * slow.frame_time + 1e-9
@@ -178,7 +178,7 @@ def test_an_arm_that_stands_a_hair_beside_where_it_is_thought_to_is_not_sent_the
         assert link.arm.hold(link.clock.now()) == "" and link.virtual.in_flight == 0
         assert link.executed() == pytest.approx(goal, abs=1e-4)
         link.arm.disarm(link.clock.now())
-    assert link.virtual.deepest <= 0.05
+    assert link.virtual.peak_work <= 0.05
 
 
 def test_travel_ends_at_its_goal_and_no_step_is_faster_than_asked() -> None:

@@ -63,7 +63,7 @@ def test_it_goes_on_soon_after_what_struck_it_is_gone(fault: str, start: float, 
     assert sent[sent > gone][0] < gone + SOON
     on = gone + SOON + UNDER_WAY
     assert np.diff([on, *sent[sent > on]]).max() < 0.05
-    assert link.arm.state is ArmState.ARMED and link.virtual.held <= 0.06
+    assert link.arm.state is ArmState.ARMED and link.virtual.queued_work <= 0.06
 
 
 def test_an_arm_that_has_begun_its_step_is_not_called_back_for_the_time_it_did_not() -> None:

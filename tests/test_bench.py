@@ -30,11 +30,11 @@ from hardware.bench.figures import (
 from hardware.bench.subjects import BENCH_WHOLE, SUBJECTS, BenchPart, Subject, Subjects, Whole
 from hardware.bench.whole import (
     MeasuredPart,
-    counted,
     measure_all,
     read_whole,
     regressions,
     summary,
+    target_counts,
     whole_markdown,
     whole_page,
 )
@@ -223,7 +223,7 @@ def test_all_parts_are_measured_and_a_failed_one_is_told(tmp_path: Path, capsys:
 
 def test_the_page_counts_colours_and_leads_to_the_pictures(tmp_path: Path) -> None:
     parts = {"toy": FIGURES, "<odd>": []}
-    assert counted(parts) == (4, 1, 1)
+    assert target_counts(parts) == (4, 1, 1)
     page = whole_page(PROGRAM, parts, {"<odd>": "why & not"}, {"toy": "toy/toy.html"}, this_machine())
     assert page.count('<td class="met">') == 3 and page.count('<td class="missed">') == 1
     assert 'href="toy/toy.html"' in page and "&lt;odd&gt;" in page and "why &amp; not" in page

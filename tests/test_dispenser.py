@@ -50,7 +50,7 @@ def test_it_is_on_from_on_until_off_and_at_no_other_time(preset: str) -> None:
     bench = Bench(preset)
     assert not bench.open and "closed" in bench.on() and not bench.open
     bench.prepared()
-    assert not bench.open and bench.model.unknown == []
+    assert not bench.open and bench.model.unknown_lines == []
     for flow in (1.0, 2.5):
         assert bench.on(flow) == ""
         bench.run(0.3)
@@ -62,7 +62,7 @@ def test_it_is_on_from_on_until_off_and_at_no_other_time(preset: str) -> None:
         assert not bench.open
     flows = [event.flow for event in bench.driver.events() if event.flow is not None]
     assert [flow > 0 for flow in flows] == [True, False, True, False]
-    assert bench.model.unknown == [] and bench.model.closed_itself == []
+    assert bench.model.unknown_lines == [] and bench.model.watchdog_stops == []
 
 
 @pytest.mark.parametrize("preset", MODELLED)
@@ -95,7 +95,7 @@ def test_off_wins_over_all_that_waits_and_a_torn_line_is_completed(preset: str, 
     assert len(bench.port.lines()) <= taken + 2, "at most the torn line and off"
     assert bench.port.lines()[-1] == bench.line.messages.off.encode()
     bench.run(0.3)
-    assert not bench.open and bench.model.unknown == []
+    assert not bench.open and bench.model.unknown_lines == []
 
 
 @pytest.mark.parametrize("preset", MODELLED)
@@ -184,7 +184,7 @@ def test_keepalives_come_evenly_while_it_is_on_and_only_then() -> None:
     bench.run(2.0)
     stamps = np.array([stamp for stamp, data in bench.port.taken if data == b"K\n"])
     assert len(stamps) == 49 and np.diff(stamps).max() <= 0.04 + POLL + 1e-9
-    assert np.diff(stamps).mean() == pytest.approx(0.04, abs=1e-4) and bench.model.closed_itself == []
+    assert np.diff(stamps).mean() == pytest.approx(0.04, abs=1e-4) and bench.model.watchdog_stops == []
     bench.off()
     sent = len(bench.port.lines())
     bench.run(2.0)
@@ -198,7 +198,7 @@ def test_a_caller_that_stalls_finds_it_off_not_on() -> None:
     bench.run(0.25, poll=0.25)
     assert not bench.open and bench.state is DispenserState.READY and "watchdog" in bench.driver.status.reason
     off = bench.driver.events()[-1]
-    assert off.flow == 0 and off.stamp == pytest.approx(bench.model.closed_itself[0], abs=1e-6)
+    assert off.flow == 0 and off.stamp == pytest.approx(bench.model.watchdog_stops[0], abs=1e-6)
     assert bench.on() == "" and bench.open
 
 
@@ -513,13 +513,13 @@ def test_a_killed_client_leaves_it_off_within_its_watchdog(tmp_path: File) -> No
         dead = clock.now()  # its last line may be read a little later, on a machine that is busy
         clock.wait_until(dead + 0.5)
     (model,) = models
-    assert len(model.closed_itself) == 1 and not model.on
-    assert killed + 0.03 < model.closed_itself[0] < dead + 0.1 + 0.03
+    assert len(model.watchdog_stops) == 1 and not model.on
+    assert killed + 0.03 < model.watchdog_stops[0] < dead + 0.1 + 0.03
     stamps, flow, switched = np.loadtxt(tmp_path / "line.csv", delimiter=",", skiprows=1).T
     assert np.diff(stamps) == pytest.approx(0.001, abs=1e-5)
     assert flow[(stamps > killed - 0.1) & (stamps < killed)] == pytest.approx(1.0, abs=0.01)
     assert flow[stamps > dead + 0.4].max() < 0.01
-    assert (switched[stamps < model.closed_itself[0]][-100:] == 1).all() and switched[-1] == 0
+    assert (switched[stamps < model.watchdog_stops[0]][-100:] == 1).all() and switched[-1] == 0
 
 
 def test_one_without_a_watchdog_stays_on_after_its_client_and_whoever_is_left_switches_it_off(tmp_path: File) -> None:
@@ -562,7 +562,7 @@ def test_on_and_off_pass_a_pty_and_a_replugged_device_is_off_and_must_be_prepare
         driver.prepare(clock.now())
         until(driver, DispenserState.READY)
         assert close_dispensers(Dispensers([driver]), clock) == []
-    assert models[0].switches == [] and models[0].unknown == []
+    assert models[0].switches == [] and models[0].unknown_lines == []
 
 
 def test_two_programs_cannot_have_one_line(tmp_path: File) -> None:

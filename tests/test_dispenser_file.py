@@ -257,7 +257,7 @@ def test_the_command_listens_and_sends_nothing(tmp_path: Path, capsys: pytest.Ca
         assert main(["dispenser", toml(tmp_path, port), "--seconds", "0.1"]) == 0
     out = capsys.readouterr().out
     assert "switches itself off 100 ms" in out and "half its flow 30 ms after on" in out and "said 0 lines" in out
-    assert models[0].unknown == [] and models[0].switches == []
+    assert models[0].unknown_lines == [] and models[0].switches == []
     assert main(["dispenser", toml(tmp_path, tmp_path / "none"), "--seconds", "0.1"]) == 1
     assert "failed" in capsys.readouterr().out
     assert main(["dispenser", "data/dispensers/arm_pwm.toml"]) == 0
@@ -292,7 +292,7 @@ def test_the_command_closes_when_it_is_interrupted(tmp_path: Path) -> None:
             pass
         process.terminate()
         assert process.wait(10) == 130
-    assert not models[0].on and models[0].closed_itself == [] and len(models[0].switches) == 2
+    assert not models[0].on and models[0].watchdog_stops == [] and len(models[0].switches) == 2
 
 
 @pytest.mark.parametrize(

@@ -354,7 +354,7 @@ def test_a_sample_a_hair_over_a_limit_counts_and_one_at_it_does_not(kind: str, s
         value = named[kind]
     judge = AxesOracle(np.zeros(6), MotionLimits(**{**named, kind: value}), TICK)
     judge(step)
-    assert judge.over[AXES_LIMITS.index(kind)] == over and judge.samples == 1
+    assert judge.violations[AXES_LIMITS.index(kind)] == over and judge.samples == 1
 
 
 def test_rest_after_a_stall_is_no_braking() -> None:
@@ -362,10 +362,10 @@ def test_rest_after_a_stall_is_no_braking() -> None:
     judge = AxesOracle(np.zeros(6), limits, TICK)
     for k in range(1, 20):
         judge(np.array([1.0 * k, 0, 0, 0, 0, 0]))  # 50 mm/s
-    fine = judge.over.copy()
+    fine = judge.violations.copy()
     judge(None)
-    assert (judge.over > fine).any()  # it stood from one tick to the next
+    assert (judge.violations > fine).any()  # it stood from one tick to the next
     judge.rest()
-    now = judge.over.copy()
+    now = judge.violations.copy()
     judge(None)
-    assert np.array_equal(judge.over, now)
+    assert np.array_equal(judge.violations, now)

@@ -77,7 +77,7 @@ def ran(
         holds = held is not None and held[0] <= stamp < held[1]
         talks = said is not None and said[0] <= stamp < said[1]
         words.append(Statement(stamp, "x" if holds or talks else "", not holds, False, stamp - 0.05))
-    return FaultRunRecord(statements=words, log=log, ended=8.0)
+    return FaultRunRecord(statements=words, log=log, end=8.0)
 
 
 def test_what_is_said_in_time_and_over_with_its_cause_is_well() -> None:

@@ -98,7 +98,7 @@ def nozzle_errors(record: Path, path: Path, profile: ArmProfile, stamps: Array, 
         log.write(command, progress)
     printed = PrintPhase.LEAVING, PrintPhase.FINISHED
     end = min([c.stamp for c, p in commands if p.phase in printed], default=np.inf)
-    last = min(log.known_until, float(stamps[-1]), end)
+    last = min(log.last_due, float(stamps[-1]), end)
 
     def axes_at(times: Array) -> Array:
         return np.stack([np.interp(times, stamps, axes[:, i]) for i in range(6)], axis=1)

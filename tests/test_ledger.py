@@ -67,12 +67,12 @@ def test_before_anything_is_commanded_there_is_no_target_and_nothing_is_extruded
     log = ledger().rows(row_instants(0.0, 0.05), at_home)
     assert np.isnan(log.base_from_target).all() and np.isnan(log.place).all() and (log.checkpoint == -1).all()
     assert not log.extrude.any() and set(log.reason) == {"no surface is followed yet"}
-    assert ledger().known_until == -np.inf
+    assert ledger().last_due == -np.inf
 
 
 def test_a_command_is_due_one_tick_and_the_known_lag_after_it() -> None:
     book = filled([0.2, 0.4, 1.0])
-    assert book.known_until == pytest.approx(1.04 + TICK + LAG)
+    assert book.last_due == pytest.approx(1.04 + TICK + LAG)
     log = book.rows(1.0 + LAG + TICK * np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5]), at_home)
     wanted = [np.nan, 0.8, 0.8, 1.2, 1.6, 2.8, 4.0, np.nan]  # mm; the first stretch has no place to come from
     assert log.place == pytest.approx(np.array(wanted), nan_ok=True, abs=1e-9)
@@ -94,7 +94,7 @@ def test_a_bead_whose_flow_was_adapted_needs_that_and_lays_it_where_no_dispenser
     planned = book.rows(times, at_home).flow
     book.adapt(FlowShares(np.array([1.4]), np.array([1.8]), np.array([1.5])))
     assert planned.min() > 0 and book.rows(times, at_home).flow == pytest.approx(planned * [1, 1.5, 1.5, 1])
-    assert book.needed(times) == pytest.approx(planned * [1, 1.5, 1.5, 1])
+    assert book.planned_flow(times) == pytest.approx(planned * [1, 1.5, 1.5, 1])
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=12), st.floats(0, 0.1))
@@ -102,7 +102,7 @@ def test_while_printing_the_place_never_goes_back(steps: list[float], lag: float
     book = TruthLog(bent(), ARM, TRUTH, TICK, lag)
     for i, fraction in enumerate(np.minimum(np.cumsum(steps), 2.0).tolist()):
         book.write(move(i * TICK), progress(fraction))
-    log = book.rows(np.append(row_instants(lag, book.known_until - 1e-9), book.known_until), at_home)
+    log = book.rows(np.append(row_instants(lag, book.last_due - 1e-9), book.last_due), at_home)
     assert np.isfinite(log.place).all() and (np.diff(log.place) >= -1e-9).all()
     assert log.place.min() >= 0 and log.place.max() <= 10.0
     assert log.place[-1] == pytest.approx(np.interp(min(sum(steps), 2.0), [0, 1, 2], PLACES))
@@ -215,7 +215,7 @@ def test_bytes_keep_their_order_and_distance(pieces: list[tuple[int, float]]) ->
         sent = wire.send(bytes(size), now)
         assert len(sent) == size and (sent >= now + 0.01 - 1e-12).all()
         arrivals = np.append(arrivals, sent)
-    assert (np.diff(arrivals) >= 0.01 - 1e-12).all() and wire.free == (arrivals[-1] if len(arrivals) else -math.inf)
+    assert (np.diff(arrivals) >= 0.01 - 1e-12).all() and wire.busy_until == max(arrivals, default=-math.inf)
 
 
 @given(sends)

@@ -180,7 +180,7 @@ def test_what_an_arm_that_moved_on_has_left_is_kept(tmp_path: Path) -> None:
     kills = Kills(kept)
     for name, rested in (("a", MAX_REST_DELAY / 2), ("b", MAX_REST_DELAY * 1.1)):
         (left / f"{name}.mcap").write_bytes(b"x")
-        kills.rests.append(rested)
+        kills.rest_delays.append(rested)
         kills.save(left / f"{name}.mcap", "feed", 3.0)
     assert sorted(file.name for file in kept.iterdir()) == ["b.mcap", "kills.csv"]
     assert (kept / "kills.csv").read_text().splitlines()[1:] == ["a.mcap,feed,0.250,3.000", "b.mcap,feed,0.550,3.000"]

@@ -192,7 +192,7 @@ def test_a_clogged_needle_holds_its_share_back_and_a_wrong_pump_gives_another_fl
     assert dispensers.flow(instants, needed) == pytest.approx([0.0, 4.0, 1.0, 4.0])
     file = worlds.write_scenario(tmp_path, worlds.IDEAL, {"dispenser": {"given": 1.25}})
     scenario = read_scenario(file)
-    assert scenario.dispenser is not None and scenario.dispenser.given == 1.25
+    assert scenario.dispenser is not None and scenario.dispenser.flow_share == 1.25
     for value in (0.0, -1.0, 9.0):
         file = worlds.write_scenario(tmp_path, worlds.IDEAL, {"dispenser": {"given": value}})
         with pytest.raises(InputError, match=r"dispenser\.given"):

@@ -183,7 +183,7 @@ def test_whatever_happens_it_is_on_only_with_a_move_that_was_sent(data: st.DataO
     )
     run.run(6.5)
     assert not run.bench.open
-    if run.bench.model.closed_itself:  # nothing could be said to it: its watchdog is all there is
+    if run.bench.model.watchdog_stops:  # nothing could be said to it: its watchdog is all there is
         allowed = [(a, b + GEL.watchdog) for a, b in run.allowed() if GEL.watchdog]
         assert outside(run.told(), allowed) == 0.0
     else:

@@ -87,7 +87,7 @@ def test_ticks_come_a_hair_slower_than_moves_last_so_that_no_queue_grows() -> No
     looping = Looping(START, linked(stand=False), seen)
     ticks = looping.run(4.0)
     assert np.diff(np.array([t.stamp for t in ticks])) == pytest.approx(0.02 * 1.005, abs=1e-6)
-    assert looping.link.virtual.deepest <= 0.0245  # the first step, to where it stands, goes before a tick
+    assert looping.link.virtual.peak_work <= 0.0245  # the first step, to where it stands, goes before a tick
 
 
 def test_what_was_decided_is_what_arrives() -> None:
@@ -226,7 +226,7 @@ def test_while_the_arm_is_held_the_motion_is_not_asked() -> None:
     ticks = Looping(START, link, seen).run(2.0)
     held = [t for t in ticks if isinstance(t.command, Hold) and "taken no bytes" in t.command.reason]
     assert 4 <= len(held) <= 9
-    assert max(link.virtual.deepest, link.deepest) <= 0.05
+    assert max(link.virtual.peak_work, link.deepest) <= 0.05
 
 
 def test_a_lost_surface_is_a_pause_on_the_wire_and_the_arm_at_rest() -> None:
@@ -253,7 +253,7 @@ def test_a_late_tick_is_made_once_and_missed_ones_are_not_made_up() -> None:
     assert looping.loop.skipped in (2, 3)
     assert np.diff([t.stamp for t in ticks]).max() > 0.06
     assert looping.loop.lateness.most > 0.005 and looping.loop.lateness.count == len(ticks)
-    assert link.virtual.deepest <= 0.05
+    assert link.virtual.peak_work <= 0.05
 
 
 def test_whatever_ends_it_the_arm_is_stopped() -> None:

@@ -132,7 +132,7 @@ def figures() -> RunFigures:
     log = eventful()
     errors = nozzle_errors(log, LINE)
     late = nozzle_log(PATH, breathing, offset=np.array([0.1, 0.0, 0.0]))
-    material = material_figures(late, LINE, nozzle_errors(late, LINE), 0.8, told=0.002)
+    material = material_figures(late, LINE, nozzle_errors(late, LINE), 0.8, open_outside=0.002)
     deposit = deposit_figures(deposit_map(log, LINE, 0.8))
     return RunFigures(nozzle_figures(log, LINE, errors), deposit, material, spread(np.array([0.1, 0.2])))
 
@@ -140,7 +140,7 @@ def figures() -> RunFigures:
 @pytest.mark.parametrize("name", BOUNDS)
 def test_a_limit_is_met_at_its_bound_and_missed_by_one_epsilon(name: str) -> None:
     run = figures()
-    reached = BOUNDS[name].of(run)
+    reached = BOUNDS[name].value_of(run)
     assert np.isfinite(reached)
     beyond = np.nextafter(reached, np.inf if BOUNDS[name].minimum else -np.inf)
     for allowed, met in ((reached, True), (float(beyond), False)):
@@ -161,7 +161,7 @@ def test_limits_are_read_in_their_order() -> None:
     limits = limits_from_table("x.toml", {"duty": 1, "p95_mm": 0.5})
     assert limits == {"duty": 1.0, "p95_mm": 0.5}
     assert limits_from_table("x.toml", {}) == {}
-    assert [v.bound.words for v in check_limits(limits, figures())] == ["duty", "position error, 95 %"]
+    assert [v.bound.label for v in check_limits(limits, figures())] == ["duty", "position error, 95 %"]
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ class Claims(Heard):
         self._reports = RunReports()
         self.motion: PrintMotion | None = None
 
-    def given(self, pose: SurfacePose) -> None:
+    def pose_delivery(self, pose: SurfacePose) -> None:
         sets = 1 if self._reports.tracking is None else self._reports.tracking.sets + 1
         self._reports.tracking = TrackingReport(pose.stamp, ("a",), pose=pose, sets=sets)
 

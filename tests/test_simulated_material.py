@@ -65,7 +65,7 @@ def test_a_map_spread_by_a_disc_is_the_convolution(rows: int, columns: int, widt
 def figures(**dispenser: object) -> MaterialFigures:
     world, sink = printed(tuple(dispenser.items()))
     line, log = planned_line(world._path), sink.log
-    return material_figures(log, line, nozzle_errors(log, line), BEAD, world.told_outside)
+    return material_figures(log, line, nozzle_errors(log, line), BEAD, world.open_outside)
 
 
 def test_without_a_table_beads_lie_where_the_motion_prints() -> None:
@@ -77,15 +77,15 @@ def test_without_a_table_beads_lie_where_the_motion_prints() -> None:
     for name in ("coverage", "gaps", "overlap", "outside", "material"):
         assert getattr(told, name) == pytest.approx(getattr(before, name), abs=0.005)
     found = figures()
-    assert np.abs([*found.begins.error, *found.stops.error]).max() < 0.05 and len(found.stops.error) == 2
-    assert found.told == 0.0 and found.ooze == 0.0 and found.laid == pytest.approx(found.planned, rel=0.01)
+    assert np.abs([*found.beginnings.error, *found.ends.error]).max() < 0.05 and len(found.ends.error) == 2
+    assert found.open_outside == found.ooze == 0.0 and found.volume == pytest.approx(found.planned_volume, rel=0.01)
 
 
 def test_what_is_laid_is_the_integral_of_the_true_flow() -> None:
     world, sink = printed(tuple((LATE | OOZING).items()))
     times = np.arange(0.0005, sink.log.stamps[-1], 1e-3)
     flown = float(world.dispensers.flow(times, np.zeros(len(times))).sum()) * 1e-3
-    assert figures(**LATE, **OOZING).laid == pytest.approx(flown, rel=2e-3) and flown > 10.0
+    assert figures(**LATE, **OOZING).volume == pytest.approx(flown, rel=2e-3) and flown > 10.0
 
 
 @given(st.lists(st.floats(0, 9), min_size=5, max_size=5))
@@ -100,32 +100,32 @@ def test_the_map_holds_what_left_the_nozzle(flows: list[float]) -> None:
 
 def test_a_delay_that_nobody_knows_of_shifts_beads_by_its_way_and_one_that_is_known_does_not() -> None:
     shifted, led = figures(**LATE, led=False), figures(**LATE)
-    assert shifted.begins.error[1] == pytest.approx(0.1 * SPEED, abs=0.1)
-    assert shifted.stops.error[0] == pytest.approx(0.06 * SPEED, abs=0.1)
-    assert np.abs([*led.begins.error, *led.stops.error]).max() < 0.15
-    assert shifted.begins.blob < -0.5 < led.begins.excess.min()  # mm^3: what is late is missing there
-    assert shifted.told == led.told == 0.0 and shifted.flowing > 0.04
+    assert shifted.beginnings.error[1] == pytest.approx(0.1 * SPEED, abs=0.1)
+    assert shifted.ends.error[0] == pytest.approx(0.06 * SPEED, abs=0.1)
+    assert np.abs([*led.beginnings.error, *led.ends.error]).max() < 0.15
+    assert shifted.beginnings.blob < -0.5 < led.beginnings.excess.min()  # mm^3: what is late is missing there
+    assert shifted.open_outside == led.open_outside == 0.0 and shifted.flow_outside > 0.04
 
 
 def test_a_lag_is_led_to_half_of_the_flow() -> None:
     led = figures(on_lag_s=0.05, off_lag_s=0.05)
-    assert np.abs([led.begins.error[1], led.stops.error[0]]).max() < 0.15
+    assert np.abs([led.beginnings.error[1], led.ends.error[0]]).max() < 0.15
 
 
 def test_ooze_is_a_blob_behind_the_bead_and_lies_beside_the_path() -> None:
     tight, leaky = figures(led=True), figures(**OOZING)
-    assert leaky.stops.excess.min() > tight.stops.excess.max() + 0.1
-    assert leaky.ooze > 0.05 and leaky.laid - tight.laid == pytest.approx(0.9, abs=0.15)  # a part comes after the run
+    assert leaky.ends.excess.min() > tight.ends.excess.max() + 0.1
+    assert leaky.ooze > 0.05 and leaky.volume - tight.volume == pytest.approx(0.9, abs=0.15)  # the rest comes later
 
 
 def test_a_valve_gives_what_it_gives() -> None:
-    assert figures(flow_mm3_s=5.0).laid == pytest.approx(figures().planned * 5.0 / SPEED, rel=0.15)
+    assert figures(flow_mm3_s=5.0).volume == pytest.approx(figures().planned_volume * 5.0 / SPEED, rel=0.15)
 
 
 def test_a_line_that_takes_nothing_stops_the_print_and_it_goes_on() -> None:
     world, sink = printed(tuple(LATE.items()), ("dispenser block at 0.65s for 1.5s",))
     model = world.dispensers.models[0]
-    assert len(model.closed_itself) == 1 and 0.65 < model.closed_itself[0] < 0.8
+    assert len(model.watchdog_stops) == 1 and 0.65 < model.watchdog_stops[0] < 0.8
     reasons = {command.reason for command in sink.commands}
     assert any("dispenser is failed: its line took nothing" in reason for reason in reasons)
     assert sink.progress[-1].fraction == 3.0 and sink.log.flow[sink.log.stamps > 2.5].max() > 5.0
@@ -134,7 +134,7 @@ def test_a_line_that_takes_nothing_stops_the_print_and_it_goes_on() -> None:
 def test_a_hold_in_the_middle_of_a_bead_closes_at_once() -> None:
     world, sink = printed((), ("tracking hang at 0.4s for 0.6s",))
     held = [command.stamp for command in sink.commands if isinstance(command, Hold) and "old" in command.reason]
-    assert held and world.told_outside == 0.0 and not world.dispensers.models[0].closed_itself
+    assert held and world.open_outside == 0.0 and not world.dispensers.models[0].watchdog_stops
     assert not sink.log.flow[(sink.log.stamps > held[0] + 0.002) & (sink.log.stamps < held[-1])].any()
     assert sink.progress[-1].fraction == 3.0
 
@@ -173,14 +173,14 @@ def test_told_on_counts_where_the_last_command_does_not_print(following: Command
     clock = SimClock()
     dispensers = SimulatedDispensers(path_through(np.array([[0.0, 0, 0], [9, 0, 0]])), None, clock)
     dispensers.control.begin(0.0, 0.0)
-    dispensers.note(moves(5.0), TICK)
+    dispensers.add_command(moves(5.0), TICK)
     dispensers.control.follow(moves(5.0), 0.0)
-    dispensers.note(following, TICK)  # and it is not followed
-    assert dispensers.told_outside(0.08) == pytest.approx(outside)
-    assert dispensers.told_outside(0.08, [(0.0, 1.0)]) == 0.0
-    assert dispensers.open_after([(0.01, 1.0)], 0.08) == pytest.approx(0.07)
+    dispensers.add_command(following, TICK)  # and it is not followed
+    assert dispensers.open_outside(0.08) == pytest.approx(outside)
+    assert dispensers.open_outside(0.08, [(0.0, 1.0)]) == 0.0
+    assert dispensers.open_unattended([(0.01, 1.0)], 0.08) == pytest.approx(0.07)
     dispensers.forbid(0.03)
-    assert dispensers.told_outside(0.08) == pytest.approx(max(outside, 0.05))
+    assert dispensers.open_outside(0.08) == pytest.approx(max(outside, 0.05))
 
 
 @pytest.mark.parametrize(

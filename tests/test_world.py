@@ -18,7 +18,7 @@ from hardware.simulator.deposit import NozzleLog
 from hardware.simulator.nozzle_error import nozzle_lag
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.shape import Deformation
-from hardware.simulator.world import RUN_OUT
+from hardware.simulator.world import FINISH_TAIL
 from planning.command import TICK_FRACTION
 from planning.path import PrintPhase, PrintProgress
 from tests.slowly import slowly
@@ -153,7 +153,7 @@ def test_a_run_ends_soon_after_the_path(tmp_path: Path) -> None:
     sink = heard(write_scenario(tmp_path, IDEAL, seconds=30.0))
     phases = zip(sink.commands, sink.progress, strict=True)
     finished = next(command.stamp for command, p in phases if p.phase is PrintPhase.FINISHED)
-    assert sink.log.stamps[-1] == pytest.approx(finished + RUN_OUT, abs=1.1e-3)
+    assert sink.log.stamps[-1] == pytest.approx(finished + FINISH_TAIL, abs=1.1e-3)
     assert "path finished" in sink.reasons
     assert sink.log.place[-1] == pytest.approx(8.0) and not sink.log.extrude[sink.log.stamps > finished].any()
 

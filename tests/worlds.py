@@ -78,7 +78,7 @@ class Heard:
         self.frames.append(frames)
         self.poses.append(pose)
 
-    def given(self, pose: SurfacePose) -> None:
+    def pose_delivery(self, pose: SurfacePose) -> None:
         pass
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
@@ -96,7 +96,7 @@ class Heard:
     def rows(self, log: NozzleLog) -> None:
         self.logs.append(log)
 
-    def registered(self, truth_from_estimate: Array) -> None:
+    def registration(self, truth_from_estimate: Array) -> None:
         self.changes.append(truth_from_estimate)
 
     def look(self, look: Look) -> None:

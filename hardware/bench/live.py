@@ -1,8 +1,8 @@
 """Subjects `live` and `beside`: whole runs in real time; the wound network beside the tracker and without it.
 
-A run has pre-rendered cameras, the virtual arm, and all processes. Rendering takes ten times as long as the pictures
-last, so they are rendered once and shown by a process of their own.
-Kills: random processes of a run end at random instants. Is the arm at rest? Does the next run go on where it was?
+A run has pre-rendered cameras, the virtual arm, and all processes. Rendering takes ten times real time, so pictures are
+rendered once and fed by a separate process.
+Kills: random processes of a run are killed at random instants. Is the arm at rest? Does the next run resume there?
 """
 
 from __future__ import annotations
@@ -51,38 +51,38 @@ WATCHED_PROCESSES = ("tracking", "motion", "recorder")  # by the main process; t
 KILLED_PROCESSES = ("run", "tracking", "motion", "recorder", "feed")
 PRINTED_TEXT = "the path is printed"
 MAX_PRINTING = 3.0  # s of printing before a kill
-MAX_REST_DELAY = 0.5  # s from a kill until the arm must rest: 0.1 until it is noticed, 0.05 queued, its servo
-MIN_REST = 0.05  # s of rest that are checked
-REST_RADIUS = 0.05  # mm from where it ended
-END_TIMEOUT = 60.0  # s in which the others must have ended
-EXECUTED_TIMEOUT = 30.0  # s in which the virtual arm has written what it did
+MAX_REST_DELAY = 0.5  # s from a kill until the arm must rest: 0.1 of detection, 0.05 queued, its servo
+MIN_REST = 0.05  # s, least rest at the end
+REST_RADIUS = 0.05  # mm from the last place
+END_TIMEOUT = 60.0  # s for the end of the others
+EXECUTED_TIMEOUT = 30.0  # s for the virtual arm's file of executed axes
 
 
 @dataclass(slots=True)
 class Kills:
     """Measurements of all kills."""
 
-    out: Path | None = None  # for a table, and for the files of runs whose arm moved on; None: nothing is saved
+    out: Path | None = None  # for a table, and for the files of runs whose arm did not rest; None: nothing is saved
     count: int = 0
-    rests: list[float] = field(default_factory=list)  # s after each kill until the arm rested
-    stuck: list[str] = field(default_factory=list)  # last lines of the runs that did not print
-    lost: list[float] = field(default_factory=list)  # checkpoints, of each resumed run
-    doubled: list[float] = field(default_factory=list)  # likewise
-    unread: list[float] = field(default_factory=list)  # s before the kill from which the recording cannot be read
-    noticed: list[float] = field(default_factory=list)  # s until the main process reported it
+    rest_delays: list[float] = field(default_factory=list)  # s after each kill until the arm rested
+    stuck: list[str] = field(default_factory=list)  # last lines of runs that did not print
+    omissions: list[float] = field(default_factory=list)  # checkpoints omitted by each resumed run
+    repetitions: list[float] = field(default_factory=list)  # checkpoints printed twice
+    losses: list[float] = field(default_factory=list)  # s of recording lost before each kill
+    reports: list[float] = field(default_factory=list)  # s from a kill until the main process reported it
 
     def save(self, record: Path, victim: str, place: float) -> None:
         """Add the last kill to the table; where the arm moved on, copy the run's files."""
         if self.out is None:
             return
-        row = (record.name, victim, f"{self.rests[-1]:.3f}", f"{place:.3f}")
+        row = (record.name, victim, f"{self.rest_delays[-1]:.3f}", f"{place:.3f}")
         append_rows(self.out / "kills.csv", ("record", "killed", "rests_s", "place"), [row])
-        for file in record.parent.glob(f"{record.stem}.*") if self.rests[-1] > MAX_REST_DELAY else ():
+        for file in record.parent.glob(f"{record.stem}.*") if self.rest_delays[-1] > MAX_REST_DELAY else ():
             shutil.copy(file, self.out)
 
 
 def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int, out: Path | None) -> list[Figure]:
-    """Kill `count` processes, each in the run that resumes the one before; after a finished print a new one begins."""
+    """Kill `count` processes, each in a run that resumes the last one; a finished print is followed by a new one."""
     rng, kills = np.random.default_rng(seed), Kills(out)
     record: Path | None = None
     place = math.nan
@@ -95,23 +95,23 @@ def kill_figures(scenario: Path, folder: Path, path: Path, count: int, seed: int
             record = RunFiles(record).next().record
             place = _kill(LiveSession(arguments), record, kills, rng, place)
         record = record if np.isfinite(place) else None
-    name, most_noticed = f"{kills.count} kills", 1000 * max(kills.noticed, default=np.nan)
-    late = sum(s > MAX_REST_DELAY for s in kills.rests)
+    name, latest_report = f"{kills.count} kills", 1000 * max(kills.reports, default=np.nan)
+    late = sum(s > MAX_REST_DELAY for s in kills.rest_delays)
     return [
         Figure(f"{name}: arms not at rest after {MAX_REST_DELAY:g} s", late, "", at_most(0)),
-        Figure(f"{name}: arm at rest after, median", 1000 * float(np.median(kills.rests or np.nan)), "ms"),
-        Figure(f"{name}: arm at rest after, most", 1000 * max(kills.rests, default=np.nan), "ms"),
+        Figure(f"{name}: arm at rest after, median", 1000 * float(np.median(kills.rest_delays or np.nan)), "ms"),
+        Figure(f"{name}: arm at rest after, most", 1000 * max(kills.rest_delays, default=np.nan), "ms"),
         Figure(f"{name}: runs that did not print again", len(kills.stuck), "", at_most(0), "", "; ".join(kills.stuck)),
-        Figure(f"{name}: most left out", max(kills.lost, default=np.nan), "checkpoints", at_most(1)),
-        Figure(f"{name}: most printed twice", max(kills.doubled, default=np.nan), "checkpoints", at_most(0)),
-        Figure(f"{name}: death of a process noticed, median", 1000 * float(np.median(kills.noticed or np.nan)), "ms"),
-        Figure(f"{name}: death of a process noticed, most", most_noticed, "ms", at_most(100)),
-        Figure(f"{name}: recording ends before the kill, most", max(kills.unread, default=np.nan), "s", at_most(1)),
+        Figure(f"{name}: most left out", max(kills.omissions, default=np.nan), "checkpoints", at_most(1)),
+        Figure(f"{name}: most printed twice", max(kills.repetitions, default=np.nan), "checkpoints", at_most(0)),
+        Figure(f"{name}: death of a process noticed, median", 1000 * float(np.median(kills.reports or np.nan)), "ms"),
+        Figure(f"{name}: death of a process noticed, most", latest_report, "ms", at_most(100)),
+        Figure(f"{name}: recording ends before the kill, most", max(kills.losses, default=np.nan), "s", at_most(1)),
     ]
 
 
-def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator, before: float | None) -> float:
-    """Kill one process of a run; the last place that it extruded, NaN where there is none to go on from."""
+def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator, last_place: float | None) -> float:
+    """Kill one process of a run; its last extruded place, NaN without a place to resume from."""
     clock = WallClock()
     try:
         if run.wait_for("\nprint\n") < 0:
@@ -122,7 +122,7 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         victim = str(rng.choice(KILLED_PROCESSES))
         now = run.kill(victim)
         if victim in WATCHED_PROCESSES and run.wait_for("was killed", timeout=END_TIMEOUT) >= 0:
-            kills.noticed.append(clock.now() - now)
+            kills.reports.append(clock.now() - now)
         run.end(END_TIMEOUT)
     finally:
         run.close()
@@ -134,38 +134,38 @@ def _kill(run: LiveSession, record: Path, kills: Kills, rng: np.random.Generator
         clock.wait_until(clock.now() + 0.1)
     clock.wait_until(clock.now() + 0.3)
     with np.load(file) as executed:
-        kills.rests.append(rest_delay(executed["stamps"], executed["axes"], now))
+        kills.rest_delays.append(rest_delay(executed["stamps"], executed["axes"], now))
     first, last = printed_range(record)
-    if before is not None and np.isfinite(first):
-        kills.lost.append(max(first - before, 0.0))
-        kills.doubled.append(max(before - first, 0.0))
+    if last_place is not None and np.isfinite(first):
+        kills.omissions.append(max(first - last_place, 0.0))
+        kills.repetitions.append(max(last_place - first, 0.0))
     try:
-        kills.unread.append(max(now - open_session(record).sets[-1][0].stamp, 0.0))
+        kills.losses.append(max(now - open_session(record).sets[-1][0].stamp, 0.0))
     except InputError:
-        kills.unread.append(math.inf)
+        kills.losses.append(math.inf)
     if victim == "recorder":  # its recording ends before the arm did: only the progress file has the place
         last = float(read_toml(RunFiles(record).progress)["fraction"])
     kills.save(record, victim, last)
-    return last if np.isfinite(last) else before if before is not None else math.nan
+    return last if np.isfinite(last) else last_place if last_place is not None else math.nan
 
 
 def rest_delay(stamps: Array, axes: Array, since: float) -> float:
-    """How long, s, after `since` an arm that was at `axes` (N, 6) at `stamps` (N,), s, came to rest; inf: never.
+    """Delay, s, from `since` until an arm with `axes` (N, 6) at `stamps` (N,), s, came to rest; inf: never.
 
-    Rest is to stay within `REST_RADIUS` of where it ended, for the last `MIN_REST` at least.
+    Rest: within `REST_RADIUS` of the last place, for the last `MIN_REST` at least.
     """
-    away = np.linalg.norm(axes[:, :3] - axes[-1, :3], axis=1) > REST_RADIUS
-    if not away.any():
+    moving = np.linalg.norm(axes[:, :3] - axes[-1, :3], axis=1) > REST_RADIUS
+    if not moving.any():
         return 0.0
-    last = float(stamps[away][-1])
+    last = float(stamps[moving][-1])
     return max(last - since, 0.0) if last < stamps[-1] - MIN_REST else math.inf
 
 
-STOP_PERIOD = 8.0  # s between stops of the run that is stopped repeatedly
-PROBE_PIECES = 20000  # of work that measure the machine before a run: ten seconds
+STOP_PERIOD = 8.0  # s between repeated stops of a run
+PROBE_PIECES = 20000  # of work to measure the machine before a run: 10 s
 MEMORY_PERIOD = 2.0  # s between measurements of the memory
-HOMING_TEXT = "\nhoming\n"  # what a run says once its path is printed
-KILLED_PATH_S = 90.0  # s of a path that is printed by runs which are killed after some seconds each
+HOMING_TEXT = "\nhoming\n"  # output of a run after its path
+KILLED_PATH_S = 90.0  # s of a path for runs that are killed after some seconds each
 SHOWN_STAGES = "frames wait for the tracker", "tracking", "frames handed over to pose"
 STOP_STAGE = "stop decided to on the wire"
 
@@ -189,13 +189,13 @@ def run_live(options: argparse.Namespace) -> list[Figure]:
 
 
 def _repeated(path: Toolpath, seconds: float) -> Toolpath:
-    """The path printed again and again, there and back, for so long."""
-    once = float(np.sum(way_lengths(path.surface_from_nozzle) / path.speed[1:]))
-    count, there = len(path), np.arange(len(path))
-    order = list(there)
-    while len(order) < seconds / once * count:
-        order += list(there[-2::-1] if order[-1] == count - 1 else there[1:])
-    index = np.array(order[: max(int(seconds / once * count), 2)])
+    """The path printed to and fro for `seconds` s."""
+    duration = float(np.sum(way_lengths(path.surface_from_nozzle) / path.speed[1:]))
+    count, indices = len(path), np.arange(len(path))
+    order = list(indices)
+    while len(order) < seconds / duration * count:
+        order += list(indices[-2::-1] if order[-1] == count - 1 else indices[1:])
+    index = np.array(order[: max(int(seconds / duration * count), 2)])
     names = "surface_from_nozzle", "speed", "material", "temperature", "layer"
     rows: dict[str, Any] = {name: getattr(path, name)[index] for name in names}
     return replace(path, **rows, extrude=path.extrude[np.maximum(index, 1)], extra={})
@@ -203,10 +203,10 @@ def _repeated(path: Toolpath, seconds: float) -> Toolpath:
 
 def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: Path) -> list[Figure]:
     record, clock = folder / "print.mcap", WallClock()
-    arguments, alone = _arguments(options.scenario, record, path), measure_evenness(clock, PROBE_PIECES)
+    arguments, idle = _arguments(options.scenario, record, path), measure_evenness(clock, PROBE_PIECES)
     if options.pinned:  # each loop has a core of its own
-        one, other = available_cores()[:1], available_cores()[1:2]
-        settings = LiveSettings(cores_tracking=one, cores_motion=other, cores_recorder=other)
+        tracking_core, other_core = available_cores()[:1], available_cores()[1:2]
+        settings = LiveSettings(cores_tracking=tracking_core, cores_motion=other_core, cores_recorder=other_core)
         (folder / "session.toml").write_text(settings_text(settings))
         arguments.insert(0, str(folder / "session.toml"))
     run = LiveSession(arguments)
@@ -225,11 +225,11 @@ def _print_figures(options: argparse.Namespace, folder: Path, path: Path, arm: P
     note = f"load {np.mean(load or [np.nan]):.1f} on {os.cpu_count()} cores"
     name = f"live {options.minutes:g} min" + (", pinned" if options.pinned else "")
     name += f", {options.busy} busy beside it" if options.busy else ""
-    even = f"{1000 * alone.usual:.1f} ms usually; before the run, nothing else of it running: no run can be more even"
+    text = f"{1000 * idle.usual:.1f} ms usually; before the run, nothing else of it running: no run can be more even"
     return [
         *_latencies(name, summary["latency_ms"], note, TARGETS_BUSY if options.busy else TARGETS_ALONE),
-        Figure(f"{name}: the machine alone, a piece of work at the worst", 1000 * alone.largest, "ms", note=even),
-        Figure(f"{name}: the machine alone, time in which work is slow", 100 * alone.slow, "%", note="three times"),
+        Figure(f"{name}: the machine alone, a piece of work at the worst", 1000 * idle.largest, "ms", note=text),
+        Figure(f"{name}: the machine alone, time in which work is slow", 100 * idle.slow, "%", note="three times"),
         *_errors(name, summary, error),
         *_load(name, summary, run.memory),
     ]
@@ -243,30 +243,30 @@ def _latencies(name: str, times: dict[str, Any], note: str, targets: tuple[float
     stages = FRAMES_TO_WIRE_STAGE, EXPOSURE_TO_WIRE_STAGE, LATE_TICK_STAGE
     wire, exposure, late = (times.get(stage, {}) for stage in stages)
     return [
-        Figure(f"{name}: frames to wire, median", _of(wire, "p50"), "ms", at_most(targets[0]), "thesis: 180 ms", note),
-        Figure(f"{name}: frames to wire, 99 %", _of(wire, "p99"), "ms", at_most(targets[1])),
-        Figure(f"{name}: frames to wire, largest", _of(wire, "max"), "ms", at_most(targets[2])),
-        Figure(f"{name}: exposure to wire, median", _of(exposure, "p50"), "ms"),
-        *(Figure(f"{name}: {stage}, median", _of(times.get(stage, {}), "p50"), "ms") for stage in SHOWN_STAGES),
-        Figure(f"{name}: tick late, 99 %", _of(late, "p99"), "ms", at_most(3)),
+        Figure(f"{name}: frames to wire, median", _ms(wire, "p50"), "ms", at_most(targets[0]), "thesis: 180 ms", note),
+        Figure(f"{name}: frames to wire, 99 %", _ms(wire, "p99"), "ms", at_most(targets[1])),
+        Figure(f"{name}: frames to wire, largest", _ms(wire, "max"), "ms", at_most(targets[2])),
+        Figure(f"{name}: exposure to wire, median", _ms(exposure, "p50"), "ms"),
+        *(Figure(f"{name}: {stage}, median", _ms(times.get(stage, {}), "p50"), "ms") for stage in SHOWN_STAGES),
+        Figure(f"{name}: tick late, 99 %", _ms(late, "p99"), "ms", at_most(3)),
     ]
 
 
 def _errors(name: str, summary: dict[str, Any], error: NozzleErrors) -> list[Figure]:
-    done, sets = f"ended: {summary['ended']}", f"of {summary['frame_sets']}"
+    end_note, sets_note = f"ended: {summary['ended']}", f"of {summary['frame_sets']}"
     return [
-        Figure(f"{name}: nozzle error, 95 %", error.figure(95), "mm", at_most(0.5), "", done),
+        Figure(f"{name}: nozzle error, 95 %", error.figure(95), "mm", at_most(0.5), "", end_note),
         Figure(f"{name}: nozzle error, largest", error.figure(100), "mm", at_most(1.0)),
         Figure(f"{name}: duty", 100 * error.duty, "%", at_least(80)),
-        Figure(f"{name}: holds", sum(hold["count"] for hold in summary["holds"]), "", None, "", _held(summary)),
+        Figure(f"{name}: holds", sum(hold["count"] for hold in summary["holds"]), "", None, "", _holds_text(summary)),
         Figure(f"{name}: most queued in the arm", 1000 * error.deepest, "ms", at_most(50)),
         Figure(f"{name}: virtual arm held up by the machine, longest", 1000 * error.held_up, "ms"),
-        Figure(f"{name}: frame sets left out", summary["frame_sets_dropped"], "", None, "", sets),
+        Figure(f"{name}: frame sets left out", summary["frame_sets_dropped"], "", None, "", sets_note),
     ]
 
 
-def _held(summary: dict[str, Any]) -> str:
-    """How long it was held in all, and for what the longest."""
+def _holds_text(summary: dict[str, Any]) -> str:
+    """Total of the holds, and reason of the longest kind."""
     holds = summary["holds"]
     longest = f", the longest: {holds[0]['reason']}" if holds else ""
     return f"{sum(hold['total_s'] for hold in holds):.1f} s{longest}"
@@ -309,13 +309,13 @@ def _stop_figures(options: argparse.Namespace, folder: Path, path: Path) -> list
     return [
         Figure(
             "stop decided to on the wire, 99 %",
-            _of(delay, "p99"),
+            _ms(delay, "p99"),
             "ms",
             at_most(STOP_TARGETS[options.busy > 0]),
             "",
             note,
         ),
-        Figure("stop decided to on the wire, largest", _of(delay, "max"), "ms"),
+        Figure("stop decided to on the wire, largest", _ms(delay, "max"), "ms"),
     ]
 
 
@@ -323,7 +323,7 @@ def _arguments(scenario: Path, record: Path, path: Path) -> list[str]:
     return ["--simulated", str(scenario), "--record", str(record), "--path", str(path), "--no-page", "--yes"]
 
 
-def _of(span: dict[str, Any], key: str) -> float:
+def _ms(span: dict[str, Any], key: str) -> float:
     return float(span[key]) if span.get(key) is not None else math.nan
 
 
@@ -331,7 +331,7 @@ BLOCK_SETS = 15  # half a second, tracked with the network and without it in tur
 
 
 def run_beside(options: argparse.Namespace) -> list[Figure]:
-    """Two trackers of the same pictures take turns, one with the network: its share of a core, what a pose costs."""
+    """Two trackers of the same pictures in turn, one with the network: its share of a core, and the time of a pose."""
     clock, cpu = WallClock(), CpuClock()
     looks, wall = list[float](), 0.0  # s of processor for each picture segmented; s of the blocks in which they were
     recording = made_recording(options.scene, options.seconds)
@@ -339,33 +339,33 @@ def run_beside(options: argparse.Namespace) -> list[Figure]:
     network = WoundNetwork(shipped_model() if options.model is None else options.model, 1)
     segmenter = NetworkSegmenter(network, network.settings)
     poses = list[SurfacePose](), list[SurfacePose]()  # without the network, with it
-    spent = list[float](), list[float](), list[float]()  # s to a pose likewise; s after it to hand pictures over
+    durations = list[float](), list[float](), list[float]()  # s to a pose likewise; s after it to hand pictures over
 
     def timed(image: Image) -> Segmentation:
         start = cpu.now()
-        found = segmenter(image)
+        segmentation = segmenter(image)
         looks.append(cpu.now() - start)
-        return found
+        return segmentation
 
     track = partial(tracker, recording.rig, recording.roi, recording.surface)
-    with track() as without, track() as along, ThreadPoolExecutor(1) as thread:
-        steps, beside = (without, along), AsyncSegmentation(recording.rig, timed, thread)
+    with track() as plain, track() as loaded, ThreadPoolExecutor(1) as thread:
+        steps, beside = (plain, loaded), AsyncSegmentation(recording.rig, timed, thread)
         for block in range(0, len(packed), BLOCK_SETS):
-            for turn in (0, 1) if block % (2 * BLOCK_SETS) else (1, 0):
+            for index in (0, 1) if block % (2 * BLOCK_SETS) else (1, 0):
                 start, sets = clock.now(), packed[block : block + BLOCK_SETS]
-                for number, each in enumerate(sets):
-                    frames = unpacked_set(each)
+                for number, packed_set in enumerate(sets):
+                    frames = unpacked_set(packed_set)
                     clock.wait_until(start + number / FRAME_RATE)
-                    begun = clock.now()
-                    poses[turn].append(steps[turn](frames))
-                    ended = clock.now()
-                    spent[turn].append(ended - begun)
-                    if turn:
+                    begin = clock.now()
+                    poses[index].append(steps[index](frames))
+                    end = clock.now()
+                    durations[index].append(end - begin)
+                    if index:
                         beside(frames)
-                        spent[2].append(clock.now() - ended)
-                    steps[turn].idle()
+                        durations[2].append(clock.now() - end)
+                    steps[index].idle()
                 clock.wait_until(start + len(sets) / FRAME_RATE)
-                wall += turn * (clock.now() - start)
+                wall += index * (clock.now() - start)
                 thread.submit(int).result()  # the network has ended before the other's turn
     pace = len(packed) / FRAME_RATE / wall  # of live cameras; below 1 the machine had no time for them
     share, note = f"{options.scene}: network's share of a core", f"{len(looks)} pictures in {wall:.1f} s, one thread"
@@ -374,4 +374,4 @@ def run_beside(options: argparse.Namespace) -> list[Figure]:
         Figure(f"{options.scene}: pace", 100 * pace, "%", at_least(95), "", "of 30 frame sets a second"),
         Figure(f"{options.scene}: network, a picture", 1000 * float(np.median(looks)), "ms", None, "", "processor"),
     ]
-    return [*figures, *beside_figures(options.scene, *poses, np.array(spent))]
+    return [*figures, *beside_figures(options.scene, *poses, np.array(durations))]

@@ -1,6 +1,6 @@
 """Subject `segmentation`: finding the wound in pictures.
 
-Dice on held-out pictures, silence where there is no wound, a half covered wound, time; areas in mm^2.
+Dice on held-out pictures, no detection without a wound, a half covered wound, time; areas in mm^2.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
     """All figures; those of real pictures only where a data set is named."""
     model: Path = shipped_model() if options.model is None else options.model
     network = WoundNetwork(model)
-    segmenter, given = NetworkSegmenter(network, network.settings), list[Labelled]()
+    segmenter, dataset = NetworkSegmenter(network, network.settings), list[Labelled]()
     if options.dataset is not None:
         with Progress(f"read {options.dataset.name}", "pictures", WallClock().now) as progress:
-            given = read_dataset(options.dataset, progress)
-    pictures = new_to(given, model)
-    if len(pictures) < len(given):
-        learned = f"{len(given) - len(pictures)} of {len(given)} pictures were learned from and judge nothing"
+            dataset = read_dataset(options.dataset, progress)
+    pictures = new_to(dataset, model)
+    if len(pictures) < len(dataset):
+        learned = f"{len(dataset) - len(pictures)} of {len(dataset)} pictures were learned from and judge nothing"
         print(
             f"note: {learned}: {model.with_suffix('.md').name} says what the folds reach", file=sys.stderr, flush=True
         )
@@ -74,16 +74,16 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
         judged = [JudgedPicture(image, segmenter(image), wound) for image, wound in images]
         options.sheet.write_bytes(encode(contact_sheet(judged), SHEET_QUALITY)[1])
     shapes = shipped_model("shape", ".toml")
-    figures = [*_dice(segmenter, pictures), *_others(pictures, new_to(given, shapes), shapes, rng)]
+    figures = [*_dice(segmenter, pictures), *_reference_figures(pictures, new_to(dataset, shapes), shapes, rng)]
     pieces = healthy_pieces(pictures, rng, HEALTHY_PIECES)
     real, rendered = silent_share(segmenter, pieces), silent_share(segmenter, [each.picture for each in healthy])
-    silent, note = at_least(0.95), f"{len(wounds)} pictures"
+    silence_target, note = at_least(0.95), f"{len(wounds)} pictures"
     mean = _mean([_dice_of(segmenter, each) for each in wounds])
     before, after = dice_before_and_after_cover(segmenter, pictures, rng)
     covered = "half covered: fall of Dice on the open part"
     figures += [
-        Figure("silent on healthy skin, real", real, "", silent, "", f"{len(pieces)} pieces"),
-        Figure("silent on healthy skin, rendered", rendered, "", silent, "", note),
+        Figure("silent on healthy skin, real", real, "", silence_target, "", f"{len(pieces)} pieces"),
+        Figure("silent on healthy skin, rendered", rendered, "", silence_target, "", note),
         Figure("Dice on rendered wounds, mean", mean, "", None, "", note),
         Figure(covered, before - after, "", at_most(0.05), "thesis by eye", f"from {before:.3f} to {after:.3f}"),
         *_time(network, pictures or wounds),
@@ -96,7 +96,7 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
 
 
 def new_to(pictures: list[Labelled], model: Path) -> list[Labelled]:
-    """The pictures that a model has not learned from, by the list of names that may lie beside it."""
+    """The pictures that a model was not trained on, by the list of names beside it, if any."""
     names = model.with_name(f"{model.stem}_trained.txt")
     learned = set(names.read_text(encoding="utf-8").splitlines()) if names.is_file() else set()
     return [each for each in pictures if each.name not in learned]
@@ -116,10 +116,10 @@ def _dice(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Fig
     ]
 
 
-def _others(
+def _reference_figures(
     pictures: Sequence[Labelled], new_to_shapes: Sequence[Labelled], shapes: Path, rng: np.random.Generator
 ) -> list[Figure]:
-    """The thesis's U-Net where it comes along, and shape matching."""
+    """The thesis's U-Net, where it is installed, and shape matching."""
     figures = []
     try:
         network = WoundNetwork(shipped_model(THESIS_MODEL))
@@ -162,7 +162,7 @@ def _rendered(number: int, wounded: bool) -> Labelled:
 
 
 def _time(network: WoundNetwork, pictures: Sequence[Labelled]) -> list[Figure]:
-    """By the wall, both looks, on the threads that it comes with; other work on the machine counts in."""
+    """Wall time of both looks, with the network's own threads; includes other load of the machine."""
     clock, times, spent = WallClock(), list[float](), 0.0
 
     def timed(planes: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -187,20 +187,20 @@ def _time(network: WoundNetwork, pictures: Sequence[Labelled]) -> list[Figure]:
 
 
 def spread_figures(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Figure]:
-    """How many labels' areas lie inside a picture's interval, and which spread would hold 95 % of them."""
+    """Share of labels' areas inside a picture's interval, and the spread with 95 % of them inside."""
     found = [area_residual(segmenter.band(bgr(each.picture)), each.wound) for each in pictures]
     residuals = [each for each in found if each is not None]
     if not residuals:
         return []
-    off, spread = np.array(residuals), segmenter.settings.spread
-    note = f"{len(off)} pictures"
-    if len(off) > 1:
-        halves = [float((off[i::2] <= conformal_spread(off[1 - i :: 2])).mean()) for i in (0, 1)]
+    errors, spread = np.array(residuals), segmenter.settings.spread
+    note = f"{len(errors)} pictures"
+    if len(errors) > 1:
+        halves = [float((errors[i::2] <= conformal_spread(errors[1 - i :: 2])).mean()) for i in (0, 1)]
         note += f"; by the spread of the other half {halves[0]:.3f} and {halves[1]:.3f}"
-    inside, used = float((off <= spread).mean()), f"used: {spread:g}; by 1 inside: {float((off <= 1).mean()):.3f}"
+    inside, used = float((errors <= spread).mean()), f"used: {spread:g}; by 1 inside: {float((errors <= 1).mean()):.3f}"
     return [
         Figure("label's area inside the interval of one picture", inside, "", at_least(0.93), "", note),
-        Figure("spread that holds 95 % of the labels", conformal_spread(off), "half bands", None, "", used),
+        Figure("spread that holds 95 % of the labels", conformal_spread(errors), "half bands", None, "", used),
     ]
 
 
@@ -208,11 +208,11 @@ RIG_PLACE_SIGMA, RIG_TURN_SIGMA = 0.05, math.radians(0.02)  # mm and rad of a ca
 
 
 def miscalibrated(rig: Rig, rng: np.random.Generator) -> Rig:
-    """A rig as it is known: each camera a little aside, and all lengths by as much too long as a ruler is."""
+    """A rig with calibration errors: of each camera's pose, and of the scale of all lengths."""
     scale, cameras = math.exp(rng.normal(0, RIG_SCALE_SIGMA)), list[Camera]()
     for camera in rig.cameras:
-        off = se3.make(se3.exp_rotation(rng.normal(0, RIG_TURN_SIGMA, 3)), rng.normal(0, RIG_PLACE_SIGMA, 3))
-        pose = camera.base_from_camera @ off
+        offset = se3.make(se3.exp_rotation(rng.normal(0, RIG_TURN_SIGMA, 3)), rng.normal(0, RIG_PLACE_SIGMA, 3))
+        pose = camera.base_from_camera @ offset
         pose[:3, 3] *= scale
         cameras.append(replace(camera, base_from_camera=pose))
     return Rig(tuple(cameras))
@@ -221,24 +221,24 @@ def miscalibrated(rig: Rig, rng: np.random.Generator) -> Rig:
 def area_figures(segmenter: NetworkSegmenter, count: int) -> list[Figure]:
     """Areas by three cameras of `count` rendered wounds beside the true ones: by the network, and by true outlines.
 
-    The rig is off by what calibration leaves.
+    The rig has the errors of a calibration.
     """
-    judged: dict[str, list[tuple[float, float, bool]]] = {"network": [], "true outlines": []}
-    refused = dict.fromkeys(judged, 0)
+    results: dict[str, list[tuple[float, float, bool]]] = {"network": [], "true outlines": []}
+    refused = dict.fromkeys(results, 0)
     for seed in with_progress("areas", "wounds", range(count), count):
-        taken = wound_set(seed)
-        rig = miscalibrated(taken.rig, np.random.default_rng([seed, 47]))
-        images = dict(enumerate(taken.images))
-        exact = {c: WoundBand(Segmentation(m, 1.0, 0.5), m, m, m) for c, m in enumerate(taken.wounds)}
+        truth = wound_set(seed)
+        rig = miscalibrated(truth.rig, np.random.default_rng([seed, 47]))
+        images = dict(enumerate(truth.images))
+        exact = {c: WoundBand(Segmentation(m, 1.0, 0.5), m, m, m) for c, m in enumerate(truth.wounds)}
         for kind, bands in (("network", {c: segmenter.band(i) for c, i in images.items()}), ("true outlines", exact)):
             area = wound_area(rig, images, bands, segmenter.settings.spread)
             if isinstance(area, str):
                 refused[kind] += 1
             else:
-                error, half = math.log(area.area / taken.area), math.log(area.high / max(area.low, 1e-9)) / 2
-                judged[kind].append((error, half, area.low <= taken.area <= area.high))
+                error, half = math.log(area.area / truth.area), math.log(area.high / max(area.low, 1e-9)) / 2
+                results[kind].append((error, half, area.low <= truth.area <= area.high))
     figures = []
-    for kind, rows in judged.items():
+    for kind, rows in results.items():
         if rows:
             error, half, inside = np.array(rows).T
             what, note = f"area by three cameras, {kind}", f"{len(rows)} rendered wounds, {refused[kind]} not measured"

@@ -32,9 +32,9 @@ from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.bench import figures
 from hardware.bench.fault_run import (
+    DELAYS_KNOWN,
+    DELAYS_ZERO,
     LATE_DISPENSER,
-    LED,
-    NOT_LED,
     BeadsPrint,
     FaultRun,
     bead_figures,
@@ -316,11 +316,11 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
     if options.seed < 0:
         raise InputError("command line", "--seed", options.seed, ">= 0")
     figures.require_positive(options, "jobs")
-    cases = [(name, way) for name in options.scenario for way in MOTION_INPUTS]
+    cases, delays = [(name, way) for name in options.scenario for way in MOTION_INPUTS], (DELAYS_KNOWN, DELAYS_ZERO)
     with workers(options.jobs) as pool:
         prints = pool.map(partial(_print_case, options.seed), *zip(*cases, strict=True))
         by_case = dict(zip(cases, with_progress("loop", "prints", prints, len(cases)), strict=True))
-        beads = dict(zip((LED, NOT_LED), pool.map(partial(print_beads, options.seed), (LED, NOT_LED)), strict=True))
+        beads = dict(zip(delays, pool.map(partial(print_beads, options.seed), delays), strict=True))
     figures.write_page(options.out, "loop.html", lambda: loop_page(by_case, beads), "picture")
     return [*(figure for name in options.scenario for figure in _figures(name, by_case)), *bead_figures(beads)]
 
@@ -371,8 +371,8 @@ def _beads_section(prints: Mapping[str, BeadsPrint]) -> str:
     charts = [
         f"<div>{ends_chart(ends, f'{way}: about where beads {what}', HALF_CHART_WIDTH)}</div>"
         for way, one in prints.items()
-        for what, ends in (("begin", one.material.begins), ("end", one.material.stops))
+        for what, ends in (("begin", one.material.beginnings), ("end", one.material.ends))
     ]
-    late = 1000 * prints[LED].delay
+    late = 1000 * prints[DELAYS_KNOWN].delay
     text = f"Half of the dispenser's flow comes {late:.0f} ms after it is told. Laid of the planned, by mm of the path."
     return section(LATE_DISPENSER, text, f'<div class="two">{"".join(charts)}</div>')

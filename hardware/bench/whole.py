@@ -1,6 +1,6 @@
-"""Commands in processes of their own: all subjects one after the other, and a live run as an operator would run it.
+"""Commands in separate processes: all subjects in sequence, and a live run controlled as by an operator.
 
-All subjects give one table as JSON, an HTML page, Markdown for the documents, and a list of what is worse than in a
+All subjects give one table as JSON, an HTML page, Markdown for the documents, and a list of figures worse than in a
 saved table. A live run gets a terminal and keys; its memory is measured.
 """
 
@@ -30,7 +30,7 @@ from hardware.report.evaluation import figure as digits
 from hardware.report.page import document, row_of_tiles, section, tile
 
 Parts = Mapping[str, Sequence[Figure]]  # by the name of the part
-MAX_MISSES_NAMED = 3  # figures of a part that are named where they miss their target; the others are counted
+MAX_MISSES_NAMED = 3  # figures of a part that miss their target and are named; the others are counted
 PART_HEADER = ("figure", "value", "target", "", "reference", "note")
 COLOURS = {"met": ' class="met"', "MISSED": ' class="missed"'}  # by verdict
 
@@ -39,7 +39,7 @@ def whole_page(
     command: str, parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, str], machine: Machine
 ) -> str:
     """An HTML page with a card for each part. troubles: why a part has no figures. pages: of parts that drew one."""
-    judged, missed, plain = counted(parts)
+    judged, missed, plain = target_counts(parts)
     counts = [(judged - missed, f"of {judged}", "targets met"), (missed, "", "missed")]
     counts += [(plain, "", "figures without a target"), (len(troubles), "", "parts that could not be measured")]
     tiles = [tile(str(count), unit, caption) for count, unit, caption in counts]
@@ -49,11 +49,11 @@ def whole_page(
         for name, figures in parts.items()
     ]
     body = [row_of_tiles(tiles), _overview(parts, troubles), *cards]
-    made = f"Made by {command} with {versions}."
-    return document("Bench", "All that is measured", measured_on(machine), body, made)
+    footer = f"Made by {command} with {versions}."
+    return document("Bench", "All that is measured", measured_on(machine), body, footer)
 
 
-def counted(parts: Parts) -> tuple[int, int, int]:
+def target_counts(parts: Parts) -> tuple[int, int, int]:
     """Figures with a target, those of them that miss it, and figures without one."""
     figures = [figure for part in parts.values() for figure in part]
     verdicts = [figure.verdict for figure in figures]
@@ -70,7 +70,7 @@ def _overview(parts: Parts, troubles: Mapping[str, str]) -> str:
     """A line for each part: how many targets it meets, and which it misses; its name leads to its card."""
     rows = []
     for name, figures in parts.items():
-        judged, missed, plain = counted({name: figures})
+        judged, missed, plain = target_counts({name: figures})
         what = [escape(figure.what) for figure in figures if figure.verdict == "MISSED"]
         more = [f"and {len(what) - MAX_MISSES_NAMED} more"] if len(what) > MAX_MISSES_NAMED else []
         misses = "; ".join([*what[:MAX_MISSES_NAMED], *more])
@@ -84,7 +84,7 @@ def _overview(parts: Parts, troubles: Mapping[str, str]) -> str:
 
 
 def _place(name: str) -> str:
-    """What a part is found by in the page."""
+    """Anchor of a part in the page."""
     return f"part-{name.replace(' ', '-')}"
 
 
@@ -109,8 +109,8 @@ def _row(figure: Figure) -> tuple[str, ...]:
 
 
 def whole_markdown(command: str, parts: Parts, machine: Machine) -> str:
-    """The same as Markdown: what was measured on what, and a table for each part."""
-    judged, missed, plain = counted(parts)
+    """The same as Markdown: the machine, and a table for each part."""
+    judged, missed, plain = target_counts(parts)
     lines = [
         "# All that is measured",
         "",
@@ -127,13 +127,13 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
-WORSE_FACTOR = 1.2  # times farther from good than before: less is what these machines vary by
+WORSE_FACTOR = 1.2  # of badness against before: less is the machines' own variation
 FIGURES_FILE, PAGE_FILE, TABLE_FILE = "figures.json", "report.html", "table.md"  # of the whole, in its folder
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPart:
-    """What one part came to."""
+    """The result of one part."""
 
     subject: str  # its name
     figures: tuple[Figure, ...]
@@ -145,24 +145,24 @@ def measure_all(out: Path, quick: bool, whole: Whole) -> list[MeasuredPart]:
 
     The table is written after each, so that an interrupted run leaves what it has measured.
     """
-    clock, machine, done = WallClock(), this_machine(), list[MeasuredPart]()
+    clock, machine, measured = WallClock(), this_machine(), list[MeasuredPart]()
     candidates = [(part, part.quick if quick else part.options) for part in whole.parts]
-    chosen = [(asked, options) for asked, options in candidates if options is not None]
-    for number, (asked, options) in enumerate(chosen, 1):
-        start, folder = clock.now(), out / (asked.name or asked.subject)
-        part = _earlier(folder, options, machine) or _measured(folder, asked, options)
+    chosen = [(bench_part, options) for bench_part, options in candidates if options is not None]
+    for number, (bench_part, options) in enumerate(chosen, 1):
+        start, folder = clock.now(), out / (bench_part.name or bench_part.subject)
+        part = _earlier(folder, options, machine) or _measured(folder, bench_part, options)
         duration = duration_text(clock.now() - start)
-        print(f"{number} of {len(chosen)}: {asked.subject} {' '.join(options)}, {duration}\n", flush=True)
+        print(f"{number} of {len(chosen)}: {bench_part.subject} {' '.join(options)}, {duration}\n", flush=True)
         print(part.trouble or table_text(part.figures), end="\n\n", flush=True)
-        done.append(part)
-        figures = {part.subject: part.figures for part in done}
-        troubles = {part.subject: part.trouble for part in done if part.trouble}
-        drawn = {part.subject: sorted((out / part.subject).glob("*.html")) for part in done}
-        pages = {name: files[0].relative_to(out).as_posix() for name, files in drawn.items() if files}
+        measured.append(part)
+        figures = {part.subject: part.figures for part in measured}
+        troubles = {part.subject: part.trouble for part in measured if part.trouble}
+        page_files = {part.subject: sorted((out / part.subject).glob("*.html")) for part in measured}
+        pages = {name: files[0].relative_to(out).as_posix() for name, files in page_files.items() if files}
         (out / FIGURES_FILE).write_text(whole_text(figures, machine), encoding="utf-8")
         (out / PAGE_FILE).write_text(whole_page(whole.command, figures, troubles, pages, machine), encoding="utf-8")
         (out / TABLE_FILE).write_text(whole_markdown(whole.command, figures, machine), encoding="utf-8")
-    return done
+    return measured
 
 
 def _earlier(folder: Path, options: Sequence[str], machine: Machine) -> MeasuredPart | None:
@@ -179,8 +179,8 @@ def _measured(folder: Path, part: BenchPart, options: Sequence[str]) -> Measured
     program = ["-m", "hardware.cli.main", "bench"] if part.program == BENCH else part.program.split()[1:]
     command = [sys.executable, *program, part.subject, "-o", str(folder), "--force", *options]
     (folder / FIGURES_FILE).unlink(missing_ok=True)
-    done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # its progress is shown as it goes
-    if done.returncode or not (folder / FIGURES_FILE).is_file():
+    process = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)  # its progress is shown as it goes
+    if process.returncode or not (folder / FIGURES_FILE).is_file():
         return MeasuredPart(
             folder.name, (), f"no figures: `{part.program} {part.subject} {' '.join(options)}` says why"
         )
@@ -188,21 +188,21 @@ def _measured(folder: Path, part: BenchPart, options: Sequence[str]) -> Measured
     return MeasuredPart(folder.name, tuple(read_figures(folder / FIGURES_FILE)))
 
 
-def summary(done: Sequence[MeasuredPart]) -> str:
+def summary(measured: Sequence[MeasuredPart]) -> str:
     """How many targets were met, and the missed ones by name."""
-    judged = [(part.subject, f) for part in done for f in part.figures if f.target is not None]
+    judged = [(part.subject, f) for part in measured for f in part.figures if f.target is not None]
     missed = [f"{subject}: {f.what} {f.value:.4g} {f.unit} ({f.target})" for subject, f in judged if f.verdict != "met"]
-    failed = [f"{part.subject}: {part.trouble}" for part in done if part.trouble]
+    failed = [f"{part.subject}: {part.trouble}" for part in measured if part.trouble]
     return "\n  ".join([f"{len(judged) - len(missed)} of {len(judged)} targets met", *missed, *failed])
 
 
-def regressions(done: Sequence[MeasuredPart], file: Path) -> str:
-    """What is worse than in a saved table: a target met no more, or a figure WORSE_FACTOR times farther from good."""
+def regressions(measured: Sequence[MeasuredPart], file: Path) -> str:
+    """Figures worse than in a saved table: a target no longer met, or badness larger by WORSE_FACTOR."""
     before, rows = read_whole(file), []
-    for name, figure in ((part.subject, figure) for part in done for figure in part.figures):
-        then = before.get((name, figure.what))
-        if then is not None and _worse(figure, then):
-            rows.append(f"{name}: {figure.what} {then:.4g} -> {figure.value:.4g} {figure.unit}")
+    for name, figure in ((part.subject, figure) for part in measured for figure in part.figures):
+        earlier = before.get((name, figure.what))
+        if earlier is not None and _worse(figure, earlier):
+            rows.append(f"{name}: {figure.what} {earlier:.4g} -> {figure.value:.4g} {figure.unit}")
     return "\n  ".join([f"worse than in {file}: {len(rows)}", *rows])
 
 
@@ -225,7 +225,7 @@ def _worse(figure: Figure, before: float) -> bool:
 
 
 def _badness(target: Target, value: float) -> float:
-    """How far from good, 1 at the limit: value by limit from above, limit by value from below."""
+    """Badness, 1 at the limit: value by limit for a maximum, limit by value for a minimum."""
     low, high = target.low, target.high
     part, whole = (low, value) if math.isinf(high) else (value, high)
     if not math.isinf(low) and not math.isinf(high):
@@ -240,25 +240,25 @@ def run_whole(out: Path, quick: bool, against: Path | None, whole: Whole) -> Non
     out.mkdir(parents=True, exist_ok=True)
     machine = this_machine()
     print(f"{machine.cpu}, {machine.cores} cores, commit {machine.commit or 'unknown'}\n", flush=True)
-    done = measure_all(out, quick, whole)
-    print(summary(done))
+    measured = measure_all(out, quick, whole)
+    print(summary(measured))
     if against is not None:
-        print(regressions(done, against))
+        print(regressions(measured, against))
     print(f"\nthe whole table: {out / PAGE_FILE}, {out / TABLE_FILE} and {out / FIGURES_FILE}")
-    if any(part.trouble for part in done):
+    if any(part.trouble for part in measured):
         raise StillbedError("not everything could be measured; what could is kept")
 
 
 PROCESS_PREFIX = "(sb-"  # of the names of a run's processes in /proc
-MAP_PROCESS = "map"  # what the tracking's own processes are called
-START_TIMEOUT = 300.0  # s in which a run must have begun to print, on a busy machine
+MAP_PROCESS = "map"  # name of the tracking's own processes
+START_TIMEOUT = 300.0  # s until a run prints, on a busy machine
 POLL_INTERVAL = 0.005  # s
 
 
 class LiveSession:
-    """A run in a process of its own.
+    """A run in a separate process.
 
-    output: what it has printed so far.
+    output: all so far.
     memory: of each measurement, instant, s, and MB by process.
     """
 
@@ -275,7 +275,7 @@ class LiveSession:
         self._reader.start()
 
     def wait_for(self, text: str, after: int = 0, timeout: float = START_TIMEOUT) -> int:
-        """Wait for a text beyond the first `after` characters of the output; where the text ends, -1: it never came."""
+        """Wait for a text beyond the first `after` characters of the output; position of its end, -1 if absent."""
         until = self._clock.now() + timeout
         while self._clock.now() < until:
             if (place := self.output.find(text, after)) >= 0:
@@ -302,11 +302,11 @@ class LiveSession:
         return {name.removeprefix(PROCESS_PREFIX): pid for name, pid in named}
 
     def measure_memory(self) -> None:
-        """Note the unshared memory, MB, of each of its processes but the virtual arm, which stores all that it did."""
+        """Store the unshared memory, MB, of each of its processes but the virtual arm, which stores all its motion."""
         private: dict[str, float] = {}
-        own = {name: pid for name, pid in self.children().items() if name != "arm"}
-        of_map = [(MAP_PROCESS, pid) for pid, _ in _children(own.get("tracking", -1))]
-        for name, pid in [("run", self.process.pid), *own.items(), *of_map]:
+        processes = {name: pid for name, pid in self.children().items() if name != "arm"}
+        map_processes = [(MAP_PROCESS, pid) for pid, _ in _children(processes.get("tracking", -1))]
+        for name, pid in [("run", self.process.pid), *processes.items(), *map_processes]:
             try:
                 resident, shared = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1:3]
             except (OSError, ValueError):
@@ -344,7 +344,7 @@ class LiveSession:
 
 
 def _children(parent: int) -> list[tuple[int, str]]:
-    """Number and name, which begins with a bracket, of the processes that a process has started."""
+    """Number and name, which begins with a bracket, of a process's children."""
     children = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:

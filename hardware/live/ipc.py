@@ -294,7 +294,7 @@ def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
     stamps = np.arange(0.0, arm.now, EXECUTED_STEP)  # (N,) s
     axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))  # (N, 6)
     counts = {"ignored": len(arm.ignored), "refused": len(arm.refused), "garbage": sum(len(d) for _, d in arm.garbage)}
-    spans = {"deepest": arm.deepest, "held_up": clock.longest, "left": arm.in_flight}
+    spans = {"deepest": arm.peak_work, "held_up": clock.longest, "left": arm.in_flight}
     done: dict[str, Any] = {"stamps": stamps + clock.begun, "axes": axes, "frames": arm.frames, **counts, **spans}
     with prepared.files.executed.open("wb") as file:
         np.savez(file, **done)

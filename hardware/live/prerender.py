@@ -148,7 +148,7 @@ class _PictureSink:
     def _ignore(self, *arguments: object, **named: object) -> None:
         pass
 
-    pose = given = tick = wire = head = rows = registered = look = event = _ignore
+    pose = pose_delivery = tick = wire = head = rows = registration = look = event = _ignore
 
 
 BLOCK_SECONDS = 10.0  # s of rows compared at once
@@ -205,7 +205,7 @@ def nozzle_errors(record: Path, executed: Path, path: Path, arm: Path) -> Nozzle
     with np.load(executed) as done:
         stamps, axes = done["stamps"], done["axes"]
         deepest, held_up = float(done["deepest"]), float(done["held_up"])
-    first, last = commands[0][0].stamp, min(truth_log.known_until, float(stamps[-1]))
+    first, last = commands[0][0].stamp, min(truth_log.last_due, float(stamps[-1]))
 
     def axes_at(times: Array) -> Array:
         return np.stack([np.interp(times, stamps, axes[:, i]) for i in range(6)], axis=1)

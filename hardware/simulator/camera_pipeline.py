@@ -1,4 +1,4 @@
-"""What becomes of the cameras' shots in virtual time: pictures, frame sets, and poses once the tracker had its time."""
+"""From the cameras' shots to pictures, frame sets and, after the tracker's processing time, poses; in virtual time."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from perception.frames import Frame, FrameSet, Pairing, PrintHead
 from perception.tracking.step import StepReport
 
 Action = Callable[[float], None]  # of the instant, s
-ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT, RENDER_EVENT = range(5)  # what goes first at one instant
+ARRIVAL_EVENT, POSE_EVENT, TICK_EVENT, EXPOSURE_EVENT, RENDER_EVENT = range(5)  # rising rank at one instant
 
 
 class EventQueue:
-    """A queue of actions by instant; what falls on one instant goes by rank, then in the order in which it came."""
+    """A queue of actions by instant; at one instant by rank, then in the order of arrival."""
 
     def __init__(self, clock: SimClock) -> None:
-        """clock: is moved on to each instant."""
+        """clock: advanced to each instant."""
         self._clock = clock
         self._heap: list[tuple[float, int, int, Action]] = []
         self._count = 0
@@ -54,7 +54,7 @@ class EventQueue:
         self._count += 1
 
     def run(self, until: Callable[[], float]) -> Iterator[float]:
-        """Do everything due before `until()`, s, in order; gives each instant after what happened at it."""
+        """Perform all actions before `until()`, s, in order; yields each instant after its action."""
         while self._heap and self._heap[0][0] < until():
             instant, _, _, action = heapq.heappop(self._heap)
             self._clock.wait_until(instant)
@@ -62,86 +62,86 @@ class EventQueue:
             yield instant
 
 
-RENDERER = Path(__file__).parent / "scene"  # its files make what a picture shows
-KEPT_RUNS = 2  # whose pictures are kept: two ways to track one scene in turn find theirs again
-PUTS = 60  # pictures from commit to commit: of a run that is killed no more are lost
+RENDERER_FOLDER = Path(__file__).parent / "scene"  # of the code that renders
+STORED_RUNS = 2  # whose pictures are kept: two methods that track one scene in turn find theirs again
+COMMIT_INTERVAL = 60  # pictures between commits: a killed run loses no more
 
 
 class PictureStore:
-    """Encoded pictures of one scenario from earlier runs, in a file of the cache, by all that they show.
+    """Encoded pictures of one scenario from earlier runs, in a file of the cache, by a hash of all that they show.
 
-    Where the nozzle went another way than in those runs, or the code that renders is another, nothing is found, and
-    pictures are rendered. So is all where the file cannot be written, or another run writes it.
+    Pictures are rendered where the nozzle's motion or the rendering code differs from those runs, where the file cannot
+    be written, and where another run writes it.
     """
 
     def __init__(self, scenario: Path, cache: Path) -> None:
-        made_by = [each.read_bytes() for each in sorted(RENDERER.glob("*.py"))]
-        text = [content_of(scenario), *made_by, np.__version__.encode(), cv2.__version__.encode()]
-        name = hashlib.sha256(b"".join(b"%d " % len(part) + part for part in text)).hexdigest()[:12]
+        sources = [each.read_bytes() for each in sorted(RENDERER_FOLDER.glob("*.py"))]
+        parts = [content_of(scenario), *sources, np.__version__.encode(), cv2.__version__.encode()]
+        name = hashlib.sha256(b"".join(b"%d " % len(part) + part for part in parts)).hexdigest()[:12]
         self.folder = cache / f"{scenario.stem}-{name}-pictures"
-        self._kept = self._run = 0
-        self._base: sqlite3.Connection | None = None
+        self._put_count = self._run = 0
+        self._database: sqlite3.Connection | None = None
         with suppress(OSError, sqlite3.Error):
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "scenario").write_text(str(scenario.resolve()), encoding="utf-8")
-            self._base = sqlite3.connect(self.folder / "pictures.db", timeout=0)
-            self._base.execute(
+            self._database = sqlite3.connect(self.folder / "pictures.db", timeout=0)
+            self._database.execute(
                 "CREATE TABLE IF NOT EXISTS picture (key BLOB PRIMARY KEY, run INT, kind TEXT, data BLOB)"
             )
-            self._run = 1 + (self._base.execute("SELECT MAX(run) FROM picture").fetchone()[0] or 0)
+            self._run = 1 + (self._database.execute("SELECT MAX(run) FROM picture").fetchone()[0] or 0)
 
     def get(self, key: bytes) -> tuple[str, bytes] | None:
         """Format and bytes of a picture; None where there is none."""
-        row = self._do("SELECT kind, data FROM picture WHERE key = ?", key)
+        row = self._execute("SELECT kind, data FROM picture WHERE key = ?", key)
         if row is not None:
-            self._do("UPDATE picture SET run = ? WHERE key = ?", self._run, key)
+            self._execute("UPDATE picture SET run = ? WHERE key = ?", self._run, key)
         return None if row is None else (str(row[0]), bytes(row[1]))
 
     def put(self, key: bytes, picture: tuple[str, bytes]) -> None:
-        """Keep a picture."""
-        self._do("INSERT OR REPLACE INTO picture VALUES (?, ?, ?, ?)", key, self._run, *picture)
-        self._kept += 1
-        if self._base is not None and self._kept % PUTS == 0:
+        """Store a picture."""
+        self._execute("INSERT OR REPLACE INTO picture VALUES (?, ?, ?, ?)", key, self._run, *picture)
+        self._put_count += 1
+        if self._database is not None and self._put_count % COMMIT_INTERVAL == 0:
             with suppress(sqlite3.Error):
-                self._base.commit()
+                self._database.commit()
 
     def finish(self) -> None:
-        """The run is over: what neither it nor the one before looked at goes."""
-        self._do("DELETE FROM picture WHERE run <= ?", self._run - KEPT_RUNS)
+        """The run is over: delete the pictures that neither it nor the one before used."""
+        self._execute("DELETE FROM picture WHERE run <= ?", self._run - STORED_RUNS)
 
     def close(self) -> None:
         """Close the file."""
-        if self._base is not None:
+        if self._database is not None:
             with suppress(sqlite3.Error):
-                self._base.commit()
-            self._base.close()
-        if self._kept:
+                self._database.commit()
+            self._database.close()
+        if self._put_count:
             print(f"pictures are kept in {self.folder}: {size_text(folder_size(self.folder))}", file=sys.stderr)
 
-    def _do(self, text: str, *values: object) -> Any:
-        """The first row of what a statement gives; None without one, and of a file that cannot be used."""
-        if self._base is None:
+    def _execute(self, text: str, *values: object) -> Any:
+        """The first row of a statement's result; None without one, or without a usable file."""
+        if self._database is None:
             return None
         try:
-            return self._base.execute(text, values).fetchone()
+            return self._database.execute(text, values).fetchone()
         except sqlite3.Error:  # another run writes it, or the disk is full
-            self._base.close()
-            self._base = None
+            self._database.close()
+            self._database = None
             return None
 
 
-def picture_key(shot: Shot, instant: WorldState, camera: Camera, scene: Scene) -> bytes:
-    """A hash of all in a picture that the scenario alone does not say."""
-    words: list[object] = [shot.camera, shot.number, shot.picture, shot.fate, shot.covered, scene.deformation]
-    words += [instant.stamp, instant.exposure, instant.strain, instant.gain]
+def picture_key(shot: Shot, state: WorldState, camera: Camera, scene: Scene) -> bytes:
+    """A hash of all that a picture depends on besides the scenario."""
+    values: list[object] = [shot.camera, shot.number, shot.picture, shot.fate, shot.covered, scene.deformation]
+    values += [state.stamp, state.exposure, state.strain, state.gain]
     arrays = [
-        instant.base_from_surface,
-        instant.twist,
-        instant.base_from_nozzle,
+        state.base_from_surface,
+        state.twist,
+        state.base_from_nozzle,
         camera.base_from_camera,
         camera.matrix,
     ]
-    parts = [repr(words).encode(), scene.laid, *(b"" if array is None else array.tobytes() for array in arrays)]
+    parts = [repr(values).encode(), scene.bead_hash, *(b"" if array is None else array.tobytes() for array in arrays)]
     return hashlib.sha256(b"".join(b"%d " % len(part) + part for part in parts)).digest()
 
 
@@ -153,10 +153,10 @@ Rendered = list[tuple[Shot, bytes, tuple[str, bytes]]]  # with the picture's key
 
 
 class PictureRenderer:
-    """Renders and encodes what was exposed, in the background while time goes on.
+    """Renders and encodes exposed pictures in the background while time goes on.
 
-    What waits is rendered together, one picture of each camera at a time, with the printed material as it was at the
-    first of them.
+    Pending pictures are rendered together, one of each camera at a time, with the printed material of the first one's
+    instant.
     """
 
     def __init__(
@@ -178,24 +178,24 @@ class PictureRenderer:
         self._background = ThreadPoolExecutor(1)
         self._job: Future[Rendered] | None = None
 
-    def expose(self, shot: Shot, instant: WorldState) -> None:
-        """Remember the world as this shot meets it."""
-        self._waiting.append((shot, instant))
+    def expose(self, shot: Shot, state: WorldState) -> None:
+        """Queue a shot with the world at its exposure."""
+        self._waiting.append((shot, state))
 
     def start(self) -> None:
-        """Begin to render what waits, once what was begun before is done: no bead is laid while pictures are made."""
+        """Begin to render the pending pictures after those in progress: no bead is printed during rendering."""
         if not self._waiting:
             return
         self._join()
-        self._print_beads(min(instant.stamp for _, instant in self._waiting))
+        self._print_beads(min(state.stamp for _, state in self._waiting))
         missing = [(*pair, self._key(*pair)) for pair in self._waiting]
-        missing = [each for each in missing if not self._found(each[0], each[2])]
+        missing = [entry for entry in missing if not self._load(entry[0], entry[2])]
         self._waiting = []
         if missing:
             self._job = self._background.submit(self._render_all, missing)
 
     def take(self, shot: Shot) -> tuple[str, bytes]:
-        """Format and bytes of a picture that was exposed; each once."""
+        """Format and bytes of an exposed picture; each once."""
         key = shot.camera, shot.number
         if key not in self._done:
             self._join()
@@ -205,39 +205,39 @@ class PictureRenderer:
         return self._done.pop(key)
 
     def _join(self) -> None:
-        """Wait until what was begun is rendered."""
+        """Wait for the pictures in progress."""
         job, self._job = self._job, None
         for shot, key, picture in () if job is None else job.result():
             self._done[shot.camera, shot.number] = picture
             if self._store is not None:
                 self._store.put(key, picture)
 
-    def _found(self, shot: Shot, key: bytes) -> bool:
-        """Take a picture from the store, if it is there."""
+    def _load(self, shot: Shot, key: bytes) -> bool:
+        """Take a picture from the store; whether it was there."""
         picture = None if self._store is None else self._store.get(key)
         if picture is not None:
             self._done[shot.camera, shot.number] = picture
         return picture is not None
 
-    def _key(self, shot: Shot, instant: WorldState) -> bytes:
-        return picture_key(shot, instant, self._true_cameras(shot), self._scene)
+    def _key(self, shot: Shot, state: WorldState) -> bytes:
+        return picture_key(shot, state, self._true_cameras(shot), self._scene)
 
-    def _render_all(self, waiting: list[tuple[Shot, WorldState, bytes]]) -> Rendered:
-        done: Rendered = []
-        while waiting:
-            batch = {each[0].camera: each for each in reversed(waiting)}  # the first of each camera
-            waiting = [each for each in waiting if each is not batch[each[0].camera]]
-            shots, instants, keys = zip(*batch.values(), strict=True)
-            done += zip(shots, keys, self._render(shots, instants), strict=True)
-        return done
+    def _render_all(self, pending: list[tuple[Shot, WorldState, bytes]]) -> Rendered:
+        rendered: Rendered = []
+        while pending:
+            batch = {entry[0].camera: entry for entry in reversed(pending)}  # the first of each camera
+            pending = [entry for entry in pending if entry is not batch[entry[0].camera]]
+            shots, states, keys = zip(*batch.values(), strict=True)
+            rendered += zip(shots, keys, self._render(shots, states), strict=True)
+        return rendered
 
-    def _render(self, shots: Sequence[Shot], instants: Sequence[WorldState]) -> list[tuple[str, bytes]]:
+    def _render(self, shots: Sequence[Shot], states: Sequence[WorldState]) -> list[tuple[str, bytes]]:
         cameras = [self._true_cameras(shot) for shot in shots]
         rngs = [self._rng(NOISE_STREAM, shot.camera, shot.picture) for shot in shots]
-        images = render(self._scene, cameras, instants, self._sensor, rngs, self._threads)
-        for i, (shot, camera, instant) in enumerate(zip(shots, cameras, instants, strict=True)):
+        images = render(self._scene, cameras, states, self._sensor, rngs, self._threads)
+        for i, (shot, camera, state) in enumerate(zip(shots, cameras, states, strict=True)):
             if shot.covered is not None:
-                images[i] = cover_wound(images[i], camera, instant.base_from_surface, shot.covered)
+                images[i] = cover_wound(images[i], camera, state.base_from_surface, shot.covered)
         with ThreadPoolExecutor(self._threads) as pool:
             encoded = list(pool.map(lambda image: encode(image, self._quality), images))
         return [
@@ -260,26 +260,26 @@ Exposures = dict[tuple[int, float], Shot]  # by camera and stamp, s
 
 
 class PipelineSink(Protocol):
-    """Receives pictures, print head and poses as they come."""
+    """Receives pictures, print head and poses."""
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture that can be decoded has arrived, as encoded by its camera."""
 
     def head(self, stamp: float, head: PrintHead) -> None:
-        """Where the print head was at the stamp of a frame set, s, which may yet find the tracker busy."""
+        """The print head at the stamp of a frame set, s, which the tracker may still skip."""
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
-        """A pose was made of a frame set in `spent` s of real time."""
+        """The pose of a frame set, computed in `spent` s of real time."""
 
     def event(self, stamp: float, text: str, level: int = WARNING) -> None:
-        """Something that a person should know."""
+        """An event for a person."""
 
 
 OnPose = Callable[[SurfacePose, FrameSet, Observations], None]  # a pose has reached the motion
 
 
 class CameraPipeline:
-    """The cameras and the tracker of one run. tracked, skipped: frame sets, and those the tracker had no time for."""
+    """The cameras and the tracker of one run. tracked, skipped: frame sets; skipped ones found the tracker busy."""
 
     def __init__(
         self,
@@ -291,24 +291,24 @@ class CameraPipeline:
         clock: Clock,
         on_pose: OnPose,
         pictures: PictureRenderer | None = None,
-        instant: Callable[[Shot, float], WorldState] | None = None,
+        state_at: Callable[[Shot, float], WorldState] | None = None,
         head: Callable[[float], PrintHead | None] = lambda stamp: None,
     ) -> None:
-        """exposures: filled with the shot of each picture, for a step that may know. clock: measures tracking times.
+        """exposures: filled with the shot of each picture. clock: measures tracking times.
 
-        pictures, instant: what renders the shots, and the world as one meets it; without them nobody looks. head: where
-        the print head was at a stamp, s.
+        pictures, state_at: the renderer, and the world at a shot's exposure; without them there are no pictures. head:
+        the print head at a stamp, s.
         """
         self.tracked, self.skipped = 0, 0
         self._scenario, self._events, self._step, self._exposures = scenario, events, step, exposures
         self._sink, self._clock, self._on_pose = sink, clock, on_pose
-        self._pictures, self._instant, self._head = pictures, instant, head
+        self._pictures, self._instant, self._head = pictures, state_at, head
         self._cameras = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
         self._pairer = Pairing(len(scenario.rig), scenario.cameras.period)
         self._rates = WorkRates(faults_striking(scenario.faults, FaultPart.TRACKING))
         self._busy = False  # the tracker
-        self._tracked_now: FrameSet | None = None  # its pose is found when it is due
-        self._waiting: FrameSet | None = None  # the newest that came meanwhile
+        self._current: FrameSet | None = None  # its pose is computed when it is due
+        self._waiting: FrameSet | None = None  # the newest that has arrived since
 
     def begin(self) -> None:
         """Put the first exposure of each camera into the queue."""
@@ -316,9 +316,9 @@ class CameraPipeline:
             self._next_shot(self._cameras.shots(camera, self._scenario.seconds))
 
     def finish(self) -> None:
-        """The run is over: find the pose that was due after its end, which nobody waits for any more."""
-        if self._tracked_now is not None:
-            self._step_through(self._tracked_now)
+        """The run is over: compute the pose that was due after its end."""
+        if self._current is not None:
+            self._step_through(self._current)
 
     def _next_shot(self, shots: Iterator[Shot]) -> None:
         shot = next(shots, None)
@@ -327,7 +327,7 @@ class CameraPipeline:
             self._events.at(due, EXPOSURE_EVENT, partial(self._expose, shot, shots))
 
     def _expose(self, shot: Shot, shots: Iterator[Shot], now: float) -> None:
-        """Half of a camera's exposure is over: from here on the world may change, the picture may not."""
+        """The middle of an exposure: later changes of the world do not change its picture."""
         self._next_shot(shots)
         if shot.fate is Fate.DROPPED:
             return
@@ -338,7 +338,7 @@ class CameraPipeline:
         self._events.at(shot.arrival, ARRIVAL_EVENT, partial(self._arrive, shot))
 
     def _arrive(self, shot: Shot, now: float) -> None:
-        frame = Frame(shot.camera, shot.stamp, np.zeros((0, 0), np.uint8))  # without renderer nobody looks at it
+        frame = Frame(shot.camera, shot.stamp, np.zeros((0, 0), np.uint8))  # without renderer it is not used
         if self._pictures is not None:
             kind, data = self._pictures.take(shot)
             try:
@@ -365,12 +365,12 @@ class CameraPipeline:
             self._track(now)
 
     def _track(self, now: float) -> None:
-        """Let the tracker begin; what it finds is worked out when it is due, while the next pictures are rendered."""
+        """Start the tracker; its pose is computed when it is due, while the next pictures are rendered."""
         assert self._waiting is not None
         frames, self._waiting, self._busy = self._waiting, None, True
         processing = self._scenario.tracking.processing
         if processing is not None:
-            self._tracked_now = frames
+            self._current = frames
             self._events.at(self._rates.done(now, processing), POSE_EVENT, partial(self._find_pose, frames))
             return
         pose, observations, spent = self._step_through(frames)
@@ -378,12 +378,12 @@ class CameraPipeline:
         self._events.at(delivery, POSE_EVENT, partial(self._deliver, pose, frames, observations))
 
     def _find_pose(self, frames: FrameSet, now: float) -> None:
-        self._tracked_now = None
+        self._current = None
         pose, observations, _ = self._step_through(frames)
         self._deliver(pose, frames, observations, now)
 
     def _step_through(self, frames: FrameSet) -> tuple[SurfacePose, Observations, float]:
-        """What the tracker makes of a frame set, and in how many seconds."""
+        """The tracker's pose of a frame set, its observations, and its time, s."""
         start = self._clock.now()
         pose = self._step(frames)
         spent = self._clock.now() - start

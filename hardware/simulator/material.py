@@ -1,6 +1,6 @@
-"""The dispensers of a simulated print, told over lines in virtual time; as late and as leaky as a scenario says.
+"""The dispensers of a simulated print, commanded over lines in virtual time; with a scenario's delays and ooze.
 
-[dispenser]                # left out: one that at once gives each bead what it needs while it is told to
+[dispenser]                # left out: one without delay that gives each bead its planned flow while it is open
 on_dead_time_s = 0.08      # these are true of the device; hardware/simulator/dispenser.py says what they mean
 on_lag_s = 0.04
 off_dead_time_s = 0.08
@@ -8,10 +8,10 @@ off_lag_s = 0.04
 ooze_mm3 = 0.5
 ooze_lag_s = 0.5
 watchdog_s = 0.1
-flow_mm3_s = 5.0           # it is a valve that gives that much; left out: it gives the flow that it is told
-given = 1.1                # of the flow it is told: 1.1 lays too much, 0.9 too little
-led = true                 # whether the motion knows the four delays and leads them; false: it takes them for 0
-file = "dispenser.toml"    # or what it takes the dispensers for, as in a dispenser file
+flow_mm3_s = 5.0           # the flow of a valve; left out: it gives the flow that is commanded
+given = 1.1                # true by commanded flow: 1.1 lays too much, 0.9 too little
+led = true                 # whether the motion knows the four delays and leads them; false: it assumes 0
+file = "dispenser.toml"    # or the dispenser file that the motion assumes
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ TRUTH_KEYS: checks.Keys = {  # in a table [dispenser]
 }
 IDEAL = VirtualDispenserSettings(on_dead_time=0.0, on_lag=0.0, off_dead_time=0.0, off_lag=0.0)
 METERED_ON = "ON {flow_mm3_s}"  # in the language of `arduino`
-ROUNDING = 1e-9  # s: what is shorter is the rounding of an instant
-ANSWER_TIME = 0.01  # s after a line is whole again, within which it is looked at and told
+ROUNDING = 1e-9  # s: shorter intervals are rounding errors of instants
+ANSWER_TIME = 0.01  # s from a line's return until the dispenser has been polled and commanded
 PRESET = "arduino"
-MAX_GIVEN = 3.0  # of the flow told: a pump that gives more is not the one that was calibrated
+MAX_FLOW_SHARE = 3.0  # of the commanded flow: a pump that gives more is not the one that was calibrated
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedDispenser:
     """A table [dispenser] of a scenario."""
 
-    truth: VirtualDispenserSettings  # what it does
-    metered: bool = True  # whether it gives the flow that it is told
-    led: bool = True  # whether the motion knows its delays
-    believed: tuple[DispenserSettings, ...] = ()  # what the motion takes it for, of a file
-    given: float = 1.0  # share of the flow it is told that it truly gives
+    truth: VirtualDispenserSettings  # of the device
+    metered: bool = True  # whether it gives the flow that is commanded
+    delays_known: bool = True  # whether the motion knows its delays
+    assumed: tuple[DispenserSettings, ...] = ()  # of a file, by the motion
+    flow_share: float = 1.0  # true flow by commanded flow
 
 
 def dispenser_from_table(where: object, table: checks.Table, folder: File) -> SimulatedDispenser | None:
@@ -74,58 +74,59 @@ def dispenser_from_table(where: object, table: checks.Table, folder: File) -> Si
         raise InputError(where, "dispenser.led", table["led"], "true or false, and left out where a file says it")
     keys: checks.Keys = {
         **TRUTH_KEYS,
-        "led": ("led", checks.flag),
-        "given": ("given", checks.within(0, MAX_GIVEN, "of the flow that it is told", open=True)),
-        "file": ("believed", lambda where, key, value: _virtual(folder / checks.text(where, key, value))),
+        "led": ("delays_known", checks.flag),
+        "given": ("flow_share", checks.within(0, MAX_FLOW_SHARE, "of the flow that it is told", open=True)),
+        "file": ("assumed", lambda where, key, value: _assumed(folder / checks.text(where, key, value))),
     }
     result = checks.record_from_table(where, "dispenser.", table, _simulated, keys)
-    if not result.believed:
+    if not result.assumed:
         _drivers(result, ("",), where)
     return result
 
 
 def _simulated(
-    led: bool = True, given: float = 1.0, believed: tuple[DispenserSettings, ...] = (), **truth: float
+    delays_known: bool = True, flow_share: float = 1.0, assumed: tuple[DispenserSettings, ...] = (), **truth: float
 ) -> SimulatedDispenser:
-    """truth: fields that are not an ideal one's. InputError names one that makes no sense."""
+    """truth: fields other than an ideal one's. InputError names one that makes no sense."""
     true = replace(IDEAL, **truth)  # type: ignore[arg-type]
-    _profile(true, ("",), metered=True, led=True)
-    return SimulatedDispenser(true, "flow" not in truth, led, believed, given)
+    _profile(true, ("",), metered=True, delays_known=True)
+    return SimulatedDispenser(true, "flow" not in truth, delays_known, assumed, flow_share)
 
 
-def _virtual(file: File) -> tuple[DispenserSettings, ...]:
+def _assumed(file: File) -> tuple[DispenserSettings, ...]:
     """The dispensers of a file, each of which a virtual one can stand for; InputError where it cannot."""
-    found = read_dispensers(file)
-    for each in found:
+    dispensers = read_dispensers(file)
+    for each in dispensers:
         if each.preset not in DIALECTS:
             raise InputError(file, "dispenser.preset", each.preset, f"for a simulation one of {', '.join(DIALECTS)}")
         if each.profile.nozzle_offset.any():
             offset = each.profile.nozzle_offset.tolist()
             raise InputError(file, "dispenser.nozzle_offset_mm", offset, "left out: a simulation has one nozzle")
-    outlets_from(found, file)
-    return found
+    outlets_from(dispensers, file)
+    return dispensers
 
 
-def _profile(truth: VirtualDispenserSettings, materials: tuple[str, ...], metered: bool, led: bool) -> DispenserProfile:
-    names = ("on_dead_time", "on_lag", "off_dead_time", "off_lag") if led else ()
+def _profile(
+    truth: VirtualDispenserSettings, materials: tuple[str, ...], metered: bool, delays_known: bool
+) -> DispenserProfile:
+    names = ("on_dead_time", "on_lag", "off_dead_time", "off_lag") if delays_known else ()
     delays = {name: getattr(truth, name) for name in names}
     return DispenserProfile("dispenser", materials, **delays, watchdog=truth.watchdog, metered=metered, flow=truth.flow)
 
 
-def _drivers(of: SimulatedDispenser, materials: tuple[str, ...], where: object) -> tuple[DispenserSettings, ...]:
-    """What the motion takes a dispenser for that carries all materials; InputError for delays too long to be led."""
-    profile, line = _profile(of.truth, materials, of.metered, of.led), PRESETS[PRESET].line
-    if of.metered:
+def _drivers(device: SimulatedDispenser, materials: tuple[str, ...], where: object) -> tuple[DispenserSettings, ...]:
+    """The motion's settings of a dispenser that carries all materials; InputError for delays too long to be led."""
+    profile, line = _profile(device.truth, materials, device.metered, device.delays_known), PRESETS[PRESET].line
+    if device.metered:
         line = replace(line, messages=replace(line.messages, on=METERED_ON, flow=METERED_ON))
-    settings = (
-        DispenserSettings(profile, PRESET, replace(line, keepalive=min(line.keepalive, 0.4 * of.truth.watchdog))),
-    )
+    line = replace(line, keepalive=min(line.keepalive, 0.4 * device.truth.watchdog))
+    settings = (DispenserSettings(profile, PRESET, line),)
     outlets_from(settings, where)
     return settings
 
 
 class SimulatedDispensers:
-    """Virtual dispensers, and the motion's hand on them.
+    """Virtual dispensers, and their control by the motion.
 
     control: for the motion, to be polled every few milliseconds. outlets: for its planner. ideal: as without a table.
     """
@@ -133,137 +134,136 @@ class SimulatedDispensers:
     def __init__(
         self,
         path: Path,
-        of: SimulatedDispenser | None,
+        settings: SimulatedDispenser | None,
         clock: Clock,
         faults: Sequence[Fault] = (),
         where: object = "path",
     ) -> None:
-        """of: a scenario's; None: an ideal one. clock: of the virtual time. faults: those on a dispenser's line count.
+        """settings: a scenario's; None: an ideal one. clock: of the virtual time. faults: those of dispensers count.
 
         InputError (where) for a path with a material that none of them carries.
         """
-        self.ideal, self._clock = of is None, clock
-        self._clogs, self._given = faults_striking(faults, FaultPart.DISPENSER, FaultKind.CLOG), 1.0
-        of = SimulatedDispenser(IDEAL, metered=False) if of is None else of
-        self._given = of.given
+        self.ideal, self._clogs = settings is None, faults_striking(faults, FaultPart.DISPENSER, FaultKind.CLOG)
+        settings = SimulatedDispenser(IDEAL, metered=False) if settings is None else settings
+        self._flow_share = settings.flow_share
         materials = tuple(dict.fromkeys(map(str, path.material.tolist())))
-        drivers = of.believed or _drivers(of, materials, where)
-        self.models = [DispenserModel(replace(of.truth, preset=each.preset), clock.now()) for each in drivers]
+        drivers = settings.assumed or _drivers(settings, materials, where)
+        self.models = [DispenserModel(replace(settings.truth, preset=driver.preset), clock.now()) for driver in drivers]
         self._ports = [DispenserPort(model, clock, faults) for model in self.models]
         lines = [
-            LineDispenser(each.profile, replace(each.line, start=0.0), port)
-            for each, port in zip(drivers, self._ports, strict=True)
-            if each.line is not None
+            LineDispenser(driver.profile, replace(driver.line, start=0.0), port)
+            for driver, port in zip(drivers, self._ports, strict=True)
+            if driver.line is not None
         ]
         dispensers = Dispensers(lines, where)
-        if of.believed:
+        if settings.assumed:
             check_path_materials(dispensers, path, where)
         self.outlets: Outlets = outlets_from(drivers, where)
         self.control = MaterialControl(dispensers, path)
-        self._permits: list[tuple[float, float]] = []  # from, until, s: when material may be told to flow
+        self._permits: list[tuple[float, float]] = []  # from, until, s: when a dispenser may be open
 
-    def cut(self) -> None:
-        """Nobody speaks to them any more."""
+    def disconnect(self) -> None:
+        """From here on no command reaches them."""
         for port in self._ports:
-            port.dead = True
+            port.disconnected = True
 
     def advance(self, now: float) -> None:
         """Let their time pass until `now`, s."""
         for model in self.models:
             model.advance(now)
 
-    # -- what was commanded, to hold what was told against
+    # -- the moves that were sent, and the dispensers' state beside them
 
-    def note(self, command: Command, tick: float) -> None:
-        """A command was sent: a Move lets material flow until the next one, or in a tick in which it closes."""
+    def add_command(self, command: Command, tick: float) -> None:
+        """A command was sent: a Move permits flow until the next one, or for the tick in which it closes."""
         until = command.stamp
         if isinstance(command, Move) and (command.flow or command.flow_after):
             until = math.inf if command.flow else command.stamp + tick
         self._permits.append((command.stamp, until))
 
     def forbid(self, now: float) -> None:
-        """The arm is not armed from `now`, s, until the next command."""
+        """No flow is permitted from `now`, s, until the next command: the arm is not armed."""
         last = self._permits[-1] if self._permits else (now, math.inf)
         if last[1] > now:
             self._permits.append((max(now, last[0]),) * 2)
 
-    def told_outside(self, until: float, alone: Sequence[tuple[float, float]] = ()) -> float:
-        """How long, s, until `until`, a device was open on its orders while none was to be: by no move that prints.
+    def open_outside(self, until: float, unattended: Sequence[tuple[float, float]] = ()) -> float:
+        """How long, s, until `until`, a device was commanded open while no move that prints was sent.
 
-        alone: from, until, s: when nobody could tell it anything, and what it does is `open_after`.
+        unattended: from, until, s: when no command could reach it; that time counts in `open_unattended`.
         """
         begin = np.array([start for start, _ in self._permits])
         end = np.minimum([end for _, end in self._permits], np.append(begin[1:], until)[: len(begin)])
         outside = 0.0
         for model in self.models:
             stamps, flows = self._switches(model)
-            edges = np.concatenate([stamps[1:], begin, end, np.ravel(alone), [until]])
+            edges = np.concatenate([stamps[1:], begin, end, np.ravel(unattended), [until]])
             edges = np.unique(np.clip(edges, 0.0, until))
             middle = (edges[1:] + edges[:-1]) / 2
             last = np.searchsorted(begin, middle, "right") - 1
-            excused = (last >= 0) & (middle < np.append(end, 0.0)[last])
-            for left, back in alone:
-                excused |= (middle >= left) & (middle < back + ANSWER_TIME)
-            told = flows[np.searchsorted(stamps, middle, "right") - 1] > 0
+            allowed = (last >= 0) & (middle < np.append(end, 0.0)[last])
+            for lost, restored in unattended:
+                allowed |= (middle >= lost) & (middle < restored + ANSWER_TIME)
+            open_now = flows[np.searchsorted(stamps, middle, "right") - 1] > 0
             length = np.diff(edges)
-            outside += float(length[told & ~excused & (length > ROUNDING)].sum())
+            outside += float(length[open_now & ~allowed & (length > ROUNDING)].sum())
         return outside
 
-    def open_after(self, alone: Sequence[tuple[float, float]], until: float) -> float:
-        """How long, s, a device stayed open at most from when nobody could tell it anything; alone: from, until, s."""
+    def open_unattended(self, unattended: Sequence[tuple[float, float]], until: float) -> float:
+        """The longest time, s, that a device stayed open since commands failed; unattended: from, until, s."""
         longest = 0.0
         for stamps, flows in map(self._switches, self.models):
-            for left, back in alone:
-                if left < until and flows[np.searchsorted(stamps, left, "right") - 1] > 0:
-                    closed = stamps[(stamps > left) & (flows == 0)]
-                    longest = max(longest, min(closed[0] if len(closed) else until, back, until) - left)
+            for lost, restored in unattended:
+                if lost < until and flows[np.searchsorted(stamps, lost, "right") - 1] > 0:
+                    closed = stamps[(stamps > lost) & (flows == 0)]
+                    longest = max(longest, min(closed[0] if len(closed) else until, restored, until) - lost)
         return longest
 
     def open_at(self, instants: Array) -> NDArray[np.bool_]:
-        """Whether a device was told last to be open (N,), and had not closed itself, at instants (N,), s."""
-        told = np.zeros(len(instants), bool)
+        """Whether a device was open by its last command (N,), and had not closed itself, at instants (N,), s."""
+        is_open = np.zeros(len(instants), bool)
         for stamps, flows in map(self._switches, self.models):
-            told |= flows[np.searchsorted(stamps, instants, "right") - 1] > 0
-        return told
+            is_open |= flows[np.searchsorted(stamps, instants, "right") - 1] > 0
+        return is_open
 
-    def flow(self, instants: Array, needed: Array) -> Array:
-        """The true flow (N,), mm^3/s, at instants (N,), s. needed: (N,) mm^3/s, what the bead needs there."""
-        leaves = self._leaves(instants)
+    def flow(self, instants: Array, planned: Array) -> Array:
+        """The true flow (N,), mm^3/s, at instants (N,), s. planned: (N,) mm^3/s, what the bead needs."""
+        share = self._passing_share(instants)
         if self.ideal:
-            return np.asarray(needed * self.open_at(instants) * leaves)
-        return np.asarray(sum(model.flow_at(instants) for model in self.models) * leaves)
+            return np.asarray(planned * self.open_at(instants) * share)
+        return np.asarray(sum(model.flow_at(instants) for model in self.models) * share)
 
-    def _leaves(self, instants: Array) -> Array:
+    def _passing_share(self, instants: Array) -> Array:
         """Share (N,) of the flow that passes the needle at instants (N,), s."""
-        share = np.full(len(instants), self._given)
+        share = np.full(len(instants), self._flow_share)
         for fault in self._clogs:
             share[(instants >= fault.start) & (instants < fault.end)] *= 1 - fault.share
         return share
 
     def flowing(self, instants: Array) -> NDArray[np.bool_]:
-        """Whether half of the flow that a device was told last leaves it (N,), at instants (N,), s."""
+        """Whether half of the commanded flow or more leaves a device (N,), at instants (N,), s."""
         flowing = np.zeros(len(instants), bool)
         for model in self.models:
             stamps, flows = self._switches(model)
             opened = flows > 0
             last = np.searchsorted(stamps[opened], instants, "right") - 1
-            told = np.append(flows[opened], math.inf)[last]  # before the first there is none
-            flowing |= model.flow_at(instants) * self._leaves(instants) > told / 2
+            flow = np.append(flows[opened], math.inf)[last]  # before the first there is none
+            flowing |= model.flow_at(instants) * self._passing_share(instants) > flow / 2
         return flowing
 
     @staticmethod
     def _switches(model: DispenserModel) -> tuple[Array, Array]:
-        """Instants (M,), s, rising, and flows (M,) that it obeyed from each on."""
+        """Instants (M,), s, rising, and the flow (M,) commanded from each on."""
         stamps, flows = np.array([(-math.inf, 0.0), *model.switches]).T
         return stamps, flows
 
 
 BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
-AREA_PIECES, MIN_WAY = 7, 0.05  # pieces whose cross-section is one; mm of each way at least: where it stands, a puddle
+AREA_PIECES, MIN_LENGTH = 7, 0.05  # pieces with one cross-section; mm, least length of it: at rest, a puddle
 
 
 class BeadDrawing:
-    """Draws into a scene what leaves the needle: as ink as wide as planned, or as gel, as much as the flow gives."""
+    """Draws what leaves the needle into a scene: as ink of the planned width, or as gel of the true volume."""
 
     def __init__(
         self,
@@ -290,17 +290,17 @@ class BeadDrawing:
         if self._gel:
             self._flow(scene, ends, places)
             return
-        laid = self._log.extruding(ends) if self._dispensers.ideal else self._dispensers.flowing(ends)
-        for place, there in zip(places, laid, strict=True):
-            if there and self._end is not None:
+        flowing = self._log.extruding(ends) if self._dispensers.ideal else self._dispensers.flowing(ends)
+        for place, on in zip(places, flowing, strict=True):
+            if on and self._end is not None:
                 scene.ink.lay(self._end, place, self._width)
-            self._end = place if there else None
+            self._end = place if on else None
 
     def _flow(self, scene: Scene, ends: Array, places: Array) -> None:
-        volume = self._dispensers.flow(ends, self._log.needed(ends)) * BEAD_STEP
+        volume = self._dispensers.flow(ends, self._log.planned_flow(ends)) * BEAD_STEP
         start = np.concatenate([places[:1] if self._end is None else self._end[None], places[:-1]])
         self._end = places[-1]
-        near, length = np.ones(min(AREA_PIECES, len(ends))), np.linalg.norm(places - start, axis=1)
-        way = np.convolve(np.maximum(length, MIN_WAY * (length > 0)), near, "same")
-        area = np.convolve(volume, near, "same") / np.maximum(way, MIN_WAY)
+        window, length = np.ones(min(AREA_PIECES, len(ends))), np.linalg.norm(places - start, axis=1)
+        moved = np.convolve(np.maximum(length, MIN_LENGTH * (length > 0)), window, "same")
+        area = np.convolve(volume, window, "same") / np.maximum(moved, MIN_LENGTH)
         scene.ink.flow(GelPieces(start, places, volume, area), float(ends[-1]))

@@ -1,6 +1,6 @@
 """Motions and waveforms from a scenario's tables: one `[[motion]]` a part, composed in the order of the file.
 
-Every part may have `pivot_mm` (the point its rotation leaves alone) and its own `kind`:
+Every part has a `kind` and may have `pivot_mm` (the fixed point of its rotation):
 
     breathing  period_s or rate_hz, inspiration, exponent, period_spread, depth_spread, sighs_per_min, sigh_factor,
                pauses_per_min, pause_s                                        } of these four:
@@ -8,7 +8,7 @@ Every part may have `pivot_mm` (the point its rotation leaves alone) and its own
     sine       rate_hz, phase_deg; mm_per_frame and fps for amplitude_mm      } (out of the surface), turn_deg [x, y, z]
     steps      every_s, rise_s, start_s, pattern "turns" or "stairs"; its amplitude is height_mm }
     tremor     rms_mm [x, y, z], rms_deg [x, y, z], band_hz
-    hand       the same, slower and counted from where it is at 0 s
+    hand       the same, slower, with 0 at 0 s
     drift      speed_mm_s, speed_deg_s [x, y, z]; walk_mm, walk_deg: RMS of a random walk after a minute
     ramp       speed_mm_s, speed_deg_s, start_s, end_s (none: for ever), back, round_s
     constant   the thesis's cube: unit_mm, speed_units_s, turn_deg_s, direction, axis, travel_s, round_s
@@ -45,10 +45,10 @@ from hardware.process.checks import Table
 from hardware.simulator.scenario_tables import TableReader
 from hardware.simulator.trace_file import corner, corner_rate, folded, folded_rate, played_trace, read_trace
 
-MOTION_STREAM = 21  # of the scenario's seed: no other draw of the simulator shares it
+MOTION_STREAM = 21  # of the scenario's seed, for motions alone
 ZERO, SURFACE_NORMAL = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 THESIS_UNIT_MM = 100.0  # edge of the thesis's cube: 282 px at 400 mm before 1109 px of focal length are 102 mm
-MAX_SPREAD = 0.9 / movements.MAX_DRAW_SIGMAS  # no breath and no beat may come out with no length
+MAX_SPREAD = 0.9 / movements.MAX_DRAW_SIGMAS  # no breath and no beat may have length 0
 
 Generator = np.random.Generator
 
@@ -56,7 +56,7 @@ Generator = np.random.Generator
 def motion_from_tables(where: object, tables: list[Table], folder: Path, seed: int) -> ComposedMotion:
     """The motion that `[[motion]]` tables describe, none for a surface at rest.
 
-    folder: what a trace's file is relative to. seed: >= 0; part i draws from it and i alone. InputError names the key.
+    folder: of relative trace files. seed: >= 0; part i draws from it and i alone. InputError names the key.
     """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise InputError(where, "motion", tables, "[[motion]] tables")
@@ -78,12 +78,12 @@ def _part(where: object, number: int, table: Table, folder: Path, seed: int) -> 
     kind = keys.word("kind", [*WAVE_KINDS, *PART_KINDS])
     rng = np.random.default_rng([seed, MOTION_STREAM, number])
     pivot = keys.vector("pivot_mm", ZERO)
-    part = _driven(keys, kind, rng, pivot) if kind in WAVE_KINDS else PART_KINDS[kind](keys, rng, pivot, folder)
+    part = _waveform_part(keys, kind, rng, pivot) if kind in WAVE_KINDS else PART_KINDS[kind](keys, rng, pivot, folder)
     keys.done()
     return part
 
 
-def _driven(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> WaveformMotion:
+def _waveform_part(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> WaveformMotion:
     wave = WAVE_KINDS[kind](keys, rng)
     direction, turn = keys.axis("direction", SURFACE_NORMAL), np.deg2rad(keys.vector("turn_deg", ZERO))
     name = "height_mm" if kind == "steps" else "amplitude_mm"
@@ -98,20 +98,20 @@ def _driven(keys: TableReader, kind: str, rng: Generator, pivot: Array) -> Wavef
 
 
 def _breathing(keys: TableReader, rng: Generator) -> Waveform:
-    usual = BreathingSpec()
+    defaults = BreathingSpec()
     if keys.has("rate_hz") and keys.has("period_s"):
         raise InputError(keys.where, keys.prefix + "rate_hz", keys.table["rate_hz"], "one of rate_hz, period_s")
-    rate = keys.number("rate_hz", 1 / usual.period, 0.02, 5)
+    rate = keys.number("rate_hz", 1 / defaults.period, 0.02, 5)
     spec = BreathingSpec(
         period=keys.number("period_s", 1 / rate, 0.2, 50),
-        inspiration=keys.number("inspiration", usual.inspiration, 0.1, 0.9),
-        exponent=keys.number("exponent", usual.exponent, 2, 20),
-        period_spread=keys.number("period_spread", usual.period_spread, 0, MAX_SPREAD),
-        depth_spread=keys.number("depth_spread", usual.depth_spread, 0, MAX_SPREAD),
-        sighs_per_min=keys.number("sighs_per_min", usual.sighs_per_min, 0, 10),
-        sigh_factor=keys.number("sigh_factor", usual.sigh_factor, 1, 5),
-        pauses_per_min=keys.number("pauses_per_min", usual.pauses_per_min, 0, 10),
-        pause=keys.number("pause_s", usual.pause, 0, 60),
+        inspiration=keys.number("inspiration", defaults.inspiration, 0.1, 0.9),
+        exponent=keys.number("exponent", defaults.exponent, 2, 20),
+        period_spread=keys.number("period_spread", defaults.period_spread, 0, MAX_SPREAD),
+        depth_spread=keys.number("depth_spread", defaults.depth_spread, 0, MAX_SPREAD),
+        sighs_per_min=keys.number("sighs_per_min", defaults.sighs_per_min, 0, 10),
+        sigh_factor=keys.number("sigh_factor", defaults.sigh_factor, 1, 5),
+        pauses_per_min=keys.number("pauses_per_min", defaults.pauses_per_min, 0, 10),
+        pause=keys.number("pause_s", defaults.pause, 0, 60),
     )
     return movements.draw_breathing(spec, rng)
 
@@ -127,16 +127,16 @@ def _sine(keys: TableReader, rng: Generator) -> Waveform:
 
 
 def _steps(keys: TableReader, rng: Generator) -> Waveform:
-    every = keys.number("every_s", 2.0, 1e-3)
-    rise = keys.number("rise_s", min(0.05, every), 1e-3, every)
-    first = keys.number("start_s", every, 0)
-    return StepWave(first, every, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
+    period = keys.number("every_s", 2.0, 1e-3)
+    rise = keys.number("rise_s", min(0.05, period), 1e-3, period)
+    first = keys.number("start_s", period, 0)
+    return StepWave(first, period, rise, keys.word("pattern", ["turns", "stairs"], "turns") == "stairs")
 
 
 def _noise(
     keys: TableReader, rng: Generator, pivot: Array, folder: Path, band: tuple[float, float], tilt: float
 ) -> WaveformMotion:
-    """Six noises of their own; tilt: 1 for one speed at every frequency, as of a hand, counted from its start."""
+    """Six independent noises; tilt: 1 for the same speed at every frequency, as of a hand, with 0 at its start."""
     low, high = keys.take("band_hz", checks.pair(0, rising=True), band)
     rms = _six(keys, "rms_mm", "rms_deg", 0.0)
     waves = tuple(movements.draw_noise(low, high, tilt, rng) for _ in range(6))
@@ -169,24 +169,24 @@ def _ramp(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
     back = keys.flag("back", False)
     if math.isinf(end) and back:
         raise InputError(keys.where, keys.prefix + "end_s", "missing", "this key, where back = true")
-    times, bends = [start, end, 2 * end - start], [1.0, -2.0 if back else -1.0, 1.0]
+    times, slope_changes = [start, end, 2 * end - start], [1.0, -2.0 if back else -1.0, 1.0]
     count = 1 if math.isinf(end) else 3 if back else 2
-    corners = RoundedCorners(np.array(times[:count]), np.array(bends[:count]), rounding)
+    corners = RoundedCorners(np.array(times[:count]), np.array(slope_changes[:count]), rounding)
     return WaveformMotion((corners,), speed[None], pivot)
 
 
 def _constant_speed(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
     """The thesis's cube (4.6): constant speed in all six degrees of freedom, 0.3 of both.
 
-    Its unit is the cube's edge; the rotation's is not said, rad/s are taken. It ran on for ever; here it comes back.
+    Its unit is the cube's edge; the rotation's is not given, rad/s are assumed. Its motion had no end; here it returns.
     """
     unit, speed = keys.number("unit_mm", THESIS_UNIT_MM, 0, open=True), keys.number("speed_units_s", 0.3)
     turn = math.radians(keys.number("turn_deg_s", math.degrees(0.3)))
-    along, about = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
+    direction, axis = (keys.vector(name, (1.0, 1.0, 1.0)) for name in ("direction", "axis"))
     travel = keys.number("travel_s", 1.0, 1e-3)
     rounding = keys.number("round_s", min(0.2, travel), 1e-3, 2 * travel)
-    reach = np.concatenate([turn * about, unit * speed * along])[None]
-    return WaveformMotion((Zigzag(travel, rounding),), reach, pivot)
+    amplitude = np.concatenate([turn * axis, unit * speed * direction])[None]
+    return WaveformMotion((Zigzag(travel, rounding),), amplitude, pivot)
 
 
 def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> WaveformMotion:
@@ -200,8 +200,8 @@ def _turn(keys: TableReader, rng: Generator, pivot: Array, folder: Path) -> Wave
     starts = start + (duration + hold) * np.arange(2.0 * len(angles))
     steps = np.stack([angles, -angles], axis=1).ravel()
     period = float(starts[-1] + duration) if keys.flag("repeat", True) else math.inf
-    reach = np.deg2rad(np.append(axis, np.zeros(3)))[None]
-    return WaveformMotion((Levels(starts, steps, duration, period),), reach, pivot)
+    amplitude = np.deg2rad(np.append(axis, np.zeros(3)))[None]
+    return WaveformMotion((Levels(starts, steps, duration, period),), amplitude, pivot)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,8 +214,8 @@ class Levels(Waveform):
     period: float = np.inf  # s after which everything repeats (from level 0), inf for never
 
     def _evaluate(self, times: Array) -> tuple[Array, Array]:
-        within = times if np.isinf(self.period) else np.where(times < 0, times, np.mod(times, self.period))
-        u = (within[:, None] - self.starts) / self.rise
+        local_times = times if np.isinf(self.period) else np.where(times < 0, times, np.mod(times, self.period))
+        u = (local_times[:, None] - self.starts) / self.rise
         rates = (ease_rate(u) * self.steps / self.rise).sum(axis=1)
         return np.asarray((ease(u) * self.steps).sum(axis=1)), np.asarray(rates)
 
@@ -225,12 +225,12 @@ class RoundedCorners(Waveform):
     """Straight lines with rounded corners; the first line has slope 0."""
 
     times: Array  # (K,) s: when the slope changes
-    bends: Array  # (K,) 1/s: change of the slope
+    slope_changes: Array  # (K,) 1/s
     rounding: float  # s: duration of each change, half of it before its time
 
     def _evaluate(self, times: Array) -> tuple[Array, Array]:
         x = times[:, None] - self.times
-        values, rates = corner(x, self.rounding) * self.bends, corner_rate(x, self.rounding) * self.bends
+        values, rates = (curve(x, self.rounding) * self.slope_changes for curve in (corner, corner_rate))
         return np.asarray(values.sum(axis=1)), np.asarray(rates.sum(axis=1))
 
 

@@ -1,8 +1,8 @@
-"""The error at the nozzle: how far it is from where it should be on the moving surface, how late, and why the arm held.
+"""The error at the nozzle: its distance from its target on the moving surface, its lag, and the reasons for holds.
 
-Everything counts the extruding rows alone: where no material leaves, being elsewhere is no error. And how well beads
-begin and end where they are planned: a bead begins where half of what it needs leaves the nozzle, and ends where that
-is no longer so. Of each planned bead, the rows count from half of the way without a bead before it to half of the next.
+Only extruding rows count: where no material leaves, a distance is no error. And the errors of the beads' beginnings
+and ends: a bead begins where half of its planned flow leaves the nozzle, and ends where less does. The rows of a
+planned bead are those from the middle of the way without a bead before it to the middle of the next such way.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hardware.simulator.deposit import (
 )
 from planning.material import MIN_FLOW_SPEED
 
-_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")  # but not the 2 of a camera called cam2
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")  # but not the 2 of a camera's name cam2
 _VARYING_NUMBER = "…"
 
 
@@ -35,16 +35,16 @@ _VARYING_NUMBER = "…"
 class HoldGroup:
     """Holds of one kind."""
 
-    reason: str  # what their reasons share, "…" for a number that differs among them
-    count: int  # how many
+    reason: str  # common to all, "…" for a number that differs
+    count: int
     seconds: float  # s in all
     longest: float  # s
-    first: float  # s, the instant at which the first began
+    first: float  # s, start of the first
 
 
 @dataclass(frozen=True, slots=True)
 class HoldSpan:
-    """One hold: from `start` to `end`, s, and the reason that it began with."""
+    """One hold: from `start` to `end`, s, and its first reason."""
 
     start: float
     end: float
@@ -54,7 +54,7 @@ class HoldSpan:
 def hold_spans(stamps: Array, reason: NDArray[np.str_], step: float) -> list[HoldSpan]:
     """The holds in rows `stamps` (N,) s with `reason` (N,), "" where the arm moves; a row lasts `step` s.
 
-    A reason that goes on with other numbers is the same hold; another one begins another.
+    A change of the numbers in a reason continues a hold; a change of its text begins another.
     """
     if not len(reason):
         return []
@@ -71,7 +71,7 @@ def hold_spans(stamps: Array, reason: NDArray[np.str_], step: float) -> list[Hol
 
 
 def group_holds(spans: list[HoldSpan]) -> tuple[HoldGroup, ...]:
-    """Holds by kind, those that took longest in all first."""
+    """Holds by kind, the longest total first."""
     groups: dict[str, list[HoldSpan]] = {}
     for span in spans:
         groups.setdefault(_without_numbers(span.reason), []).append(span)
@@ -93,28 +93,28 @@ def _common_reason(reasons: list[str]) -> str:
     return _NUMBER.sub(lambda _: next(numbers), reasons[0])
 
 
-MAX_LAG = 0.25  # s, the largest shift tried; a loop later than this follows nothing that breathes
-COARSE_STEP = 0.01  # s between the shifts first tried
+MAX_LAG = 0.25  # s, the largest shift searched; a later loop cannot follow breathing
+COARSE_STEP = 0.01  # s between the shifts of the first search
 MIN_TARGET_SPEED = 1.0  # mm/s, root mean square: slower, 10 um of noise already are 10 ms of lag
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NozzleLag:
-    """How late the nozzle is."""
+    """The nozzle's lag behind the target."""
 
     seconds: float  # behind the target, below 0 ahead of it, NaN where unknown
-    shifts: Array  # (M,) s that were tried
+    shifts: Array  # (M,) s, of the search
     distance: Array  # (M,) mm, RMS between the nozzle and the target so shifted
 
 
 def nozzle_lag(log: NozzleLog) -> NozzleLag:
     """The shift tau that minimises the mean of |nozzle(t) - target(t - tau)|^2 over the extruding rows, in base.
 
-    This is their cross-correlation in least squares: the two differ by what does not depend on tau. It is searched for
-    by whole rows and refined by a parabola through the best three. Only rows count that have a target for MAX_LAG on
-    either side, without a gap in the stamps, so each shift is judged by the same rows. Nothing is fitted but tau: on a
-    surface at rest and a straight path an offset along the path cannot be told from a lag. NaN where no row counts, the
-    target moves slower than MIN_TARGET_SPEED, or the best shift is at the end of the search.
+    This is their cross-correlation in least squares: the two differ by a constant. The search is by whole rows, refined
+    by a parabola through the best three. Only rows count that have a target for MAX_LAG on either side, without a gap
+    in the stamps, so all shifts use the same rows. Only tau is fitted: on a surface at rest and a straight path an
+    offset along the path cannot be distinguished from a lag. NaN where no row counts, the target moves slower than
+    MIN_TARGET_SPEED, or the best shift is at the end of the search.
     """
     unknown = NozzleLag(float("nan"), np.empty(0), np.empty(0))
     if len(log) < 3:
@@ -126,27 +126,27 @@ def nozzle_lag(log: NozzleLog) -> NozzleLag:
     velocity = (target[rows + 1] - target[rows - 1]) / (2 * step)
     if not len(rows) or np.sqrt(np.mean(np.sum(velocity**2, axis=1))) < MIN_TARGET_SPEED:
         return unknown
-    tried = np.arange(-max_shift, max_shift + 1, stride)
-    squares = _squares(nozzle, target, rows, tried)
-    best = int(tried[np.argmin(squares)])
-    near = np.arange(max(best - stride, -max_shift), min(best + stride, max_shift) + 1)
-    around = _squares(nozzle, target, rows, near)
-    i = int(np.argmin(around))
-    shifts, distance = np.asarray(tried * step), np.asarray(np.sqrt(squares))
-    if not 0 < i < len(near) - 1:
+    offsets = np.arange(-max_shift, max_shift + 1, stride)
+    squares = _squares(nozzle, target, rows, offsets)
+    best = int(offsets[np.argmin(squares)])
+    candidates = np.arange(max(best - stride, -max_shift), min(best + stride, max_shift) + 1)
+    candidate_squares = _squares(nozzle, target, rows, candidates)
+    i = int(np.argmin(candidate_squares))
+    shifts, distance = np.asarray(offsets * step), np.asarray(np.sqrt(squares))
+    if not 0 < i < len(candidates) - 1:
         return NozzleLag(float("nan"), shifts, distance)
-    before, at, after = around[i - 1 : i + 2]
+    before, at, after = candidate_squares[i - 1 : i + 2]
     bend = before - 2 * at + after
     part = 0.5 * (before - after) / bend if bend > 0 else 0.0
-    return NozzleLag(float((near[i] + part) * step), shifts, distance)
+    return NozzleLag(float((candidates[i] + part) * step), shifts, distance)
 
 
 def _comparable_rows(log: NozzleLog, step: float, max_shift: int) -> NDArray[np.int64]:
-    known = np.isfinite(log.base_from_target[:, 0, 3])
+    due = np.isfinite(log.base_from_target[:, 0, 3])
     gaps = np.flatnonzero(np.abs(np.diff(log.stamps) - step) > 0.5 * step) + 1
     inside = np.zeros(len(log), bool)
     for first, last in zip([0, *gaps], [*gaps, len(log)], strict=True):
-        for part in stretches(known[first:last]):
+        for part in stretches(due[first:last]):
             inside[first + part.start + max_shift : max(first + part.stop - max_shift, 0)] = True
     return np.flatnonzero(inside & log.extrude)
 
@@ -155,8 +155,8 @@ def _squares(nozzle: Array, target: Array, rows: NDArray[np.int64], shifts: NDAr
     return np.array([np.mean(np.sum((nozzle[rows] - target[rows - shift]) ** 2, axis=1)) for shift in shifts])
 
 
-NEAR_ERROR = 0.5  # mm: what a thin bead forgives
-END_TOLERANCE = 0.01  # mm from the end of the path at which it counts as finished
+NEAR_ERROR = 0.5  # mm: the tolerance of a thin bead
+END_TOLERANCE = 0.01  # mm short of its end, within which the path counts as finished
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,7 +175,7 @@ class RowErrors:
 
 
 def nozzle_errors(log: NozzleLog, line: PlannedLine) -> RowErrors:
-    """The error in every row, each from nothing but its own row."""
+    """The error in every row, each from its own row alone."""
     base_from_surface = log.base_from_surface[:, :3, :3]
     difference = log.base_from_nozzle[:, :3, 3] - log.base_from_target[:, :3, 3]
     vector = np.einsum("nji,nj->ni", base_from_surface, difference)
@@ -196,8 +196,8 @@ class NozzleFigures:
     """The figures of a run. Spreads are over the extruding rows with a target, parts of the error without sign.
 
     The path is finished in the last row that extrudes or has a place more than END_TOLERANCE short of the end; if no
-    row comes that near to the end, in the last row of the log. Travel are the rows whose place lies on a piece that
-    does not print; a row without a place has the last known one.
+    row comes that near to the end, in the last row of the log. Travel rows have their place on a piece that does not
+    print; a row without a place has the last known one.
     """
 
     position: Spread  # mm, length of the error
@@ -250,43 +250,43 @@ def nozzle_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> Nozz
 
 
 def _printing(log: NozzleLog, line: PlannedLine) -> tuple[NDArray[np.bool_], int, bool]:
-    """(N,) rows in which material was due; the row after the last before the end of the path; if it was finished."""
-    known = np.isfinite(log.place)
-    short = known & (log.place < line.knots[-1] - END_TOLERANCE)
-    finished = bool((known & ~short).any())
-    going = np.flatnonzero(short | log.extrude)
-    end = int(going[-1]) + 1 if finished and len(going) else len(log)
+    """(N,) rows with planned material; the first row after the end of the path; whether the path was finished."""
+    placed = np.isfinite(log.place)
+    unfinished = placed & (log.place < line.knots[-1] - END_TOLERANCE)
+    finished = bool((placed & ~unfinished).any())
+    active = np.flatnonzero(unfinished | log.extrude)
+    end = int(active[-1]) + 1 if finished and len(active) else len(log)
     rows = np.arange(len(log))
-    last_known = np.maximum.accumulate(np.where(known, rows, -1))
+    last_known = np.maximum.accumulate(np.where(placed, rows, -1))
     place = np.where(last_known >= 0, log.place[last_known], 0.0)
     due = line.printed[line.piece(place)] & (rows < end)
     first = int(np.argmax(log.extrude)) if log.extrude.any() else len(log)
     return due & (rows >= first), end, finished
 
 
-HALF_FLOW = 0.5  # of what the bead needs
+HALF_FLOW = 0.5  # of the planned flow
 PROFILE_REACH, PROFILE_STEP = 4.0, 0.2  # mm along the path about a bead's end, and the step of its profile
 FLAT = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EndsOfBeads:
-    """All beginnings, or all ends, of the B planned beads that the print has come past; NaN where nothing was laid."""
+class BeadEnds:
+    """All beginnings, or all ends, of the B planned beads that the print has passed; NaN where nothing was laid."""
 
-    error: Array  # (B,) mm along the path from the planned to the true one; above 0: too late, farther on
+    error: Array  # (B,) mm along the path from the planned to the true one; above 0: too late
     speed: Array  # (B,) mm/s, at which the nozzle passed the planned one
     excess: Array  # (B,) mm^3 laid within BLOB_RADIUS of the planned one, less what is planned there
-    profile: Array  # (B, M) laid per planned, along the path about the planned one; see profile_edges
+    profile: Array  # (B, M) volume by planned volume along the path about it; see profile_edges
 
     @property
     def size(self) -> Spread:
-        """Of the errors without their sign, mm; a bead that was not laid counts as infinite, which meets no limit."""
-        with np.errstate(invalid="ignore"):  # between two infinite ones lies nothing that is known
+        """Of the absolute errors, mm; a bead that was not laid counts as infinite, which meets no limit."""
+        with np.errstate(invalid="ignore"):  # between two infinite ones there is no known value
             return spread(np.nan_to_num(np.abs(self.error), nan=np.inf))
 
     @property
     def median(self) -> float:
-        """mm, of the errors with their sign; NaN without any."""
+        """mm, of the signed errors; NaN without any."""
         return float(np.nanmedian(self.error)) if np.isfinite(self.error).any() else float("nan")
 
     @property
@@ -302,35 +302,37 @@ def profile_edges() -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialFigures:
-    """What was laid, and where it began and ended."""
+    """The volume printed, and the beads' beginnings and ends."""
 
-    begins: EndsOfBeads
-    stops: EndsOfBeads
-    laid: float  # mm^3 that left the nozzle
-    planned: float  # mm^3
-    ooze: float  # mm^3 that fell beside the beads, farther than half a width from every printed line
-    flowing: float  # s in which half of what a bead needs left the nozzle, or more, while the motion did not print
-    told: float  # s in which a dispenser was open on its orders while no move that prints was sent; NaN: not known
+    beginnings: BeadEnds
+    ends: BeadEnds
+    volume: float  # mm^3 that left the nozzle
+    planned_volume: float  # mm^3
+    ooze: float  # mm^3 farther than half a width from every printed line
+    flow_outside: float  # s with half of the planned flow or more while the motion did not print
+    open_outside: float  # s in which a dispenser was commanded open while no move that prints was sent; NaN: unknown
 
 
-def material_figures(log: NozzleLog, line: PlannedLine, errors: RowErrors, bead: float, told: float) -> MaterialFigures:
-    """The figures of a log; bead: width, mm. told: s, as in the figures."""
+def material_figures(
+    log: NozzleLog, line: PlannedLine, errors: RowErrors, bead: float, open_outside: float
+) -> MaterialFigures:
+    """The figures of a log; bead: width, mm. open_outside: s, as in the figures."""
     rows = _rows(log, line, errors)
     begins, ends, _ = planned_beads(line)
-    reached = float(np.nanmax(log.place)) if np.isfinite(log.place).any() else -np.inf
+    last_place = float(np.nanmax(log.place)) if np.isfinite(log.place).any() else -np.inf
     volume = row_volumes(log)
     flat = replace(line, points=line.points * FLAT)
-    leaves = np.flatnonzero((volume > 0) & np.isfinite(log.surface_from_tip[:, 0]))
-    beside = flat.distance(log.surface_from_tip[leaves] * FLAT) > bead / 2
+    flow_rows = np.flatnonzero((volume > 0) & np.isfinite(log.surface_from_tip[:, 0]))
+    outside = flat.distance(log.surface_from_tip[flow_rows] * FLAT) > bead / 2
     lengths = np.diff(line.knots)[line.printed]
     return MaterialFigures(
-        begins=_ends(rows, log, line, np.flatnonzero(begins < reached - END_TOLERANCE), False),
-        stops=_ends(rows, log, line, np.flatnonzero(ends <= reached + END_TOLERANCE), True),
-        laid=float(volume.sum()),
-        planned=float(lengths @ line.area[line.printed]),
-        ooze=float(volume[leaves][beside].sum()),
-        flowing=float((rows.flows & ~log.extrude).sum()) * row_step(log),
-        told=told,
+        beginnings=_ends(rows, log, line, np.flatnonzero(begins < last_place - END_TOLERANCE), False),
+        ends=_ends(rows, log, line, np.flatnonzero(ends <= last_place + END_TOLERANCE), True),
+        volume=float(volume.sum()),
+        planned_volume=float(lengths @ line.area[line.printed]),
+        ooze=float(volume[flow_rows][outside].sum()),
+        flow_outside=float((rows.flowing & ~log.extrude).sum()) * row_step(log),
+        open_outside=open_outside,
     )
 
 
@@ -339,44 +341,42 @@ class _Rows:
     """Each of N rows along the path."""
 
     place: Array  # (N,) mm along the path of the true nozzle
-    speed: Array  # (N,) mm/s, at which the path goes on
-    flows: NDArray[np.bool_]  # (N,) whether half of what a bead needs leaves, or more
+    speed: Array  # (N,) mm/s, along the path
+    flowing: NDArray[np.bool_]  # (N,) whether half of the planned flow or more leaves
 
 
 def _rows(log: NozzleLog, line: PlannedLine, errors: RowErrors) -> _Rows:
     along = np.where(np.isfinite(log.place), log.place + np.nan_to_num(errors.split[:, 0]), np.nan)
-    known = np.flatnonzero(np.isfinite(along))
-    if not len(known):
-        nothing = np.zeros(len(log))
-        return _Rows(nothing, nothing, nothing > 0)
-    following = known[np.minimum(np.searchsorted(known, np.arange(len(log))), len(known) - 1)]
-    due = log.place[following]
+    placed = np.flatnonzero(np.isfinite(along))
+    if not len(placed):
+        zeros = np.zeros(len(log))
+        return _Rows(zeros, zeros, zeros > 0)
+    row_of = placed[np.minimum(np.searchsorted(placed, np.arange(len(log))), len(placed) - 1)]
+    due = log.place[row_of]
     step = row_step(log)
     speed = np.maximum(np.gradient(due, step), 0.0) if len(log) > 1 else np.zeros(len(log))
     needed = line.area[row_pieces(log, line)] * np.maximum(speed, MIN_FLOW_SPEED)
-    return _Rows(along[following], speed, log.flow > HALF_FLOW * needed)
+    return _Rows(along[row_of], speed, log.flow > HALF_FLOW * needed)
 
 
-def _ends(rows: _Rows, log: NozzleLog, line: PlannedLine, which: NDArray[np.int64], stop: bool) -> EndsOfBeads:
+def _ends(rows: _Rows, log: NozzleLog, line: PlannedLine, beads: NDArray[np.int64], stop: bool) -> BeadEnds:
     begins, ends, areas = planned_beads(line)
-    planned, count = ends if stop else begins, len(which)
+    planned, count = ends if stop else begins, len(beads)
     between = (ends[:-1] + begins[1:]) / 2
     low, high = np.append(-np.inf, between), np.append(between, np.inf)
     error, speed = np.full(count, np.nan), np.full(count, np.nan)
-    edges, volume = profile_edges(), row_volumes(log)
+    place, edges, volume = planned[beads], profile_edges(), row_volumes(log)
     profile = np.zeros((count, len(edges) - 1))
-    for i, bead in enumerate(which.tolist()):
+    for i, bead in enumerate(beads.tolist()):
         inside = (rows.place > low[bead]) & (rows.place <= high[bead])
-        flowing = np.flatnonzero(inside & rows.flows)
+        flowing = np.flatnonzero(inside & rows.flowing)
         if len(flowing):
             error[i] = rows.place[flowing[-1 if stop else 0]] - planned[bead]
-        passed = int(np.argmax(rows.place >= planned[bead] - END_TOLERANCE))
-        around = slice(max(passed - 50, 0), passed + 50)
-        speed[i] = float(rows.speed[around].max(initial=0.0))
-        laid = np.histogram((rows.place - planned[bead])[inside], edges, weights=volume[inside])[0]
-        profile[i] = laid / (areas[bead] * PROFILE_STEP)
-    piece = np.clip(
-        np.searchsorted(line.knots, planned[which], "left" if stop else "right") - 1, 0, len(line.layer) - 1
-    )
-    at = np.stack([np.interp(planned[which], line.knots, line.points[:, axis]) for axis in (0, 1)], axis=1)
-    return EndsOfBeads(error, speed, excess_volumes(log, line, at, line.layer[piece]), profile)
+        row = int(np.argmax(rows.place >= planned[bead] - END_TOLERANCE))
+        window = slice(max(row - 50, 0), row + 50)
+        speed[i] = float(rows.speed[window].max(initial=0.0))
+        volumes = np.histogram((rows.place - planned[bead])[inside], edges, weights=volume[inside])[0]
+        profile[i] = volumes / (areas[bead] * PROFILE_STEP)
+    piece = np.clip(np.searchsorted(line.knots, place, "left" if stop else "right") - 1, 0, len(line.layer) - 1)
+    at = np.stack([np.interp(place, line.knots, line.points[:, axis]) for axis in (0, 1)], axis=1)
+    return BeadEnds(error, speed, excess_volumes(log, line, at, line.layer[piece]), profile)

@@ -1,4 +1,4 @@
-"""report.html of a simulated print: errors, holds, deposit and the way of the nozzle, in one file without a network."""
+"""report.html of a simulated print: errors, holds, deposit and path of the nozzle, in one self-contained file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hardware.report import page
 from hardware.report.evaluation import figure
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, sections, time_range
 from hardware.simulator.deposit import HALF_BEAD, DepositMap, gaps_and_overlaps, row_step
-from hardware.simulator.nozzle_error import NEAR_ERROR, EndsOfBeads, NozzleLag, profile_edges
+from hardware.simulator.nozzle_error import NEAR_ERROR, BeadEnds, NozzleLag, profile_edges
 from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share
 
 PAGE_FOOTER = (
@@ -27,13 +27,13 @@ PAGE_FOOTER = (
 MET_MARKS = {True: '<span class="met">✓ met</span>', False: '<span class="missed">✗ missed</span>'}
 MAX_LAYERS = 6  # bead maps shown
 MAX_LINE_POINTS = 12_000  # of a log drawn as one line
-MAX_SHADED_SPANS = 1500  # stretches shaded in a chart: finer ones cannot be told apart
-WIDE_ASPECT = 2.2  # width over height of the print from which its pictures stand one below the other
+MAX_SHADED_SPANS = 1500  # in a chart: finer ones cannot be distinguished
+WIDE_ASPECT = 2.2  # width over height of the print above which its pictures are one below the other
 CELL_KINDS = ("as planned", "missing", "double", "outside")  # of cells, in this order; report.css has them as classes
 CELL_COLOURS = (0x5C, 0x97, 0xBD), (0xD0, 0x56, 0x3E), (0xE3, 0xA5, 0x3C), (0x84, 0x66, 0xB8)  # red, green, blue
 MIN_PICTURE_PX = 1000  # px across a picture's longer side, at least: cells are drawn with smooth edges
 ERROR_STEPS = (0.1, 0.25, 0.5, 1.0)  # mm: the error's colours change here
-MAX_WAY_PIECES = 4000  # of the way drawn: more are no longer seen
+MAX_WAY_PIECES = 4000  # of the tip's path: more cannot be seen
 SCALE_HEIGHT_PX = 34  # px below a picture for its scale
 MIN_PICTURE_HEIGHT = 40.0  # px, the least height of a picture
 
@@ -102,17 +102,17 @@ def cell_kinds(planned: Array, deposited: Array) -> NDArray[np.uint8]:
 
 
 def _png(kind: NDArray[np.uint8], thickness: Array) -> bytes:
-    """A PNG (H, W) that is coloured by kind and clear where nothing is; the first row of the map is at its bottom."""
+    """A PNG (H, W) coloured by kind and transparent elsewhere; the first row of the map is at its bottom."""
     picture = np.empty((*kind.shape, 4), np.uint8)
     picture[..., :3] = np.array(CELL_COLOURS, np.uint8)[kind][..., ::-1]
     picture[..., 3] = np.round(255 * np.clip(4 * thickness - 1.5, 0, 1)).astype(np.uint8)  # half a bead is its edge
-    done, data = cv2.imencode(".png", picture[::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    assert done
+    encoded, data = cv2.imencode(".png", picture[::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    assert encoded
     return data.tobytes()
 
 
 def way_picture(result: NozzleResult, width: float) -> str:
-    """The planned path, dashed, and the way of the tip while it printed, coloured by the error."""
+    """The planned path, dashed, and the printing tip's path, coloured by the error."""
     view = whole_map_view(result.deposit, width)
     plan = view.pixels(result.line.points)
     lines = [_polyline("plan", plan[i : i + 2]) for i in np.flatnonzero(result.line.printed)]
@@ -192,8 +192,8 @@ def _figures(result: NozzleResult) -> str:
 
 def _limits(result: NozzleResult) -> str:
     rows = "".join(
-        f"<tr><td>{escape(v.bound.words)}</td><td>{escape(v.reached_text)}</td>"
-        f"<td>{escape(v.allowed_text)}</td><td>{MET_MARKS[v.met]}</td></tr>"
+        f"<tr><td>{escape(v.bound.label)}</td><td>{escape(v.value_text)}</td>"
+        f"<td>{escape(v.limit_text)}</td><td>{MET_MARKS[v.met]}</td></tr>"
         for v in result.verdicts
     )
     head = "<thead><tr><th></th><th>reached</th><th>allowed</th><th></th></tr></thead>"
@@ -319,25 +319,26 @@ def _pictures(result: NozzleResult) -> str:
     return page.section("Deposited and planned", text, (both if wide else f'<div class="two">{both}</div>') + rest)
 
 
-MAX_DRAWN_ENDS = 200  # beads in a chart: more are no longer told apart
+MAX_DRAWN_ENDS = 200  # beads in a chart: more cannot be distinguished
 
 
 def _ends(result: NozzleResult) -> str:
-    """Where beads begin and end, as a table and as what was laid about there."""
+    """Beginnings and ends of beads: a table, and profiles of the material about them."""
     m = result.figures.material
-    if not len(m.begins.error):
+    if not len(m.beginnings.error):
         return ""
     rows, charts = [], []
-    for name, ends in (("begin", m.begins), ("end", m.stops)):
+    for name, ends in (("begin", m.beginnings), ("end", m.ends)):
         missing, excess = int(np.isnan(ends.error).sum()), float(ends.excess.mean()) if len(ends.excess) else np.nan
         values = ends.median, ends.size.p95, ends.size.max, excess, ends.blob
         rows.append([f"{name}: {len(ends.error)}, {missing} not laid", *map(figure, values)])
         charts.append(f"<div>{ends_chart(ends, f'about where beads {name}', HALF_CHART_WIDTH)}</div>")
     head = ("", "median, mm", "95 %, mm", "max, mm", "too much, mean, mm³", "most, mm³")
-    told = "not known" if np.isnan(m.told) else f"{1000 * m.told:.0f} ms"
+    open_text = "not known" if np.isnan(m.open_outside) else f"{1000 * m.open_outside:.0f} ms"
     note = (
-        f"{m.laid:.1f} of {m.planned:.1f} mm³ were laid, {figure(m.ooze)} mm³ of it beside all beads. For "
-        f"{1000 * m.flowing:.0f} ms material flowed while the motion did not print; told to was it then for {told}."
+        f"{m.volume:.1f} of {m.planned_volume:.1f} mm³ were laid, {figure(m.ooze)} mm³ of it beside all beads. For "
+        f"{1000 * m.flow_outside:.0f} ms material flowed while the motion did not print; told to was it then for "
+        f"{open_text}."
     )
     text = (
         "Errors along the path: above 0, material begins or ends farther on than planned. Too much: what lies within "
@@ -347,8 +348,8 @@ def _ends(result: NozzleResult) -> str:
     return page.section("Where beads begin and end", text, body + f'<div class="two">{"".join(charts)}</div>')
 
 
-def ends_chart(ends: EndsOfBeads, label: str, width: int) -> str:
-    """What was laid of the planned about each bead's beginning or end, by mm along the path; and the median of all."""
+def ends_chart(ends: BeadEnds, label: str, width: int) -> str:
+    """Profile of laid by planned material about each bead's beginning or end, by mm of the path; and the median."""
     edges = profile_edges()
     at = (edges[1:] + edges[:-1]) / 2
     top = max(1.5, float(ends.profile.max(initial=0.0)) * 1.1)
@@ -375,5 +376,4 @@ def _holds(result: NozzleResult) -> str:
 def _camera_pictures(result: NozzleResult) -> str:
     if not result.run.pictures:
         return ""
-    shown = page.camera_pictures(result.run.pictures)
-    return page.section("What the cameras saw", "One instant of the run.", shown)
+    return page.section("What the cameras saw", "One instant of the run.", page.camera_pictures(result.run.pictures))

@@ -1,4 +1,4 @@
-"""The result of a simulated print: its limits and whether they were met, its summary as text, JSON and table.
+"""The result of a simulated print: verdicts on its limits, its summary as text, JSON and table.
 
 A scenario's table [limits] has keys of BOUNDS, all optional. Those without a unit are shares from 0 to 1.
 """
@@ -39,22 +39,22 @@ from planning.path import Path
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunFigures:
-    """All that can be bounded."""
+    """All figures that can be bounded."""
 
     nozzle: NozzleFigures
     deposit: DepositFigures
     material: MaterialFigures
-    tracking: Spread | None = None  # errors of the estimated surface, mm, from the start; None where not known
+    tracking: Spread | None = None  # errors of the estimated surface, mm, from the start; None where unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bound:
     """A figure that a scenario may bound."""
 
-    words: str  # what it is
+    label: str
     unit: str  # "" for a share
-    minimum: bool  # whether the bound must be reached; else it must not be passed
-    of: Callable[[RunFigures], float]  # the figure in that unit
+    minimum: bool  # whether the bound is a minimum; else it is a maximum
+    value_of: Callable[[RunFigures], float]  # the figure in that unit
 
 
 def _tracking(part: str) -> Callable[[RunFigures], float]:
@@ -80,9 +80,9 @@ BOUNDS = {  # key in [limits]: with its unit
     "gaps": Bound("gaps", "", False, lambda f: f.deposit.gaps),
     "overlap": Bound("overlap", "", False, lambda f: f.deposit.overlap),
     "outside": Bound("material outside", "", False, lambda f: f.deposit.outside),
-    "bead_begin_p95_mm": Bound("beads begin off the plan, 95 %", "mm", False, lambda f: f.material.begins.size.p95),
-    "bead_stop_p95_mm": Bound("beads end off the plan, 95 %", "mm", False, lambda f: f.material.stops.size.p95),
-    "told_outside_ms": Bound("told to flow while not printing", "ms", False, lambda f: 1000 * f.material.told),
+    "bead_begin_p95_mm": Bound("beads begin off the plan, 95 %", "mm", False, lambda f: f.material.beginnings.size.p95),
+    "bead_stop_p95_mm": Bound("beads end off the plan, 95 %", "mm", False, lambda f: f.material.ends.size.p95),
+    "told_outside_ms": Bound("told to flow while not printing", "ms", False, lambda f: 1000 * f.material.open_outside),
     "tracking_rms_mm": Bound("tracking error, RMS", "mm", False, _tracking("rmse")),
     "tracking_p95_mm": Bound("tracking error, 95 %", "mm", False, _tracking("p95")),
     "tracking_max_mm": Bound("tracking error, largest", "mm", False, _tracking("max")),
@@ -94,27 +94,27 @@ RunLimits = dict[str, float]  # the bounds of one scenario by their key in BOUND
 
 @dataclass(frozen=True, slots=True)
 class LimitVerdict:
-    """One limit and what came of it. A NaN never meets a limit."""
+    """One limit, the run's value, and whether it meets it. A NaN never does."""
 
     name: str  # key of BOUNDS
-    reached: float  # in its unit
-    allowed: float  # in its unit
+    value: float  # in its unit
+    limit: float  # in its unit
     met: bool
 
     @property
     def bound(self) -> Bound:
-        """What is bounded, and how."""
+        """The bounded figure."""
         return BOUNDS[self.name]
 
     @property
-    def reached_text(self) -> str:
-        """What was reached, with its unit; a share, which has none, in percent."""
-        return f"{figure(self.reached)} {self.bound.unit}" if self.bound.unit else share(self.reached)
+    def value_text(self) -> str:
+        """The value with its unit; a share, which has none, in percent."""
+        return f"{figure(self.value)} {self.bound.unit}" if self.bound.unit else share(self.value)
 
     @property
-    def allowed_text(self) -> str:
+    def limit_text(self) -> str:
         """The bound, with its unit and its side."""
-        number = f"{self.allowed:g} {self.bound.unit}" if self.bound.unit else percent(self.allowed)
+        number = f"{self.limit:g} {self.bound.unit}" if self.bound.unit else percent(self.limit)
         return f"{'at least' if self.bound.minimum else 'at most'} {number}"
 
 
@@ -127,12 +127,12 @@ def limits_from_table(where: object, table: checks.Table) -> RunLimits:
 
 
 def check_limits(limits: RunLimits, figures: RunFigures) -> list[LimitVerdict]:
-    """A verdict for each limit, in the order in which they were given."""
+    """A verdict for each limit, in their order."""
     verdicts = []
-    for name, allowed in limits.items():
-        reached = BOUNDS[name].of(figures)
-        met = reached >= allowed if BOUNDS[name].minimum else reached <= allowed
-        verdicts.append(LimitVerdict(name, reached, allowed, met))
+    for name, limit in limits.items():
+        value = BOUNDS[name].value_of(figures)
+        met = value >= limit if BOUNDS[name].minimum else value <= limit
+        verdicts.append(LimitVerdict(name, value, limit, met))
     return verdicts
 
 
@@ -145,12 +145,12 @@ class NozzleRun:
     path: Path  # in the true surface frame
     bead: float  # width, mm
     limits: RunLimits = field(default_factory=dict)
-    told_outside: float = math.nan  # s in which a dispenser was told to be open while no move printed
+    open_outside: float = math.nan  # s in which a dispenser was commanded open while no move printed
     tracking: Evaluation | None = None  # of the surface, where known
     complete: bool = True  # whether it ran to its end
     pictures: tuple[tuple[str, bytes], ...] = ()  # of the cameras: name, and bytes of a JPEG or PNG
-    files: tuple[tuple[str, str], ...] = ()  # beside the page: relative name, and what it holds
-    looks: tuple[Look, ...] = ()  # at what was laid
+    files: tuple[tuple[str, str], ...] = ()  # beside the page: relative name, and content
+    looks: tuple[Look, ...] = ()  # at the printed material
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,19 +166,19 @@ class NozzleResult:
 
     @property
     def met(self) -> bool:
-        """Whether the run was complete, printed something, and that only where a target was, and met all its limits."""
+        """Whether the run was complete, printed, printed only where a target was due, and met all its limits."""
         printed = self.figures.nozzle.extruding > 0 and self.figures.nozzle.without_target == 0
         return self.run.complete and printed and all(verdict.met for verdict in self.verdicts)
 
 
 def evaluate_run(run: NozzleRun) -> NozzleResult:
-    """What a run came to."""
+    """The result of a run."""
     line = planned_line(run.path)
     errors = nozzle_errors(run.log, line)
     deposit = deposit_map(run.log, line, run.bead)
     comparison = None if run.tracking is None else run.tracking.comparison
     tracking = None if comparison is None else spread(comparison.start.translation)
-    material = material_figures(run.log, line, errors, run.bead, run.told_outside)
+    material = material_figures(run.log, line, errors, run.bead, run.open_outside)
     figures = RunFigures(nozzle_figures(run.log, line, errors), deposit_figures(deposit), material, tracking)
     return NozzleResult(run, line, errors, figures, deposit, tuple(check_limits(run.limits, figures)))
 
@@ -187,7 +187,7 @@ SPREAD_COLUMNS = {"median": "median", "rmse": "RMS", "p95": "95 %", "p99": "99 %
 
 
 def rows_of_errors(result: NozzleResult) -> list[tuple[str, str, Spread, float]]:
-    """The table of errors: words, key in the summary, spread, and what a value in it is multiplied by for display."""
+    """The table of errors: label, key in the summary, spread, and factor of its values for display."""
     f = result.figures.nozzle
     return [
         ("position, mm", "position_mm", f.position, 1.0),
@@ -204,7 +204,7 @@ def nozzle_verdict(result: NozzleResult) -> list[str]:
     f, deposit = result.figures.nozzle, result.figures.deposit
     sentences = [] if result.run.complete else ["This run was cut short; what follows is about the part that was done."]
     if not math.isfinite(f.position.p95):
-        return [*sentences, "Nothing was printed, so there is no error to tell.", *_limits_in_words(result)]
+        return [*sentences, "Nothing was printed, so there is no error to tell.", *_limit_sentences(result)]
     sentences.append(
         f"While it printed, the nozzle was {figure(f.position.rmse)} mm from its place (RMS), 95 % of the time within "
         f"{figure(f.position.p95)} mm and never more than {figure(f.position.max)} mm away."
@@ -213,27 +213,27 @@ def nozzle_verdict(result: NozzleResult) -> list[str]:
     if math.isfinite(deposit.coverage):
         sentences.append(f"{share(deposit.coverage)} of the planned area got its material.")
     material = result.figures.material
-    if material.told > 0:
+    if material.open_outside > 0:
         sentences.append(
-            f"For {1000 * material.told:.0f} ms a dispenser was told to be open while nothing was printed."
+            f"For {1000 * material.open_outside:.0f} ms a dispenser was told to be open while nothing was printed."
         )
     if f.without_target > 0:
         sentences.append(f"For {f.without_target:.3f} s material left the nozzle where nothing was due.")
-    return sentences + _limits_in_words(result)
+    return sentences + _limit_sentences(result)
 
 
-def _limits_in_words(result: NozzleResult) -> list[str]:
+def _limit_sentences(result: NozzleResult) -> list[str]:
     missed = [verdict for verdict in result.verdicts if not verdict.met]
     if not result.verdicts:
         return ["The scenario sets no limits."]
     if not missed:
         return [f"All {len(result.verdicts)} limits were met." if len(result.verdicts) > 1 else "Its limit was met."]
-    details = "; ".join(f"{v.bound.words} {v.reached_text}, {v.allowed_text}" for v in missed)
+    details = "; ".join(f"{v.bound.label} {v.value_text}, {v.limit_text}" for v in missed)
     return [f"{len(missed)} of {len(result.verdicts)} limits missed: {details}."]
 
 
 def share(value: float) -> str:
-    """A share in percent, a dash for one that is not known."""
+    """A share in percent, a dash for an unknown one."""
     return percent(value) if math.isfinite(value) else "–"
 
 
@@ -246,7 +246,7 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
         "met": result.met,
         "verdict": nozzle_verdict(result),
         "limits": [
-            {"name": v.name, "reached": v.reached, "allowed": v.allowed, "met": bool(v.met)} for v in result.verdicts
+            {"name": v.name, "reached": v.value, "allowed": v.limit, "met": bool(v.met)} for v in result.verdicts
         ],
         "errors": {
             key: {name: value * scale for name, value in asdict(spread).items()}
@@ -280,7 +280,7 @@ def nozzle_dict(result: NozzleResult) -> dict[str, Any]:
 
 
 def _material_dict(material: MaterialFigures) -> dict[str, Any]:
-    ends = {"begin": material.begins, "stop": material.stops}
+    ends = {"begin": material.beginnings, "stop": material.ends}
     return {
         **{
             name: {
@@ -294,11 +294,11 @@ def _material_dict(material: MaterialFigures) -> dict[str, Any]:
             }
             for name, each in ends.items()
         },
-        "laid_mm3": material.laid,
-        "planned_mm3": material.planned,
+        "laid_mm3": material.volume,
+        "planned_mm3": material.planned_volume,
         "ooze_mm3": material.ooze,
-        "flowing_while_not_printing_ms": 1000 * material.flowing,
-        "told_while_not_printing_ms": 1000 * material.told,
+        "flowing_while_not_printing_ms": 1000 * material.flow_outside,
+        "told_while_not_printing_ms": 1000 * material.open_outside,
     }
 
 

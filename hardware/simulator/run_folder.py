@@ -1,11 +1,11 @@
-"""The folder of a simulated run: all that passes is written to it as it comes, and can be read if it is cut short.
+"""The folder of a simulated run: written as the run goes on, and readable if the run ends early.
 
 session.mcap, session/     the session, as `stillbed track` and `replay` take it: pictures, rig, region, head and truth
 tracking/                  poses.csv, poses.tum and their report, as `stillbed track` writes them
-commands.csv, frames.bin   what the motion decided, and the bytes that went to the arm
-nozzle.csv                 where the nozzle was and should have been, every millisecond
-arm.toml, scenario.toml    what was assumed of the arm, and what was simulated
-watch.html, report.html    what the cameras see while it runs, on a page that reloads itself; and the result
+commands.csv, frames.bin   the motion's commands, and the bytes sent to the arm
+nozzle.csv                 the nozzle's place and its target, every millisecond
+arm.toml, scenario.toml    the arm as the motion knew it, and the scenario
+watch.html, report.html    the cameras' pictures while it runs, on a page that reloads itself; and the result
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from planning.path import PrintProgress
 WATCH_INTERVAL = 0.5  # s of the run between two pictures
 MAIN_TILE, SIDE_TILE = (960, 540), (480, 270)  # px: the first camera's picture, and the others'
 WATCH_JPEG_QUALITY = 85
-CLOSE_UP_PX = 400  # px of the picture that fill a tile's width once the line's place is known
+CLOSE_UP_PX = 400  # px of the picture across a tile's width once the line's place is known
 LINE_BGR = (255, 200, 90)  # BGR
 STATE_BGR = {  # as the report's states
     TrackState.INITIALISING: (160, 160, 160),
@@ -85,11 +85,11 @@ class WatchPage:
         self._write('<meta http-equiv="refresh" content="1">', "<p>This page renews itself while the run goes on.</p>")
 
     def begin(self) -> None:
-        """There is no picture yet, but a page that will show it."""
+        """Write a page before the first picture."""
         self._write('<meta http-equiv="refresh" content="1">', "<p>The first pictures are being rendered.</p>")
 
     def finish(self, verdict: str) -> None:
-        """The run is over: the page stands still and leads to the report."""
+        """The run is over: the page no longer reloads itself, and links to the report."""
         self._write("", f'<p>{escape(verdict)} <a href="report.html">The report</a></p>')
 
     def _write(self, refresh: str, foot: str) -> None:
@@ -116,7 +116,7 @@ class WatchPage:
         return canvas
 
     def _draw(self, tile: Image, image: Image, camera: int, pose: SurfacePose, line: Array | None) -> None:
-        """The picture on its tile, brought close to the line where the pose says that it lies, and the line on it."""
+        """The picture on its tile, zoomed to the line by the pose, and the line on it."""
         width, (h, w) = image.shape[1], tile.shape[:2]
         pixels: Array | None = None
         if line is not None and pose.state.measured:
@@ -126,9 +126,9 @@ class WatchPage:
         zoom, corner = w / width, np.zeros(2)
         if pixels is not None:
             zoom, corner = w / CLOSE_UP_PX, pixels.mean(0) - [CLOSE_UP_PX / 2, CLOSE_UP_PX * h / w / 2]
-        move = np.array([[zoom, 0, -zoom * corner[0]], [0, zoom, -zoom * corner[1]]])
+        tile_from_picture = np.array([[zoom, 0, -zoom * corner[0]], [0, zoom, -zoom * corner[1]]])
         colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-        cv2.warpAffine(colour, move, (w, h), dst=tile, flags=cv2.INTER_LINEAR)
+        cv2.warpAffine(colour, tile_from_picture, (w, h), dst=tile, flags=cv2.INTER_LINEAR)
         if pixels is not None:
             corners = [np.rint(16 * zoom * (pixels - corner)).astype(np.int32).reshape(-1, 1, 2)]
             cv2.polylines(tile, corners, False, LINE_BGR, 1, cv2.LINE_AA, 4)
@@ -151,7 +151,7 @@ class NozzleWriter:
         self._line = line
 
     def write(self, log: NozzleLog) -> None:
-        """The rows that came since the last call."""
+        """The rows since the last call."""
         nozzle, target, errors = log.base_from_nozzle, log.base_from_target, nozzle_errors(log, self._line)
         error = errors.distance, errors.vector, np.degrees(errors.angle), errors.path
         places = nozzle[:, :3, 3], target[:, :3, 3]
@@ -174,10 +174,10 @@ def _quoted(reason: str) -> str:
     return ('"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\r') else text) + "\n"
 
 
-SHOWN_ROWS = 20  # of the nozzle's log, one of which is shown to viewers: 50 a second
+ROW_STRIDE = 20  # of the nozzle's log for viewers: 50 rows a second
 LANDMARKS_PERIOD = 2.0  # s between two clouds of the landmarks
-STAMP_DIGITS = 9  # of a stamp: a row and an exposure of one instant are one
-TRUTH_DELAY = 0.5  # s beyond the transport until a picture has surely arrived; truth is written in order of stamp
+STAMP_DIGITS = 9  # of a stamp: a row and an exposure at one instant become one
+TRUTH_DELAY = 0.5  # s beyond the transport by which any picture has arrived; truth is written in order of stamp
 
 RUN_FILES = (
     *("session.mcap", "commands.csv", "frames.bin", "nozzle.csv", "arm.toml", "scenario.toml"),
@@ -188,7 +188,7 @@ PosesAt = Callable[[Array], Array]  # times (N,), s -> base_from_surface (N, 4, 
 
 
 def clear_run(out: Path) -> None:
-    """Remove from the folder `out` what an earlier run left there: of two runs no session could be made."""
+    """Remove an earlier run from the folder `out`: two runs make no session."""
     for name in ("session", "tracking"):
         shutil.rmtree(out / name, ignore_errors=True)
     for name in RUN_FILES:
@@ -196,52 +196,52 @@ def clear_run(out: Path) -> None:
 
 
 class RunFolder:
-    """Writes a run; a context manager that leaves all files readable however it ends."""
+    """Writes a run; a context manager that leaves all files readable on any end."""
 
     def __init__(
         self, out: Path, scenario: Scenario, line: PlannedLine, rois: Sequence[Roi], truth: PosesAt, scan: Path | None
     ) -> None:
-        """out: a folder that is there. line: the planned line. scan: the scan's file in out/session, if any."""
+        """out: an existing folder. line: the planned line. scan: the scan's file in out/session, if any."""
         self.out, self._truth, self._line, self._seconds = out, truth, line, scenario.seconds
         self.logs: list[NozzleLog] = []
         self.looks: list[Look] = []
-        self.pictures: dict[int, bytes] = {}  # per camera, the newest, if there is one the newest of the printing
+        self.pictures: dict[int, bytes] = {}  # per camera, the newest while printing, else the newest
         self.watch = WatchPage(out, scenario.known_rig, scenario.title)
         self._line_points: Array | None = None  # (N, 3) mm, of the line in the tracker's own surface frame
         self._activity, self._printing, self._printed = "waiting for a surface to follow", False, False
         self._state: TrackState | None = None
         self._reason = ""
-        self._pending: list[Array] = []  # s, instants whose truth is still to be written
-        self._written: list[Array] = []  # s, rising
+        self._pending: list[Array] = []  # s, instants without a written truth
+        self._truth_stamps: list[Array] = []  # s, rising
         self._until = -np.inf  # s, the last of them
-        self._headed = -np.inf  # s, the last frame set whose print head was written
-        self._posed = 0.0  # s, stamp of the last pose
+        self._last_head = -np.inf  # s, the last frame set with a written print head
+        self._last_pose = 0.0  # s, stamp of the last pose
         self._tracker: TrackingStep | None = None
-        self._mapped = -np.inf  # s, when viewers were last shown its landmarks
+        self._last_map = -np.inf  # s, of the last landmarks for viewers
         cameras = scenario.cameras
-        self._latest = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
+        self._truth_delay = cameras.transport + JITTER_LIMIT * cameras.transport_jitter + TRUTH_DELAY
         shutil.copyfile(scenario.file, out / "scenario.toml")
         write_arm(out / "arm.toml", scenario.profile, "what the motion knew of the arm")
         (out / "tracking").mkdir(exist_ok=True)
-        with ExitStack() as opening:  # what is open is closed if the next cannot be opened
+        with ExitStack() as stack:  # open files are closed if the next cannot be opened
             names = [camera.name for camera in scenario.known_rig.cameras]
-            self._poses = opening.enter_context(PoseWriter(out / "tracking", names, STAGES))
-            self._commands = opening.enter_context(CommandWriter(out))
-            self._nozzle = opening.enter_context(NozzleWriter(out / "nozzle.csv", line))
+            self._poses = stack.enter_context(PoseWriter(out / "tracking", names, STAGES))
+            self._commands = stack.enter_context(CommandWriter(out))
+            self._nozzle = stack.enter_context(NozzleWriter(out / "nozzle.csv", line))
             self._session: tuple[SessionFolderWriter, Recorder] | None = None
-            began = round(utc_now() * 1e9)  # the time of day at which virtual time begins
+            start_ns = round(utc_now() * 1e9)  # the time of day at which virtual time begins
             if scenario.tracking.pictures:
                 self._session = (
-                    opening.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois, began)),
-                    opening.enter_context(
-                        Recorder(out / "session.mcap", scenario.known_rig, overwrite=True, began=began)
+                    stack.enter_context(SessionFolderWriter(out / "session", scenario.known_rig, rois, start_ns)),
+                    stack.enter_context(
+                        Recorder(out / "session.mcap", scenario.known_rig, overwrite=True, began=start_ns)
                     ),
                 )
                 if scan is not None:
                     self._session[1].surface(scan)
                 for roi in rois:
                     self._session[1].write(roi)
-            self._files = opening.pop_all()
+            self._files = stack.pop_all()
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture has arrived, as encoded by its camera."""
@@ -255,20 +255,20 @@ class RunFolder:
             self._printed |= self._printing
 
     def head(self, stamp: float, head: PrintHead) -> None:
-        """Where the print head was at the stamp of a frame set, tracked or not; an instant told again is one."""
-        if self._session is not None and stamp > self._headed:
-            self._headed = stamp
+        """The print head at the stamp of a frame set, tracked or not; a repeated stamp is ignored."""
+        if self._session is not None and stamp > self._last_head:
+            self._last_head = stamp
             for container in self._session:
                 container.head_row(row_from_head(stamp, head), head.extruding)
 
-    def follow(self, tracker: TrackingStep) -> None:
-        """Viewers are shown the landmarks of this tracker."""
+    def show_tracker(self, tracker: TrackingStep) -> None:
+        """Show this tracker's landmarks to viewers."""
         self._tracker = tracker
 
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
-        """A pose was made of a frame set in `spent` s of real time."""
+        """The pose of a frame set, computed in `spent` s of real time."""
         self._poses.write(pose, len(frames.frames), report, spent)
-        self._posed = pose.stamp
+        self._last_pose = pose.stamp
         if pose.state is not self._state:
             self.event(pose.stamp, f"{pose.state.value}: {pose.reason}", INFO if pose.state.measured else WARNING)
             self._state = pose.state
@@ -278,49 +278,49 @@ class RunFolder:
             self._show_landmarks(pose.stamp)
             error, log = "not printing", self.logs[-1] if self.logs else None
             if log is not None and log.extrude.any():
-                off = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
-                error = f"{np.linalg.norm(off, axis=1).mean():.3f} mm"
+                errors = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
+                error = f"{np.linalg.norm(errors, axis=1).mean():.3f} mm"
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
             facts = [("time", time), ("arm", self._activity), ("error at the nozzle", error)]
             self.watch.show(frames, pose, self._line_points, facts)
 
     def _show_landmarks(self, stamp: float) -> None:
-        """Now and then, as the map grows."""
-        if self._session is None or self._tracker is None or stamp < self._mapped + LANDMARKS_PERIOD:
+        """Every LANDMARKS_PERIOD, as the map grows."""
+        if self._session is None or self._tracker is None or stamp < self._last_map + LANDMARKS_PERIOD:
             return
         if (surface_map := self._tracker.map) is not None:
-            self._mapped = stamp
+            self._last_map = stamp
             self._session[1].show_surface(stamp, surface_map.points)
 
     def look(self, look: Look) -> None:
-        """What was laid was looked at."""
+        """The result of a look at what was printed."""
         self.looks.append(look)
         if self._session is not None:
             self._session[1].write(look)
 
-    def registered(self, truth_from_estimate: Array) -> None:
-        """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
+    def registration(self, truth_from_estimate: Array) -> None:
+        """The path's registration: truth_surface_from_estimated_surface (4, 4)."""
         self._line_points = se3.transform_points(se3.inverse(truth_from_estimate), self._line.points)
         if self._session is not None:
-            self._session[1].show_path(self._posed, self._line_points, self._line.knots)
+            self._session[1].show_path(self._last_pose, self._line_points, self._line.knots)
 
     @property
     def keeper(self) -> LoopKeeper | None:
-        """Keeps what the motion's loop is given, in session.mcap; None without."""
+        """Records the inputs of the motion's loop in session.mcap; None without."""
         return None if self._session is None else LoopKeeper(self._session[1].attach, self._session[1].write)
 
     def wire(self, stamp: float, data: bytes, sent: bool) -> None:
-        """Bytes passed the arm's port, to the arm or from it."""
+        """Bytes at the arm's port: sent to the arm, or received."""
         if sent:
             self._commands.send(data)
         if self._session is not None:
             (self._session[1].sent if sent else self._session[1].received)(stamp, data)
 
-    def given(self, pose: SurfacePose) -> None:
-        """A pose has reached the motion; it is written when it is made."""
+    def pose_delivery(self, pose: SurfacePose) -> None:
+        """A pose has reached the motion; `pose` has written it."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
-        """A tick was made, and how far the print is by it; None before the path was placed."""
+        """A tick, and the progress of the print by it; None before the path was placed."""
         if progress is None:
             return
         command = tick.command
@@ -342,14 +342,14 @@ class RunFolder:
         self.logs.append(log)
         self._nozzle.write(log)
         if self._session is not None and log.extrude.any():
-            off = (log.base_from_nozzle - log.base_from_target)[:, :3, 3]
-            for k in np.flatnonzero(log.extrude)[::SHOWN_ROWS]:
-                self._session[1].error(float(log.stamps[k]), "nozzle", float(np.linalg.norm(off[k])))
+            errors = (log.base_from_nozzle - log.base_from_target)[:, :3, 3]
+            for k in np.flatnonzero(log.extrude)[::ROW_STRIDE]:
+                self._session[1].error(float(log.stamps[k]), "nozzle", float(np.linalg.norm(errors[k])))
         self._pending.append(log.stamps)
-        self._write_truth(float(log.stamps[-1]) - self._latest)
+        self._write_truth(float(log.stamps[-1]) - self._truth_delay)
 
     def event(self, stamp: float, text: str, level: int = WARNING) -> None:
-        """Something that a person should know."""
+        """An event for a person."""
         if self._session is not None:
             self._session[1].event(stamp, text, level, "simulation")
 
@@ -362,7 +362,7 @@ class RunFolder:
         due = stamps[(stamps <= until) & (stamps > self._until)]
         if len(due):
             self._until = float(due[-1])
-            self._written.append(due)
+            self._truth_stamps.append(due)
             for row in rows_from_trajectory(self._trajectory(due)):
                 self._session[1].truth_row(row, exact=True)
 
@@ -375,5 +375,5 @@ class RunFolder:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         with self._files:
             self._write_truth(np.inf)
-            if self._session is not None and self._written:
-                self._session[0].truth(self._trajectory(np.concatenate(self._written)))
+            if self._session is not None and self._truth_stamps:
+                self._session[0].truth(self._trajectory(np.concatenate(self._truth_stamps)))

@@ -251,10 +251,10 @@ def _tracking(path: Path, table: Table) -> TrackingSettings:
     return checks.record_from_table(path, "tracking.", table, _settings, TRACKING_KEYS)
 
 
-def _settings(by: str = "pictures", register: str = "texture", **more: float | None) -> TrackingSettings:
+def _settings(by: str = "pictures", register: str = "texture", **timing: float | None) -> TrackingSettings:
     method = MAP_METHOD if by in ("pictures", *WITHOUT_PICTURES) else by
     pictures, scan = by not in WITHOUT_PICTURES, register == "scan"
-    return TrackingSettings(pictures, by == "tracks", **more, scan=scan, method=method)
+    return TrackingSettings(pictures, by == "tracks", **timing, scan=scan, method=method)
 
 
 def _processing(where: object, key: str, value: object) -> float | None:

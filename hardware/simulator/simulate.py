@@ -1,8 +1,8 @@
 """`stillbed simulate`: a scenario from its file to the report, and whether its own limits were met.
 
-Besides the tracking step of a live run there are two trackers that look at no pictures: one that is told the truth, and
-one whose landmarks on the true surface are seen as pictures would show them. The latter leaves out detection, and with
-it nearly all of the time that a simulated second takes; its estimator is that of a live run.
+Besides the tracking step of a live run there are two trackers without pictures: one that returns the truth, and one
+whose landmarks on the true surface are projected into the cameras. The latter omits rendering and detection, and with
+them nearly all of the time of a simulated second; its estimator is that of a live run.
 """
 
 from __future__ import annotations
@@ -58,29 +58,29 @@ from planning.laid_beads import with_looks
 from planning.material import is_metered
 from planning.path import Path as Checkpoints
 
-LANDMARK_COUNT, LANDMARK_AREA = 90, (56.0, 42.0)  # landmarks, and mm of the surface round the wound that they lie in
+LANDMARK_COUNT, LANDMARK_AREA = 90, (56.0, 42.0)  # landmarks, and mm of the surface about the wound for them
 DETECTED_SHARE = 0.85  # of landmarks, in a picture
 DAMAGED_SHARE = 0.5  # of those, in a damaged picture
 TRACK_SIGMA = 0.3  # px, of a track
-STRAY_SHARE, STRAY_PX = 0.02, 30.0  # share of tracks that lie anywhere within so many px
-USABLE_GAINS = 0.2, 4.0  # of a picture that shows anything
-MIN_INITIAL_TRACKS = 30  # tracks to begin with
+STRAY_SHARE, STRAY_PX = 0.02, 30.0  # share of tracks with an error of up to so many px
+USABLE_GAINS = 0.2, 4.0  # of a picture with visible landmarks
+MIN_INITIAL_TRACKS = 30  # of the first pose
 
 
 class LandmarkTracker:
-    """Answers like TrackingStep, without looking at pictures."""
+    """A tracking step without pictures, from projected landmarks."""
 
     last: StepReport
 
     def __init__(
-        self, true: Rig, known: Rig, truth: Truth, shape: Shape, shot: Callable[[int, float], Shot], seed: int
+        self, true_rig: Rig, known_rig: Rig, truth: Truth, shape: Shape, shot: Callable[[int, float], Shot], seed: int
     ) -> None:
-        """shot: that of a camera's frame with a stamp, s."""
+        """shot: of a camera's frame with a stamp, s."""
         rng = np.random.default_rng([seed, 81])
         places = rng.uniform(-0.5, 0.5, (LANDMARK_COUNT, 2)) * np.minimum(LANDMARK_AREA, shape.size)
         self._points, self._normals = shape.points(places), shape.normals(places)
-        self._true_cameras, self._cameras = TrueCameras(undistorting(true).cameras), len(true)
-        self._known_rig, self._truth, self._shot = known, truth, shot
+        self._true_cameras, self._cameras = TrueCameras(undistorting(true_rig).cameras), len(true_rig)
+        self._known_rig, self._truth, self._shot = known_rig, truth, shot
         self._rng = np.random.default_rng([seed, 82])
         self._follower: Follower | None = None
 
@@ -112,11 +112,11 @@ class LandmarkTracker:
         return self._follower.estimator.pose
 
     def _view(self, camera: int, shot: Shot) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Camera (N,), track (N,) and pixels (N, 2) of the landmarks that one picture shows."""
+        """Camera (N,), track (N,) and pixels (N, 2) of the visible landmarks of one picture."""
         rng, instant = self._rng, np.array([shot.exposed])
         chance = rng.random(LANDMARK_COUNT)
-        other = shot.lens not in (None, camera) or shot.covered is not None  # nothing there looks as it did before
-        blind = other or shot.fate is Fate.DUPLICATED or not USABLE_GAINS[0] <= shot.gain <= USABLE_GAINS[1]
+        changed = shot.lens not in (None, camera) or shot.covered is not None  # appearances change
+        no_tracks = changed or shot.fate is Fate.DUPLICATED or not USABLE_GAINS[0] <= shot.gain <= USABLE_GAINS[1]
         amount = np.broadcast_to(self._truth.amount(instant), LANDMARK_COUNT)
         points = self._points + self._truth.displacement(self._points, amount) if amount.any() else self._points
         pose = self._truth.base_from_surface(instant)
@@ -124,35 +124,35 @@ class LandmarkTracker:
         noisy = pixels[0] + TRACK_SIGMA * rng.standard_normal((LANDMARK_COUNT, 2))
         stray = rng.random(LANDMARK_COUNT) < STRAY_SHARE
         noisy[stray] += rng.uniform(-STRAY_PX, STRAY_PX, (int(stray.sum()), 2))
-        share = 0.0 if blind else DETECTED_SHARE * (DAMAGED_SHARE if shot.fate is Fate.GARBLED else 1.0)
+        share = 0.0 if no_tracks else DETECTED_SHARE * (DAMAGED_SHARE if shot.fate is Fate.GARBLED else 1.0)
         track = np.flatnonzero(inside[0] & (chance < share)).astype(np.int64)
         return np.full(len(track), camera), track, noisy[track]
 
 
-EXACT_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but no matrix without an inverse
+EXACT_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but invertible
 
 
 class OracleTracker:
-    """Answers like TrackingStep, without looking at pictures."""
+    """A tracking step without pictures, from the truth."""
 
     last: StepReport
 
     def __init__(self, truth: Truth, offset: Array, exposed: Callable[[int, float], float], cameras: int) -> None:
-        """offset: (4, 4) known_base_from_base, what a wrong rig makes of every pose.
+        """offset: (4, 4) known_base_from_base, by the errors of the known rig.
 
-        exposed: the true instant, s, of a camera's frame with a stamp, s: clocks that are wrong stay wrong.
+        exposed: the true instant, s, of a camera's frame with a stamp, s: errors of clocks remain.
         """
         self._predictor = Predictor()
         self._truth, self._offset, self._exposed, self._cameras = truth, offset, exposed, cameras
 
     def __call__(self, frames: FrameSet) -> SurfacePose:
-        """The pose at the mean of the true exposures, under the stamp that the cameras tell."""
+        """The pose at the mean of the true exposures, with the cameras' stamp."""
         instant = np.array([np.mean([self._exposed(f.camera, f.stamp) for f in frames.frames])])
         pose, twist = self._truth.base_from_surface(instant)[0], self._truth.twist(instant)[0]
-        nothing, none = no_observations(frames.stamp), np.zeros(self._cameras, np.int64)
-        self.last = report_without_offsets(nothing, none, np.zeros(len(STAGES)))
-        measured = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
-        return replace(measured, forecast=self._predictor.add(measured))
+        observations, counts = no_observations(frames.stamp), np.zeros(self._cameras, np.int64)
+        self.last = report_without_offsets(observations, counts, np.zeros(len(STAGES)))
+        surface_pose = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
+        return replace(surface_pose, forecast=self._predictor.add(surface_pose))
 
     def idle(self) -> None:
         """There is nothing else to do."""
@@ -180,12 +180,12 @@ class SimulationOptions:
     threads: int = 2  # that render
     force: bool = False  # write into a folder that is not empty
     open: bool = False  # open the page that shows it in a browser
-    cache: Path | None = None  # where pictures of earlier runs are found, and those of this one kept
+    cache: Path | None = None  # of pictures of earlier runs and of this one
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationResult:
-    """What a run came to."""
+    """The result of a run."""
 
     text: str  # for a terminal
     met: bool  # whether it ran to its end and met its scenario's limits
@@ -194,8 +194,7 @@ class SimulationResult:
 def run_simulation(file: Path, out: Path, options: SimulationOptions | None = None) -> SimulationResult:
     """Run the scenario in `file` into the folder `out`.
 
-    Whatever ends the run early leaves all files of what was simulated until then, report included. InputError for a
-    scenario, path or scan that makes no sense.
+    An early end leaves all files of the run until then, report included. InputError for a bad scenario, path or scan.
     """
     options = options or SimulationOptions()
     if options.threads < 1:
@@ -225,39 +224,40 @@ def run_simulation(file: Path, out: Path, options: SimulationOptions | None = No
         scan.parent.mkdir(exist_ok=True)
         write_ply(scan, *scene.shape.mesh(SCAN_MESH_STEP))
     folder = RunFolder(out, scenario, planned_line(path), wound_rois, truth.base_from_surface, scan)
-    complete, skipped, told_outside = False, 0, float("nan")
+    complete, skipped, open_outside = False, 0, float("nan")
     try:
         with folder, ExitStack() as stack:
             exposures: Exposures = {}
             step = stack.enter_context(_tracking(scenario, truth, scene.shape, wound_rois, scan, exposures))
             if isinstance(step, TrackingStep):
-                folder.follow(step)
+                folder.show_tracker(step)
             progress = stack.enter_context(Progress("simulate", "frame sets", WallClock().now))
             folder.watch.begin()
             print(f"watch: {folder.watch.page.resolve().as_uri()}", file=sys.stderr)
             if options.open:
                 open_in_browser(folder.watch.page.resolve().as_uri())
-            loop = step, exposures, folder, WallClock(), options.threads
-            kept = options.cache if scenario.tracking.pictures else None
-            store = None if kept is None else stack.enter_context(closing(PictureStore(file, kept)))
+            cache = options.cache if scenario.tracking.pictures else None
+            store = None if cache is None else stack.enter_context(closing(PictureStore(file, cache)))
             if (keeper := folder.keeper) is not None:
                 scenario = replace(scenario, profile=keeper.arm(scenario.profile))
-            world = SimulatedWorld(scenario, scene, path, truth, *loop, store, keeper)
+            world = SimulatedWorld(
+                scenario, scene, path, truth, step, exposures, folder, WallClock(), options.threads, store, keeper
+            )
             try:
                 world.run(progress)
                 if store is not None:
                     store.finish()
             finally:
                 skipped = world.pipeline.skipped
-                told_outside = world.told_outside
+                open_outside = world.open_outside
         complete = True
     finally:
-        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped, told_outside)
+        outcome = _write_results(scenario, path, truth, folder, wound_rois, complete, skipped, open_outside)
     return outcome
 
 
 def true_surface(scenario: Scenario, scene: Scene) -> Truth:
-    """The truth of a scenario's surface, its faults included; the scene is told how it folds."""
+    """The truth of a scenario's surface, its faults included; sets the scene's folds."""
     strain = scenario.strain
     if (fold := fold_deformation(scenario.file, scene.deformation, scenario.faults)) is not None:
         scene.deformation, strain = fold
@@ -289,11 +289,11 @@ def _write_results(
     regions: Sequence[Roi],
     complete: bool,
     skipped: int,
-    told_outside: float,
+    open_outside: float,
 ) -> SimulationResult:
-    """Judge what was simulated; writes both reports and summaries. skipped: frame sets that found the tracker busy.
+    """Evaluate the run; writes both reports and summaries. skipped: frame sets that found the tracker busy.
 
-    told_outside: s in which a dispenser was told to be open while no move printed.
+    open_outside: s in which a dispenser was commanded open while no move printed.
     """
     out = folder.out
     if not folder.logs:
@@ -302,8 +302,8 @@ def _write_results(
     pictures = tuple((scenario.rig.cameras[c].name, data) for c, data in sorted(folder.pictures.items()))
     files = tuple(f for f in FILE_NOTES if scenario.tracking.pictures or f[0] != "session")
     log = join_logs(folder.logs)
-    judged = scenario.limits, told_outside, tracking, complete
-    run = NozzleRun(scenario.title, log, path, scenario.bead, *judged, pictures, files, tuple(folder.looks))
+    title, bead, limits, looks = scenario.title, scenario.bead, scenario.limits, tuple(folder.looks)
+    run = NozzleRun(title, log, path, bead, limits, open_outside, tracking, complete, pictures, files, looks)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
     summary["provenance"] = provenance().table()
@@ -318,18 +318,18 @@ def _tracking_report(
     scenario: Scenario, truth: Truth, folder: Path, regions: Sequence[Roi], complete: bool
 ) -> Evaluation:
     table = read_poses(folder / "poses.csv")
-    exact = Trajectory(table.stamps, truth.base_from_surface(table.stamps), exact=True) if len(table) else None
-    since = min((roi.stamp for roi in regions), default=-np.inf)
+    trajectory = Trajectory(table.stamps, truth.base_from_surface(table.stamps), exact=True) if len(table) else None
+    start = min((roi.stamp for roi in regions), default=-np.inf)
     tracking = scenario.tracking
     method = tracking.method if tracking.pictures else "tracks" if tracking.tracks else "truth"
-    result = evaluate(table, exact, scenario.title, since, complete, method=method)
+    result = evaluate(table, trajectory, scenario.title, start, complete, method=method)
     write_summary(folder / "summary.json", result)
     write_report(folder / "report.html", result)
     return result
 
 
 def regions(scenario: Scenario, scene: Scene, truth: Truth) -> tuple[Roi, ...]:
-    """What an operator would draw around the wound in each camera's first picture."""
+    """An operator's outline of the wound in each camera's first picture."""
     cameras = SimulatedCameras(scenario.cameras, scenario.seed, scenario.faults)
     polygons: list[Roi] = []
     for camera in range(len(scenario.rig)):
@@ -350,8 +350,8 @@ def _tracking(
             yield step
         return
     if scenario.tracking.tracks:
-        rigs = scenario.rig, scenario.known_rig
-        yield LandmarkTracker(*rigs, truth, shape, lambda camera, stamp: exposures[camera, stamp], scenario.seed)
+        true_rig, known_rig, seed = scenario.rig, scenario.known_rig, scenario.seed
+        yield LandmarkTracker(true_rig, known_rig, truth, shape, lambda camera, stamp: exposures[camera, stamp], seed)
         return
     known, true = scenario.known_rig.cameras[0], scenario.rig.cameras[0]
     offset = known.base_from_camera @ se3.inverse(true.base_from_camera)

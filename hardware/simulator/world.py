@@ -1,12 +1,11 @@
 """The closed loop in virtual time: the wound moves, cameras expose, poses and commands travel, the arm executes.
 
-Nothing here decides anything. Tracking, motion, the motion's loop and the arm's link are those of a live run: what
-pacing, flow control, a stop or a call back do there, they do here. The world is the clock on which that loop waits, and
-goes on meanwhile: the transport of a picture, the tracking, the bytes on the wire, the arm's interpolation and its
-servo. Virtual time does not depend on how fast this runs, unless the scenario asks for measured tracking times.
+No decision is made here. Tracking, motion, the motion's loop and the arm's link are those of a live run, with its
+pacing, flow control, stops and recalls. The world is the clock on which that loop waits, and advances meanwhile: the
+transport of a picture, the tracking, the bytes on the wire, the arm's interpolation and its servo. Virtual time does
+not depend on how fast this runs, unless the scenario asks for measured tracking times.
 
-A live run has an operator, and so has this one: he arms the arm once the path is placed, and again where it was
-stopped; he puts material in and makes a dispenser ready that is not.
+A simulated operator arms the arm once the path is placed, and again after a stop; he refills and resets dispensers.
 """
 
 from __future__ import annotations
@@ -59,37 +58,37 @@ from planning.laid_beads import Look
 from planning.path import LOOK, Path, PrintPhase, PrintProgress
 
 ROW_BLOCK = 0.2  # s of truth rows handed to the sink at once
-RUN_OUT = 0.3  # s that the run goes on after the path is finished
-AFTER_KILL = 1.5  # s that the rest of the world goes on without the motion
+FINISH_TAIL = 0.3  # s of the run after the end of the path
+KILL_TAIL = 1.5  # s of the run after the motion was killed
 ORDER_PERIOD = 0.3  # s between an operator's orders
-SEEN_TO_AFTER = 0.3  # s until he makes a dispenser ready that is not, and tries again
-LOOK_SECONDS = 2.5  # s that judging takes: two on a core without load
+SERVICE_DELAY = 0.3  # s from a dispenser's fault until the operator resets it, and until the next try
+LOOK_DURATION = 2.5  # s for the evaluation of a look: 2 s on an idle core
 
 
 class WorldSink(PipelineSink, Protocol):
     """Receives everything that happens in a run."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
-        """A tick was made, and how far the print is by it; None before the path was placed."""
+        """A tick, and the progress of the print by it; None before the path was placed."""
 
     def wire(self, stamp: float, data: bytes, sent: bool) -> None:
-        """Bytes passed the arm's port, to the arm or from it."""
+        """Bytes at the arm's port: sent to the arm, or received."""
 
     def rows(self, log: NozzleLog) -> None:
         """The next rows of the truth at the nozzle."""
 
-    def given(self, pose: SurfacePose) -> None:
+    def pose_delivery(self, pose: SurfacePose) -> None:
         """A pose has reached the motion."""
 
-    def registered(self, truth_from_estimate: Array) -> None:
-        """The path was registered: truth_surface_from_estimated_surface (4, 4)."""
+    def registration(self, truth_from_estimate: Array) -> None:
+        """The path's registration: truth_surface_from_estimated_surface (4, 4)."""
 
     def look(self, look: Look) -> None:
-        """What was laid was looked at."""
+        """The result of a look at what was printed."""
 
 
 class _Wire:
-    """Tells the sink what passes the arm's port."""
+    """Hands the bytes at the arm's port to the sink."""
 
     def __init__(self, sink: WorldSink, clock: Clock) -> None:
         self._sink, self._clock = sink, clock
@@ -108,34 +107,34 @@ class _Wire:
 
 
 class _SimulatedOperator:
-    """Gives the orders that an operator gives. seen_to: s, at which he made a dispenser ready or put material in."""
+    """The orders of an operator. service_times: s, at which he refilled or reset a dispenser."""
 
     def __init__(self, material: MaterialControl) -> None:
         self._material = material
-        self._ordered, self._dry_since = -math.inf, -math.inf
-        self._stands = False
-        self.seen_to: list[float] = []
+        self._last_order, self._unready_since = -math.inf, -math.inf
+        self._homed = False
+        self.service_times: list[float] = []
 
     def __call__(self, progress: PrintProgress | None, state: ArmState, tracking: bool, now: float) -> list[LoopOrder]:
-        """state: of the arm. tracking: whether the newest pose is sure of itself."""
-        if not self._stands:
-            self._stands = True
+        """state: of the arm. tracking: whether the newest pose is TRACKING."""
+        if not self._homed:
+            self._homed = True
             return [Order.AT_HOME]
         if progress is None:
             return []
         orders: list[LoopOrder] = []
-        dry = self._material.reason
-        self._dry_since = self._dry_since if dry else now
+        unready = self._material.reason
+        self._unready_since = self._unready_since if unready else now
         if progress.wanted and progress.wanted != LOOK:
-            self.seen_to.append(now)
+            self.service_times.append(now)
             orders.append(PauseOrder.MATERIAL_IN)
-        elif dry and now >= self._dry_since + SEEN_TO_AFTER:
-            self._dry_since = now
-            self.seen_to.append(now)
+        elif unready and now >= self._unready_since + SERVICE_DELAY:
+            self._unready_since = now
+            self.service_times.append(now)
             orders.append(PauseOrder.RESUME)
-        if state not in (ArmState.STOPPED, ArmState.DISARMED) or not tracking or now < self._ordered + ORDER_PERIOD:
+        if state not in (ArmState.STOPPED, ArmState.DISARMED) or not tracking or now < self._last_order + ORDER_PERIOD:
             return orders
-        self._ordered = now
+        self._last_order = now
         return [*orders, Order.ARM]
 
 
@@ -144,9 +143,9 @@ class _MotionKilledError(Exception):
 
 
 class SimulatedWorld:
-    """One run of one scenario; `run` lets its time pass. For its MotionLoop it is the clock.
+    """One run of one scenario, by `run`. It is the clock of its MotionLoop.
 
-    link: the arm, as the motion sees it. arm: as it is.
+    link: the motion's model of the arm. arm: the simulated arm itself.
     """
 
     def __init__(
@@ -164,48 +163,49 @@ class SimulatedWorld:
         keeper: LoopKeeper | None = None,
     ) -> None:
         """scene: the scenario's, None without pictures; beads are drawn into it. path: in the true surface frame.
-        exposures: filled with each picture's shot, for a step that may know. clock: of tracking. keeper: of the loop.
-        store: pictures of earlier runs.
+        exposures: filled with each picture's shot. clock: of tracking. store: of pictures. keeper: of the loop.
         """
         self.scenario, self._scene, self._path, self._sink = scenario, scene, path, sink
         if scene is not None:
             scene.gel = scenario.gel
         self._step, self._truth, self._exposures, self._keeper, self._time = step, truth, exposures, keeper, SimClock()
         self._events = EventQueue(self._time)
-        profile, faults, self._commanded = scenario.profile, scenario.faults, CommandedPose(scenario.profile)
+        profile, faults, self._commanded_pose = scenario.profile, scenario.faults, CommandedPose(scenario.profile)
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, faults, scenario.baud)
         self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time))
         self._truth_log = TruthLog(path, scenario.true_arm, truth, profile.tick, profile.lag)
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
             assert scene is not None
-            how = scenario.sensor, scenario.jpeg_quality, scenario.seed, threads, self._print_beads, store
-            pictures = PictureRenderer(scene, TrueCameras(scenario.rig.cameras), *how)
+            cameras, sensor = TrueCameras(scenario.rig.cameras), scenario.sensor
+            quality, seed = scenario.jpeg_quality, scenario.seed
+            pictures = PictureRenderer(scene, cameras, sensor, quality, seed, threads, self._print_beads, store)
         self._last_state: WorldState | None = None
-        head = self._commanded.at if scenario.nozzle else lambda stamp: None
-        told = sink, clock, self._on_pose, pictures, self._state_at, head
-        self.pipeline = CameraPipeline(scenario, self._events, step, exposures, *told)
-        self._hangs = faults_striking(faults, FaultPart.MOTION)
-        self._lines = faults_striking(faults, FaultPart.DISPENSER, FaultKind.UNPLUG, FaultKind.BLOCK, FaultKind.DROP)
+        head = self._commanded_pose.at if scenario.nozzle else lambda stamp: None
+        self.pipeline = CameraPipeline(
+            scenario, self._events, step, exposures, sink, clock, self._on_pose, pictures, self._state_at, head
+        )
+        self._motion_faults = faults_striking(faults, FaultPart.MOTION)
+        self._outages = faults_striking(faults, FaultPart.DISPENSER, FaultKind.UNPLUG, FaultKind.BLOCK, FaultKind.DROP)
         self._handover: PoseHandover | None = None
-        self._given: list[LoopOrder] = []  # since the loop last asked
+        self._queued_orders: list[LoopOrder] = []  # since the loop's last call
         self.dispensers = SimulatedDispensers(path, scenario.dispenser, self._time, faults, scenario.path)
         (material := self.dispensers.control).begin(0.0, 0.0)
         self._operator = _SimulatedOperator(material)
         settings, put = LoopSettings(until=scenario.seconds), keeper.write if keeper else drop_record
-        given = self, S6H4D(self._device, profile), lambda: self._handover, self._orders
-        source = RecordingSource(*given, put, profile, material, settings)
+        arm = S6H4D(self._device, profile)
+        source = RecordingSource(self, arm, lambda: self._handover, self._orders, put, profile, material, settings)
         self._loop = PrintLoop(source, profile, settings, self._time, self._report)
         self.motion, self.link = self._loop.motion, self._loop.arm
-        beads = scenario.gel is not None, scenario.bead, truth, self._truth_log
-        self._beads = BeadDrawing(*beads, self._nozzle_at, self.dispensers)
+        gel, width, log = scenario.gel is not None, scenario.bead, self._truth_log
+        self._beads = BeadDrawing(gel, width, truth, log, self._nozzle_at, self.dispensers)
         self._looks: SurfaceLooks | None = None
-        self._rows_until, self._end, self._reported = 0.0, scenario.seconds, 0
-        self._begun = self._killed = self._broken = False
+        self._rows_end, self._end, self._reported_sets = 0.0, scenario.seconds, 0
+        self._started = self._killed = self._failed = False
         self._progress: ProgressReport = no_progress
 
     def run(self, progress: ProgressReport = no_progress) -> None:
-        """Let the scenario's time pass; `progress` is called for each frame set tracked."""
+        """Simulate the whole scenario; `progress` is called for each frame set tracked."""
         self._progress = progress
         self.pipeline.begin()
         try:
@@ -214,14 +214,14 @@ class SimulatedWorld:
             self._advance(self._end)  # of a motion that was killed
             self.pipeline.finish()
         finally:
-            self._emit_rows(self.ended)
+            self._emit_rows(self.elapsed)
 
     def order(self, order: LoopOrder) -> None:
         """Give the motion an order."""
-        self._given.append(order)
+        self._queued_orders.append(order)
 
     def every(self, period: float, action: Callable[[float], None]) -> None:
-        """Do `action` every `period` s from the beginning on; it is given the instant, s."""
+        """Call `action` with the instant, s, every `period` s from 0 s on."""
 
         def act(now: float) -> None:
             self._events.at(now + period, TICK_EVENT, act)
@@ -230,79 +230,79 @@ class SimulatedWorld:
         self._events.at(0.0, TICK_EVENT, act)
 
     @property
-    def seen_to(self) -> list[float]:
-        """Instants, s, at which the operator made a dispenser ready again or put material in."""
-        return self._operator.seen_to
+    def service_times(self) -> list[float]:
+        """Instants, s, at which the operator refilled or reset a dispenser."""
+        return self._operator.service_times
 
     @property
-    def told_outside(self) -> float:
-        """How long, s, a dispenser was told to be open until now while no move that prints was sent."""
-        return self.dispensers.told_outside(self.ended, self._left_alone)
+    def open_outside(self) -> float:
+        """How long, s, a dispenser was commanded open until now while no move that prints was sent."""
+        return self.dispensers.open_outside(self.elapsed, self._unattended)
 
     @property
-    def left_open(self) -> float:
-        """How long, s, a dispenser stayed open at most after its line or the motion had ended."""
-        return self.dispensers.open_after(self._left_alone, self.ended)
+    def open_unattended(self) -> float:
+        """The longest time, s, that a dispenser stayed open after its line or the motion failed."""
+        return self.dispensers.open_unattended(self._unattended, self.elapsed)
 
     @property
-    def ended(self) -> float:
-        """How far the run has come, s."""
+    def elapsed(self) -> float:
+        """Duration of the run so far, s."""
         return min(self._time.now(), self._end)
 
     @property
-    def _left_alone(self) -> list[tuple[float, float]]:
-        """From, until, s: when nobody could tell a dispenser anything."""
-        return [(fault.start, min(fault.end, self.scenario.seconds)) for fault in (*self._lines, *self._hangs)]
+    def _unattended(self) -> list[tuple[float, float]]:
+        """From, until, s: when no command could reach a dispenser."""
+        return [(f.start, min(f.end, self.scenario.seconds)) for f in (*self._outages, *self._motion_faults)]
 
-    # -- the clock of the motion: while it waits, the rest of the world goes on
+    # -- the clock of the motion: while it waits, the rest of the world advances
 
     def now(self) -> float:
         """Instant, s."""
         return self._time.now()
 
     def wait_until(self, instant: float) -> None:
-        """Let the world go on until `instant`, s, or for as long as the motion hangs."""
+        """Advance the world until `instant`, s, or for as long as the motion hangs."""
         if self.link.state is not ArmState.ARMED:
             self.dispensers.forbid(self._time.now())
         self._advance(instant)
-        for fault in () if self._killed else self._hangs:
+        for fault in () if self._killed else self._motion_faults:
             now = self._time.now()
             if not fault.covers(now):
                 continue
             if fault.kind is FaultKind.KILL or fault.end >= self.scenario.seconds:
                 self._killed = True
-                self.dispensers.cut()
+                self.dispensers.disconnect()
                 self._device.faults = PortFaults(away=[(now, math.inf)])
-                self._end = min(self._end, now + AFTER_KILL)
+                self._end = min(self._end, now + KILL_TAIL)
                 raise _MotionKilledError
             self._advance(fault.end)
 
     def _advance(self, instant: float) -> None:
-        total, past = int(self.scenario.seconds / self.scenario.cameras.period), math.nextafter(instant, math.inf)
+        total, end = int(self.scenario.seconds / self.scenario.cameras.period), math.nextafter(instant, math.inf)
 
         def until() -> float:
-            return -math.inf if self._broken else min(past, self._end)
+            return -math.inf if self._failed else min(end, self._end)
 
-        with self._ending():
+        with self._end_on_error():
             for _ in self._events.run(until):
-                if self.pipeline.tracked > self._reported:
-                    self._reported = self.pipeline.tracked
-                    self._progress(self._reported, total)
+                if self.pipeline.tracked > self._reported_sets:
+                    self._reported_sets = self.pipeline.tracked
+                    self._progress(self._reported_sets, total)
         self._time.wait_until(instant)
 
     @contextmanager
-    def _ending(self) -> Iterator[None]:
-        """What is raised meanwhile ends the run: nothing more is rendered while the loop stops its arm."""
+    def _end_on_error(self) -> Iterator[None]:
+        """An exception ends the run: nothing more is rendered while the loop stops its arm."""
         try:
             yield
         except BaseException:
-            self._broken, self._end = True, self.ended
+            self._failed, self._end = True, self.elapsed
             raise
 
-    # -- what cameras see
+    # -- the cameras' view
 
     def _state_at(self, shot: Shot, now: float) -> WorldState:
-        """The world as a shot meets it; the very same object for cameras that expose together."""
+        """The world at a shot's exposure; one object for cameras that expose together."""
         last = self._last_state
         if last is not None and (last.stamp, last.gain) == (shot.exposed, shot.gain):
             return last
@@ -324,14 +324,14 @@ class SimulatedWorld:
                 self.dispensers.advance(self._time.now())
             self._beads.draw(self._scene, until)
 
-    # -- what the motion is given, and what it does
+    # -- inputs and outputs of the motion
 
     def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
         """Begin the print with the path in the tracker's surface frame, as soon as that frame can be measured."""
         now, scenario = self._time.now(), self.scenario
         self._handover = PoseHandover(pose, now, now)
-        self._sink.given(pose)
-        if self._begun:
+        self._sink.pose_delivery(pose)
+        if self._started:
             self._look_at(pose, frames)
             return
         if pose.state is not TrackState.TRACKING:
@@ -346,18 +346,18 @@ class SimulatedWorld:
         if change is None:
             return
         placed_path = replace(self._path, surface_from_nozzle=se3.inverse(change) @ self._path.surface_from_nozzle)
-        order, self._begun = BeginPrint(placed_path, scenario.profile, 0.0, self.dispensers.outlets, ""), True
+        order, self._started = BeginPrint(placed_path, scenario.profile, 0.0, self.dispensers.outlets, ""), True
         self.order(order if self._keeper is None else self._keeper.begun(order))
-        self._sink.registered(change)
+        self._sink.registration(change)
         if scenario.looks is not None:
             self._looks = SurfaceLooks(scenario.known_rig, placed_path, adapt=scenario.adapt)
 
     def _look_at(self, pose: SurfacePose, frames: FrameSet) -> None:
         looks, progress, last = self._looks, self.motion.progress, self.motion.last
         if looks is not None and progress is not None and looks.at(progress, last, frames, pose, self._step):
-            self._events.at(self._time.now() + LOOK_SECONDS, TICK_EVENT, partial(self._looked, looks))
+            self._events.at(self._time.now() + LOOK_DURATION, TICK_EVENT, partial(self._finish_look, looks))
 
-    def _looked(self, looks: SurfaceLooks, now: float) -> None:
+    def _finish_look(self, looks: SurfaceLooks, now: float) -> None:
         if (shares := looks.adapted()) is not None:
             self.order(shares)
             self._truth_log.adapt(shares)
@@ -370,30 +370,30 @@ class SimulatedWorld:
     def _orders(self) -> list[LoopOrder]:
         if (now := self._time.now()) >= self._end:
             return [Order.QUIT]
-        (given, self._given), last = (self._given, []), self._handover
-        tracking = last is not None and last.pose.state is TrackState.TRACKING
-        return [*given, *self._operator(self.motion.progress, self.link.state, tracking, now)]
+        (orders, self._queued_orders), handover = (self._queued_orders, []), self._handover
+        tracking = handover is not None and handover.pose.state is TrackState.TRACKING
+        return [*orders, *self._operator(self.motion.progress, self.link.state, tracking, now)]
 
     def _report(self, tick: Tick) -> None:
         now, progress = self._time.now(), self.motion.progress
-        self.dispensers.note(tick.command, self.scenario.profile.tick)
+        self.dispensers.add_command(tick.command, self.scenario.profile.tick)
         if progress is not None:
             self._truth_log.write(tick.command, progress)
-            self._commanded.add(tick.command, now)
+            self._commanded_pose.add(tick.command, now)
             if progress.phase is PrintPhase.FINISHED:
-                self._end = min(self._end, now + RUN_OUT)
-        with self._ending():
+                self._end = min(self._end, now + FINISH_TAIL)
+        with self._end_on_error():
             self._sink.tick(tick, progress)
             for event in self.link.events():
                 level = INFO if event.state in (None, ArmState.ARMED, ArmState.DISARMED) else WARNING
                 self._sink.event(event.stamp, f"arm: {event.text}", level)
-            if now - self._rows_until >= ROW_BLOCK:
+            if now - self._rows_end >= ROW_BLOCK:
                 self._emit_rows(now)
 
     def _emit_rows(self, now: float) -> None:
         self._device.advance(self._time.now())
         self.dispensers.advance(self._time.now())
-        times = row_instants(self._rows_until, now)
+        times = row_instants(self._rows_end, now)
         if len(times):
-            self._rows_until = now
+            self._rows_end = now
             self._sink.rows(self._truth_log.rows(times, self.arm.axes_at, self.dispensers.flow))

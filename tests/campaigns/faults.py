@@ -109,7 +109,7 @@ def judge_fault(run: FaultRunRecord, fault: Fault, until: float) -> FaultVerdict
     log, stamps = run.log, np.array([statement.stamp for statement in statements])
     report, moving, own = np.array([(bool(s.text), s.moving, s.own) for s in statements]).reshape(-1, 3).T
     ready = (stamps >= fault.start - 0.3) & (stamps < fault.start)
-    if not ready.any() or not moving[ready].all() or report[ready].any() or run.ended < fault.start + MIN_WATCHED:
+    if not ready.any() or not moving[ready].all() or report[ready].any() or run.end < fault.start + MIN_WATCHED:
         return None
     error = np.linalg.norm((log.base_from_nozzle - log.base_from_target)[:, :3, 3], axis=1)
     error[~log.extrude] = np.nan
@@ -128,7 +128,7 @@ def judge_fault(run: FaultRunRecord, fault: Fault, until: float) -> FaultVerdict
         silent=_silent(wrong, stamps[rows & report]),
         restless=_restless(log, stamps[rows], (moving | own)[rows]),
         recovered=_recovered(stamps[rows], report[rows] | ~moving[rows], fault),
-        operator=any(fault.start <= stamp < until for stamp in (*run.stopped, *run.seen_to)),
+        operator=any(fault.start <= stamp < until for stamp in (*run.stops, *run.service_times)),
     )
 
 
@@ -262,9 +262,9 @@ def one_run(seed: int, number: int) -> list[FaultRow]:
     start = clock.now()
     run = FaultRun(prepared(shipped_file("scenarios", f"{scenario}.toml")), faults, 1000 * seed + number)()
     spent = clock.now() - start
-    ends = [*(fault.start for fault in faults[1:]), run.ended]
+    ends = [*(fault.start for fault in faults[1:]), run.end]
     verdicts = [judge_fault(run, fault, end) for fault, end in zip(faults, ends, strict=True)]
-    of_run, material = (seed, number, scenario, run.over, spent), (run.told_outside, run.left_open)
+    of_run, material = (seed, number, scenario, run.violations, spent), (run.open_outside, run.open_unattended)
     return [FaultRow(*of_run, verdict, *material) for verdict in verdicts if verdict is not None]
 
 

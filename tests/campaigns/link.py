@@ -221,7 +221,7 @@ class LinkRun:
         self._stops = len(arm.stops)
         if self._ends and self._virtual.now >= self._ends[0]:
             self._ends.popleft()
-            counts.after[self.kind] = max(counts.after.get(self.kind, 0.0), self._virtual.held)
+            counts.after[self.kind] = max(counts.after.get(self.kind, 0.0), self._virtual.queued_work)
 
     def _count_run(self) -> None:
         counts, virtual, events = self._counts, self._virtual, self._arm.events()
@@ -231,8 +231,8 @@ class LinkRun:
         counts.overflows += len(virtual.ignored)
         counts.refused += len(virtual.refused)
         counts.underruns += len(virtual.underruns)
-        counts.queued[self.kind] = max(counts.queued.get(self.kind, 0.0), virtual.deepest)
-        counts.commands[self.kind] = max(counts.commands.get(self.kind, 0), virtual.fullest)
+        counts.queued[self.kind] = max(counts.queued.get(self.kind, 0.0), virtual.peak_work)
+        counts.commands[self.kind] = max(counts.commands.get(self.kind, 0), virtual.peak_commands)
 
 
 ZERO = at_most(0)

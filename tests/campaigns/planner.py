@@ -167,8 +167,8 @@ PLAN_TARGETS = at_most(3.0), at_most(8.0)  # ms, median and 99 %
 class StreamTally:
     """Counts over all streams."""
 
-    over: Array = field(default_factory=lambda: np.zeros(len(AXES_LIMITS)))
-    worst: Array = field(default_factory=lambda: np.zeros(len(AXES_LIMITS)))
+    violations: Array = field(default_factory=lambda: np.zeros(len(AXES_LIMITS)))
+    max_shares: Array = field(default_factory=lambda: np.zeros(len(AXES_LIMITS)))
     samples: int = 0
     moves: int = 0
     printing: int = 0
@@ -239,13 +239,14 @@ def follow_stream(seed: tuple[int, int], tally: StreamTally, profile: ArmProfile
                 tally.twice += max(printed - place, 0.0)
                 printed = max(printed, planner.progress.place)
     tally.samples += oracle.samples
-    tally.over, tally.worst = tally.over + oracle.over, np.maximum(tally.worst, oracle.worst)
+    tally.violations = tally.violations + oracle.violations
+    tally.max_shares = np.maximum(tally.max_shares, oracle.max_shares)
 
 
 def _limits(tally: StreamTally) -> list[Figure]:
     none, note = at_most(0), f"of {tally.samples:,} updates, {tally.moves:,} of them moves, {tally.printing:,} printing"
-    figures = [Figure("samples over a limit by 0.1 %", float(tally.over.sum()), "", none, "ruckig #160", note)]
-    for kind, over, worst in zip(AXES_LIMITS, tally.over, tally.worst, strict=True):
+    figures = [Figure("samples over a limit by 0.1 %", float(tally.violations.sum()), "", none, "ruckig #160", note)]
+    for kind, over, worst in zip(AXES_LIMITS, tally.violations, tally.max_shares, strict=True):
         figures.append(Figure(f"{kind}: most of its limit", float(worst), "", at_most(1.001), note=f"{int(over)} over"))
     return [
         *figures,

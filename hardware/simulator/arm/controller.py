@@ -32,7 +32,7 @@ AXIS_COUNT = 6
 
 
 class Polyline:
-    """Knots, each an instant, the axes (6,) there and their slope until the next knot; it grows at its end.
+    """Knots, each an instant, the axes (6,) there and their slope until the next knot; it is extended at its end.
 
     Before the first knot and, where the last slope is zero, after the last one, the axes rest.
     """
@@ -61,7 +61,7 @@ class Polyline:
         return self._knots[: self._size, 1 + AXIS_COUNT :]
 
     def append(self, instant: float, axes: Array, slope: Array) -> None:
-        """Go on from `axes` with `slope`; a knot at the instant of the last one takes its place."""
+        """Continue from `axes` with `slope`; a knot at the instant of the last one replaces it."""
         if self._size and instant == self._knots[self._size - 1, 0]:
             self._size -= 1
         assert not self._size or instant > self._knots[self._size - 1, 0]
@@ -72,13 +72,13 @@ class Polyline:
         self._size += 1
 
     def stop(self, instant: float) -> None:
-        """Forget what comes after `instant`, and rest there."""
+        """Delete all after `instant`, and rest there."""
         axes = self.at(np.array([instant]))[0]
         self._size = int(np.searchsorted(self.instants, instant, "right"))
         self.append(instant, axes, np.zeros(AXIS_COUNT))
 
     def before(self, instants: Array) -> tuple[np.ndarray, Array]:
-        """For instants (N,): the knot at or before each, the first where there is none, and s since then."""
+        """For instants (N,): the index of the knot at or before each, else of the first, and s since then."""
         index = np.maximum(np.searchsorted(self.instants, instants, "right") - 1, 0)
         return index, np.maximum(instants - self.instants[index], 0.0)
 
@@ -89,11 +89,11 @@ class Polyline:
 
 
 class Servo:
-    """Where the axes really are: tau y' = u - y, where u is the line `dead_time` s ago; y is u at its first knot."""
+    """The true axes y: tau y' = u - y, where u is the line `dead_time` s ago; y is u at its first knot."""
 
     def __init__(self, line: Polyline, dead_time: float, tau: float) -> None:
         self._line, self._dead_time, self._tau = line, dead_time, tau
-        self._behind = np.zeros((64, AXIS_COUNT))  # y - u at each knot
+        self._lag_axes = np.zeros((64, AXIS_COUNT))  # y - u at each knot
         self._size = 1
 
     def at(self, instants: Array, now: float) -> Array:
@@ -104,28 +104,28 @@ class Servo:
         axes = self._line.axes[index] + slopes * since[:, None]
         if self._tau == 0:
             return np.asarray(axes)
-        left = np.exp(-since / self._tau)[:, None]
-        return np.asarray(axes + (self._behind[index] * left + slopes * self._tau * (left - 1)))
+        decay = np.exp(-since / self._tau)[:, None]
+        return np.asarray(axes + (self._lag_axes[index] * decay + slopes * self._tau * (decay - 1)))
 
     def _settle(self, now: float) -> None:
         instants, slopes = self._line.instants, self._line.slopes
         size = int(np.searchsorted(instants, now, "right"))
-        while len(self._behind) < size:
-            self._behind = np.concatenate([self._behind, np.zeros_like(self._behind)])
+        while len(self._lag_axes) < size:
+            self._lag_axes = np.concatenate([self._lag_axes, np.zeros_like(self._lag_axes)])
         if self._tau == 0 or size <= self._size:
             return
-        left = np.exp(-np.diff(instants[self._size - 1 : size]) / self._tau).tolist()
-        for knot, share in zip(range(self._size, size), left, strict=True):
+        decays = np.exp(-np.diff(instants[self._size - 1 : size]) / self._tau).tolist()
+        for knot, decay in zip(range(self._size, size), decays, strict=True):
             steady = slopes[knot - 1] * self._tau
-            self._behind[knot] = (self._behind[knot - 1] + steady) * share - steady
+            self._lag_axes[knot] = (self._lag_axes[knot - 1] + steady) * decay - steady
         self._size = size
 
 
-CONTINUATION_GAP = 1e-5  # s: a move that comes this late after the last one still follows it without a stop
+CONTINUATION_GAP = 1e-5  # s: a move this late after the last one still follows it without a stop
 
 
 class VirtualArm:
-    """One arm from 0 s on; it knows the time from its caller alone, which never goes back."""
+    """One arm from 0 s on; its time is its caller's, which never goes back."""
 
     def __init__(
         self,
@@ -139,35 +139,35 @@ class VirtualArm:
         if home_axes.shape != (AXIS_COUNT,) or not np.isfinite(home_axes).all():
             raise InputError("arm", "home", home_axes.tolist(), "6 finite numbers X Y Z A B C, mm and rad")
         self.frames, self.mode, self.now = 0, 0, 0.0  # instructions understood; the last mode set; s
-        self.deepest, self.fullest = 0.0, 0  # s of work and commands that the queue ever held, stalls left out
+        self.peak_work, self.peak_commands = 0.0, 0  # s of work without stalls, and commands: the most ever queued
         self.ignored: list[float] = []  # s, commands that found the FIFO full
         self.refused: list[float] = []  # s, targets and origins out of reach
-        self.underruns: list[float] = []  # s, the queue ran dry within a motion: the arm stopped before the next move
+        self.underruns: list[float] = []  # s, the queue was empty within a motion: the arm stopped before the next move
         self.garbage: list[tuple[float, bytes]] = []  # s, and bytes that belong to no frame of this dialect
         self._settings = settings
         decode = partial(protocol.decode, dialect=dialect)
         self._stream = protocol.FrameStream(protocol.FRAME_LENGTH, protocol.FRAME_TAILS, decode)
-        self._line_in = FaultyLine(faults, np.random.default_rng([settings.seed, 1]))
-        self.struck = self._line_in.struck  # s, frames that a fault lost or garbled
+        self._input = FaultyLine(faults, np.random.default_rng([settings.seed, 1]))
+        self.faulty_frames = self._input.faulty_frames  # s, frames that a fault lost or garbled
         self._rates = WorkRates(faults_striking(faults, FaultPart.ARM))
-        self._answers = Telemetry(settings, baud, faults)
+        self._telemetry = Telemetry(settings, baud, faults)
         self._setpoint = Polyline(0.0, home_axes)
         self._servo = Servo(self._setpoint, settings.dead_time, settings.servo_lag)
         self._target = home_axes.copy()  # machine coordinates, of the last command queued
         self.origin = np.zeros(3)  # of work, mm
         self._fifo: deque[WorkStretches] = deque()  # of the commands in it
-        self._free = 0.0  # when the last one ends
-        self._flowing = False  # it is a move, and the next one may follow without a stop
+        self._queue_end = 0.0  # s, end of the last one
+        self._moving = False  # whether it is a move, which the next may follow without a stop
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes that have arrived at `now`, s, in any split."""
         self.advance(now)
-        instructions, garbage = self._stream(self._line_in(data, now))
+        instructions, garbage = self._stream(self._input(data, now))
         if garbage:
             self.garbage.append((now, garbage))
         for instruction in instructions:
             self.frames += 1
-            self._take(instruction)
+            self._execute(instruction)
 
     def advance(self, until: float) -> None:
         """Let time pass until `until`, s."""
@@ -175,12 +175,12 @@ class VirtualArm:
         self.now = until
         while self._fifo and self._fifo[0][-1][1] <= until:
             self._fifo.popleft()
-        self._answers.advance(until, self.axes_at, self.origin)
+        self._telemetry.advance(until, self.axes_at, self.origin)
 
     def transmit(self, now: float) -> bytes:
         """The bytes that have reached the host by `now`, s, since the last call."""
         self.advance(now)
-        return self._answers.take(now)
+        return self._telemetry.take(now)
 
     def axes_at(self, instants: Array) -> Array:
         """Executed axes (N, 6), mm and rad, at instants (N,), s, that are not in the future."""
@@ -189,20 +189,20 @@ class VirtualArm:
 
     @property
     def queued(self) -> int:
-        """Commands in the FIFO, the one being done included."""
+        """Commands in the FIFO, including the one in execution."""
         return len(self._fifo)
 
     @property
     def in_flight(self) -> float:
         """Seconds until the queue is done."""
-        return max(self._free - self.now, 0.0)
+        return max(self._queue_end - self.now, 0.0)
 
     @property
-    def held(self) -> float:
-        """Seconds of work in the queue: what it would take if nothing stalled."""
-        return sum(rate * max(end - max(begin, self.now), 0.0) for each in self._fifo for begin, end, rate in each)
+    def queued_work(self) -> float:
+        """Seconds of work in the queue without stalls."""
+        return sum(rate * max(end - max(start, self.now), 0.0) for item in self._fifo for start, end, rate in item)
 
-    def _take(self, instruction: Instruction) -> None:
+    def _execute(self, instruction: Instruction) -> None:
         low, high = self._settings.low, self._settings.high
         match instruction:
             case G1() | G4() if self.queued >= self._settings.fifo:
@@ -225,32 +225,32 @@ class VirtualArm:
                 self._setpoint.stop(self.now)
                 self._target = self._setpoint.axes[-1].copy()
                 self._fifo.clear()
-                self._free, self._flowing = self.now, False
+                self._queue_end, self._moving = self.now, False
                 if isinstance(instruction, ControllerReset):
                     self.origin, self.mode = np.zeros(3), 0
 
     def _queue(self, work: float, target: Array | None) -> None:
-        """Put a command behind the others: `work` s of motion to `target` (6,), or of pause."""
-        begin, moving = max(self.now, self._free), target is not None and work > 0
-        if moving and self._flowing and self.now > self._free + CONTINUATION_GAP:
-            self.underruns.append(self._free)
-        self._flowing = moving
+        """Append a command: `work` s of motion to `target` (6,), or of pause."""
+        begin, moving = max(self.now, self._queue_end), target is not None and work > 0
+        if moving and self._moving and self.now > self._queue_end + CONTINUATION_GAP:
+            self.underruns.append(self._queue_end)
+        self._moving = moving
         stretches = self._rates.stretches(begin, work, moving)
-        self._free = stretches[-1][1]
+        self._queue_end = stretches[-1][1]
         self._fifo.append(stretches)
-        self.deepest, self.fullest = max(self.deepest, self.held), max(self.fullest, self.queued)
-        if target is not None and self._free > begin and moving:
+        self.peak_work, self.peak_commands = max(self.peak_work, self.queued_work), max(self.peak_commands, self.queued)
+        if target is not None and self._queue_end > begin and moving:
             speed, axes = (target - self._target) / work, self._target
             for begin, end, rate in stretches:
                 self._setpoint.append(begin, axes, rate * speed)
                 axes = axes + rate * speed * (end - begin)
-            self._setpoint.append(self._free, target, np.zeros(AXIS_COUNT))
+            self._setpoint.append(self._queue_end, target, np.zeros(AXIS_COUNT))
             self._target = target
 
 
-def _duration(way: Array, feed: float, settings: ArmSettings) -> float:
+def _duration(travel: Array, feed: float, settings: ArmSettings) -> float:
     """Seconds that a move along `way` (6,), mm and rad, takes at `feed` mm/s, or degrees/s if it only turns."""
-    length, turns = float(np.linalg.norm(way[:3])), np.abs(way[3:])
+    length, turns = float(np.linalg.norm(travel[:3])), np.abs(travel[3:])
     if length > MIN_TRAVEL or not turns.any():
         duration = length / min(feed, settings.top_speed)
     else:

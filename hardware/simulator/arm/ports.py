@@ -1,7 +1,7 @@
 """Two ways to a virtual arm: a port in virtual time with faults of its own, and a pseudo-terminal in real time.
 
-The port's own faults are those of an adapter: it takes a part of a write or nothing for a while, it is gone for a
-while, and stray bytes get in between. Faults of the arm itself are in settings.py.
+The port's own faults are those of an adapter: it accepts a part of a write or nothing for a while, it is gone for a
+while, and it adds stray bytes. Faults of the arm itself are in settings.py.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ Interval = tuple[float, float]  # from, until, s
 class PortFaults:
     """What goes wrong at the port."""
 
-    blocked: Sequence[Interval] = ()  # when the port takes nothing
-    away: Sequence[Interval] = ()  # when the device is not there
-    partial: float = 0.0  # share of writes of which only a part is taken
+    blocked: Sequence[Interval] = ()  # when the port accepts nothing
+    away: Sequence[Interval] = ()  # when the device is gone
+    partial: float = 0.0  # share of writes that are accepted in part
     noise: float = 0.0  # stray bytes a second towards the host
     noise_out: float = 0.0  # share of writes that get a stray byte
 
@@ -50,19 +50,19 @@ class PortFaults:
 
 
 class LineListener(Protocol):
-    """Who listens on the line."""
+    """An observer of the line."""
 
     def opened(self) -> None:
         """The host has opened the device."""
 
     def from_host(self, data: bytes) -> None:
-        """The port has taken bytes."""
+        """The port has accepted bytes."""
 
     def to_arm(self, data: bytes) -> None:
         """Bytes have reached the arm."""
 
     def to_host(self, sent: bytes, read: bytes) -> None:
-        """What the arm has sent, and what the host reads with the noise."""
+        """The arm's bytes, and the bytes that the host reads, with noise."""
 
 
 class VirtualPort:
@@ -71,60 +71,60 @@ class VirtualPort:
     def __init__(self, device: VirtualDevice) -> None:
         self._device = device
         self._wire = SerialWire(device.baud)
-        self._under_way: deque[tuple[float, bytes]] = deque()
-        self._looked = device.here()
+        self._in_transit: deque[tuple[float, bytes]] = deque()
+        self._last_read = device.present()
         if device.listener is not None:
             device.listener.opened()
 
     def write(self, data: bytes) -> int:
-        """Take bytes, or some of them, or none."""
-        device, now = self._device, self._device.here()
+        """Accept all bytes, some or none; their count."""
+        device, now = self._device, self._device.present()
         faults, rng = device.faults, device.rng
         if any(start <= now < end for start, end in faults.blocked):
             return 0
         if faults.partial and rng.random() < faults.partial:
             data = data[: rng.integers(len(data))]
-        taken = len(data)
+        count = len(data)
         if device.listener is not None:
             device.listener.from_host(data)
         if faults.noise_out and rng.random() < faults.noise_out:
-            place = rng.integers(taken + 1)
+            place = rng.integers(count + 1)
             data = data[:place] + rng.bytes(1) + data[place:]
         if data:
-            self._under_way.append((float(self._wire.send(data, now)[-1]), data))
-        return taken
+            self._in_transit.append((float(self._wire.send(data, now)[-1]), data))
+        return count
 
     def read(self) -> bytes:
-        """What the arm has sent, and noise."""
-        device, now = self._device, self._device.here()
+        """The arm's bytes, with noise."""
+        device, now = self._device, self._device.present()
         self.deliver(now)
         data = device.arm.transmit(now)
-        noise = device.rng.poisson(device.faults.noise * (now - self._looked)) if device.faults.noise else 0
-        self._looked = now
+        noise = device.rng.poisson(device.faults.noise * (now - self._last_read)) if device.faults.noise else 0
+        self._last_read = now
         read = data + device.rng.bytes(noise) if noise else data
         if device.listener is not None and read:
             device.listener.to_host(data, read)
         return read
 
     def waiting(self) -> int:
-        """Bytes that are not through the wire yet."""
-        left = (self._wire.free - self._device.clock.now()) * self._device.baud / BITS_PER_BYTE
-        return int(left) if left > 0 else 0
+        """Count of bytes still on the wire."""
+        count = (self._wire.busy_until - self._device.clock.now()) * self._device.baud / BITS_PER_BYTE
+        return int(count) if count > 0 else 0
 
     def close(self) -> None:
-        """Let go; what is not through the wire is lost."""
+        """Close it; bytes still on the wire are lost."""
         self.deliver(self._device.clock.now())
-        self._under_way.clear()
+        self._in_transit.clear()
 
     def deliver(self, now: float) -> None:
-        """Let the arm receive what is through the wire at `now`, s."""
-        while self._under_way and self._under_way[0][0] <= now:
-            arrival, data = self._under_way.popleft()
+        """Hand the arm the bytes that have passed the wire by `now`, s."""
+        while self._in_transit and self._in_transit[0][0] <= now:
+            arrival, data = self._in_transit.popleft()
             self._device.receive(data, arrival)
 
 
 class VirtualDevice:
-    """What opens ports to a VirtualArm; an Opener."""
+    """Opens ports to a VirtualArm; an Opener."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class VirtualDevice:
         seed: int = 0,
         listener: LineListener | None = None,
     ) -> None:
-        """listener: is told all that passes."""
+        """listener: of all bytes."""
         self.arm, self.clock, self.baud = arm, clock, baud
         self.faults = PortFaults() if faults is None else faults
         self.rng = np.random.default_rng(seed)
@@ -148,12 +148,12 @@ class VirtualDevice:
         return self._port
 
     def advance(self, now: float) -> None:
-        """Let the time of wire and arm pass until `now`, s."""
+        """Advance wire and arm to `now`, s."""
         if self._port is not None:
             self._port.deliver(now)
         self.arm.advance(max(now, self.arm.now))
 
-    def here(self) -> float:
+    def present(self) -> float:
         """The instant, s; UnpluggedError while the device is away."""
         now = self.clock.now()
         if any(start <= now < end for start, end in self.faults.away):
@@ -168,13 +168,13 @@ class VirtualDevice:
 
 
 def open_pty() -> tuple[int, int, str]:
-    """A pty that changes no byte: descriptors of the arm's side and of the host's, and the host's device name.
+    """A raw pty: descriptors of the arm's side and of the host's, and the host's device name.
 
     As long as the host's descriptor stays open here, clients may come and go.
     """
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
-    return ours, theirs, os.ttyname(theirs)
+    arm_side, host_side = pty.openpty()
+    tty.setraw(host_side)
+    return arm_side, host_side, os.ttyname(host_side)
 
 
 _print_line = partial(print, flush=True)
@@ -216,19 +216,19 @@ def run_virtual_arm(
 
 @contextmanager
 def served_pty(link: Path | None, stop: threading.Event, say: Callable[[str], None]) -> Iterator[int]:
-    """A new pty, whose device is said and linked, until the block ends: the device's side, which does not block.
+    """A new pty until the block ends, its device printed and linked: the device's side, which does not block.
 
     Ctrl-C and SIGTERM set `stop`. InputError where `link` would overwrite something.
     """
-    ours, theirs, device = open_pty()
+    arm_side, host_side, device = open_pty()
     try:
-        os.set_blocking(ours, False)
+        os.set_blocking(arm_side, False)
         with device_link(link, device), stop_on_signals(stop):
             say(device)
-            yield ours
+            yield arm_side
     finally:
-        os.close(theirs)
-        os.close(ours)
+        os.close(host_side)
+        os.close(arm_side)
 
 
 @contextmanager
@@ -246,16 +246,16 @@ def open_log(log: Path | None, header: str) -> Iterator[TextIO | None]:
         yield file
 
 
-def _log_motion(file: TextIO, arm: VirtualArm, begun: float) -> None:
+def _log_motion(file: TextIO, arm: VirtualArm, origin: float) -> None:
     size = int(arm.now / LOG_STEP + 1e-6) + 1  # a whole number of steps may come out just below it
     for start in range(0, size, _ROWS_AT_ONCE):
         stamps = np.minimum(np.arange(start, min(start + _ROWS_AT_ONCE, size)) * LOG_STEP, arm.now)
         axes = arm.axes_at(stamps) * [1, 1, 1, *np.rad2deg([1.0, 1, 1])]
-        np.savetxt(file, np.column_stack([stamps + begun, axes]), "%.6f", delimiter=",")
+        np.savetxt(file, np.column_stack([stamps + origin, axes]), "%.6f", delimiter=",")
 
 
 def run_summary(arm: VirtualArm) -> str:
-    """What came over the line and what became of it, in a few lines."""
+    """Counts of frames and faults of the line, in a few lines."""
     underruns = f", the first at {arm.underruns[0]:.3f} s" if arm.underruns else ""
     stray = ""
     if arm.garbage:
@@ -265,46 +265,46 @@ def run_summary(arm: VirtualArm) -> str:
         f"{arm.frames} frames in {arm.now:.1f} s\n"
         f"{len(arm.ignored)} ignored, the queue was full\n"
         f"{len(arm.refused)} refused, out of reach\n"
-        f"{len(arm.struck)} lost or garbled by a fault\n"
+        f"{len(arm.faulty_frames)} lost or garbled by a fault\n"
         f"{len(arm.underruns)} underruns{underruns}\n"
         f"{sum(len(data) for _, data in arm.garbage)} bytes in no frame{stray}"
     )
 
 
 def _serve(port: int, arm: VirtualArm, start: float, rate: float, clock: Clock, stop: threading.Event) -> None:
-    """Carry bytes both ways, in at most `rate` a second; what no client reads is lost, as on a line.
+    """Transfer bytes both ways, in at most `rate` a second; bytes that no client reads are lost, as on a line.
 
     start: s, when the arm's own time begins.
     """
-    allowed = 0.0
+    budget = 0.0
     while not stop.is_set():
         clock.wait_until(start + arm.now + POLL_PERIOD)
         now = clock.now() - start
-        allowed = min(allowed, 1.0) + rate * (now - arm.now)
+        budget = min(budget, 1.0) + rate * (now - arm.now)
         data = b""
         with suppress(BlockingIOError):
-            data = os.read(port, int(allowed))
-        allowed -= len(data)
+            data = os.read(port, int(budget))
+        budget -= len(data)
         for part, instant in _arrivals(data, arm.now, now):
             arm.receive(part, instant)
         with suppress(BlockingIOError):
             os.write(port, arm.transmit(now))
 
 
-def _arrivals(data: bytes, before: float, now: float) -> Iterator[tuple[bytes, float]]:
-    """Bytes with the instants, s, at which they came: evenly since the last look, where the machine held this one up.
+def _arrivals(data: bytes, last: float, now: float) -> Iterator[tuple[bytes, float]]:
+    """Bytes with their instants of arrival, s: spread evenly since the last poll, for polls that the machine delayed.
 
-    A controller has a core of its own; one that took them all at once now would be late with all that follows.
+    A controller has a core of its own; handling all bytes only now would delay all that follows.
     """
-    looks, size = max(round((now - before) / POLL_PERIOD), 1), len(data)
-    for look in range(looks):
-        instant = before + (now - before) * (look + 1) / looks
-        yield data[size * look // looks : size * (look + 1) // looks], instant
+    parts, size = max(round((now - last) / POLL_PERIOD), 1), len(data)
+    for i in range(parts):
+        instant = last + (now - last) * (i + 1) / parts
+        yield data[size * i // parts : size * (i + 1) // parts], instant
 
 
 @contextmanager
 def device_link(link: Path | None, device: str) -> Iterator[None]:
-    """Have `link` point at the device meanwhile; a link left behind by a run that is gone makes way."""
+    """A link to the device until the block ends; it replaces a stale link of an earlier run."""
     if link is None:
         yield
         return
@@ -322,14 +322,14 @@ def device_link(link: Path | None, device: str) -> Iterator[None]:
 
 @contextmanager
 def stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Have Ctrl-C and SIGTERM set `stop` meanwhile, in the main thread."""
+    """Ctrl-C and SIGTERM set `stop` until the block ends, in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    handlers = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
+        for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""What the virtual arm is like, and its serial line; a TOML table [arm] gives it, in mm, degrees and s.
+"""The virtual arm's settings and its serial line; the settings are a TOML table [arm], in mm, degrees and s.
 
 fifo = 200
 dead_time_s = 0.0
@@ -12,8 +12,8 @@ reply_period_s = 0.05
 seed = 0
 
 The serial line is in virtual time: bytes on the wire, frames lost on the way in, and telemetry. What each fault
-means stands in hardware/process/faults.py. Without a duration a drop or garble takes one frame, the first one from its
-start on; with one, every frame that begins meanwhile.
+means stands in hardware/process/faults.py. Without a duration a drop or garble hits one frame, the first one from its
+start on; with one, every frame that begins within it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _REACH_LIMIT = np.array([1600.0] * 3 + [np.deg2rad(320.0)] * 3)  # a reply's int
 
 
 class ReplyMode(Enum):
-    """What the arm sends."""
+    """The arm's replies."""
 
     OFF = "off"
     STREAM = "stream"  # place and angles every period, as a public driver reads them
@@ -108,7 +108,7 @@ def arm_settings_from_table(where: object, table: checks.Table) -> ArmSettings:
 
 
 def write_virtual_arm(file: Path, settings: ArmSettings, faults: tuple[Fault, ...]) -> None:
-    """Write what `read_virtual_arm` reads back as the same."""
+    """Write settings and faults for `read_virtual_arm`."""
     values = {key: getattr(settings, name) for key, (name, _) in ARM_KEYS.items()}
     values |= {key: values[key] / AXIS_UNITS for key in ("low_mm_deg", "high_mm_deg")}
     values |= {"top_turn_deg_s": float(np.rad2deg(settings.top_turn)), "replies": settings.replies.value}
@@ -126,19 +126,19 @@ def read_virtual_arm(file: Path) -> tuple[ArmSettings, tuple[Fault, ...]]:
 
 
 class SerialWire:
-    """One direction of a line; remembers until when it is busy. baud: bits/s, infinite for a line without delay."""
+    """One direction of a line. baud: bits/s, infinite for a line without delay."""
 
     def __init__(self, baud: float) -> None:
         if not baud > 0:
             raise InputError("wire", "baud", baud, "> 0 bits/s")
         self._byte_time = BITS_PER_BYTE / baud
-        self.free = -math.inf  # s, when the last byte sent so far has arrived; -inf before the first
+        self.busy_until = -math.inf  # s, when the last byte sent so far has arrived; -inf before the first
 
     def send(self, data: bytes, now: float) -> Array:
         """Instants (N,), s, at which the bytes handed over at `now` have arrived; they wait for those before them."""
-        arrivals = max(self.free, now) + self._byte_time * np.arange(1, len(data) + 1)
+        arrivals = max(self.busy_until, now) + self._byte_time * np.arange(1, len(data) + 1)
         if len(arrivals):
-            self.free = float(arrivals[-1])
+            self.busy_until = float(arrivals[-1])
         return np.asarray(arrivals)
 
 
@@ -148,36 +148,36 @@ def unplugged(faults: Sequence[Fault], instant: float) -> bool:
 
 
 class FaultyLine:
-    """The line into the arm. Frames are told apart by counting 48 bytes each from the first byte on.
+    """The line into the arm. Frames are counted as 48 bytes each from the first byte on.
 
-    struck: instants, s, at which a frame began that was lost or garbled.
+    faulty_frames: instants, s, at which a frame began that was lost or garbled.
     """
 
     def __init__(self, faults: Sequence[Fault], rng: np.random.Generator) -> None:
         self._faults, self._rng = list(faults), rng
-        self._place = 0
+        self._position = 0
         self._mask: bytes | None = bytes(FRAME_LENGTH)  # bits of this frame that flip; None where it is lost
-        self.struck: list[float] = []
+        self.faulty_frames: list[float] = []
 
     def __call__(self, data: bytes, now: float) -> bytes:
-        """What arrives of `data`, which comes at `now`, s."""
-        arrived = bytearray()
+        """The bytes that pass of `data`, received at `now`, s."""
+        output = bytearray()
         while data:
-            if self._place == 0:
+            if self._position == 0:
                 self._begin(now)
-            part, data = data[: FRAME_LENGTH - self._place], data[FRAME_LENGTH - self._place :]
+            part, data = data[: FRAME_LENGTH - self._position], data[FRAME_LENGTH - self._position :]
             if self._mask is not None:
-                arrived += bytes(a ^ b for a, b in zip(part, self._mask[self._place :], strict=False))
-            self._place = (self._place + len(part)) % FRAME_LENGTH
-        return b"" if unplugged(self._faults, now) else bytes(arrived)
+                output += bytes(a ^ b for a, b in zip(part, self._mask[self._position :], strict=False))
+            self._position = (self._position + len(part)) % FRAME_LENGTH
+        return b"" if unplugged(self._faults, now) else bytes(output)
 
     def _begin(self, now: float) -> None:
         self._mask = bytes(FRAME_LENGTH)
         for fault in faults_striking(self._faults, FaultPart.ARM, FaultKind.DROP, FaultKind.GARBLE):
-            once = fault.duration == 0
-            if not (now >= fault.start if once else fault.covers(now)):
+            one_frame = fault.duration == 0
+            if not (now >= fault.start if one_frame else fault.covers(now)):
                 continue
-            if once:
+            if one_frame:
                 self._faults.remove(fault)
             if fault.kind is FaultKind.DROP or self._mask is None:
                 self._mask = None
@@ -185,7 +185,7 @@ class FaultyLine:
                 bits = np.zeros(8 * FRAME_LENGTH, np.uint8)
                 bits[self._rng.choice(len(bits), self._rng.integers(1, 9), replace=False)] = 1
                 self._mask = np.packbits(bits).tobytes()
-            self.struck.append(now)
+            self.faulty_frames.append(now)
 
 
 class Telemetry:
@@ -200,34 +200,34 @@ class Telemetry:
         self._mode, self._period = settings.replies, settings.reply_period
         self._faults, self._wire = faults, SerialWire(baud)
         self._rng = np.random.default_rng([settings.seed, 0])
-        self._under_way: deque[tuple[float, int]] = deque()  # when each byte arrives
+        self._in_transit: deque[tuple[float, int]] = deque()  # when each byte arrives
         self._count, self._next, self._stray = 0, 0.0, 0
         self._schedule()
 
     def advance(self, now: float, axes_at: Callable[[Array], Array], origin: Array) -> None:
-        """Send what is due up to `now`, s. axes_at: the executed axes (N, 6) at instants (N,). origin: (3,) mm."""
-        due: list[float] = []
+        """Send the replies due up to `now`, s. axes_at: the executed axes (N, 6) at instants (N,). origin: (3,) mm."""
+        instants: list[float] = []
         replies: list[bytes] = []
         while self._mode is not ReplyMode.OFF and self._next <= now:
-            due.append(self._next)
+            instants.append(self._next)
             replies.append(bytes([self._stray]))
             self._schedule()
-        if due and self._mode is ReplyMode.STREAM:
+        if instants and self._mode is ReplyMode.STREAM:
             kinds = ReplyKind.PLACE, ReplyKind.TOOL, ReplyKind.ARM
             replies = []
-            for axes in axes_at(np.array(due)):
+            for axes in axes_at(np.array(instants)):
                 values = zip(kinds, (axes[:3] - origin, axes[3:], np.zeros(3)), strict=True)
                 replies.append(b"".join(encode_reply(Reply(*each)) for each in values))
-        for instant, data in zip(due, replies, strict=True):
-            if self._wire.free <= instant and not unplugged(self._faults, instant):
-                self._under_way.extend(zip(self._wire.send(data, instant).tolist(), data, strict=True))
+        for instant, data in zip(instants, replies, strict=True):
+            if self._wire.busy_until <= instant and not unplugged(self._faults, instant):
+                self._in_transit.extend(zip(self._wire.send(data, instant).tolist(), data, strict=True))
 
     def take(self, now: float) -> bytes:
-        """The bytes that have reached the host by `now` and were not taken before."""
-        arrived = bytearray()
-        while self._under_way and self._under_way[0][0] <= now:
-            arrived.append(self._under_way.popleft()[1])
-        return bytes(arrived)
+        """The bytes that have reached the host by `now` since the last call."""
+        output = bytearray()
+        while self._in_transit and self._in_transit[0][0] <= now:
+            output.append(self._in_transit.popleft()[1])
+        return bytes(output)
 
     def _schedule(self) -> None:
         self._count += 1

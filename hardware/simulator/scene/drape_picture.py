@@ -95,10 +95,10 @@ class _Cloth(NamedTuple):
 def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> _Cloth:
     scene, moving = state.scene, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
     lift = scene.deformation.bulge * state.instant.strain, -1 / (2 * scene.deformation.radius**2)
-    half, rest, held = (0.0, 0.0), -1e6, -1e6 - 1  # without an opening all of it rests
+    half, resting, attached = (0.0, 0.0), -1e6, -1e6 - 1  # without an opening all of it rests
     if scene.sheet.half is not None:
-        half, rest, held = scene.sheet.half, AT_REST_BEYOND, ATTACHED_WITHIN
-    opening = half[0] - OPENING_CORNER, half[1] - OPENING_CORNER, OPENING_CORNER, rest, 1 / (held - rest)
+        half, resting, attached = scene.sheet.half, AT_REST_BEYOND, ATTACHED_WITHIN
+    opening = half[0] - OPENING_CORNER, half[1] - OPENING_CORNER, OPENING_CORNER, resting, 1 / (attached - resting)
     bend = 1 / state.factors[0], 1 / state.factors[1], *lift
     frames = as_field(moving[:3]), as_field(rest_from_camera[:3])
     return _Cloth(*frames, as_field(bend), as_field(opening), scene.sheet.heights)
@@ -107,8 +107,8 @@ def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> _Clo
 def _edges(depth: Field) -> NDArray[np.uint8]:
     """The squares of the lattice (h, w) where the cloth hides itself, and what is between them would draw steps."""
     bend = np.array([[1.0, -2.0, 1.0]], np.float32)
-    bent = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
-    return np.asarray(cv2.dilate((bent > DEPTH_JUMP).astype(np.uint8), np.ones((3, 3), np.uint8)), np.uint8)
+    bending = np.maximum(*(np.abs(cv2.filter2D(depth, -1, k, borderType=cv2.BORDER_REPLICATE)) for k in (bend, bend.T)))
+    return np.asarray(cv2.dilate((bending > DEPTH_JUMP).astype(np.uint8), np.ones((3, 3), np.uint8)), np.uint8)
 
 
 def _key_light_share(state: SceneState, view: RenderView, rays: Rays, depth: Field) -> Field:
@@ -148,11 +148,11 @@ def _above_cloth(
     ex, ey = max(dx, NOTHING), max(dy, NOTHING)
     outside = np.sqrt(ex * ex + ey * ey) + min(max(dx, dy), NOTHING) - opening[2]  # as `opening_distance`
     t = min(max((outside - opening[3]) * opening[4], NOTHING), ONE)
-    held = t * t * (np.float32(3) - np.float32(2) * t)
+    share = t * t * (np.float32(3) - np.float32(2) * t)
     mx, my = mx * bend[0], my * bend[1]
     if bend[2] != NOTHING:
         mz -= bend[2] * np.exp(bend[3] * (mx * mx + my * my))
-    mx, my, mz = rx + held * (mx - rx), ry + held * (my - ry), rz + held * (mz - rz)
+    mx, my, mz = rx + share * (mx - rx), ry + share * (my - ry), rz + share * (mz - rz)
     per_mm = np.float32(1 / DRAPE_STEP)
     u = mx * per_mm + HALF * np.float32(heights.shape[1] - 1)
     v = my * per_mm + HALF * np.float32(heights.shape[0] - 1)
@@ -173,13 +173,13 @@ def _first_on_cloth(
     steps: int,
 ) -> np.float32:
     """Depth mm at which a ray first meets the cloth, by equal steps from near to far; far where it never does."""
-    step, above = (far - near) / np.float32(steps), ONE
+    step, last_gap = (far - near) / np.float32(steps), ONE
     for k in range(steps + 1):
         depth = near + step * np.float32(k)
-        left, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
-        if left <= NOTHING:
-            return depth + step * left / max(above - left, np.float32(1e-6))
-        above = left
+        gap, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
+        if gap <= NOTHING:
+            return depth + step * gap / max(last_gap - gap, np.float32(1e-6))
+        last_gap = gap
     return far
 
 
@@ -195,12 +195,12 @@ def _on_cloth(
     depth: np.float32,
 ) -> Place:
     """The depth of a ray after a round of the secant method, and the cloth's x, y mm there."""
-    last, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth + HALF)
-    left, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
-    fall = np.float32(2) * (last - left)
-    if abs(fall) < np.float32(0.1):
-        fall = -HALF
-    depth -= min(max(left / fall, np.float32(-15)), np.float32(15))
+    upper_gap, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth + HALF)
+    gap, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
+    slope = np.float32(2) * (upper_gap - gap)
+    if abs(slope) < np.float32(0.1):
+        slope = -HALF
+    depth -= min(max(gap / slope, np.float32(-15)), np.float32(15))
     _, cloth_x, cloth_y = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
     return depth, cloth_x, cloth_y
 
@@ -247,8 +247,8 @@ def _refine_cloth(
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
             rx, ry, at = x[row, column], y[row, column], depth[row, column]
-            found, cloth_x, cloth_y = _on_cloth(moving, resting, bend, opening, heights, rx, ry, at)
-            depth[row, column] = found
+            refined, cloth_x, cloth_y = _on_cloth(moving, resting, bend, opening, heights, rx, ry, at)
+            depth[row, column] = refined
             u[row, column], v[row, column] = cloth_x * texels[0] + texels[1], cloth_y * texels[0] + texels[2]
 
 

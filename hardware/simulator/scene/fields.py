@@ -4,10 +4,10 @@ Lengths of noise are in texels. Noise is drawn coarsely where it is smooth, so t
 
 Printed beads on a scene: as ink of a given width, or as gel that has a cross-section, spreads and sags.
 
-Gel: what leaves the needle over 1 mm of its way, A mm^2, lies as a parabola of width w and height k w, so that
+Gel: the volume per mm of the needle's path, A mm^2, has the cross-section of a parabola of width w and height k w, so
 A = 2/3 k w^2. k falls from FRESH_ASPECT to that of gel at rest exponentially in time. Both are drawn by the density
-3 / (2 pi R^3) sqrt(R^2 - r^2) about the tip, R = w / 2, which swept along a straight way gives just that parabola. So
-volume is kept to rounding wherever and however slowly the needle moves, and beads that touch add up.
+3 / (2 pi R^3) sqrt(R^2 - r^2) about the tip, R = w / 2, which integrates to that parabola along a straight path. So
+volume is exact to rounding at any speed of the needle, and overlapping beads add up.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def as_field(values: object) -> Field:
 
 
 def sample(source: Field, u: Field, v: Field) -> Field:
-    """The source at columns u and rows v (H, W), bilinear, beyond its edge as it is there."""
+    """The source at columns u and rows v (H, W), bilinear, constant beyond its edge."""
     return as_field(cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def sample_texture(texture: Field, u: Field, v: Field) -> Field:
-    """A texture (H, W, 4) at columns u and rows v, bilinear, nothing beyond its edge."""
+    """A texture (H, W, 4) at columns u and rows v, bilinear, zero beyond its edge."""
     return as_field(cv2.remap(texture, u, v, cv2.INTER_LINEAR))  # OpenCV's own border is zero
 
 
@@ -75,8 +75,8 @@ def smooth_noise(shape: Size, scale: float, rng: np.random.Generator) -> Field:
     """Gaussian noise of mean 0 and variance 1 whose hills are about `scale` texels wide."""
     halvings = max(0, int(np.log2(max(scale, 1.0) / 3)))
     coarse = ((shape[0] >> halvings) + 8, (shape[1] >> halvings) + 8)
-    drawn = gaussian_blur(rng.standard_normal(coarse, np.float32), max(0.4, 0.4 * scale / (1 << halvings)))
-    large = as_field((drawn - drawn.mean()) / drawn.std())
+    noise = gaussian_blur(rng.standard_normal(coarse, np.float32), max(0.4, 0.4 * scale / (1 << halvings)))
+    large = as_field((noise - noise.mean()) / noise.std())
     for _ in range(halvings):
         large = as_field(cv2.pyrUp(large))  # resize by cubics would leave a comb on every slope
     edge = 3 << halvings
@@ -95,8 +95,8 @@ def octave_noise(shape: Size, scale: float, count: int, rng: np.random.Generator
 def fibre_noise(shape: Size, scale: tuple[float, float], rng: np.random.Generator) -> Field:
     """Noise of variance 1 whose hills are `scale` (along x, along y) texels wide: fibres of one direction."""
     sigma = np.maximum(0.4 * np.array(scale), 0.3)
-    drawn = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (0, 0), sigma[0], sigmaY=sigma[1])
-    return as_field((drawn - drawn.mean()) / drawn.std())
+    noise = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (0, 0), sigma[0], sigmaY=sigma[1])
+    return as_field((noise - noise.mean()) / noise.std())
 
 
 def voronoi_cells(shape: Size, pitch: float, rng: np.random.Generator) -> tuple[Field, Field]:
@@ -119,7 +119,7 @@ def random_spots(
     shape: Size, pitch: float, radius: tuple[float, float], rng: np.random.Generator, kept: float = 1.0
 ) -> Field:
     """Soft round spots 0..1, one in each square of `pitch` with chance `kept`; radius: (from, to), one sigma."""
-    out = np.zeros(shape, np.float32)
+    spots = np.zeros(shape, np.float32)
     y, x = np.mgrid[0 : shape[0] / pitch, 0 : shape[1] / pitch]
     centres = (np.stack([x, y], -1) + rng.uniform(0, 1, (*x.shape, 2))).reshape(-1, 2) * pitch
     sigma = radius[0] * (radius[1] / radius[0]) ** rng.uniform(0, 1, len(centres))
@@ -131,19 +131,19 @@ def random_spots(
         if x0 < x1 and y0 < y1:
             gx = np.exp(-(((np.arange(x0, x1, dtype=np.float32) - cx) / s) ** 2) / 2)
             gy = np.exp(-(((np.arange(y0, y1, dtype=np.float32) - cy) / s) ** 2) / 2)
-            patch = out[y0:y1, x0:x1]
+            patch = spots[y0:y1, x0:x1]
             np.maximum(patch, d * gy[:, None] * gx, out=patch)
-    return out
+    return spots
 
 
 def draw_lines(shape: Size, lines: list[Array], width: float, soft: float = 0.0) -> Field:
     """Lines 0..1 through points (N, 2) texels each, `width` texels wide (below one: fainter), blurred by `soft`."""
-    drawn = np.zeros(shape, np.uint8)
-    thick = max(1, round(width))
+    mask = np.zeros(shape, np.uint8)
+    thickness = max(1, round(width))
     for line in lines:
         points = np.rint(line * 16).astype(np.int32)
-        cv2.polylines(drawn, [points], False, 255, thick, cv2.LINE_AA, shift=4)
-    cover = as_field(drawn) * np.float32(min(1.0, width) / 255)
+        cv2.polylines(mask, [points], False, 255, thickness, cv2.LINE_AA, shift=4)
+    cover = as_field(mask) * np.float32(min(1.0, width) / 255)
     return gaussian_blur(cover, soft) if soft else cover
 
 
@@ -159,7 +159,7 @@ def wandering_line(
 
 Texture = NDArray[np.float32]  # (H, W, 4)
 PYRAMID_LEVELS = 4
-BLOCK_TEXELS = 1 << (PYRAMID_LEVELS - 1)  # texels: textures are whole blocks, so that halving them moves nothing
+BLOCK_TEXELS = 1 << (PYRAMID_LEVELS - 1)  # textures are whole blocks, so that halving them shifts nothing
 
 
 class Layers:
@@ -188,7 +188,7 @@ class Layers:
         return scale, -self.corner[0] * scale - 0.5, -self.corner[1] * scale - 0.5
 
     def refresh(self, x0: int, y0: int, x1: int, y1: int) -> None:
-        """Work a change of the finest texels x0..x1, y0..y1 (the last excluded) into the coarser levels."""
+        """Update the coarser levels from the finest texels x0..x1, y0..y1 (the last excluded)."""
         box = (x0 // BLOCK_TEXELS, y0 // BLOCK_TEXELS, -(-x1 // BLOCK_TEXELS), -(-y1 // BLOCK_TEXELS))
         for pyramid in (self.colour, self.relief):
             for k in range(1, PYRAMID_LEVELS):
@@ -216,22 +216,22 @@ GEL_ABSORBANCE = 1.7  # per mm: a bead 0.4 mm high covers half of what is below
 BEAD_HEIGHT_BY_WIDTH = 0.45
 GEL_GLOSS = 0.95
 FRESH_ASPECT = 0.55  # height by width as it leaves the needle: nearly round, pressed against the surface
-MIN_RADIUS, MAX_RADIUS = 0.15, 2.0  # mm of a bead: a hair, and a puddle under a needle that stands
-DROP_STEP = 0.08  # mm of way at most from one drop to the next: less than a texel
+MIN_RADIUS, MAX_RADIUS = 0.15, 2.0  # mm of a bead: a hair, and a puddle under a needle at rest
+DROP_STEP = 0.08  # mm between drops at most: less than a texel
 
 
 @dataclass(frozen=True, slots=True)
 class Gel:
-    """How a material lies."""
+    """The shape and look of printed gel."""
 
     aspect: float = 0.3  # height by width of a bead at rest: it meets the surface at 50 degrees
-    sag_time: float = 2.0  # s in which 63 % of the way to it is gone
+    sag_time: float = 2.0  # s, time constant of its approach
     gloss: float = GEL_GLOSS  # 0 matt, as behind crossed polarisers, to 1 wet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GelPieces:
-    """N straight pieces of the tip's way on which gel left the needle, in order of time."""
+    """N straight pieces of the tip's path with gel, in order of time."""
 
     start: Array  # (N, 2) mm, material points
     end: Array  # (N, 2) mm
@@ -240,26 +240,26 @@ class GelPieces:
 
 
 class PrintedBeads:
-    """Beads on the layers of a scene. gel: how it lies; None: as ink, which has a look but no height."""
+    """Beads on the layers of a scene. gel: its settings; None: ink, which has a look but no height."""
 
     def __init__(self, layers: Layers, gel: Gel | None = None) -> None:
         self._layers, self.gel = layers, gel
-        self._under: tuple[Field, Field] | None = None  # the finest colour and relief as they were
+        self._bare_layers: tuple[Field, Field] | None = None  # the finest colour and relief without beads
         self._height = np.zeros((0, 0), np.float32)  # mm
-        self._fresh = np.zeros((3, 0, 0))  # mm: drops as laid, and the same at rest, both fading; all at rest
-        self._box: tuple[int, int, int, int] | None = None  # x0, y0, x1, y1 texels that hold gel
+        self._fresh = np.zeros((3, 0, 0))  # mm: fresh drops, and the same at rest, both decaying; all at rest
+        self._box: tuple[int, int, int, int] | None = None  # x0, y0, x1, y1 texels with gel
         self._stamp = -math.inf  # s, of the fields
         self.version = 0  # of the heights
-        self.laid = b""  # a hash of all that was laid so far, in its order
+        self.bead_hash = b""  # of all beads so far, in their order
 
     def lay(self, xy_start: ArrayLike, xy_end: ArrayLike, width: float) -> None:
-        """Lay a bead of `width` mm from one material point (2,) mm to another; off the texture nothing is laid.
+        """Lay a bead of `width` mm from one material point (2,) mm to another; none off the texture.
 
         The same bead twice is one bead, and beads that join end to end are one bead.
         """
         layers = self._layers
-        self._note(np.asarray([xy_start, xy_end], float), np.array([width]))
-        self._begin()
+        self._update_hash(np.asarray([xy_start, xy_end], float), np.array([width]))
+        self._allocate()
         scale, ox, oy = layers.offsets(0)
         start, end = (np.asarray(p, float) * scale + (ox, oy) for p in (xy_start, xy_end))
         radius = width / 2 * scale
@@ -275,10 +275,10 @@ class PrintedBeads:
         layers.refresh(x0, y0, x1, y1)
 
     def flow(self, pieces: GelPieces, now: float) -> None:
-        """Let gel leave the needle, and what lies there sag, until `now`, s; off the texture nothing is laid."""
+        """Add gel from the needle, and let printed gel sag, until `now`, s; none off the texture."""
         assert self.gel is not None
-        self._note(pieces.start, pieces.end, pieces.volume, pieces.area, np.array([now]))
-        self._begin()
+        self._update_hash(pieces.start, pieces.end, pieces.volume, pieces.area, np.array([now]))
+        self._allocate()
         fade = math.exp(-(now - self._stamp) / self.gel.sag_time) if math.isfinite(self._stamp) else 0.0
         self._stamp = now
         if self._box is not None:
@@ -302,47 +302,47 @@ class PrintedBeads:
                 drop *= volume / texel**2
                 for k in layers:
                     self._fresh[k, low[1] : high[1], low[0] : high[0]] += drop
-                self._grow(low, high)
-        self._settle()
+                self._extend_box(low, high)
+        self._update_heights()
 
     def scrape(self) -> None:
-        """Take all gel away: the surface is as it was."""
+        """Remove all gel."""
         if self._box is not None:
             x0, y0, x1, y1 = self._box
             self._fresh[:, y0:y1, x0:x1] = 0.0
-            self._note()
-            self._settle()
+            self._update_hash()
+            self._update_heights()
 
     def heights(self, size: tuple[float, float], step: float) -> Field:
         """Heights (H, W) mm of gel on nodes `step` mm apart about the origin, over `size` (x, y) mm; all 0 of ink."""
         scale, ox, oy = self._layers.offsets(0)
         x, y = ((np.arange(round(s / step) + 1) - round(s / step) / 2) * step for s in size)
-        if self.gel is None or self._under is None:
+        if self.gel is None or self._bare_layers is None:
             return np.zeros((len(y), len(x)), np.float32)
         u, v = np.meshgrid(x * scale + ox, y * scale + oy)
         return sample(self._height, as_field(u), as_field(v))
 
     def volume(self) -> float:
-        """All gel that lies on the scene, mm^3."""
+        """Volume of all gel on the scene, mm^3."""
         return float(self._height.sum(dtype=float)) * self._layers.texel**2
 
-    def _note(self, *laid: Array) -> None:
-        self.laid = sha256(b"".join([self.laid, *(np.ascontiguousarray(each).tobytes() for each in laid)])).digest()
+    def _update_hash(self, *data: Array) -> None:
+        self.bead_hash = sha256(b"".join([self.bead_hash, *(np.ascontiguousarray(a).tobytes() for a in data)])).digest()
 
-    def _begin(self) -> None:
-        if self._under is None:
-            self._under = self._layers.colour[0].copy(), self._layers.relief[0].copy()
+    def _allocate(self) -> None:
+        if self._bare_layers is None:
+            self._bare_layers = self._layers.colour[0].copy(), self._layers.relief[0].copy()
             self._height = np.zeros(self._layers.size, np.float32)
             if self.gel is not None:
                 self._fresh = np.zeros((3, *self._layers.size))
 
-    def _grow(self, low: Array, high: Array) -> None:
+    def _extend_box(self, low: Array, high: Array) -> None:
         box = (*low.tolist(), *high.tolist())
         if self._box is not None:
             box = (*np.minimum(self._box[:2], low).tolist(), *np.maximum(self._box[2:], high).tolist())
         self._box = box[0], box[1], box[2], box[3]
 
-    def _settle(self) -> None:
+    def _update_heights(self) -> None:
         if self._box is None:
             return
         x0, y0, x1, y1 = self._box
@@ -353,18 +353,18 @@ class PrintedBeads:
         self._layers.refresh(x0, y0, x1, y1)
 
     def _paint(self, x0: int, y0: int, x1: int, y1: int) -> None:
-        assert self._under is not None
-        around = self._height[y0 - 1 : y1 + 1, x0 - 1 : x1 + 1]
-        sx, sy = (s[1:-1, 1:-1] for s in gradient(np.ascontiguousarray(around), self._layers.texel))
-        height = around[1:-1, 1:-1]
-        colour, relief = (u[y0:y1, x0:x1] for u in self._under)
+        assert self._bare_layers is not None
+        heights = self._height[y0 - 1 : y1 + 1, x0 - 1 : x1 + 1]
+        sx, sy = (s[1:-1, 1:-1] for s in gradient(np.ascontiguousarray(heights), self._layers.texel))
+        height = heights[1:-1, 1:-1]
+        colour, relief = (u[y0:y1, x0:x1] for u in self._bare_layers)
         share = (1 - np.exp(-GEL_ABSORBANCE * height))[..., None]
         opacity = colour[..., 3:]
         self._layers.colour[0][y0:y1, x0:x1, :3] = colour[..., :3] * (1 - share) + GEL_COLOUR * opacity * share
-        wet = np.clip(height / 0.06, 0, 1)[..., None]
+        coverage = np.clip(height / 0.06, 0, 1)[..., None]
         gloss = np.full_like(height, GEL_GLOSS if self.gel is None else self.gel.gloss)
-        over = np.dstack([relief[..., 0] * 0.5 + sx, relief[..., 1] * 0.5 + sy, gloss, relief[..., 3]])
-        self._layers.relief[0][y0:y1, x0:x1] = relief * (1 - wet) + over * wet
+        bead = np.dstack([relief[..., 0] * 0.5 + sx, relief[..., 1] * 0.5 + sy, gloss, relief[..., 3]])
+        self._layers.relief[0][y0:y1, x0:x1] = relief * (1 - coverage) + bead * coverage
 
 
 def _bead_profile(start: object, end: object, radius: float, size: tuple[int, int]) -> Field:

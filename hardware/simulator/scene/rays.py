@@ -17,10 +17,10 @@ from perception.lens import undistort
 
 
 class HeightField(NamedTuple):
-    """A height field (H, W) mm, and the heights it keeps within, mm."""
+    """A height field (H, W) mm, and bounds of its heights, mm."""
 
     height: Field
-    slopes: Field  # (H, W, 4) a node along u and v, the height again, and nothing: OpenCV is fastest with four
+    slopes: Field  # (H, W, 4) per node along u and v, height, zero: OpenCV is fastest with four channels
     smooth_slopes: Field  # (H, W, 4) the same, of means over SMOOTH_NODES
     low: float
     high: float
@@ -36,8 +36,8 @@ def height_field(height: Field) -> HeightField:
 SMOOTH_NODES = 9  # nodes over which slopes are smooth
 
 
-RAY_MARGIN_PX = 3 * CELL_PX  # by which the rays kept reach beyond the box asked for: a moving box is found again
-LENS_NODE_PX = 8  # px between the rays that are traced through the lens; cubic between them, off by less than 1e-5 px
+RAY_MARGIN_PX = 3 * CELL_PX  # margin of cached rays about a box, for a moving box
+LENS_NODE_PX = 8  # px between rays through the lens model; cubic between them, error below 1e-5 px
 
 
 class ImageBox(NamedTuple):
@@ -77,7 +77,7 @@ class Rays(NamedTuple):
 
 
 class RenderView:
-    """One camera, and the rays of the part of its image that was last needed."""
+    """One camera, and cached rays of a part of its image."""
 
     def __init__(self, camera: Camera, base_from_rest: Array) -> None:
         """base_from_rest: (4, 4), of the scene's grid at rest."""
@@ -97,23 +97,23 @@ class RenderView:
         return self._fall[sensor.vignetting]
 
     def clip(self, low: Array, high: Array) -> ImageBox | None:
-        """The cells that hold pixels low to high (2,), None if they miss the image."""
+        """The cells with pixels low to high (2,), None outside the image."""
         x0, y0 = (int(v) for v in np.clip(np.floor(low / CELL_PX) * CELL_PX, 0, self.whole[2:]))
         x1, y1 = (int(v) for v in np.clip(np.ceil(high / CELL_PX) * CELL_PX, 0, self.whole[2:]))
         return ImageBox(x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
     def rays(self, box: ImageBox) -> Rays:
         """Rays (H, W) of all samples of a box."""
-        held = self._box
-        if not (held.x0 <= box.x0 and held.y0 <= box.y0 and held.x1 >= box.x1 and held.y1 >= box.y1):
+        cached = self._box
+        if not (cached.x0 <= box.x0 and cached.y0 <= box.y0 and cached.x1 >= box.x1 and cached.y1 >= box.y1):
             margin = RAY_MARGIN_PX
-            held = ImageBox(box.x0 - margin, box.y0 - margin, box.x1 + margin, box.y1 + margin)
+            cached = ImageBox(box.x0 - margin, box.y0 - margin, box.x1 + margin, box.y1 + margin)
             x, y = (
                 (np.arange((b - a) * SAMPLES_PER_PIXEL) + 0.5) / SAMPLES_PER_PIXEL + a - 0.5
-                for a, b in (held[::2], held[1::2])
+                for a, b in (cached[::2], cached[1::2])
             )
-            self._rays, self._box = Rays(*rays_at(self.camera, x, y)), held
-        return Rays(*(tangents[held.samples(box)] for tangents in self._rays))
+            self._rays, self._box = Rays(*rays_at(self.camera, x, y)), cached
+        return Rays(*(tangents[cached.samples(box)] for tangents in self._rays))
 
     def coarse(self, step: int) -> Rays:
         """Rays through the middles of squares of `step` px over the whole image."""

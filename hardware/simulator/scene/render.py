@@ -1,4 +1,4 @@
-"""Pictures of a scene: what each camera's image is at each instant, the nozzle in front of what is behind it."""
+"""Pictures of a scene by each camera at each instant, the nozzle in front."""
 
 from __future__ import annotations
 
@@ -44,30 +44,30 @@ def render(
         skins = [pool.submit(surface_picture, s, v) for s, v in jobs]
         cloths = [pool.submit(drape_picture, s, v) for s, v in jobs]
         images = [
-            pool.submit(_finished, s, v, skin.result(), cloth.result(), sensor, rng)
+            pool.submit(_picture, s, v, skin.result(), cloth.result(), sensor, rng)
             for (s, v), skin, cloth, rng in zip(jobs, skins, cloths, rngs, strict=True)
         ]
         return [image.result() for image in images]
 
 
 class StillScene:
-    """Pictures of a scene that stands still, with a nozzle before it that casts no shadow: a tenth of the work."""
+    """Pictures of a scene at rest with a nozzle that casts no shadow: a tenth of the work."""
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], still: WorldState) -> None:
         """still: without a nozzle."""
         shared = scene_state(scene, still)
         self._scene, self._shared = scene, shared
         self._views = [scene.view(camera) for camera in cameras]
-        self._behind = [(surface_picture(shared, view), drape_picture(shared, view)) for view in self._views]
+        self._backgrounds = [(surface_picture(shared, view), drape_picture(shared, view)) for view in self._views]
 
     def __call__(self, camera: int, instant: WorldState, sensor: Sensor, rng: Generator) -> Image:
         """The image (H, W, 3) BGR of a camera by its number."""
-        skin, cloth = self._behind[camera]
-        now, fresh = replace(self._shared, instant=instant), replace(cloth, light=cloth.light.copy())
-        return _finished(now, self._views[camera], skin, fresh, sensor, rng)
+        skin, cloth = self._backgrounds[camera]
+        state, background = replace(self._shared, instant=instant), replace(cloth, light=cloth.light.copy())
+        return _picture(state, self._views[camera], skin, background, sensor, rng)
 
 
-def _finished(
+def _picture(
     now: SceneState, view: RenderView, skin: SurfacePicture | None, cloth: DrapePicture, sensor: Sensor, rng: Generator
 ) -> Image:
     light = cloth.light
@@ -77,27 +77,27 @@ def _finished(
     boxes = part_boxes(nozzle, view)
     if nozzle is not None and boxes:
         box, lit = whole_box(boxes), (now.scene.base_from_rest, now.lamps, now.scene.look.ambient)
-        blend_over(light, nozzle_picture(nozzle, *lit, view, boxes, _behind(box, skin, cloth)), box.y0, box.x0)
+        blend_over(light, nozzle_picture(nozzle, *lit, view, boxes, _depth_behind(box, skin, cloth)), box.y0, box.x0)
     return expose(light, sensor, view.fall(sensor), now.instant.gain, rng)
 
 
-def _behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> NDArray[np.float32]:
+def _depth_behind(box: ImageBox, skin: SurfacePicture | None, cloth: DrapePicture) -> NDArray[np.float32]:
     depth = upsample(cloth.depth[box.lattice(DRAPE_LATTICE_PX)], box.sample_size)
     if skin is None or skin.depth is None:
         return depth
-    both = ImageBox(*np.maximum(box[:2], skin.box[:2]).tolist(), *np.minimum(box[2:], skin.box[2:]).tolist())
-    if min(both.size) > 0:
-        near = skin.depth[skin.box.samples(both)]
-        np.copyto(depth[box.samples(both)], near, where=np.isfinite(near))
+    overlap = ImageBox(*np.maximum(box[:2], skin.box[:2]).tolist(), *np.minimum(box[2:], skin.box[2:]).tolist())
+    if min(overlap.size) > 0:
+        skin_depth = skin.depth[skin.box.samples(overlap)]
+        np.copyto(depth[box.samples(overlap)], skin_depth, where=np.isfinite(skin_depth))
     return depth
 
 
 WOUND_EXTENT = np.array([[x, y, 0.0] for x in (-26.0, 26.0) for y in (-19.0, 19.0)])  # mm, round a usual wound
-COVER_SCALE = 1.35  # a cover that lies over all of the wound is larger than it by this
+COVER_SCALE = 1.35  # size of a cover by that of the wound
 
 
 def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.random.Generator) -> Image:
-    """A blotchy, skin-toned cover over a box (low, high px); aside: by which part of its width it is drawn away."""
+    """A blotchy, skin-toned cover over a box (low, high px); aside: shift, as a share of its width."""
     low, high = box
     angle = rng.uniform(0, 2 * np.pi)
     half = COVER_SCALE * (high - low) / 2
@@ -112,10 +112,10 @@ def draw_cover(image: Image, box: tuple[Array, Array], aside: float, rng: np.ran
     corner = np.round(middle - half).astype(int)
     x0, y0 = np.clip(corner, 0, (w, h))
     x1, y1 = np.clip(corner + size, 0, (w, h))
-    covered = image.copy()
+    result = image.copy()
     part = cover[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]  # may be empty
-    covered[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
-    return covered
+    result[y0:y1, x0:x1] = np.clip(part, 0, 255).astype(np.uint8)
+    return result
 
 
 def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: Fault) -> Image:
@@ -125,7 +125,7 @@ def cover_wound(image: Image, camera: Camera, base_from_surface: Array, fault: F
     return np.stack([draw_cover(image[..., k], box, 0.0, fault_rng(fault)) for k in range(image.shape[2])], -1)
 
 
-VIEW_TEXEL = 0.15  # mm: what a camera 350 mm away resolves; half the time of the simulator's own
+VIEW_TEXEL = 0.15  # mm, resolved by a camera at 350 mm; half the time of the simulator's own
 MASK_SAMPLES = 4  # samples a pixel and axis of the true mask
 FINER_OUTLINES = 3  # of pictures by which areas are judged: at 4 and 0.25 mm the outline is off by 1 % of a small wound
 IMAGE_SIZES = ((1280, 720), (640, 480), (768, 576))  # px
@@ -150,11 +150,11 @@ class WoundSet:
     wounds: tuple[NDArray[np.bool_], ...]  # (H, W), by camera
     rig: Rig
     base_from_surface: Array  # (4, 4) mm
-    area: float  # mm^2 inside the wound's edge of the skin as it would go on over the wound
+    area: float  # mm^2 of the skin inside the wound's edge, as without the wound
 
 
 def wound_view(seed: int, wounded: bool = True) -> WoundView:
-    """The picture of a seed: body, wound, tone, wetness, drape, lamps and camera are drawn from it."""
+    """The picture of a seed: random body, wound, tone, wetness, drape, lamps and camera."""
     rng = np.random.default_rng([seed, 41])
     scene, _ = _random_scene(rng, seed, wounded)
     size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
@@ -168,7 +168,7 @@ def wound_view(seed: int, wounded: bool = True) -> WoundView:
 
 
 def wound_set(seed: int) -> WoundSet:
-    """The pictures of a seed by the thesis's three cameras: drawn as in `wound_view`, and how far away they stand."""
+    """The pictures of a seed by the thesis's three cameras: random as in `wound_view`, and their distance."""
     rng = np.random.default_rng([seed, 43])
     scene, bare = _random_scene(rng, seed, True)
     size = IMAGE_SIZES[rng.integers(len(IMAGE_SIZES))]
@@ -183,7 +183,7 @@ def wound_set(seed: int) -> WoundSet:
 
 
 def _random_scene(rng: np.random.Generator, seed: int, wounded: bool) -> tuple[Scene, Shape]:
-    """A scene, and the shape of its skin as it would be without the wound."""
+    """A scene, and the shape of its skin without the wound."""
     wound = Wound((rng.uniform(12, 60), rng.uniform(10, 40)), rng.uniform(0.5, 4.0)) if wounded else None
     kind = rng.choice(list(BODIES))
     return Scene(body(kind, wound, seed), _random_appearance(rng), seed=seed), body(kind, None, seed)
@@ -194,22 +194,22 @@ def _random_pictures(rng: np.random.Generator, scene: Scene, rig: Rig) -> tuple[
     pose = BASE_FROM_REST @ se3.make(se3.exp_rotation(rng.normal(0, [0.15, 0.15, 1.5])), rng.normal(0, [12, 12, 6]))
     instant = WorldState(0.0, 0.004, pose, np.zeros(6), gain=float(np.exp(rng.normal(0, 0.15))))
     sensor = Sensor(noise=rng.uniform(0.5, 4), blur=rng.uniform(0.3, 1.2))
-    draws = [rng] if len(rig) == 1 else rng.spawn(len(rig))
-    return render(scene, rig.cameras, [instant] * len(rig), sensor, draws, threads=1), pose
+    rngs = [rng] if len(rig) == 1 else rng.spawn(len(rig))
+    return render(scene, rig.cameras, [instant] * len(rig), sensor, rngs, threads=1), pose
 
 
 def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: int = 1) -> NDArray[np.bool_]:
-    """(H, W) what a camera sees of the wound; all False without one.
+    """(H, W) pixels of the wound in a camera; all False without one.
 
-    finer: times that the outline is drawn finer; by 1 it runs through the outermost nodes, half a node too far in.
+    finer: refinement of the outline; by 1 it runs through the outermost nodes, half a node too far in.
     """
     outlines = []
     if shape.inside is not None:
         inside = cv2.resize(shape.inside, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
         contours, _ = cv2.findContours((inside > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         middle = (np.array(shape.inside.shape[::-1]) - 1) / 2
-        for each in contours:
-            nodes = (each.reshape(-1, 2) + 0.5) / finer - 0.5
+        for contour in contours:
+            nodes = (contour.reshape(-1, 2) + 0.5) / finer - 0.5
             points = shape.points((nodes - middle) * shape.step)
             outlines.append(pixels_from_points(camera, se3.transform_points(base_from_surface, points))[0])
     return mask_from_outlines(outlines, camera.size, finer * MASK_SAMPLES)
@@ -218,7 +218,7 @@ def _true_mask(shape: Shape, camera: Camera, base_from_surface: Array, finer: in
 def mask_from_outlines(
     outlines: Sequence[Array], size: tuple[int, int], samples: int = MASK_SAMPLES
 ) -> NDArray[np.bool_]:
-    """(H, W) pixels that lie for the most part inside closed outlines (N, 2) px, in an image of `size` (W, H).
+    """(H, W) pixels more than half inside closed outlines (N, 2) px, in an image of `size` (W, H).
 
     Drawn finer, by `samples` a pixel and axis, and shrunk: OpenCV fills the outline's own pixels too, which would add
     half a pixel all round.
@@ -238,7 +238,7 @@ def _random_appearance(rng: np.random.Generator) -> Appearance:
 
 BOARD_SAMPLES = 3  # per pixel and axis: edges lie true to a hundredth of a pixel
 PAPER_MARGIN = 0.5  # of a square, white around the print
-PAPER_GREY, INK_GREY, WALL_GREY = 205.0, 38.0, 120.0  # grey levels of paper, ink and what is behind
+PAPER_GREY, INK_GREY, WALL_GREY = 205.0, 38.0, 120.0  # grey levels of paper, ink and background
 DRAWING_SCALE = 8  # parts of a cell along its edge; light between two is interpolated, so that edges do not step
 BOX_MARGIN_PX = 12  # px around the board that are drawn
 
@@ -250,9 +250,9 @@ class BoardView:
         self.camera, self._board = camera, board
         ink, cell = ink_cells(board)
         rim = round(PAPER_MARGIN * board.square / cell * DRAWING_SCALE)
-        drawn = np.kron(np.where(ink, INK_GREY, PAPER_GREY), np.ones((DRAWING_SCALE, DRAWING_SCALE)))
+        drawing = np.kron(np.where(ink, INK_GREY, PAPER_GREY), np.ones((DRAWING_SCALE, DRAWING_SCALE)))
         paper = INK_GREY if board.inverted else PAPER_GREY
-        self._drawing = np.pad(drawn, rim, constant_values=paper).astype(np.float32)
+        self._drawing = np.pad(drawing, rim, constant_values=paper).astype(np.float32)
         scale, shift = DRAWING_SCALE / cell, rim - 0.5  # cells' middles are whole numbers
         self._drawing_from_board = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
 

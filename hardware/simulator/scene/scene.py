@@ -33,7 +33,7 @@ UNDEFORMED = Deformation()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaintedScene:
-    """What takes a second to make."""
+    """The parts of a scene that take a second to make."""
 
     node_heights: Field  # (H, W) mm, at rest
     relief: HeightField  # of these
@@ -43,10 +43,10 @@ class PaintedScene:
 
 
 class Scene:
-    """A body before the cameras; same arguments, same pictures. It is painted when somebody first looks.
+    """A body before the cameras; same arguments, same pictures. It is painted at its first use.
 
-    base_from_rest: (4, 4) mm, base_from_surface when nothing moves: there the far cloth lies and over it hang lamps.
-    Only `ink` changes: pictures rendered after a bead was laid show it. gel: how what is printed lies; None: as ink.
+    base_from_rest: (4, 4) mm, base_from_surface at rest, for the far cloth and the lamps. Only `ink` changes: pictures
+    rendered after a bead was laid show it. gel: of printed beads; None: as ink.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class Scene:
         base_from_rest: Array = BASE_FROM_REST,
         gel: Gel | None = None,
     ) -> None:
-        self.gel = gel  # to be set before somebody looks
-        self._raised: tuple[int, HeightField] | None = None  # version of the beads, and the heights with them
+        self.gel = gel  # to be set before the first use
+        self._bead_relief: tuple[int, HeightField] | None = None  # version of the beads, and the heights with them
         self.shape, self.look, self.deformation = shape, look or Appearance(), deformation
         self.base_from_rest = base_from_rest @ shape.surface_from_grid  # of the grid
         self._seed = seed
@@ -69,23 +69,23 @@ class Scene:
 
     @property
     def layers(self) -> Layers:
-        """What is painted on the shape."""
+        """The textures of the shape."""
         return self._get_painted().layers
 
     @property
     def sheet(self) -> Drape:
-        """The cloth round it."""
+        """The cloth about it."""
         return self._get_painted().sheet
 
     @property
     def ink(self) -> PrintedBeads:
-        """What was printed on it."""
+        """The printed beads."""
         return self._get_painted().ink
 
     @property
-    def laid(self) -> bytes:
-        """A hash of what was printed on it, without painting it; empty before the first bead."""
-        return b"" if self._painted is None else self._painted.ink.laid
+    def bead_hash(self) -> bytes:
+        """A hash of the printed beads, without painting the scene; empty before the first bead."""
+        return b"" if self._painted is None else self._painted.ink.bead_hash
 
     def _get_painted(self) -> PaintedScene:
         with self._lock:
@@ -100,33 +100,33 @@ class Scene:
             return self._painted
 
     def heights(self, amount: float) -> HeightField:
-        """Heights on the nodes of material points under `amount` of the deformation, the drape's hem among them."""
+        """Heights on the nodes of material points under `amount` of the deformation, including the drape's hem."""
         painted, shape = self._get_painted(), self.shape
-        still = self._with_beads(painted)
+        relief = self._with_beads(painted)
         if not amount * self.deformation.bulge:
-            return still
+            return relief
         lift = self.deformation.lift(np.stack(node_axes(shape.size, shape.step), -1), amount)
-        return height_field(still.height + lift.astype(np.float32))
+        return height_field(relief.height + lift.astype(np.float32))
 
     def _with_beads(self, painted: PaintedScene) -> HeightField:
         beads = painted.ink
         if beads.gel is None or not beads.version:
             return painted.relief
-        if self._raised is None or self._raised[0] != beads.version:
-            laid = beads.heights(self.shape.size, self.shape.step)
-            self._raised = beads.version, height_field(painted.node_heights + laid)
-        return self._raised[1]
+        if self._bead_relief is None or self._bead_relief[0] != beads.version:
+            bead_heights = beads.heights(self.shape.size, self.shape.step)
+            self._bead_relief = beads.version, height_field(painted.node_heights + bead_heights)
+        return self._bead_relief[1]
 
     @property
     def opening(self) -> tuple[float, float]:
-        """Sides (x, y) mm of the part of the shape that no cloth covers."""
+        """Sides (x, y) mm of the uncovered part of the shape."""
         if not self.look.drape:
             return self.shape.size
         half = half_opening(self.shape)
         return 2 * half[0], 2 * half[1]
 
     def view(self, camera: Camera) -> RenderView:
-        """What stays the same between the pictures of one camera."""
+        """The constants of one camera's pictures."""
         with self._lock:
             if camera not in self._views:
                 self._views[camera] = RenderView(camera, self.base_from_rest)
@@ -134,7 +134,7 @@ class Scene:
 
 
 def rois(scene: Scene, rig: Rig, base_from_surface: Array, stamp: float, part: float = 0.8) -> tuple[Roi, ...]:
-    """Polygons around what each camera sees of the ellipse that fills the central `part` of the opening."""
+    """Outlines in each camera of the ellipse that fills the central `part` of the opening."""
     half = part * np.array(scene.opening) / 2
     flat = scene.shape.grid(2.0)
     flat = flat[np.linalg.norm(flat / half, axis=1) <= 1]
@@ -152,10 +152,10 @@ def rois(scene: Scene, rig: Rig, base_from_surface: Array, stamp: float, part: f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldState:
-    """The world in the middle of one exposure: the seam between the simulated motion and the pictures taken of it."""
+    """The world in the middle of one exposure: the interface from the simulated motion to its pictures."""
 
     stamp: float  # s, true time
-    exposure: float  # s, how long the shutter is open about it
+    exposure: float  # s, duration, centred on it
     base_from_surface: Array  # (4, 4) mm
     twist: Array  # (6,) body velocity of the surface, rad/s and mm/s
     strain: float = 0.0  # amount of the scene's deformation, 1 as specified
@@ -168,50 +168,50 @@ SHADOW_STEP = 0.5  # mm: a needle's shadow is 0.7 mm wide
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneState:
-    """A scene at one instant, as all its cameras share it."""
+    """A scene at one instant, shared by all its cameras."""
 
     scene: Scene
     instant: WorldState
     base_from_grid: Array  # (4, 4) mm
     rest_from_grid: Array  # (4, 4) mm, against the grid at rest
     relief: HeightField  # deformed heights on the nodes of material points
-    factors: tuple[float, float]  # by which material lengths x, y are stretched
+    factors: tuple[float, float]  # stretch of material lengths x, y
     lamps: tuple[Lamp, Lamp]
     towards: Array  # (2, 3) the lamps' directions, grid frame
     shadow: Field | None  # (h, w, 4) share of each lamp's light, twice, nodes SHADOW_STEP apart; None without a nozzle
 
 
 def scene_state(scene: Scene, instant: WorldState) -> SceneState:
-    """Work out what the cameras of this instant share."""
-    shape, both = scene.shape, lamps(scene.look)
+    """The state of a scene at `instant`."""
+    shape, lamp_pair = scene.shape, lamps(scene.look)
     base_from_grid = instant.base_from_surface @ shape.surface_from_grid
     rest_from_grid = se3.inverse(scene.base_from_rest) @ base_from_grid
     relief = scene.heights(instant.strain)
-    towards = np.stack([lamp.towards for lamp in both]) @ rest_from_grid[:3, :3]
+    towards = np.stack([lamp.towards for lamp in lamp_pair]) @ rest_from_grid[:3, :3]
     factors = scene.deformation.factors(instant.strain)
     shadow = None
     if instant.base_from_nozzle is not None:
-        skip = max(1, round(SHADOW_STEP / shape.step))
-        z = relief.height[::skip, ::skip]
-        x = (np.arange(z.shape[1], dtype=np.float32) * skip * shape.step - shape.size[0] / 2) * factors[0]
-        y = (np.arange(z.shape[0], dtype=np.float32) * skip * shape.step - shape.size[1] / 2) * factors[1]
+        stride = max(1, round(SHADOW_STEP / shape.step))
+        z = relief.height[::stride, ::stride]
+        x = (np.arange(z.shape[1], dtype=np.float32) * stride * shape.step - shape.size[0] / 2) * factors[0]
+        y = (np.arange(z.shape[0], dtype=np.float32) * stride * shape.step - shape.size[1] / 2) * factors[1]
         nozzle_from_base = se3.inverse(instant.base_from_nozzle)
         points = transform_fields(nozzle_from_base @ base_from_grid, x[None], y[:, None], z)
         nozzle_from_rest = nozzle_from_base @ scene.base_from_rest
-        passed = [passing_light(points, nozzle_from_rest, lamp) for lamp in both]
-        shadow = np.dstack([*passed, *passed])
-    return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, both, towards, shadow)
+        shares = [passing_light(points, nozzle_from_rest, lamp) for lamp in lamp_pair]
+        shadow = np.dstack([*shares, *shares])
+    return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, lamp_pair, towards, shadow)
 
 
 def transform_fields(transform: Array, x: Field, y: Field, z: Field) -> tuple[Field, Field, Field]:
-    """Points x, y, z (H, W) each, carried by a transform (4, 4)."""
+    """Points x, y, z (H, W) each, transformed by (4, 4)."""
     m = transform.astype(np.float32)
     a, b, c = (np.asarray(m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3], np.float32) for i in range(3))
     return a, b, c
 
 
 def rotate_rays(rotation: Array, x: Field, y: Field) -> tuple[Field, Field, Field]:
-    """Directions x, y, z (H, W) each, of rays (x, y, 1) carried by a rotation (3, 3)."""
+    """Directions x, y, z (H, W) each, of rays (x, y, 1) rotated by (3, 3)."""
     m = rotation.astype(np.float32)
     a, b, c = (np.asarray(m[i, 0] * x + m[i, 1] * y + m[i, 2], np.float32) for i in range(3))
     return a, b, c

@@ -17,15 +17,15 @@ from estimation.se3 import Array
 from hardware.simulator.scene.fields import smooth_noise
 
 NODE_STEP = 0.25  # mm between nodes: a wound's rim rises over 2 mm
-MIN_FACING = 0.1  # mean of a scan's normals by area: a closed body's is 0, and no plane is its mean plane
-CAST_HEIGHT = 1.0  # mm over the highest point, from where rays are cast down
+MIN_FACING = 0.1  # length of a scan's mean normal by area: a closed body's is 0, without a mean plane
+CAST_HEIGHT = 1.0  # mm over the highest point, origin of rays cast down
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
     """Heights over a rectangle, bilinear between nodes: z = Z(x, y) in the grid frame, z out of the surface.
 
-    Material points are named by (x, y) mm in the grid frame, whose origin is the middle of the rectangle.
+    Material points are (x, y) mm in the grid frame, whose origin is the middle of the rectangle.
     """
 
     step: float  # mm between nodes
@@ -41,7 +41,7 @@ class Shape:
         return (columns - 1) * self.step, (rows - 1) * self.step
 
     def heights_at(self, xy: ArrayLike) -> Array:
-        """Z (N,) mm at material points (N, 2) mm; beyond the rectangle as at its edge."""
+        """Z (N,) mm at material points (N, 2) mm; constant beyond the rectangle's edge."""
         return _bilinear(self, self.nodes(xy))[0]
 
     def points(self, xy: ArrayLike) -> Array:
@@ -60,13 +60,13 @@ class Shape:
         return np.asarray(se3.transform_points(se3.inverse(self.surface_from_grid), points_surface)[:, :2])
 
     def covers(self, xy: ArrayLike) -> NDArray[np.bool_]:
-        """Whether (N,) there is a surface at material points (N, 2) mm: on the rectangle, and in no hole."""
+        """Whether (N,) material points (N, 2) mm are on the surface: on the rectangle, and in no hole."""
         xy = np.asarray(xy, float).reshape(-1, 2)
-        on = (np.abs(xy) <= np.array(self.size) / 2 + 1e-6).all(axis=1)
+        inside = (np.abs(xy) <= np.array(self.size) / 2 + 1e-6).all(axis=1)
         if self.valid is None:
-            return np.asarray(on)
+            return np.asarray(inside)
         x, y = np.rint(self.nodes(xy)).astype(int).T
-        return np.asarray(on & self.valid[y, x])
+        return np.asarray(inside & self.valid[y, x])
 
     def grid(self, step: float, part: float = 1.0) -> Array:
         """Material points (N, 2) mm, row by row, over the central `part` of the rectangle, about `step` mm apart."""
@@ -86,7 +86,7 @@ class Shape:
         return self.points(flat), triangles
 
     def nodes(self, xy: ArrayLike) -> Array:
-        """Material points (N, 2) in nodes from the first one, kept on the rectangle."""
+        """Material points (N, 2) in nodes from the first one, clipped to the rectangle."""
         nodes = np.asarray(xy, float).reshape(-1, 2) / self.step + (np.array(self.heights.shape[::-1]) - 1) / 2
         return np.clip(nodes, 0, np.array(self.heights.shape[::-1]) - 1)
 
@@ -105,7 +105,7 @@ def _bilinear(shape: Shape, nodes: Array) -> tuple[Array, Array, Array]:
 def shape_from_function(
     height: Callable[[Array, Array], Array], size: tuple[float, float], step: float = NODE_STEP
 ) -> Shape:
-    """The shape z = height(x, y), mm, over `size` (x, y) mm, rounded up to whole steps; the law holds at the nodes."""
+    """The shape z = height(x, y), mm, over `size` (x, y) mm, rounded up to whole steps; exact at the nodes."""
     columns, rows = (int(np.ceil(s / step - 1e-9)) + 1 for s in size)
     x, y = (np.arange(n) * step - (n - 1) * step / 2 for n in (columns, rows))
     heights = np.asarray(height(*np.meshgrid(x, y)), float)
@@ -126,8 +126,8 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = NOD
     """The shape of a scan, vertices (V, 3) mm and triangles (T, 3) anticlockwise from outside, in the scan's own frame.
 
     The grid lies in the mean plane of the triangles (their normals' mean, weighted by area), its origin at their mean.
-    Each node takes the outermost height above it, so that what an overhang hides is left out; nodes over holes and
-    beyond the rim are not `valid` and are not drawn. InputError for a body that is closed: it faces no way.
+    Each node has the outermost height, so the surface under an overhang is omitted; nodes over holes and beyond the rim
+    are not `valid` and are not drawn. InputError for a closed body.
     """
     scan = scan_from_triangles(vertices, triangles)
     surface_from_grid = _mean_plane(scan)
@@ -147,7 +147,7 @@ def shape_from_scan(vertices: ArrayLike, triangles: ArrayLike, step: float = NOD
 def _mean_plane(scan: Scan) -> Array:
     """surface_from_grid (4, 4): z along the mean normal, the sides of the least rectangle round the scan along x and y.
 
-    Of the four ways to lay them, x is the one nearest to the scan's own x (its y where that stands upright).
+    Of the four such axes, x is the one nearest to the scan's own x (to its y where x is along z).
     """
     areas = face_areas(scan)
     z = areas @ face_normals(scan) / areas.sum()
@@ -163,13 +163,13 @@ def _mean_plane(scan: Scan) -> Array:
     flattened = (scan.vertices @ rotation[:, :2]).astype(np.float32)
     turn = np.deg2rad((cv2.minAreaRect(flattened)[2] + 45) % 90 - 45)
     rotation = rotation @ se3.exp_rotation([0.0, 0.0, turn])
-    turned = scan.vertices @ rotation  # grid axes, the scan's origin
-    middle = (turned.min(0) + turned.max(0)) / 2
+    rotated = scan.vertices @ rotation  # grid axes, the scan's origin
+    middle = (rotated.min(0) + rotated.max(0)) / 2
     middle[2] = areas @ (scan.corners.mean(1) @ rotation[:, 2]) / areas.sum()
     return se3.make(rotation, rotation @ middle)
 
 
-STRETCH_RANGE = (-0.3, 0.5)  # a skin tears beyond
+STRETCH_RANGE = (-0.3, 0.5)  # beyond, skin tears
 MAX_BULGE = 30.0  # mm
 BULGE_RADIUS_RANGE = (5.0, 500.0)  # mm
 
@@ -194,22 +194,22 @@ class Deformation:
             raise InputError("deformation", "radius", self.radius, allowed)
 
     def factors(self, amount: float) -> tuple[float, float]:
-        """By how much lengths along x and y grow."""
+        """Factors of lengths along x and y."""
         return 1 + amount * self.stretch[0], 1 + amount * self.stretch[1]
 
     def lift(self, xy: ArrayLike, amount: float | Array) -> Array:
-        """How far out (N,) mm material points (N, 2) mm bulge; amount: one, or (N,)."""
+        """Height of the bulge (N,), mm, at material points (N, 2) mm; amount: one, or (N,)."""
         square = np.einsum("...i,...i->...", np.asarray(xy, float), np.asarray(xy, float))
         return np.asarray(amount * self.bulge * np.exp(-square / (2 * self.radius**2)))
 
     def displacement(self, points: ArrayLike, amount: float | Array) -> Array:
-        """How far (N, 3) mm points (N, 3) mm of the shape at rest are moved, in the grid frame; amount: or (N,)."""
+        """Displacement (N, 3) mm of points (N, 3) mm of the shape at rest, in the grid frame; amount: one, or (N,)."""
         points = np.asarray(points, float)
         along = np.asarray(amount)[..., None] * points[..., :2] * np.array(self.stretch)
         return np.concatenate([along, self.lift(points[..., :2], amount)[..., None]], -1)
 
     def undo(self, points: ArrayLike, amount: float | Array) -> Array:
-        """Where points (N, 3) mm of the deformed shape lie at rest, (N, 3) mm, in the grid frame; amount: or (N,)."""
+        """Places at rest (N, 3) mm of points (N, 3) mm of the deformed shape, grid frame; amount: one, or (N,)."""
         points = np.asarray(points, float)
         flat = points[..., :2] / (1 + np.asarray(amount)[..., None] * np.array(self.stretch))
         return np.concatenate([flat, (points[..., 2] - self.lift(flat, amount))[..., None]], -1)
@@ -252,7 +252,7 @@ BODIES: dict[str, tuple[Callable[[Array, Array], Array], tuple[float, float]]] =
 
 
 def body(kind: str, wound: Wound | None, seed: int, step: float = NODE_STEP) -> Shape:
-    """The shape of `kind` (a key of BODIES) with a wound at the origin, its skin level there being z = 0."""
+    """The shape of `kind` (a key of BODIES) with a wound at the origin, where the skin has z = 0."""
     height, opening = BODIES[kind]
     rng = np.random.default_rng([seed, 21])
     bare = shape_from_function(height, (opening[0] + 2 * DRAPE_MARGIN, opening[1] + 2 * DRAPE_MARGIN), step)
@@ -267,13 +267,13 @@ def body(kind: str, wound: Wound | None, seed: int, step: float = NODE_STEP) -> 
 
 
 def with_wound(shape: Shape, wound: Wound, seed: int) -> Shape:
-    """The shape with a wound drawn, not carved, at its middle: a scan has its own relief."""
+    """The shape with a wound in the textures alone at its middle: a scan has its own relief."""
     inside = wound_distance(shape.heights.shape, shape.step, wound, np.random.default_rng([seed, 21]))
     return Shape(shape.step, shape.heights, shape.surface_from_grid, inside, shape.valid)
 
 
 def wound_distance(grid: tuple[int, int], step: float, wound: Wound, rng: np.random.Generator) -> Array:
-    """About how far inside the wound's edge each node is, (H, W) mm; an irregular oval of the wound's size."""
+    """Approximate distance inside the wound's edge, (H, W) mm, of each node; an irregular oval of the wound's size."""
     rows, columns = grid
     x, y = np.meshgrid((np.arange(columns) - (columns - 1) / 2) * step, (np.arange(rows) - (rows - 1) / 2) * step)
     half = np.array(wound.size) / 2
@@ -289,15 +289,15 @@ def wound_distance(grid: tuple[int, int], step: float, wound: Wound, rng: np.ran
 def _wound_relief(inside: Array, step: float, wound: Wound, rng: np.random.Generator) -> Array:
     wall = 0.9 * wound.depth  # mm wide, so that its slope stays below 1
     t = np.clip((inside + 0.25 * wall) / (1.6 * wall), 0, 1)
-    sunk = t * t * (3 - 2 * t)
-    uneven = 0.22 * smooth_noise(inside.shape, 9 / step, rng) + 0.1 * smooth_noise(inside.shape, 3 / step, rng)
-    bed = wound.depth * (0.82 + 0.18 * np.clip(inside / 8, 0, 1) + np.clip(uneven, -0.5, 0.5))
-    swollen = 0.45 * np.exp(-(((inside + 2.2) / 1.9) ** 2))
-    return np.asarray(cv2.GaussianBlur(swollen - sunk * bed, (0, 0), 0.35 / step))
+    depth_share = t * t * (3 - 2 * t)
+    bed_noise = 0.22 * smooth_noise(inside.shape, 9 / step, rng) + 0.1 * smooth_noise(inside.shape, 3 / step, rng)
+    bed = wound.depth * (0.82 + 0.18 * np.clip(inside / 8, 0, 1) + np.clip(bed_noise, -0.5, 0.5))
+    rim = 0.45 * np.exp(-(((inside + 2.2) / 1.9) ** 2))
+    return np.asarray(cv2.GaussianBlur(rim - depth_share * bed, (0, 0), 0.35 / step))
 
 
 def _arch(y: Array, radius: Array | float) -> Array:
-    """Heights of a circle's top, going on straight where its slope passes 0.85: cloth and camera see no further."""
+    """Heights of a circle's top, continued straight from slope 0.85: steeper parts are not visible."""
     edge = radius * 0.85 / np.hypot(1, 0.85)
     near = np.clip(y, -edge, edge)
     return np.asarray(np.sqrt(radius**2 - near**2) - radius - 0.85 * (np.abs(y) - np.abs(near)))
