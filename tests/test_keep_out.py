@@ -21,7 +21,7 @@ from perception.lens import Lenses
 from perception.mapping.masks import (
     BEAD_REACH_MM,
     BEAD_STEP_MM,
-    CLIPPED,
+    CLIPPING_GREY,
     DARK_LEVELS,
     GEL_TIME_S,
     LIGHT_SIGMA,
@@ -213,8 +213,8 @@ def test_compiled_colours_are_those_of_the_formula(seed: int) -> None:
     now, dark, free = colour_ratios(image, scale, at)
     assert np.allclose(now, np.log([red / green, blue / green]), rtol=0, atol=1e-4)
     assert np.allclose(dark, DARK_LEVELS * (1 / green - 1 / np.stack([red, blue])), rtol=0, atol=1e-4)
-    clear = np.abs(levels.max(0) - CLIPPED) > 1e-3
-    assert (free == (inside & (levels.max(0) < CLIPPED)))[clear].all()
+    clear = np.abs(levels.max(0) - CLIPPING_GREY) > 1e-3
+    assert (free == (inside & (levels.max(0) < CLIPPING_GREY)))[clear].all()
     # normal equations
     sums, free = rng.normal(size=(80, 14)), rng.uniform(size=80) < 0.7
     before, slopes, noise = rng.normal(size=(2, 80)), rng.normal(size=(2, 80, 3)), np.array([0.02, 0.002])

@@ -48,7 +48,7 @@ class Printing:
         self.bench = Bench(profile=GEL)
         self.bench.clock = self.bench.port.clock = clock = self.link.clock
         self.bench.port._clock = clock
-        self.bench.model.now = self.bench.model._fed = 0.0
+        self.bench.model.now = self.bench.model._last_message = 0.0
         self.bench.model._knots.clear()
         self.bench.model._knots.append((0.0, 0.0, 0.0, 1.0, 0.0))
         path = raster(speed=10.0)
