@@ -26,7 +26,7 @@ from hardware.cameras.genicam import INSTALL, SYSTEM_PYTHON, GenicamCapture, ara
 from hardware.cameras.live import LiveCameras
 from hardware.cameras.sources import GENICAM_PREFIX, CameraSource, Identity, SourceKind
 from perception.frames import FrameSet
-from tests.streams import CLOCK
+from tests.camera_streams import CLOCK
 
 FAKE = "arv-fake-gv-camera-0.8"
 GVCP_PORT = 3956

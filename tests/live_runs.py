@@ -26,7 +26,7 @@ from hardware.operator.view import MoveRequest
 from hardware.process.clock import WallClock
 from hardware.recording.mcap_file import ChunkMessages, parse, walk
 from hardware.recording.session_reader import open_session
-from tests.light_live import prepare_files
+from tests.pictureless_run import prepare_files
 
 ROOT = Path(__file__).parents[1]
 CLOCK = WallClock()
@@ -255,7 +255,7 @@ def light_runs(folder: Path, *flags: str, **path: float) -> Iterator[Callable[..
     prepare_files(folder, **path)
 
     def start(record: Path, *more: str) -> Running:
-        program = "tests.light_live", str(folder), str(record)
+        program = "tests.pictureless_run", str(folder), str(record)
         running.append(Running(*flags, *more, cache=folder, program=program))
         return running[-1]
 

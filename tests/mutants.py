@@ -365,7 +365,7 @@ MUTANTS = (
         "hardware/operator/shared_state.py",
         "own = newest is not None and newest.number == request.number",
         "own = newest is not None",
-        ("test_operator_words.py::test_an_outline_goes_with_its_own_request_and_with_no_other",),
+        ("test_operator_messages.py::test_an_outline_goes_with_its_own_request_and_with_no_other",),
     ),
     Mutant(
         "a guess is confirmed as it lies",
@@ -400,7 +400,7 @@ MUTANTS = (
         "hardware/operator/broadcast.py",
         "if not MoveRequest(*shift).allowed:",
         "if not shift:",
-        ("test_operator_words.py::test_a_move_that_is_not_three_figures_within_bounds_is_no_message",),
+        ("test_operator_messages.py::test_a_move_that_is_not_three_figures_within_bounds_is_no_message",),
     ),
     Mutant(
         "the colours of ink are the tissue's",

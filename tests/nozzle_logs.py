@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from hardware.simulator.deposit import NozzleLog, planned_line
 from hardware.simulator.run_folder import NOZZLE_HEADER
 from planning.path import Path
-from tests.moving import REST, path_through
+from tests.moving_surfaces import REST, path_through
 
 Motion = Callable[[Array], Array]  # stamps (N,) s -> base_from_surface (N, 4, 4)
 

@@ -32,8 +32,8 @@ from hardware.simulator.scene.scene import Scene, WorldState
 from perception.frames import Image
 from tests.board_session import BOARD, RATE, small_rig
 from tests.boards import motion
+from tests.camera_streams import CLOCK, HttpCamera, served
 from tests.printed_sheet import FPS, pictures, rig
-from tests.streams import CLOCK, HttpCamera, served
 
 SETS = 40
 BOARD_INSTANTS = 20

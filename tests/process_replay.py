@@ -19,7 +19,7 @@ import numpy as np
 
 from hardware.report.page import Plot, document, figures_table, legend, line_key, section, spanning
 from hardware.report.report import HALF_CHART_WIDTH
-from tests.pinned import ENVIRONMENT, ROOT, made_with, run_pinned, unlike
+from tests.pinned_arithmetic import ENVIRONMENT, ROOT, made_with, run_pinned, unlike
 from tests.reference_cases import CASES, FOLDER, TRACKS, keep, kept, replayed
 from tests.reference_signals import DECISION, NEW, STATES, Change, changes, differing
 
@@ -29,7 +29,7 @@ MOST = 30  # signals in the picture of a recording
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Compare or update, in the arithmetic of `tests.pinned`; the exit code."""
+    """Compare or update, in the arithmetic of `tests.pinned_arithmetic`; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true", help="what comes of them now is what is to come of them")
     parser.add_argument("--case", choices=CASES, action="append", help="only this recording")

@@ -14,7 +14,7 @@ from hardware.files.rig_file import ImageSource, write_rig
 from hardware.live.prerender import prerender
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.reference_cases import FOLDER
 
 QUALITY = 75  # of the pictures, as JPEG

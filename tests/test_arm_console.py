@@ -33,7 +33,7 @@ from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from hardware.simulator.watched_arm import WatchedArm, watched_arm
 from perception.frames import SYRINGE, Image
 from planning.kinematics import SimpleArm, nozzle_from_axes
-from tests.streams import CLOCK, HttpCamera, served
+from tests.camera_streams import CLOCK, HttpCamera, served
 from tests.test_arm_port import serving
 from tests.virtual_arm import HOME, arm_fault
 

@@ -20,7 +20,7 @@ from hardware.motion.loop import Order
 from hardware.process.faults import Fault, FaultKind, FaultPart, WorkRates
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, FaultyLine, ReplyMode
-from tests.linked import Linked, linked
+from tests.linked_arm import Linked, linked
 from tests.test_motion_loop import Looping
 from tests.virtual_arm import HOME, IDEAL, arm_fault, axes_at, motion, move, virtual_arm
 

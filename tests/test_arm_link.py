@@ -18,7 +18,7 @@ from hardware.simulator.arm.controller import VirtualArm
 from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
-from tests.linked import Linked, circle, linked, moving, waiting
+from tests.linked_arm import Linked, circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault, virtual_arm
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)

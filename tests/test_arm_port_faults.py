@@ -18,7 +18,7 @@ from hardware.arm.s6h4d import S6H4D
 from hardware.simulator.arm.ports import PortFaults, VirtualPort
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
-from tests.linked import circle, linked, moving, waiting
+from tests.linked_arm import circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault
 
 ANSWERING = ArmSettings(servo_lag=0.02, replies=ReplyMode.STREAM)

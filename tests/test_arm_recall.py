@@ -21,9 +21,9 @@ from planning.command import Move
 from planning.kinematics import nozzle_from_axes
 from planning.motion.curve import place_passed
 from planning.motion.planner import Planner
-from tests.linked import Linked, circle, linked
-from tests.moving import breathing, pose_at, raster
-from tests.slowly import slowly
+from tests.linked_arm import Linked, circle, linked
+from tests.moving_surfaces import breathing, pose_at, raster
+from tests.slow_cases import slowly
 from tests.test_motion_loop import Looping, seen
 from tests.virtual_arm import HOME, arm_fault
 

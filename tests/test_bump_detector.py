@@ -16,8 +16,8 @@ from estimation.pose_solver import project
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import observations
-from tests.slowly import slowly
-from tests.synthetic import breathing
+from tests.rendered_sets import breathing
+from tests.slow_cases import slowly
 from tests.test_estimator import LANDMARKS, RATE, RIG, begun
 
 CALM, AFTER = 3.6, 1.2  # s

@@ -55,7 +55,7 @@ from hardware.simulator.arm.ports import VirtualDevice
 from hardware.simulator.arm.settings import ArmSettings
 from hardware.simulator.dispenser import DispenserModel, VirtualDispenserSettings
 from hardware.simulator.watched_arm import watched_arm
-from tests.dispensing import HinderedPort
+from tests.dispenser_bench import HinderedPort
 
 DISPENSER = DispenserProfile("pump", ("gel",), metered=True, watchdog=None)
 TRUE = VirtualDispenserSettings("new_era", 0.08, 0.04, 0.06, 0.05, watchdog=float("inf"))

@@ -25,8 +25,8 @@ from hardware.process.progress import Progress
 from perception.frames import Frame, FrameSet, Image, StampedBy
 from tests.board_session import BOARD, LENSES, rendered, small_rig
 from tests.boards import motion
-from tests.started import spoken, started
-from tests.streams import CLOCK, HttpCamera, served
+from tests.camera_streams import CLOCK, HttpCamera, served
+from tests.command_processes import spoken, started
 
 SIZE, RATE = (640, 480), 8.0
 INSTANTS = 14

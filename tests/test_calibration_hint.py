@@ -12,8 +12,8 @@ from hardware.simulator.scene.scene import rois
 from perception.frames import Frame, FrameSet, Image, Roi
 from perception.mapping.features import calibration_hint, grey
 from perception.tracking.step import TrackingStep
-from tests.slowly import slowly
-from tests.synthetic import WIDE, patch, pictures
+from tests.rendered_sets import WIDE, patch, pictures
+from tests.slow_cases import slowly
 
 RIG = arc_rig(size=(640, 480), focal=560.0)
 SCENE = patch(2, wound=WIDE)

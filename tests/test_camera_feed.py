@@ -43,7 +43,7 @@ from hardware.cameras.stamping import (
 )
 from hardware.process.clock import Clock, SimClock, WallClock
 from perception.frames import FrameSet
-from tests.streams import BLACK, CLOCK, SIZE, HttpCamera, ListedCapture, Shot, picture, served
+from tests.camera_streams import BLACK, CLOCK, SIZE, HttpCamera, ListedCapture, Shot, picture, served
 
 PERIOD, LAG, EXPOSURE = 0.04, 0.03, 0.008
 DEVICE = CameraSource(Identity(SourceKind.DEVICE, "usb:A1"), fps=1 / PERIOD)

@@ -14,7 +14,7 @@ from hardware.cameras.inspection import CELL_SIZE, preview_sheet, sharpness
 from hardware.cameras.live import LiveCameras
 from hardware.cameras.sources import CameraSource, identity_from_text, list_devices
 from hardware.cli.main import main
-from tests.streams import CLOCK, HttpCamera, picture, served
+from tests.camera_streams import CLOCK, HttpCamera, picture, served
 from tests.test_camera_names import rig_file
 
 

@@ -34,7 +34,7 @@ from planning.clearance import (
 from planning.command import MotionLimits, Move, Refusal, RefusalCode
 from planning.kinematics import SimpleArm, axes_from_nozzle
 from planning.motion.guard import Guard
-from tests.moving import breathing, path_through, pose_at
+from tests.moving_surfaces import breathing, path_through, pose_at
 
 STEP = 0.5
 PARTS = (

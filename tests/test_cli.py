@@ -31,10 +31,10 @@ from hardware.process.progress import BAD, Progress, count_text, duration_text, 
 from hardware.recording.session_reader import open_session
 from perception.frames import FrameSet
 from perception.tracking.step import STAGES, StepReport
+from tests.command_processes import ROOT, started
 from tests.nozzle_logs import read_nozzle
-from tests.runs import Replayed
-from tests.started import ROOT, started
-from tests.worlds import IDEAL, SMALL, write_scenario
+from tests.simulated_worlds import IDEAL, SMALL, write_scenario
+from tests.tracking_runs import Replayed
 
 CLOCK = WallClock()
 LARGE = {"numpy", "scipy", "numba", "gtsam", "cv2", "onnxruntime", "toppra", "ruckig", "shapely", "aiohttp", "mcap"}

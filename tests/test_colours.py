@@ -19,7 +19,7 @@ from tests.campaigns.deceit.judge import Judge, frame_sets, tracker
 from tests.campaigns.deceit.kinds import NAMES, make_session
 from tests.campaigns.deceit.scenes import TRICK, Session
 from tests.campaigns.deceit.world import Renderer, on_tissue
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 SIZE, SEED = (480, 360), 11
 

@@ -17,7 +17,7 @@ from tests.campaigns.deceit.judge import GUARD_MM, Judge, run
 from tests.campaigns.deceit.kinds import NAMES, make_session
 from tests.campaigns.deceit.scenes import Draw, Session, changed, ordinary
 from tests.campaigns.deceit.world import Renderer, local_places, on_tissue
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 SMALL = 320, 240
 COUNT, SEED = 200, 1

@@ -37,7 +37,7 @@ from hardware.dispenser.messages import PRESETS, DispenserMessages, MessageValue
 from hardware.process.clock import SimClock, WallClock
 from hardware.simulator.dispenser import DispenserModel, VirtualDispenserSettings, run_virtual_dispenser
 from planning.path import Path
-from tests.dispensing import POLL, Bench
+from tests.dispenser_bench import POLL, Bench
 
 MODELLED = ["arduino", "new_era", "gcode_valve"]
 

@@ -16,8 +16,8 @@ from estimation.pose import SurfacePose, TrackState, identity_pose
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
-from tests.slowly import slowly
-from tests.synthetic import Motion, breathing
+from tests.rendered_sets import Motion, breathing
+from tests.slow_cases import slowly
 from tests.test_smoother import broken
 
 RIG = arc_rig()

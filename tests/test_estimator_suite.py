@@ -25,7 +25,7 @@ from estimation.synthetic.world import World, synthetic_world
 from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
 from planning.command import MotionLimits
 from tests.campaigns.estimator import nees, pool_errors
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 TRACKING, DEGRADED, COASTING, LOST = (TrackState.TRACKING, TrackState.DEGRADED, TrackState.COASTING, TrackState.LOST)
 MOVEMENTS = ("still", "breathing", "shaker", "steps", "turns", "sway", "lively")

@@ -30,13 +30,13 @@ from hardware.files.path_file import read_path, write_path
 from hardware.operator.view import MoveRequest
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.board_session import rendered
+from tests.camera_streams import HttpCamera, served
 from tests.documents import commands
 from tests.live_runs import ROOT, Running, asks_to_move
-from tests.moving import raster
-from tests.recorded import whole_recording
+from tests.moving_surfaces import raster
+from tests.recording_samples import whole_recording
+from tests.rendered_sets import write_session
 from tests.shown_commands import MADE, to_run
-from tests.streams import HttpCamera, served
-from tests.synthetic import write_session
 from tests.test_arm_port import serving
 from tests.test_dispenser import served as dispensing
 from tests.test_viewers import columns, rerun

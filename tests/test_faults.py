@@ -51,7 +51,7 @@ from hardware.simulator.world import SimulatedWorld
 from perception.frames import Frame, FrameSet
 from planning.command import Hold
 from tests.session_files import SIZE, make_folder
-from tests.worlds import SMALL, Heard, patch, write_path, write_scenario
+from tests.simulated_worlds import SMALL, Heard, patch, write_path, write_scenario
 
 ROOT = Path(__file__).parents[1]
 WORDS = ("camera0", "arm", "stall", "2s", "at", "for", "seed", "-1", "80%", "2mm", "off", "x")

@@ -35,7 +35,7 @@ from planning.fill.bead import (
 from planning.fill.fill import fill, settle_angle, smooth_corners
 from planning.fill.spiral import order_runs
 from tests.campaigns.fill import random_wound
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 PACE = PrintPace()
 ROUND = region_of(np.stack([9 * np.cos(np.arange(60) * 2 * np.pi / 60), 6 * np.sin(np.arange(60) * 2 * np.pi / 60)], 1))

@@ -25,10 +25,10 @@ from perception.mapping.first_map import FirstMap, build_first_map, in_frame
 from perception.mapping.patches import Pyramid
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
-from tests.linked import linked
-from tests.moving import breathing, pose_at, raster
-from tests.slowly import slowly
-from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, pictures
+from tests.linked_arm import linked
+from tests.moving_surfaces import breathing, pose_at, raster
+from tests.rendered_sets import RADIUS, SCAN_FROM_SURFACE, patch, pictures
+from tests.slow_cases import slowly
 
 Pyramids = dict[int, Pyramid]
 RIG = arc_rig(size=(640, 480), focal=560.0)

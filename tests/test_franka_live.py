@@ -24,10 +24,10 @@ from planning.path import PrintPhase
 from tests import octoprint_bench
 from tests.arm_benches import closing_bench
 from tests.franka_bench import HOST, MISSING, FrankaBench, FrankaServer, installed
-from tests.light_live import HOME, TILT, prepare_files
 from tests.live_runs import CLOCK, PATH, SCENARIO, Running, messages
-from tests.moving import breathing
+from tests.moving_surfaces import breathing
 from tests.octoprint_bench import ROOT, OctoPrintServer
+from tests.pictureless_run import HOME, TILT, prepare_files
 from tests.test_arm_laws import straight
 from tests.test_live_run import confirmed
 
@@ -60,7 +60,7 @@ class Live:
         self.server = serve(folder, home)
 
     def start(self, record: Path, *flags: str) -> Running:
-        program = "tests.light_live", str(self.folder), str(record), *flags
+        program = "tests.pictureless_run", str(self.folder), str(record), *flags
         self.runs.append(Running(self.address, f"--height={HEIGHT}", cache=self.folder, program=program))
         return self.runs[-1]
 

@@ -31,7 +31,7 @@ from tests.campaigns.fuzz_process import (
     read_log,
     run_tasks,
 )
-from tests.deadly import deadly_readers
+from tests.crashing_readers import deadly_readers
 
 READERS = readers()
 

@@ -31,7 +31,7 @@ from hardware.live.recorded_run import replay_run
 from planning.kinematics import axes_from_nozzle, nozzle_from_axes, tool_lean
 from tests import octoprint_bench
 from tests.arm_benches import closing_bench
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.octoprint_bench import GcodeBench, OctoPrintServer, gantry
 from tests.test_arm_laws import straight
 from tests.test_franka_live import Live, nozzle_errors

@@ -29,6 +29,7 @@ from hardware.cli.main import main
 from hardware.operator.view import CheckVerdict
 from hardware.process.clock import SimClock
 from hardware.recording.session_reader import open_session
+from tests.camera_streams import CLOCK, ListedCapture, Shot, picture
 from tests.counterparts import (
     FakeCamera,
     PacketLoss,
@@ -40,7 +41,6 @@ from tests.counterparts import (
     sets_until,
     watch_stamps,
 )
-from tests.streams import CLOCK, ListedCapture, Shot, picture
 from tests.test_camera_names import rig_file
 
 SIZE = (320, 240)

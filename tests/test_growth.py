@@ -29,7 +29,7 @@ from perception.mapping.first_map import FirstMap, build_first_map
 from perception.mapping.growth import NewLandmarks, Probation, SurfaceSnapshot, between_known
 from perception.mapping.patches import Pyramid
 from perception.tracking.step import TrackingStep
-from tests.synthetic import frame_sets, patch, pictures
+from tests.rendered_sets import frame_sets, patch, pictures
 
 RIG = arc_rig(size=(320, 240), focal=560.0)  # 0.7 mm a pixel, 228 mm wide
 LONG = patch(1, (320.0, 60.0), np.inf, Wound((310.0, 56.0)))

@@ -26,7 +26,7 @@ from tests.campaigns.guard import (
     random_log,
     simple_rules,
 )
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 TICK = 1 / 64  # powers of two, so that a limit can be met to the last bit
 ARM = SimpleArm(home=np.zeros(6))

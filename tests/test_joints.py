@@ -35,7 +35,7 @@ from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import PrintPhase
 from tests.campaigns.planner import StreamTally, bench_arm, follow_stream
-from tests.moving import REST, breathing, pose_at, raster
+from tests.moving_surfaces import REST, breathing, pose_at, raster
 
 SEEDS = st.integers(0, 100_000)
 FLIP = np.diag([1.0, -1, -1])  # the nozzle's z points back into the tool, the flange's out of it

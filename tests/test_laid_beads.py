@@ -22,7 +22,7 @@ from planning.laid_beads import (
     stations_of,
 )
 from planning.path import Path
-from tests.moving import path_through
+from tests.moving_surfaces import path_through
 
 AREA, WIDTH, PITCH, LENGTH = 0.64, 1.6, 1.6, 20.0  # mm^2 and mm of the usual layer
 NOISE = 0.03  # mm

@@ -20,7 +20,7 @@ from hardware.live.recorded_run import replay_run
 from hardware.process.faults import fault_from_text, faults_from_texts
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from tests.live_runs import CLOCK, Running, light_runs, messages
-from tests.recorded import events
+from tests.recording_samples import events
 from tests.test_arm_port import serving
 
 Start = Callable[..., Running]

@@ -72,10 +72,10 @@ from hardware.recording.session_reader import open_session, read_poses
 from perception.frames import Frame, FrameSet, Image
 from planning.material import Outlet, SwitchDelay
 from planning.path import fingerprint
-from tests.moving import breathing, pose_at, raster
+from tests.moving_surfaces import breathing, pose_at, raster
 from tests.scans import body, height_field
 from tests.session_files import image, rig
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 THERE = available_cores()
 PROFILE = ArmProfile()

@@ -23,7 +23,6 @@ from planning.kinematics import nozzle_from_axes
 from planning.path import Path as PrintPath
 from planning.placement import path_middle
 from tests.browser import Browser, Page
-from tests.light_live import HOME, prepare_files
 from tests.live_runs import (
     CLOCK,
     Running,
@@ -36,8 +35,9 @@ from tests.live_runs import (
     rests,
     summary,
 )
-from tests.recorded import events
-from tests.slowly import slowly
+from tests.pictureless_run import HOME, prepare_files
+from tests.recording_samples import events
+from tests.slow_cases import slowly
 from tests.test_arm_port import serving
 
 Start = Callable[..., Running]

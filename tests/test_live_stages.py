@@ -50,7 +50,7 @@ from planning.command import Hold
 from planning.material import FlowShares
 from planning.path import LOOK, PrintPhase, PrintProgress, way_lengths
 from planning.placement import PathPlacement, PlacedBy, path_middle
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.session_files import rig
 
 PROFILE = ArmProfile()

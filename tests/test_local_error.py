@@ -24,8 +24,8 @@ from estimation.synthetic.world import arc_rig, observations, project_landmarks,
 from hardware.recording.messages import message_from_pose, pose_from_message
 from hardware.simulator.scene.shape import Deformation
 from planning.motion import guard
-from tests.slowly import slowly
-from tests.synthetic import breathing, still
+from tests.rendered_sets import breathing, still
+from tests.slow_cases import slowly
 
 RIG = arc_rig()
 REACH_PX = 2.5  # of the alignment, as TrackingStep's FINE_REACH_PX

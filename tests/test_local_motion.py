@@ -25,8 +25,8 @@ from estimation.surface_map import SurfaceMap
 from estimation.synthetic.world import arc_rig, observations, patch
 from hardware.simulator.scene.shape import Deformation
 from hardware.simulator.truth import FOLD_SIGMA
-from tests.slowly import slowly
-from tests.synthetic import breathing
+from tests.rendered_sets import breathing
+from tests.slow_cases import slowly
 
 RIG, RATE = arc_rig(), 30.0
 LANDMARKS = patch(120, np.random.default_rng(3)).points

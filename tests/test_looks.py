@@ -69,9 +69,9 @@ from planning.material import AS_PLANNED, FlowShares
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import LOOK, Path, PrintPhase, PrintProgress
-from tests import worlds
-from tests.moving import path_through, pose_at, still
-from tests.slowly import slowly
+from tests import simulated_worlds
+from tests.moving_surfaces import path_through, pose_at, still
+from tests.slow_cases import slowly
 from tests.test_planner import CLOSE, LIMITS
 
 TICK, START = 0.02, 10.0  # s
@@ -190,11 +190,11 @@ def test_a_clogged_needle_holds_its_share_back_and_a_wrong_pump_gives_another_fl
     dispensers.models[0].receive(b"ON 1\n", 0.5)
     instants, needed = np.array([0.1, 1.0, 2.5, 3.5]), np.full(4, 4.0)
     assert dispensers.flow(instants, needed) == pytest.approx([0.0, 4.0, 1.0, 4.0])
-    file = worlds.write_scenario(tmp_path, worlds.IDEAL, {"dispenser": {"given": 1.25}})
+    file = simulated_worlds.write_scenario(tmp_path, simulated_worlds.IDEAL, {"dispenser": {"given": 1.25}})
     scenario = read_scenario(file)
     assert scenario.dispenser is not None and scenario.dispenser.flow_share == 1.25
     for value in (0.0, -1.0, 9.0):
-        file = worlds.write_scenario(tmp_path, worlds.IDEAL, {"dispenser": {"given": value}})
+        file = simulated_worlds.write_scenario(tmp_path, simulated_worlds.IDEAL, {"dispenser": {"given": value}})
         with pytest.raises(InputError, match=r"dispenser\.given"):
             read_scenario(file)
 
@@ -209,13 +209,13 @@ def test_a_clogged_needle_holds_its_share_back_and_a_wrong_pump_gives_another_fl
 )
 def test_a_look_that_makes_no_sense_is_refused(top: dict[str, object], key: str, tmp_path: File) -> None:
     with pytest.raises(InputError, match=key):
-        read_scenario(worlds.write_scenario(tmp_path, worlds.IDEAL, **top))
+        read_scenario(simulated_worlds.write_scenario(tmp_path, simulated_worlds.IDEAL, **top))
 
 
 @pytest.mark.parametrize(("key", "value"), [("aspect", 0.9), ("sag_s", 0.0), ("gloss", 1.5), ("glossy", 1.0)])
 def test_a_gel_that_makes_no_sense_is_refused(key: str, value: float, tmp_path: File) -> None:
     with pytest.raises(InputError, match=f"gel.*{key}"):
-        read_scenario(worlds.write_scenario(tmp_path, worlds.IDEAL, {"gel": {key: value}}))
+        read_scenario(simulated_worlds.write_scenario(tmp_path, simulated_worlds.IDEAL, {"gel": {key: value}}))
 
 
 def some_look(gap: bool = True) -> Look:

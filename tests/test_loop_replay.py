@@ -29,7 +29,7 @@ from planning.command import Move
 from planning.material import FlowShares
 from planning.motion.planner import Planner
 from tests.live_runs import CLOCK, Running, light_runs, messages
-from tests.worlds import Heard, world_of, write_scenario
+from tests.simulated_worlds import Heard, world_of, write_scenario
 
 ROOT = Path(__file__).parents[1]
 BREATHING = [{"kind": "breathing", "amplitude_mm": 4.0, "rate_hz": 0.25}]

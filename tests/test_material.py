@@ -18,8 +18,8 @@ from planning.material import MAX_DELAY, Outlet, Outlets, SwitchDelay, material_
 from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path, PrintPhase, PrintProgress
-from tests.moving import Motion, breathing, path_through, pose_at, raster, still
-from tests.slowly import slowly
+from tests.moving_surfaces import Motion, breathing, path_through, pose_at, raster, still
+from tests.slow_cases import slowly
 
 TICK, LIMITS = 0.02, MotionLimits()
 CLOSE = SimpleArm(home=SimpleArm().home - [0, 0, 62, 0, 0, 0])  # 1 mm above the surface: prints begin at once

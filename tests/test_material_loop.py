@@ -23,10 +23,10 @@ from hardware.process.clock import SimClock
 from hardware.simulator.arm.ports import PortFaults
 from planning.command import Command, Hold, Move
 from planning.material import Outlet, SwitchDelay
-from tests.dispensing import Bench
-from tests.linked import Linked, linked
-from tests.moving import breathing, pose_at, raster
-from tests.slowly import slowly
+from tests.dispenser_bench import Bench
+from tests.linked_arm import Linked, linked
+from tests.moving_surfaces import breathing, pose_at, raster
+from tests.slow_cases import slowly
 
 GEL = DispenserProfile("gel", ("1",), on_dead_time=0.08, on_lag=0.04, off_dead_time=0.08, off_lag=0.04, watchdog=0.1)
 OUTLETS = {"1": Outlet(SwitchDelay(GEL.on_delay, GEL.off_delay))}

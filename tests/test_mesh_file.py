@@ -28,7 +28,7 @@ from hardware.files.mesh_reader import MAX_LINE_BYTES, MAX_MESH_ROWS, STL_HEADER
 from hardware.plan.order import in_mm
 from tests import scans
 from tests.campaigns.fuzz import GLTF_TEXT, OFF_TEXT, PCD_HEADER
-from tests.synthetic import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
+from tests.rendered_sets import RADIUS, SCAN_FROM_SURFACE, patch, scan_of
 
 BALL = scans.ball(30.0, 12)
 KEPT: list[MeshReader] = []  # the process that reads all files of this module

@@ -20,8 +20,8 @@ from planning.command import Hold, MotionLimits, Move, Refusal
 from planning.kinematics import axes_from_nozzle, nozzle_from_axes
 from planning.motion.curve import APPROACH_HEIGHT
 from planning.path import PrintPhase
-from tests.moving import REST, Motion, breathing, pose_at, raster, still
-from tests.slowly import slowly
+from tests.moving_surfaces import REST, Motion, breathing, pose_at, raster, still
+from tests.slow_cases import slowly
 
 
 def test_a_move_is_a_g1_frame_and_a_hold_a_g4_frame() -> None:

@@ -21,7 +21,7 @@ from hardware.motion.step import MotionStep
 from perception.frames import SYRINGE
 from planning.clearance import TissueGuard, envelope_over, tool_body
 from planning.command import Move
-from tests.moving import breathing, pose_at, raster
+from tests.moving_surfaces import breathing, pose_at, raster
 
 body = tool_body(SYRINGE, (), margin=0.0, touch=1.0)
 tissue = TissueGuard(body, envelope_over(np.eye(4), np.array([-40.0, -40]), 1.0, np.full((81, 81), -3.0), 15.0))

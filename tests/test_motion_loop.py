@@ -25,8 +25,8 @@ from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
-from tests.linked import Linked, linked
-from tests.moving import breathing, pose_at, raster
+from tests.linked_arm import Linked, linked
+from tests.moving_surfaces import breathing, pose_at, raster
 from tests.virtual_arm import HOME, arm_fault
 
 ROOT = Path(__file__).parents[1]

@@ -32,7 +32,7 @@ from hardware.simulator.nozzle_error import (
     nozzle_lag,
 )
 from planning.path import Path
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.nozzle_logs import breathing, dry, held, needed, nozzle_log, part, sliding, straight, through, without_target
 
 FEW = settings(max_examples=10)

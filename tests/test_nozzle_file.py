@@ -44,10 +44,10 @@ from hardware.simulator.nozzle_summary import (
 )
 from hardware.simulator.run_folder import NozzleWriter
 from planning.path import Path
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.nozzle_logs import breathing, dry, held, nozzle_log, part, read_nozzle, straight, through, without_target
-from tests.runs import run
 from tests.test_report import text_of_page
+from tests.tracking_runs import run
 
 PATH = raster()
 LINE = planned_line(PATH)

@@ -24,8 +24,8 @@ from hardware.operator.server import page_files
 from hardware.operator.settings import AccessControl, OperatorSettings, check_settings
 from hardware.operator.shared_state import OperatorLink
 from hardware.operator.view import Wish
-from tests.light_live import prepare_files
 from tests.operator_page import Served, served
+from tests.pictureless_run import prepare_files
 
 TOKEN = "a-token-of-sixteen-letters"
 SETTINGS = OperatorSettings(token=TOKEN)

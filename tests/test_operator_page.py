@@ -25,7 +25,7 @@ from hardware.operator.view import (
 )
 from tests.browser import Browser, Page, axe_findings
 from tests.operator_page import LIVE, OFFERED, Run
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 SIZES = [(1024, 768), (768, 1024), *slowly((1440, 900))]  # which is the first, with more room
 SURE = (Wish.START, Wish.RESUME, Wish.LOOK, Wish.LIFT, Wish.HOME, Wish.END)
@@ -46,7 +46,7 @@ def settle(page: Page) -> None:
 
 def test_every_button_asks_for_what_it_says_once_and_those_that_move_the_arm_ask_twice(run: Run) -> None:
     page = run.open()
-    elsewhere = (Wish.MOVE, Wish.OUTLINE)  # they have no button there: test_moving_page.py, test_outline_page.py
+    elsewhere = (Wish.MOVE, Wish.OUTLINE)  # they have no button there: test_path_page.py, test_outline_page.py
     for wish in (wish for wish in Wish if wish not in elsewhere):
         view = run.show(offers=(wish,) if wish is not Wish.STOP else (), stage=RunStage.PAUSED)
         if wish in (Wish.CONFIRM, Wish.START, Wish.RESUME):

@@ -44,7 +44,7 @@ from hardware.report.page import Plot, document, figures_table, legend, line_key
 from planning.command import Hold, HoldReason, RefusalCode
 from tests.browser import Browser, axe_findings
 from tests.operator_page import LIVE, OFFERED, Run, Served
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 ROOT = Path(__file__).parents[1]
 SIZES = [(1440, 900), (1024, 768), (390, 844)]

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.started import ROOT
+from tests.command_processes import ROOT
 
 STARTS = """
 import sys, time
 from hardware.process.system import SPAWN
-from tests import orphaned
+from tests import orphan_processes
 
 if __name__ == "__main__":
     for _ in range(2):
-        process = SPAWN.Process(target=getattr(orphaned, sys.argv[1]), args=(orphaned.SlowToLoad(sys.argv[2]),))
+        process = SPAWN.Process(target=getattr(orphan_processes, sys.argv[1]), args=(orphan_processes.SlowToLoad(sys.argv[2]),))
         process.start()
         print(process.pid, flush=True)
     time.sleep(60)

@@ -28,7 +28,7 @@ from tests.campaigns.outage_run import (
     draw_outage,
 )
 from tests.campaigns.outages import judge_outage, outage_figures, outage_table, scene_jobs
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 from tests.test_estimator import begun, lively, look, run_skewed, stamps, step
 
 RIG = arc_rig(size=(320, 180), focal=280.0)

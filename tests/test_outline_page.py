@@ -16,7 +16,7 @@ from hardware.operator.view import STAGE_OFFERS, PlacementView, RequestAnswer, R
 from tests.browser import Browser, Page
 from tests.operator_page import Served, full_view
 from tests.printed_sheet import SIZE, rig
-from tests.test_moving_page import click, drag
+from tests.test_path_page import click, drag
 
 NAMES = [camera.name for camera in rig().cameras]
 FOUND = np.array([[200.0, 90.0], [290.0, 100.0], [280.0, 170.0], [210.0, 160.0]])  # px

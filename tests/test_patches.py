@@ -36,7 +36,7 @@ from perception.mapping.patches import (
     project_into,
     project_squares,
 )
-from tests.synthetic import LOOK, WIDE, patch, pictures
+from tests.rendered_sets import LOOK, WIDE, patch, pictures
 
 RIG = arc_rig(size=(640, 480), focal=700.0)
 LENSES = Lenses(RIG)

@@ -16,7 +16,7 @@ from estimation.se3 import Array
 from hardware.files.path_file import PATH_HEADER, read_path, write_path
 from planning.motion.curve import curve_through
 from planning.path import LEVER_ARM, Path, check_path, way_lengths
-from tests.moving import path_through, raster
+from tests.moving_surfaces import path_through, raster
 
 HEAD = ",".join(PATH_HEADER)
 GOOD = [f"{x},0,0,0,0,0,5,1,20,0,1" for x in range(3)]

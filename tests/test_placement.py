@@ -26,7 +26,7 @@ from planning.placement import (
     tangent_frame,
 )
 from tests import scans
-from tests.moving import path_through, raster
+from tests.moving_surfaces import path_through, raster
 
 UP = np.array([0.0, 0.0, 1.0])
 SIDE = np.linspace(-60, 60, 33)

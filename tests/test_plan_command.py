@@ -38,8 +38,8 @@ from planning.command import MotionLimits, Move
 from planning.kinematics import SimpleArm
 from planning.motion.planner import Planner
 from tests.browser import Browser, axe_findings
-from tests.moving import pose_at, still
-from tests.wounds import scan_of
+from tests.moving_surfaces import pose_at, still
+from tests.wound_scans import scan_of
 
 SQUARE = "x_mm,y_mm\n0,0\n12,0\n12,8\n0,8\n"
 

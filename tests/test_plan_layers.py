@@ -24,7 +24,7 @@ from planning.layers.repair import repair_mesh
 from planning.layers.slicing import LAYER_MODES, BumpLayer, BumpPassing, LayerMode, Tissue, bumps_in, layer_stack, slabs
 from planning.layers.wound import WoundVolume, find_wound
 from tests.scans import height_field
-from tests.wounds import SKIN, scan_of, sheet, wound_of
+from tests.wound_scans import SKIN, scan_of, sheet, wound_of
 
 
 @given(

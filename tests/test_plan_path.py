@@ -29,8 +29,8 @@ from planning.layers.slicing import LAYER_MODES, LayerMode, Tissue
 from planning.layers.wound import WoundVolume, find_wound
 from planning.motion.retime import run_times
 from planning.path import check_path
-from tests.slowly import slowly
-from tests.wounds import SKIN, scan_of, wound_of
+from tests.slow_cases import slowly
+from tests.wound_scans import SKIN, scan_of, wound_of
 
 BLOB = np.array([[0.0, 0], [20, -3], [31, 6], [24, 17], [15, 12], [4, 18], [-6, 9]])
 

@@ -31,7 +31,7 @@ from planning.layers.plan import Plan, PlanOrder, make_plan, unscanned_beads
 from planning.layers.repair import repair_mesh
 from planning.layers.slicing import Tissue
 from planning.layers.wound import find_wound
-from tests.wounds import scan_of, wound_of
+from tests.wound_scans import scan_of, wound_of
 
 STUB = np.array([[0.0, 0.5], [2.5, 0.5], [3.2, 4.0], [40.0, 4.0]])  # a needle of 2.5 mm on a wide syringe
 LONG = np.array([[0.0, 0.5], [60.0, 0.5], [61.0, 4.0], [90.0, 4.0]])

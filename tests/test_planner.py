@@ -21,8 +21,8 @@ from planning.motion.guard import Guard
 from planning.motion.planner import Planner
 from planning.path import Path, PrintPhase
 from tests.campaigns.planner import StreamTally, bench_arm, follow_stream
-from tests.moving import REST, Motion, breathing, pose_at, raster, still
-from tests.slowly import slowly
+from tests.moving_surfaces import REST, Motion, breathing, pose_at, raster, still
+from tests.slow_cases import slowly
 
 TICK, LIMITS, ARM = 0.02, MotionLimits(), SimpleArm()
 CLOSE = SimpleArm(home=ARM.home - [0, 0, 62, 0, 0, 0])  # 1 mm above the surface, so that prints begin at once

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.pose import Forecast, SurfacePose, TrackState
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 
 def pose(seed: int) -> SurfacePose:

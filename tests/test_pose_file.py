@@ -18,7 +18,7 @@ from hardware.files.folder_tables import read_rows, read_tum, write_rows, write_
 from hardware.files.pose_file import PoseTable, PoseWriter, read_poses
 from hardware.offline.trajectory_files import read_pose_series
 from perception.tracking.step import StepReport
-from tests.runs import run
+from tests.tracking_runs import run
 
 STATES = {3: TrackState.DEGRADED, 4: TrackState.COASTING, 5: TrackState.LOST}
 

@@ -21,8 +21,8 @@ from hardware.simulator.scenario import read_scenario
 from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import PrintProgress
-from tests.moving import breathing, pose_at, raster
-from tests.worlds import Heard, world_of, write_path, write_scenario
+from tests.moving_surfaces import breathing, pose_at, raster
+from tests.simulated_worlds import Heard, world_of, write_path, write_scenario
 
 TICK = ArmProfile().tick
 BREATHING = {"kind": "breathing", "amplitude_mm": 4.0, "rate_hz": 0.25, "turn_deg": [1.0, 0.4, 0.0]}

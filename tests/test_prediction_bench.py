@@ -45,8 +45,8 @@ from tests.campaigns.smoothing import (
     run_smoothing,
     smooth_rendered,
 )
-from tests.slowly import slowly
-from tests.synthetic import write_session
+from tests.rendered_sets import write_session
+from tests.slow_cases import slowly
 from tests.virtual_arm import HOME
 
 SECONDS, WARM = 14.0, 8.0

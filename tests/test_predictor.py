@@ -17,7 +17,7 @@ from estimation import se3
 from estimation.forecast.predictor import ACCEPT_AFTER_S, HORIZONS, InnovationGate, PoseHistory, Predictor
 from estimation.pose import Forecast, SurfacePose, TrackState, body_rate, radius
 from estimation.se3 import Array
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 MOVED = se3.exp(np.array([0.7, -1.1, 0.4, 300.0, -200.0, 500.0]))
 

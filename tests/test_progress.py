@@ -20,7 +20,7 @@ from planning.command import MotionLimits, Move
 from planning.kinematics import SimpleArm
 from planning.motion.planner import Planner
 from planning.path import Path, PrintPhase, fingerprint, progress_mark, resume_fraction
-from tests.moving import breathing, pose_at, raster
+from tests.moving_surfaces import breathing, pose_at, raster
 
 TICK = 0.02
 CLOSE = SimpleArm(home=SimpleArm().home - [0, 0, 61, 0, 0, 0])  # 2 mm above the surface

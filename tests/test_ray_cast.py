@@ -32,8 +32,8 @@ from perception.mapping.scan_map import (
     match_near,
 )
 from tests import scans
-from tests.slowly import slowly
-from tests.synthetic import LOOK, SCAN_FROM_SURFACE, WIDE, pictures
+from tests.rendered_sets import LOOK, SCAN_FROM_SURFACE, WIDE, pictures
+from tests.slow_cases import slowly
 
 seeds = st.integers(0, 2**32 - 1)
 DOWN = se3.make(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 400.0])  # surface_from_camera: straight above, looking down

@@ -20,7 +20,7 @@ from hardware.offline.reach import reach_page
 from hardware.report.page import Plot
 from planning.kinematics import POSTURES, JointModel, nozzle_from_joints
 from planning.path import REACH_REASONS, SurfaceMotion, best_posture, best_spin, reach_at_spin, reach_of
-from tests.moving import path_through, raster
+from tests.moving_surfaces import path_through, raster
 
 ARMS = Path(__file__).parents[1] / "data" / "arms"
 STILL = SurfaceMotion()

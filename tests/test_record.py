@@ -24,10 +24,10 @@ from hardware.live.camera_recording import CameraRecording, RecordOrder, check_o
 from hardware.offline.track import run_track
 from hardware.recording.session_reader import open_session
 from tests.board_session import BOARD, LENSES, small_rig
+from tests.camera_streams import HttpCamera, served
 from tests.live_runs import CLOCK, Running
 from tests.outside_cameras import SETS, outside
 from tests.printed_sheet import FPS, SHEET, SIZE, corners_at, pose_at, rig
-from tests.streams import HttpCamera, served
 
 SECONDS = 5.5
 NAMES = ("camera0", "camera1", "camera2")

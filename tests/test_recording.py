@@ -30,7 +30,7 @@ from hardware.recording.ros_messages import image_from
 from hardware.recording.session_reader import open_session
 from perception.frames import Frame, Roi
 from planning.command import Hold, Move
-from tests.recorded import LOST, events, pose, write_frames
+from tests.recording_samples import LOST, events, pose, write_frames
 from tests.session_files import image, rig, stamps, trajectory
 
 EXACT_STAMPS = st.floats(-1e8, 1e8) | st.floats(1e9, 4e9)

@@ -33,10 +33,10 @@ from hardware.recording.messages import message_from_rig
 from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.session_reader import open_session
 from tests.board_session import BOARD, rendered
-from tests.recorded import whole_recording, write_frames
+from tests.command_processes import ROOT
+from tests.recording_samples import whole_recording, write_frames
 from tests.session_files import image, make_folder, rig, stamps
-from tests.started import ROOT
-from tests.wounds import scan_of
+from tests.wound_scans import scan_of
 
 SQUARE = ROOT / "data" / "paths" / "square_10mm.csv"
 

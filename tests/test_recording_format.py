@@ -31,7 +31,7 @@ from hardware.recording.session_reader import open_session
 from perception.frames import Image, OutlinedPicture, Roi
 from planning.command import Hold, Move
 from planning.path import PrintPhase
-from tests.recorded import LOST, pose, whole_recording, write_frames
+from tests.recording_samples import LOST, pose, whole_recording, write_frames
 from tests.session_files import NAMES, image, rig, stamps, trajectory
 from tests.test_looks import some_look
 

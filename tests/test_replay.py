@@ -27,15 +27,15 @@ from planning.command import Command, Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.path import PrintProgress
 from tests import process_replay, reference_cases
-from tests.moving import breathing, pose_at, poses, raster
-from tests.pinned import ENVIRONMENT, PACKAGES, made_with, run_pinned, unlike
+from tests.moving_surfaces import breathing, pose_at, poses, raster
+from tests.pinned_arithmetic import ENVIRONMENT, PACKAGES, made_with, run_pinned, unlike
 from tests.reference_cases import CASES, FOLDER, Arrays, kept, recorded_tracks, replayed
 from tests.reference_signals import changes, differing
 
 ROOT = Path(__file__).parents[1]
 DIGEST = """
 import hashlib
-from tests.moving import breathing, poses
+from tests.moving_surfaces import breathing, poses
 from tests.test_replay import replayed_print
 
 print(hashlib.sha256(replayed_print(poses(breathing, 10.0))[1]).hexdigest())

@@ -32,7 +32,7 @@ from hardware.report.evaluation import (
 )
 from hardware.report.page import Plot, Scale, round_step, spanning, stretches, thinned
 from hardware.report.report import track_page, write_report
-from tests.runs import run
+from tests.tracking_runs import run
 
 SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.1])
 VOID = {"meta", "path", "rect", "circle", "image", "img"}

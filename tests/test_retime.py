@@ -37,7 +37,7 @@ from tests.campaigns.planner import (
     seconds_to_print,
     zigzag_with_hops,
 )
-from tests.moving import Motion, path_through, pose_at, raster, still
+from tests.moving_surfaces import Motion, path_through, pose_at, raster, still
 
 with left_out("matplotlib", "matplotlib.pyplot"):
     from toppra.algorithm import TOPPRA

@@ -16,8 +16,8 @@ from estimation.pose import SurfacePose, TrackState, radius
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, observations
-from tests.slowly import slowly
-from tests.synthetic import Motion, breathing, still
+from tests.rendered_sets import Motion, breathing, still
+from tests.slow_cases import slowly
 from tests.test_estimator import LANDMARKS, RIG, begun, error, look, step
 
 START = 2.0  # s, when the trick begins

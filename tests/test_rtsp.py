@@ -12,8 +12,8 @@ from hardware.cameras.feed import CameraPlace
 from hardware.cameras.live import LiveCameras
 from hardware.cameras.sources import CameraSource, Identity, SourceKind
 from perception.frames import FrameSet, Image
+from tests.camera_streams import CLOCK
 from tests.counterparts import rtsp_server, sets_until
-from tests.streams import CLOCK
 
 PERIOD = 1 / 25
 MAX_DELAY = 0.15  # s: an encoder's, a decoder's and the network's, which nothing here can tell from the exposure

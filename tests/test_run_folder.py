@@ -31,7 +31,7 @@ from perception.tracking.step import STAGES, StepReport, report_without_offsets
 from planning.command import Command, Hold, Move
 from planning.path import PrintPhase, PrintProgress
 from tests.nozzle_logs import nozzle_log, part, read_nozzle, straight
-from tests.worlds import IDEAL, SMALL, write_scenario
+from tests.simulated_worlds import IDEAL, SMALL, write_scenario
 
 ROIS = tuple(Roi(c, 0.1, np.array([[10.0, 5], [80, 5], [50, 60]])) for c in range(3))
 

@@ -19,7 +19,7 @@ from hardware.process.faults import FaultKind
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scenario_tables import scene_from_table, sensor_from_table
 from hardware.simulator.scene.shape import flat
-from tests.worlds import write_path, write_scenario
+from tests.simulated_worlds import write_path, write_scenario
 
 LOST = {"cameras": {"off": [["cam_9", 1, 2]]}}
 

@@ -41,7 +41,7 @@ from hardware.simulator.scene.shape import (
 )
 from hardware.simulator.truth import Truth
 from perception.frames import Image
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 TEXEL = 0.15  # mm
 PATCH = (72.0, 54.0)  # mm

@@ -31,7 +31,7 @@ from perception.tracking.step import report_without_offsets
 from perception.training.dataset import Labelled, read_dataset
 from perception.wound.network import SHIPPED_MODEL, WoundNetwork, hash_of, read_settings, shipped_model
 from perception.wound.segmentation import NetworkSegmenter, Segmentation, centroid, dice
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.session_files import make_folder
 from tests.test_segmentation import SETTINGS, disc, picture, red_is_wound
 

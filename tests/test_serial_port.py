@@ -23,7 +23,7 @@ from hardware.arm.protocol import FRAME_LENGTH, encode
 from hardware.process.clock import WallClock
 from hardware.simulator.arm.ports import open_pty
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
-from tests.linked import circle, moving
+from tests.linked_arm import circle, moving
 from tests.test_arm_port import serving
 from tests.virtual_arm import HOME
 

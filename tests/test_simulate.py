@@ -32,8 +32,8 @@ from hardware.simulator.scenario import read_scenario
 from hardware.simulator.scene.render import render
 from hardware.simulator.simulate import SimulationOptions, run_simulation
 from tests.nozzle_logs import read_nozzle
+from tests.simulated_worlds import IDEAL, SMALL, write_path, write_scenario
 from tests.test_viewers import placed, read
-from tests.worlds import IDEAL, SMALL, write_path, write_scenario
 
 BREATHING = {"kind": "breathing", "amplitude_mm": 2.0, "rate_hz": 0.4}
 FAULTY = {  # whatever chance may bring

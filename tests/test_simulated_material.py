@@ -29,8 +29,8 @@ from hardware.simulator.truth import divide_path
 from hardware.simulator.world import SimulatedWorld
 from planning.command import Command, Hold, Move
 from planning.material import bead_areas
-from tests import worlds
-from tests.moving import path_through
+from tests import simulated_worlds
+from tests.moving_surfaces import path_through
 from tests.nozzle_logs import nozzle_log, straight
 
 TICK, SPEED, BEAD = 0.02, 10.0, 1.0  # s, mm/s, mm
@@ -42,15 +42,17 @@ PLACES = (-9.0, -4.0, -1.0, 4.0)  # mm: two beads of 5 mm and a gap of 3
 @cache
 def printed(
     dispenser: tuple[tuple[str, object], ...] = (), faults: Sequence[str] = ()
-) -> tuple[SimulatedWorld, worlds.Heard]:
+) -> tuple[SimulatedWorld, simulated_worlds.Heard]:
     """A print of two beads on a surface at rest that nothing delays but the dispenser."""
     with TemporaryDirectory() as name:
         rows = [f"{x},0,0,0,0,0,{SPEED},1,20,0,{i % 2}" for i, x in enumerate(PLACES)]
-        (File(name) / "path.csv").write_text("\n".join([worlds.HEADER, *rows]) + "\n")
-        tables = [worlds.IDEAL, *([{"dispenser": dict(dispenser)}] if dispenser else [])]
+        (File(name) / "path.csv").write_text("\n".join([simulated_worlds.HEADER, *rows]) + "\n")
+        tables = [simulated_worlds.IDEAL, *([{"dispenser": dict(dispenser)}] if dispenser else [])]
         top = {"faults": list(faults)} if faults else {}
-        scenario = read_scenario(worlds.write_scenario(File(name), *tables, seconds=5.0 if faults else 2.6, **top))
-        world = worlds.world_of(scenario, sink := worlds.Heard())
+        scenario = read_scenario(
+            simulated_worlds.write_scenario(File(name), *tables, seconds=5.0 if faults else 2.6, **top)
+        )
+        world = simulated_worlds.world_of(scenario, sink := simulated_worlds.Heard())
     world.run()
     return world, sink
 
@@ -200,13 +202,15 @@ def test_a_table_that_makes_no_sense_is_refused_by_its_key(tmp_path: File, table
     text = '[[dispenser]]\nname = "a"\nmaterials = [1]\npreset = "arm_pwm"\npwm_on = 1\npwm_off = 0\n'
     (tmp_path / "pwm.toml").write_text(text)
     with pytest.raises(InputError, match=key):
-        read_scenario(worlds.write_scenario(tmp_path, worlds.IDEAL, dispenser=table))
+        read_scenario(simulated_worlds.write_scenario(tmp_path, simulated_worlds.IDEAL, dispenser=table))
 
 
 def test_a_file_says_what_the_motion_takes_the_dispenser_for(tmp_path: File) -> None:
     text = '[[dispenser]]\nname = "a"\nmaterials = [1]\npreset = "arduino"\nport = "/dev/x"\non_dead_time_s = 0.03\n'
     (tmp_path / "own.toml").write_text(text + "kept_at_c = 20\n")
-    file = worlds.write_scenario(tmp_path, worlds.IDEAL, dispenser={"on_dead_time_s": 0.1, "file": "own.toml"})
+    file = simulated_worlds.write_scenario(
+        tmp_path, simulated_worlds.IDEAL, dispenser={"on_dead_time_s": 0.1, "file": "own.toml"}
+    )
     scenario = read_scenario(file)
     assert scenario.dispenser is not None and scenario.dispenser.truth.on_dead_time == 0.1
     found = SimulatedDispensers(read_path(scenario.path), scenario.dispenser, SimClock())

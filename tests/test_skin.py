@@ -21,7 +21,7 @@ from planning.layers.repair import repair_mesh
 from planning.layers.skin import bent_base, depressions, restored_skin, skin_cells
 from planning.layers.wound import find_wound
 from tests.campaigns.wounds import LIMBS, CarvedWound, carve, score_wound, tube
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 
 def ring_of(height: object, inner: float, outer: float, noise: float, seed: int = 0) -> Array:

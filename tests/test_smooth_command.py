@@ -39,8 +39,8 @@ from hardware.recording.session_reader import open_session, read_observations, r
 from hardware.report.evaluation import best_constant
 from hardware.simulator.scenario import read_scenario
 from perception.frames import Frame, Image
-from tests.slowly import slowly
-from tests.synthetic import write_session
+from tests.rendered_sets import write_session
+from tests.slow_cases import slowly
 
 ROOT = Path(__file__).parents[1]
 

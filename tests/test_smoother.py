@@ -19,7 +19,7 @@ from estimation.online.window import (
 )
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST
-from tests.synthetic import Motion, breathing
+from tests.rendered_sets import Motion, breathing
 
 NOISE = np.array([2e-3] * 3 + [0.03] * 3)  # rad, mm: what one frame set is worth
 COVARIANCE = np.diag(NOISE**2)

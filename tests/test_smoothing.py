@@ -30,7 +30,7 @@ from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.follow import follow
 from estimation.synthetic.world import World, synthetic_world
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 FEW = 40  # landmarks
 

@@ -16,8 +16,8 @@ from estimation.online.surface_state import Measurement, MotionDetector, PoseSta
 from estimation.pose import MotionState, TrackState
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST
-from tests.slowly import slowly
-from tests.synthetic import breathing
+from tests.rendered_sets import breathing
+from tests.slow_cases import slowly
 
 GOOD = Measurement(("left", "right"), 100, 0.1)
 LIMITS = StateSettings(averaged_poses=1)

@@ -33,8 +33,7 @@ from hardware.recording.session_reader import open_session
 from hardware.simulator.motion_table import Levels, RoundedCorners, Zigzag
 from hardware.simulator.scene.scene import rois
 from perception.mapping.features import grey
-from tests.slowly import slowly
-from tests.synthetic import (
+from tests.rendered_sets import (
     AWAY,
     CLEAN,
     NOISY,
@@ -46,6 +45,7 @@ from tests.synthetic import (
     scan_of,
     write_session,
 )
+from tests.slow_cases import slowly
 
 SMALL = arc_rig(size=(640, 360), focal=700.0)
 TURNED = BASE_FROM_REST @ se3.exp([0.06, -0.08, 0.3, 4.0, -3.0, 6.0])

@@ -28,9 +28,9 @@ from perception.frames import Frame, FrameSet, Roi
 from perception.thesis.camera import Corners, KeyPoints
 from perception.thesis.step import ThesisStep
 from perception.tracking import TRACKING_METHODS
-from tests.slowly import slowly
-from tests.synthetic import WIDE, Motion, frame_sets, patch, write_session
-from tests.worlds import SMALL, write_scenario
+from tests.rendered_sets import WIDE, Motion, frame_sets, patch, write_session
+from tests.simulated_worlds import SMALL, write_scenario
+from tests.slow_cases import slowly
 
 RIG = arc_rig(focal=550.0, size=(640, 360))
 PATCH = patch(radius=np.inf, wound=WIDE)

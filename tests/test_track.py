@@ -24,11 +24,11 @@ from hardware.files.session import FrameRef
 from hardware.offline.convert import TrackRecorder
 from hardware.recording.session_reader import open_session
 from hardware.recording.session_reader import read_poses as read_recorded_poses
-from tests.recorded import events
-from tests.runs import Replayed
+from tests.command_processes import started
+from tests.recording_samples import events
+from tests.rendered_sets import still, write_session
 from tests.session_files import change
-from tests.started import started
-from tests.synthetic import still, write_session
+from tests.tracking_runs import Replayed
 
 SMALL = arc_rig(size=(640, 360), focal=700.0)
 

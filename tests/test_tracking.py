@@ -20,8 +20,8 @@ from hardware.simulator.scene.scene import Scene, rois
 from perception.frames import Frame, FrameSet, Image, Roi
 from perception.mapping.features import grey
 from perception.tracking.step import STAGES, TrackingStep
-from tests.slowly import slowly
-from tests.synthetic import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures
+from tests.rendered_sets import AWAY, CLEAN, Motion, breathing, frame_sets, patch, pictures
+from tests.slow_cases import slowly
 
 RIG = arc_rig(size=(640, 480), focal=560.0)
 SCENE = patch(0)

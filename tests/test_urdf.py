@@ -17,7 +17,7 @@ from hardware.offline.reach import ReachQuestion, run_reach
 from hardware.recording.loop_record import recorded_arm
 from planning.urdf import UrdfKinematics
 from tests.franka_bench import fr3
-from tests.moving import raster
+from tests.moving_surfaces import raster
 
 ROOT = Path(__file__).parents[1]
 FR3 = ROOT / "data/arms/fr3.toml"

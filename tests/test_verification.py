@@ -27,7 +27,7 @@ from perception.mapping.masks import TrackingMasks
 from perception.mapping.matcher import Matcher
 from perception.mapping.patches import Pyramid, cut_templates
 from perception.mapping.verification import MAX_TISSUE_SPEED, Verification, _grain_left
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 SIDE_MM, TEXEL_MM = 160.0, 0.2
 TEXELS = int(SIDE_MM / TEXEL_MM)

@@ -34,10 +34,10 @@ from hardware.report.evaluation import calibration_words
 from perception.frames import Frame
 from planning.command import Hold, Move
 from tests.browser import Browser, axe_findings
-from tests.moving import raster
-from tests.recorded import pose, whole_recording
-from tests.runs import breathing
+from tests.moving_surfaces import raster
+from tests.recording_samples import pose, whole_recording
 from tests.session_files import image, make_folder, rig
+from tests.tracking_runs import breathing
 
 COUNT = 24
 

@@ -28,7 +28,7 @@ from hardware.recording import ros_messages
 from hardware.recording.recorder import Recorder
 from hardware.recording.session_reader import open_session
 from perception.frames import PrintHead
-from tests.recorded import write_frames
+from tests.recording_samples import write_frames
 from tests.session_files import NAMES, rig, trajectory
 
 ROOT = Path(__file__).parents[1]

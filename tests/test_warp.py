@@ -20,8 +20,8 @@ from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap, Warp
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig, observations, patch
 from hardware.simulator.scene.shape import Deformation
-from tests.slowly import slowly
-from tests.synthetic import Motion, breathing, still
+from tests.rendered_sets import Motion, breathing, still
+from tests.slow_cases import slowly
 
 RIG = arc_rig()
 LANDMARKS = patch(100, np.random.default_rng(3)).points

@@ -21,8 +21,8 @@ from hardware.simulator.scene.shape import Deformation
 from hardware.simulator.world import FINISH_TAIL
 from planning.command import TICK_FRACTION
 from planning.path import PrintPhase, PrintProgress
-from tests.slowly import slowly
-from tests.worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
+from tests.simulated_worlds import HEADER, IDEAL, Heard, errors, heard, inner, world_of, write_path, write_scenario
+from tests.slow_cases import slowly
 
 VELOCITY = np.array([3.0, -2.0, 4.0])  # mm/s of the surface, in the rest frame
 SPEED = 5.0  # mm/s along the path, which is x

@@ -40,7 +40,7 @@ from perception.tracking.wound_area import (
 from perception.training.dataset import Labelled
 from perception.wound.network import WoundNetwork, shipped_model
 from perception.wound.segmentation import NetworkSegmenter, Segmentation, WoundBand, WoundMask
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 from tests.test_segmentation import SETTINGS, disc, picture, red_is_wound
 
 RIG = arc_rig(distortion=(0.0,) * 5)

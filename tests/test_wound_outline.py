@@ -26,7 +26,7 @@ from perception.mapping.features import polygon_mask
 from perception.tracking.wound_step import SEGMENTATION_DELAY_SETS, RegionSearch
 from perception.wound.segmentation import Segmentation, dice, largest_part
 from tests import printed_sheet as sheet
-from tests.recorded import write_frames
+from tests.recording_samples import write_frames
 from tests.session_files import NAMES, image, rig
 from tests.test_recording_format import foreign
 

@@ -25,12 +25,12 @@ from hardware.live.prerender import prerender
 from hardware.live.view import Console
 from hardware.recording.recorder import Recorder
 from tests.board_session import BOARD
-from tests.light_live import prepare_files
-from tests.recorded import write_frames
+from tests.command_processes import ROOT
+from tests.pictureless_run import prepare_files
+from tests.recording_samples import write_frames
 from tests.session_files import rig
-from tests.slowly import slowly
-from tests.started import ROOT
-from tests.wounds import scan_of
+from tests.slow_cases import slowly
+from tests.wound_scans import scan_of
 
 WRONG = """
 track missing -o OUT
@@ -430,7 +430,7 @@ def test_a_live_run_needs_no_standard_input(tmp_path: Path) -> None:
     prepare_files(tmp_path, lines=2, speed=10.0)
     """And a session that is over once all is printed is enough."""
     files = str(tmp_path), str(tmp_path / "x.mcap")
-    done = without((0,), "-m", "tests.light_live", *files, "--yes", "--until-printed")
+    done = without((0,), "-m", "tests.pictureless_run", *files, "--yes", "--until-printed")
     assert done.returncode == 0 and "done: the path is printed" in done.stderr
     assert "--resume" not in done.stderr and "Traceback" not in done.stderr
 

@@ -28,7 +28,7 @@ from tests.test_arm_calibration import touched, touched_file
 from tests.test_mesh_file import write as write_mesh
 from tests.test_training_data import labelled
 from tests.test_training_data import write as write_labelled
-from tests.wounds import scan_of
+from tests.wound_scans import scan_of
 
 CLOCK = WallClock()
 SECONDS = 6.0  # the faults that the documents name begin before

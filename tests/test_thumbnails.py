@@ -27,7 +27,7 @@ from perception.frames import Roi
 from planning.command import Move
 from planning.kinematics import axes_from_nozzle
 from planning.path import PrintPhase, PrintProgress
-from tests.moving import breathing, pose_at, raster
+from tests.moving_surfaces import breathing, pose_at, raster
 
 
 def shot(width: int = 1280, height: int = 720) -> CameraShot:

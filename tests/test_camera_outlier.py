@@ -15,8 +15,8 @@ from estimation.online.fit import motion_sigmas
 from estimation.rig import Rig
 from estimation.se3 import Array
 from estimation.synthetic.world import observations
-from tests.slowly import slowly
-from tests.synthetic import breathing
+from tests.rendered_sets import breathing
+from tests.slow_cases import slowly
 from tests.test_estimator import LANDMARKS, RIG, begun, follow, joined, look
 
 SECONDS, NEXT = 2.0, 2.0 + 1 / 30

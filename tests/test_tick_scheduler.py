@@ -28,7 +28,7 @@ from hardware.process.clock import (
     tick_in_step,
 )
 from hardware.process.system import SharedLatest
-from tests.moving import breathing, pose_at
+from tests.moving_surfaces import breathing, pose_at
 
 LOOK = 0.002  # s between looks of the loop
 

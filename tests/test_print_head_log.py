@@ -18,9 +18,9 @@ from hardware.recording.recorder import MAX_CHUNK_SECONDS, Recorder
 from hardware.recording.session_reader import open_session
 from hardware.recording.session_reader import read_heads as recorded_heads
 from perception.frames import PrintHead
-from tests.recorded import write_frames
-from tests.runs import Replayed
+from tests.recording_samples import write_frames
 from tests.session_files import make_folder, rig, stamps
+from tests.tracking_runs import Replayed
 
 HEADER = ",".join(HEAD_COLUMNS)
 

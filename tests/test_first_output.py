@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from hardware.process.progress import FIRST_WORD_DELAY, FirstWord
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 ROOT = Path(__file__).parents[1]
 BOUND = 4.0  # s: 0.8 were seen beside five busy processes, where it were 3 to 12 before

@@ -1,4 +1,4 @@
-"""A live run for tests that needs no pictures: `python -m tests.light_live FOLDER RECORD [FLAG ...]`."""
+"""A live run for tests that needs no pictures: `python -m tests.pictureless_run FOLDER RECORD [FLAG ...]`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def prepare_files(folder: Path, lines: int = 40, speed: float = 5.0) -> None:
     from hardware.arm.profile import ArmProfile
     from hardware.files.arm_file import write_arm
     from hardware.files.path_file import write_path
-    from tests.moving import raster
+    from tests.moving_surfaces import raster
 
     (folder / "rig.toml").write_text("".join(RIG.format(name=name, x=x) for name, x in (("a", 0), ("b", 100))))
     write_path(folder / "path.csv", raster(lines=lines, speed=speed))
@@ -62,7 +62,7 @@ def track_nothing(
     from hardware.process.clock import WallClock
     from hardware.process.system import pipe_closed, set_up_process
     from planning.placement import PathPlacement, PlacedBy
-    from tests.moving import breathing, pose_at
+    from tests.moving_surfaces import breathing, pose_at
 
     set_up_process("tracking")
     if deaf:
@@ -158,6 +158,6 @@ def main(folder: Path, record: Path, *flags: str) -> int:
 
 
 if __name__ == "__main__":
-    import tests.light_live as itself  # its processes import it by this name
+    import tests.pictureless_run as itself  # its processes import it by this name
 
     sys.exit(itself.main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:]))

@@ -21,7 +21,7 @@ from perception.frames import Frame, FrameSet
 from tests.board_session import BOARD, LENSES, RATE, rendered, small_rig
 from tests.boards import motion
 from tests.browser import Browser, Page
-from tests.started import spoken, started
+from tests.command_processes import spoken, started
 
 CLOCK = WallClock()
 SIZE = (640, 480)

@@ -23,7 +23,7 @@ from hardware.simulator.truth import Truth, TruthLog, row_instants
 from planning.command import Command, Hold, Move
 from planning.material import FlowShares
 from planning.path import Path, PrintPhase, PrintProgress
-from tests.moving import path_through
+from tests.moving_surfaces import path_through
 
 TICK, LAG = 0.02, 0.03
 ARM = placed(ArmProfile(), BASE_FROM_REST).arm

@@ -29,7 +29,7 @@ from hardware.simulator.truth import (
     truth_from_estimate,
 )
 from planning.path import check_path, way_lengths
-from tests.moving import path_through, raster
+from tests.moving_surfaces import path_through, raster
 
 RIG = arc_rig()
 RAMP = {"kind": "ramp", "speed_mm_s": [5.0, -3.0, 8.0], "speed_deg_s": [3.0, 2.0, -4.0]}

@@ -25,8 +25,8 @@ from perception.mapping.first_map import FirstMap, build_first_map
 from perception.mapping.matcher import Matcher
 from perception.mapping.patches import Pyramid
 from perception.tracking.reobservation import KnownMotion, ReferencePictures, Reobserver
-from tests.slowly import slowly
-from tests.synthetic import AWAY, WIDE, frame_sets, patch, pictures
+from tests.rendered_sets import AWAY, WIDE, frame_sets, patch, pictures
+from tests.slow_cases import slowly
 
 RIG = arc_rig()
 SCENE = patch(1, wound=WIDE)

@@ -16,9 +16,9 @@ from hardware.operator.shared_state import CameraPicture, OperatorRequest, PageP
 from hardware.operator.view import STAGE_OFFERS, PlacementView, RequestAnswer, RunStage, Wish
 from planning.placement import PathPlacement, PlacedBy, SurfaceMove, moved_along, tangent_of
 from tests.browser import Browser, Page
-from tests.moving import raster
+from tests.moving_surfaces import raster
 from tests.operator_page import Served, full_view
-from tests.slowly import slowly
+from tests.slow_cases import slowly
 
 SIZE = (640, 360)
 PLACE = se3.make(np.diag([1.0, -1.0, -1.0]) @ se3.exp_rotation([0.5, 0.2, 0.3]), [60.0, 160.0, 280.0])  # seen aslant
