@@ -45,6 +45,15 @@ def test_a_rig_is_watched_by_name_and_refused_controls_told(tmp_path: Path, caps
     assert "c0 did not take gain not there, asked for 3" in told
 
 
+def test_a_sheet_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Above all where it is the picture that is looked at."""
+    shown = tmp_path / "wound.png"
+    cv2.imwrite(str(shown), picture(1))
+    before = shown.read_bytes()
+    assert main(["cameras", str(shown), "--seconds", "0.1", "-o", str(shown)]) == 2
+    assert shown.read_bytes() == before and "--force" in capsys.readouterr().err
+
+
 def test_no_cameras_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     if not list_devices():
         assert main(["cameras"]) == 0 and "plug one in" in capsys.readouterr().out

@@ -190,6 +190,36 @@ def test_a_path_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.Captu
     assert len(read_path(out)) > 2
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--unit", "cm"),
+        ("--flip", None),
+        ("--outline", "contour.csv"),
+        ("--clicks", "0,0,0/1,0,0/1,1,0"),
+        ("--wound", "2"),
+    ],
+)
+@pytest.mark.parametrize("example", [True, False])
+def test_an_option_of_a_scan_is_refused_where_there_is_none(
+    option: str, value: str | None, example: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = contour(tmp_path)
+    subject = ["--example", "forearm"] if example else [str(drawn)]
+    words = [option] if value is None else [option, str(drawn) if value.endswith(".csv") else value]
+    assert main(["plan", *subject, *words, "-o", str(tmp_path / "path.csv")]) == 2
+    assert f"{option} = " in capsys.readouterr().err and not (tmp_path / "path.csv").exists()
+
+
+@pytest.mark.parametrize("name", ["path.csv", "path_layers.csv", "path.json"])
+def test_no_file_of_a_plan_is_written_over_by_its_g_code(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["plan", str(contour(tmp_path)), "--gcode", str(tmp_path / name), "-o", str(tmp_path / "path.csv")]
+    assert main(command) == 2
+    assert "--gcode = " in capsys.readouterr().err
+
+
 def test_nothing_of_an_earlier_plan_stays_beside_a_path(tmp_path: Path) -> None:
     """A path with the scan of another plan would be kept off tissue that is not there."""
     scan, out = tmp_path / "scan.ply", tmp_path / "of.monday.csv"

@@ -174,8 +174,9 @@ def test_the_commands_say_where_the_tool_has_no_room(tmp_path: Path, capsys: pyt
 def sine(folder: Path, amplitude: float) -> Path:
     stamps = np.arange(0, 20, 0.05)
     rows = [f"{t:.3f} 10 20 {300 + amplitude * np.sin(1.5 * t):.6f} 0 0 0 1" for t in stamps]
-    (folder / "breath.tum").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return folder / "breath.tum"
+    file = folder / f"breath_{amplitude:g}.tum"
+    file.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return file
 
 
 def test_the_margin_is_by_the_motion_that_is_given_or_measured(tmp_path: Path) -> None:
@@ -193,6 +194,7 @@ def test_the_margin_is_by_the_motion_that_is_given_or_measured(tmp_path: Path) -
         (replace(request, arm=None), "--motion"),
         (replace(told, motion=motion), "--motion"),
         (replace(request, motion=str(sine(tmp_path, 6e5))), "of tissue, not of a camera"),
+        (replace(request, motion=str(sine(tmp_path, 0.006))), "in mm, not m"),
     ):
         with pytest.raises(InputError, match=words):
             tool_of(wrong)

@@ -115,6 +115,25 @@ def test_the_command_marks_the_path_and_what_can_be_printed(tmp_path: Path, caps
     assert "<svg" in (tmp_path / "bad" / "reach.html").read_text()
 
 
+def test_the_path_that_is_read_is_not_overwritten_and_no_earlier_answer_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = tmp_path / "path.csv"
+    write_path(mine, raster())
+    before = mine.read_bytes()
+    command = ["reach", str(mine), "--arm", str(ARMS / "s6h4d.toml"), "--force", "-o"]
+    assert main([*command, str(tmp_path)]) == 2
+    assert mine.read_bytes() == before and "would be overwritten" in capsys.readouterr().err
+    assert main([*command, str(tmp_path / "out")]) == 0
+    monkeypatch.setattr("hardware.offline.reach.run_times", interrupted)
+    assert main([*command, str(tmp_path / "out")]) == 130
+    assert not list((tmp_path / "out").iterdir())
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_a_dense_path_is_drawn_as_the_curve_that_it_is() -> None:
     turn = np.linspace(0.0, 2 * np.pi * 20, 50_000)
     x, y = (1 + turn / 100) * np.cos(turn), (1 + turn / 100) * np.sin(turn)

@@ -140,6 +140,17 @@ def scaled(by: float) -> Callable[[Path], None]:
     return act
 
 
+def other_clock(by: float, *cameras: str, shift: float = 0.0) -> Callable[[Path], None]:
+    """The same stamps of these cameras in another unit, or from another zero."""
+
+    def act(folder: Path) -> None:
+        rows = [line.split(",") for line in (folder / "frames.csv").read_text().split()]
+        lines = [[c, n, repr(by * float(s) + shift)] if c in cameras else [c, n, s] for c, n, s in rows]
+        (folder / "frames.csv").write_text("\n".join(map(",".join, lines)))
+
+    return act
+
+
 def second_scan(folder: Path) -> None:
     (folder / "surface.stl").write_bytes(b"solid\n")
 
@@ -159,6 +170,9 @@ FAULTS: list[tuple[str, Callable[[Path], None], str, str, str]] = [
     ("stamp back", in_frames(row("left", 3), "left,3,-5.0\n"), "frames.csv", "stamp_s of frame 3", "-5.0"),
     ("stamp equal", in_frames(row("left", 3), f"left,3,{stamps(6)[2]!r}\n"), "frames.csv", "of frame 3", "later than"),
     ("frame twice", in_frames(row("left", 3), row("left", 2)), "frames.csv", "line 5", "left,2"),
+    ("stamps in ms", other_clock(1e3, "left", "top"), "frames.csv", "'left': stamp_s", "seconds, not ms or ns"),
+    ("stamps in ns", other_clock(1e9, "left", "top"), "frames.csv", "'left': stamp_s", "seconds, not ms or ns"),
+    ("two zeros", other_clock(1, "left", shift=1.7e9), "frames.csv", "'left': stamp_s", "one clock for all cameras"),
     ("stamp nan", in_frames(row("left", 3), "left,3,nan\n"), "frames.csv", "line 5: stamp_s", "nan"),
     ("stamp inf", in_frames(row("left", 3), "left,3,inf\n"), "frames.csv", "line 5: stamp_s", "inf"),
     ("stamp no number", in_frames(row("left", 3), "left,3,soon\n"), "frames.csv", "stamp_s", "soon"),

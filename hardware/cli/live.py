@@ -329,6 +329,7 @@ def add_cameras(commands: Commands) -> None:
     add("which", nargs="*", metavar="DEVICE_OR_URL_OR_RIG.toml", help="cameras to watch; none: list")
     add("--seconds", type=float, default=5.0, metavar="S", help="to watch; default 5")
     add("-o", "--out", type=Path, metavar="SHEET.jpg", help="write their last pictures on one sheet")
+    add("--force", action="store_true", help="overwrite the sheet")
     add("--json", action="store_true", help="print JSON")
 
 
@@ -339,11 +340,8 @@ def _run_cameras(a: argparse.Namespace) -> int:
     if a.which:
         return _watch_cameras(a)
     devices, industrial = list_devices(), list_industrial()
-    if a.json:
-        print(json_text(_cameras_table(devices, industrial or ())))
-        return 0
-    print(list_text(devices, industrial or ()))
-    if industrial is None:
+    print(json_text(_cameras_table(devices, industrial or ())) if a.json else list_text(devices, industrial or ()))
+    if industrial is None and not a.json:
         print(f"\n{NO_ARAVIS_TEXT}\n  {INSTALL}")
     return 0
 
@@ -387,14 +385,16 @@ def _watch_cameras(a: argparse.Namespace) -> int:
         raise wrong_option("--seconds", a.seconds, "0 < seconds <= 3600")
     if a.out is not None and a.out.suffix.lower() not in (".jpg", ".jpeg", ".png"):
         raise wrong_option("--out", a.out, "a file that ends in .jpg or .png")
+    if a.out is not None:
+        check_new(a.out, a.force)
     rig, sources = sources_named(a.which)
     clock = WallClock()
     with LiveCameras(places_without_rig(len(a.which)) if rig is None else rig, sources, clock) as live:
         inspection = inspect(live, a.seconds, clock)
     print(json_text(inspection_table(inspection)) if a.json else inspection_text(inspection))
     if a.out is not None:
-        jpeg = None if a.out.suffix.lower() == ".png" else SHEET_JPEG_QUALITY
-        a.out.write_bytes(encode(inspection_sheet(inspection), jpeg)[1])
+        sheet = encode(inspection_sheet(inspection), None if a.out.suffix.lower() == ".png" else SHEET_JPEG_QUALITY)[1]
+        a.out.write_bytes(sheet)
         if not a.json:
             print(f"\ntheir last pictures are in {a.out}")
     return FAILED if inspection.faulty else 0

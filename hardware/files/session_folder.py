@@ -6,15 +6,19 @@ or .obj, recorded.toml (when it was recorded).
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from estimation.errors import InputError
 from estimation.pose import Trajectory
-from estimation.rig import Camera
+from estimation.rig import Camera, Rig
+from estimation.se3 import Array
 from hardware.files.folder_tables import read_frames, read_heads, read_recorded, read_roi, read_tum
 from hardware.files.images import Video, check_size, count_by_decoding, decode
 from hardware.files.rig_file import ImageSource, RigFile, read_rig, surface_of_folder
@@ -22,6 +26,8 @@ from hardware.files.session import NO_PRINT_HEADS, FrameRef, Session, common_sta
 from hardware.process import checks
 from perception.frames import Image
 
+MAX_FRAME_STEP = 10.0  # s, median of a camera's frames: 100 fps in ms, and less in anything finer, are above
+MAX_APART = 60.0  # s between the pictures of two cameras that never overlap: one has another zero, as an epoch has
 TRUTH_FILES = (("truth.tum", True), ("reference.tum", False))  # the first that is there counts
 
 
@@ -84,10 +90,12 @@ def open_folder(folder: Path, rig_file: RigFile | None = None) -> Session:
 
     rig_file: instead of what its rig.toml says, where that is not calibrated yet.
     """
+    still = rig_file is not None  # pictures to calibrate by, which may be minutes apart
     rig_file = read_rig(folder / "rig.toml") if rig_file is None else rig_file
     rig = rig_file.rig
     cameras = tuple(_files(folder, c, s) for c, s in zip(rig.cameras, rig_file.sources, strict=True))
     stamps = read_frames(folder / "frames.csv", rig)
+    _check_clocks(folder / "frames.csv", rig, stamps, math.inf if still else MAX_FRAME_STEP)
     for files, times in zip(cameras, stamps, strict=True):
         _check_count(folder / "frames.csv", files, len(times))
         _check_first_image(files)
@@ -144,6 +152,22 @@ def _check_count(frames_csv: Path, files: CameraFiles, expected: int) -> None:
     if there != expected:
         key = f"number of frames of camera {files.camera.name!r}"
         raise InputError(frames_csv, key, expected, f"{there}, as many as there are {what}")
+
+
+def _check_clocks(frames_csv: Path, rig: Rig, stamps: Sequence[Array], max_step: float) -> None:
+    """InputError where stamps (N,) of the cameras are no seconds, or those of two cameras have no common zero."""
+    common = [(c.name, s) for c, s in zip(rig.cameras, common_stamps(rig, stamps), strict=True) if len(s)]
+    for name, times in common:
+        step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        if step > max_step:
+            got, allowed = f"{step:g} s between frames", f"{max_step:g} s or less: seconds, not ms or ns"
+            raise InputError(frames_csv, f"camera {name!r}: stamp_s", got, allowed)
+    first, ended = min(common, key=lambda one: one[1][-1])
+    late, times = max(common, key=lambda one: one[1][0])
+    if times[0] - ended[-1] > MAX_APART:
+        got = f"from {times[0]:.10g} s on, when those of {first!r} ended at {ended[-1]:.10g} s"
+        allowed = "one clock for all cameras, or clock_offset_s in rig.toml"
+        raise InputError(frames_csv, f"camera {late!r}: stamp_s", got, allowed)
 
 
 def _check_first_image(files: CameraFiles) -> None:

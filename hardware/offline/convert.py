@@ -62,7 +62,7 @@ def import_folder(
     if not folder.is_dir():
         raise InputError(folder, "session", "no such folder", "a session folder (with rig.toml)")
     if target.is_dir() or (target.exists() and not overwrite):
-        raise InputError(target, "recording", "exists already", "a new file, or leave to overwrite")
+        raise InputError(target, "recording", "exists already", "a new file, or --force")
     if jpeg_quality is not None and not 0 <= jpeg_quality <= 100:
         raise InputError(target, "jpeg quality", jpeg_quality, "0 .. 100")
     session = open_session(folder)

@@ -17,7 +17,7 @@ from hardware.files.arm_file import read_arm, tool_body_of
 from hardware.files.mesh_file import read_mesh
 from hardware.files.path_file import read_path, write_path
 from hardware.process.clock import WallClock
-from hardware.process.progress import Progress, duration_text, prepare_out
+from hardware.process.progress import Progress, check_apart, duration_text, prepare_out
 from hardware.report.page import (
     MAX_LINE_POINTS,
     Plot,
@@ -52,8 +52,8 @@ from planning.path import (
 from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
 
 PAGE_WIDTH_PX = 900
+WRITTEN = "path.csv", "reach.csv", "reach.html"
 PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS, TRUTH_CLASS = "estimate", "off", "aside", "truth"  # of report.css
-
 
 REMEDIES = {  # by REACH_REASONS
     "too far": "bring the surface nearer to the arm (--surface), or allow it more room (limits in the arm file)",
@@ -192,7 +192,10 @@ def run_reach(
     """Whether an arm can print a path, given their files; writes path.csv, reach.csv and reach.html into `out`."""
     checkpoints = read_path(path)
     if out is not None:
+        check_apart("--out", out / WRITTEN[0], path)
         prepare_out(out, force)
+        for stale in WRITTEN:  # an earlier run's, which nobody is to take for this one's
+            (out / stale).unlink(missing_ok=True)
     with Progress("reach", "steps", WallClock().now) as progress:
         progress.note = "joints and speeds of each checkpoint, wherever the surface moves to"
         progress(0, 4)

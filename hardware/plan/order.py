@@ -250,6 +250,7 @@ def in_mm(vertices: Array, triangles: Index, unit: str, where: object) -> Array:
     raise InputError(where, "size of the scan", f"{size:.4g} mm along its longest side, read as {unit}", allowed)
 
 
+MIN_AMPLITUDE = 0.1  # mm of a motion that is measured: breathing of up to 100 mm, in metres, is below
 AMPLITUDE_SHARE = 99.0  # % of the time in which the tissue is within its amplitude: a lost pose is none of it
 
 
@@ -283,6 +284,9 @@ def measured_amplitude(motion: str) -> float:
     amplitude, most = float(np.percentile(off, AMPLITUDE_SHARE)), max(row[2] for row in SETTING_RANGES[-1:])
     if not amplitude <= most:
         raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", f"{most:g} mm or less: of tissue, not of a camera")
+    if amplitude < MIN_AMPLITUDE:
+        allowed = f"{MIN_AMPLITUDE:g} mm or more; places are in mm, not m; of tissue at rest: --amplitude-mm 0"
+        raise InputError(motion, "amplitude", f"{amplitude:.2g} mm", allowed)
     return amplitude
 
 
@@ -314,17 +318,19 @@ def check_out(request: PlanRequest) -> None:
 
     InputError as well where the scan or the outline would be overwritten.
     """
-    out, gcode, force = request.out, request.gcode, request.force
+    out, gcode = request.out, request.gcode
     if out.suffix.lower() != ".csv":
         raise InputError(COMMAND_LINE, "--out", out, "a file that ends in .csv")
     written = [out, *([gcode] if gcode else [])]
     for read in filter(None, (request.scan, request.outline)):
         for file in (*written, *PlanFiles(out).companions):
             check_apart("--out", file, read)
-    for file in written:
-        if file.is_dir() or (file.exists() and not force):
+    if gcode in (out, *PlanFiles(out).companions):
+        raise InputError(COMMAND_LINE, "--gcode", gcode, "another file than those of the plan")
+    for option, file in zip(("--out", "--gcode"), written, strict=False):
+        if file.is_dir() or (file.exists() and not request.force):
             got = "a folder" if file.is_dir() else "a file that exists"
-            raise InputError(file, "--out", got, "a new one, or --force")
+            raise InputError(file, option, got, "a new one, or --force")
         file.parent.mkdir(parents=True, exist_ok=True)
 
 

@@ -83,6 +83,8 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     from hardware.recording.session_reader import open_session
 
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
+    if flat or request.example is not None:
+        _check_scan_options(request)
     order = replace(order_of(request.settings, flat), tool=tool_of(request))
     if request.arm is not None:
         read_jointed_arm(request.arm)  # what is wrong with it is told before the long work
@@ -115,6 +117,17 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     if request.session is not None:
         placed = placement_lines(*scan_placement(request.session, PlanFiles(request.out).scan, plan.wound.rim))
     return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed]), damage
+
+
+def _check_scan_options(request: PlanRequest) -> None:
+    """InputError where an option says how to read a scan and there is none: a contour, or a built-in example."""
+    given = {
+        "--unit": request.unit if request.unit != "mm" else None, "--flip": True if request.flip else None,
+        "--outline": request.outline, "--clicks": request.clicks, "--wound": request.wound,
+    }  # fmt: skip
+    for option, value in given.items():
+        if value is not None:
+            raise InputError("command line", option, value, "only with the scan of a wound, a mesh or points")
 
 
 def _tables(

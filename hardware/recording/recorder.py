@@ -117,8 +117,7 @@ class Recorder:
         try:
             self._file = open(self.path, "wb" if overwrite else "xb")  # noqa: SIM115  (closed in `close`)
         except FileExistsError:
-            allowed = "a new file, or leave to overwrite"
-            raise InputError(self.path, "recording", "a file that exists", allowed) from None
+            raise InputError(self.path, "recording", "a file that exists", "a new file, or --force") from None
         except OSError as error:
             raise StillbedError(f"{self.path}: cannot write: {error}") from error
         self._writer = McapWriter(self._file, MAX_CHUNK_BYTES, compress)
