@@ -33,6 +33,7 @@ from hardware.plan.order import (
     subject_of,
 )
 from hardware.plan.run import MAX_MIDDLE_DISTANCE, WoundSighting, _sighting, placement_lines
+from hardware.report.page import document, figures_table, section
 from perception.lens import Lenses
 from planning.command import MotionLimits, Move
 from planning.kinematics import SimpleArm
@@ -119,6 +120,19 @@ def test_axe_finds_nothing_serious_in_a_plan_or_in_what_an_arm_can_reach(browser
         page.until("document.readyState === 'complete' && Boolean(document.querySelector('footer'))")
         assert axe_findings(page) == [], file
         page.close()
+
+
+def test_no_table_widens_a_page_beyond_a_phone(browser: Browser, tmp_path: Path) -> None:
+    file, words = tmp_path / "wide.html", [f"measured {i}" for i in range(11)]
+    text = document("report", "wide", "", [section("wide", "", figures_table(words, [words]))], "")
+    file.write_text(text, encoding="utf-8")
+    page = browser.page("about:blank", (390, 844))
+    page.go(file.as_uri())
+    page.until("Boolean(document.querySelector('footer'))")
+    assert page.js("document.documentElement.scrollWidth") == 390
+    assert page.js("(() => { const s = document.querySelector('section'); return s.scrollWidth > s.clientWidth })()")
+    assert axe_findings(page) == []
+    page.close()
 
 
 def test_a_finger_scrolls_the_page_up_and_down_and_turns_the_plan_sideways(browser: Browser, tmp_path: Path) -> None:
