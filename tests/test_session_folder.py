@@ -312,6 +312,14 @@ def test_a_picture_that_cannot_be_decoded_is_named_when_its_turn_comes(tmp_path:
         next(frames)
 
 
+@pytest.mark.parametrize("name", ["rig.toml", "top.avi"])
+def test_a_file_of_a_folder_is_refused_with_the_folder(name: str, tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "s")
+    with pytest.raises(InputError) as caught:
+        open_session(folder / name)
+    assert str(caught.value).endswith(f"the folder: {folder}")
+
+
 def test_a_path_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file or folder"):
         open_session(tmp_path / "none")

@@ -115,6 +115,8 @@ def check_exists(path: Path) -> None:
     """InputError where there is no such session: known before what reads it is loaded."""
     if not path.exists():
         raise InputError(path, "session", "no such file or folder", "a session folder (with rig.toml) or an .mcap file")
+    if path.is_file() and (path.parent / "rig.toml").is_file() and path.suffix.lower() != ".mcap":
+        raise InputError(path, "session", "a file of a session folder", f"the folder: {path.parent}")
 
 
 def damage_text(damage: str) -> str:
