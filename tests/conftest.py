@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tests.browser import Browser
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy, as the command line does
-settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile("fixed", deadline=None, derandomize=True, max_examples=15)
 settings.register_profile("many", settings.get_profile("fixed"), max_examples=250)  # `make slow`
 settings.register_profile("unshrunk", settings.get_profile("fixed"), phases=[Phase.explicit, Phase.generate])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))  # mutants need no smallest example

@@ -74,6 +74,7 @@ def test_a_port_that_goes_while_an_arm_is_asked_to_obey_is_an_arm_unplugged(monk
     assert link.arm.frames == frames and any("gone" in event.text for event in link.arm.events())
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(blocked=st.floats(0.84, 0.98), stalls=st.floats(0.80, 0.96))
 def test_a_step_home_that_waited_in_the_port_when_called_back_is_made_after_all(blocked: float, stalls: float) -> None:

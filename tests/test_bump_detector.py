@@ -71,6 +71,7 @@ def test_a_lens_that_was_turned_is_told_from_a_bump(turned: tuple[int, float, st
     assert any(f"{share} %" in reasons[-1] for share in ("0.8", "0.9", "1.0", "1.1"))
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_put_back_is_trusted_again() -> None:
     states, reasons = watched(knocked(1, se3.exp([0, 0, 0, 0.7, 0, 0])), back=True)
     assert "bumped" in reasons[round(AFTER * RATE) - 2] and states[-1] is TrackState.TRACKING and not reasons[-1]

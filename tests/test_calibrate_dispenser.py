@@ -121,6 +121,7 @@ def test_the_stated_doubt_is_that_of_the_noise() -> None:
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 2.0
 
 
+@pytest.mark.slow
 def test_a_virtual_dispenser(measured: LinesResult) -> None:
     on, off = measured.on, measured.off
     assert abs(on.delay - ON) < 0.01 and abs(off.delay - OFF) < 0.01
@@ -245,6 +246,7 @@ def test_a_ruler(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         delays_by_hand([(-1.0, 0.5, 10.0)], DISPENSER)
 
 
+@pytest.mark.slow
 @settings(max_examples=5)
 @given(st.lists(st.integers(5, 30), min_size=2, max_size=3, unique=True), st.integers(1, 2))
 def test_the_nozzle_is_at_its_speed_long_before_and_after(speeds: list[int], repeats: int) -> None:

@@ -87,6 +87,7 @@ def state(name: str, phase: CameraPhase, newest: Image | None) -> CameraState:
     return CameraState(name, "a list", phase, *[0.0] * 5, by, 0, 0, 0, {}, None, 0, (), newest)
 
 
+@pytest.mark.slow
 def test_live_cameras_are_calibrated_from_what_they_showed(pictures: list[list[Image]], tmp_path: Path) -> None:
     file, out, store = board_file(tmp_path), tmp_path / "rig.toml", tmp_path / "rig.corners.npz"
     devices = devices_named(["http://h/0", "http://h/1", "http://h/2"])
@@ -115,6 +116,7 @@ def still(pictures: list[list[Image]]) -> Iterator[list[HttpCamera]]:
         yield three
 
 
+@pytest.mark.slow
 def test_what_was_found_is_kept_after_ctrl_c_and_the_next_run_goes_on(still: list[HttpCamera], tmp_path: Path) -> None:
     out, store = tmp_path / "rig.toml", tmp_path / "rig.corners.npz"
     urls, file = [camera.url for camera in still], board_file(tmp_path)

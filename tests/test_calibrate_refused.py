@@ -68,6 +68,7 @@ Refused = Callable[..., None]
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("board", "words"),
     [
@@ -113,6 +114,7 @@ def test_a_camera_turned_by_90_degrees_whose_size_was_changed_along_is_named(ses
     refused("the picture of b is turned by (90|270) degrees")
 
 
+@pytest.mark.slow
 def test_two_cameras_that_are_swapped_are_named(session: Path, refused: Refused) -> None:
     for old, new in (("b", "kept"), ("c", "b"), ("kept", "c")):
         (session / old).rename(session / new)
@@ -212,6 +214,7 @@ def test_corners_are_good_to_half_a_pixel_and_half_a_millimetre(recording: tuple
     assert 0.005 < found.jitter < 0.03
 
 
+@pytest.mark.slow
 def test_with_given_lenses_the_cameras_stand_where_they_are_given(recording: tuple[str, BoardViews, Rig]) -> None:
     name, views, rig = recording
     found = calibrate(views, known=KnownLenses(np.stack([lens_of(c) for c in rig.cameras]), np.zeros((3, 9))))

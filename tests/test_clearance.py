@@ -332,6 +332,7 @@ def test_the_arms_that_come_along_have_a_tool(name: str) -> None:
 WAY = np.array([[0.0, 0, 1], [20, 0, 1], [20, 1, 1]])
 
 
+@pytest.mark.slow
 def test_a_motion_stands_before_a_wall_and_says_why() -> None:
     """A path that runs into tissue, on a surface that breathes: the syringe, 4.8 mm wide, stays off it."""
     x = np.arange(121) * STEP - 30

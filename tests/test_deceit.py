@@ -52,6 +52,7 @@ def darkest(dark: Array, about: Array, reach: int = 6) -> Array:
     return np.array([column + (part * x).sum() / part.sum(), row + (part * y).sum() / part.sum()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rise", [3.0, *slowly(0.0)])
 def test_a_dot_is_drawn_where_the_camera_model_says(session: Session, rise: float) -> None:
     lie = replace(session.world.relief, rise=lambda t: rise * (t > 0.5))

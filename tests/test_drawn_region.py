@@ -170,6 +170,7 @@ def place(page: Page, camera: str, x: float, y: float) -> tuple[float, float]:
     )
 
 
+@pytest.mark.slow
 def test_corners_that_are_clicked_are_the_regions_corners(browser: Browser) -> None:
     with served() as made:
         made.link.scene.put(scene_from(rig()))

@@ -89,6 +89,7 @@ def test_the_claim_is_as_wide_as_the_errors(case: str, movements: tuple[str, ...
     assert 0.35 < found.nees < 1.4 and found.inside > 0.87 and found.twist_nees < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("movement", ["still", "lively", *slowly("breathing", "sway", "turns")])
 def test_a_twist_is_as_uncertain_as_it_claims(movement: str) -> None:
     run = follow(world(movement, seconds=6.0))
@@ -162,6 +163,7 @@ def test_a_part_that_comes_into_view_moves_nothing() -> None:
     assert found.error_mm < 1.8 * found.bound_mm and found.nees < 1.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instants", [{"offsets": OFFSETS}, *slowly({"jitter": 0.005})])
 def test_cameras_out_of_step_are_followed_better_than_by_their_plain_mean(
     monkeypatch: pytest.MonkeyPatch, instants: dict[str, Any]

@@ -49,6 +49,7 @@ def run(name: str, *words: object) -> None:
     runpy.run_path(str(EXAMPLES / name))["main"](*map(str, words))
 
 
+@pytest.mark.slow
 def test_a_folder_of_pictures_is_tracked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_session(tmp_path / "s", seconds=0.7, rate=10.0, seed=2, cameras=arc_rig(size=(640, 360), focal=700.0))
     run("track_videos.py", tmp_path / "s")
@@ -108,6 +109,7 @@ def test_poses_are_judged_by_evo(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "off by: rmse 0.3536, median 0.2500, max 0.5000" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_recording_is_made_ready_for_rerun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = whole_recording(tmp_path)
     run("show_in_rerun.py", recording)

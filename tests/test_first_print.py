@@ -214,6 +214,7 @@ def test_each_command_that_is_printed_is_run_here() -> None:
     assert len(named) == 3 and all((ROOT / file).is_file() for file in named)
 
 
+@pytest.mark.slow
 def test_the_arm_and_the_dispenser_are_tried(table: Table) -> None:
     with table.devices("tried"):
         heard = table("stillbed arm /dev/ttyUSB0", "--seconds 1")
@@ -228,6 +229,7 @@ def test_the_arm_and_the_dispenser_are_tried(table: Table) -> None:
     assert abs(0.001 * (flow[:, 1] > HALF_FLOW).sum() - 2.0) < 0.2  # s: on a busy machine it is told late
 
 
+@pytest.mark.slow
 def test_plan_and_reach(planned: Table) -> None:
     path = read_path(planned.folder / "path.csv")
     assert path.extrude.any() and (planned.folder / "path.html").exists() and "feasible" in path.extra

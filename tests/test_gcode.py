@@ -266,6 +266,7 @@ def test_whatever_is_lost_a_bead_gets_its_volume_and_what_is_drawn_back_is_given
     assert board.place[0] == pytest.approx(x, abs=1e-4)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 12), st.integers(0, 12), st.booleans())
 def test_what_is_called_back_before_it_went_out_is_neither_pushed_nor_counted(

@@ -269,6 +269,7 @@ def test_a_triggered_camera_has_no_phase_of_its_own() -> None:
         assert given[-1] == (pytest.approx(0.05) if trigger is None else None)
 
 
+@pytest.mark.slow
 def test_a_fake_camera_is_found_set_up_and_watched(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     need_fakes(several=True)
     camera = FakeCamera(0)
@@ -289,6 +290,7 @@ def test_a_fake_camera_is_found_set_up_and_watched(capsys: pytest.CaptureFixture
     assert seen["transport"]["lost_packets"] == 0 and seen["transport"]["received_packets"] > 15 * 59
 
 
+@pytest.mark.slow
 def test_what_a_camera_does_not_have_is_told() -> None:
     need_fakes(several=True)
     camera = FakeCamera(0)

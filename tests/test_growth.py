@@ -60,6 +60,7 @@ def passed() -> tuple[list[SurfacePose], list[SurfaceMap], TrackingStep]:
     return poses, [m for m in maps if m is not None], step
 
 
+@pytest.mark.slow
 def test_a_surface_of_which_all_that_was_known_has_gone_is_still_followed() -> None:
     poses, maps, _ = passed()
     late = [p for p in poses[FIRST:] if p.state is not TrackState.TRACKING]

@@ -353,6 +353,7 @@ def forgetful(rules: GuardRules, name: str) -> Guard:
     return Guard(loosened(rules.limits, name), rules.arm, rules.tick, rules.zone, rules.lag)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -417,6 +418,7 @@ def test_the_range_and_speed_of_each_joint_are_met_and_broken_by_next_to_nothing
         assert code_of(guard, move) is (RefusalCode.JOINT_SPEED if name == "speed" else RefusalCode.JOINT_RANGE)
 
 
+@pytest.mark.slow
 def test_the_oracle_finds_a_guard_that_does_not_look_at_the_joints() -> None:
     rules = jointed_rules()
     slow = replace(rules.arm.jointed, speed=rules.arm.jointed.speed / 10)

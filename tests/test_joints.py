@@ -185,6 +185,7 @@ def test_axes_and_nozzle_are_one(seed: int) -> None:
     assert np.allclose(nozzle_from_axes(arm, axes), nozzle, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_whole_print_keeps_the_joints_within_ranges_and_speeds() -> None:
     settings_ = profile()
     arm, model = settings_.arm, settings_.arm.joints

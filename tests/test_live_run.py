@@ -82,6 +82,7 @@ def test_a_run_that_still_loads_ends_at_once(start: Start, tmp_path: Path, numbe
     assert "nothing was recorded yet" in run.said and not (tmp_path / "run.mcap").exists()
 
 
+@pytest.mark.slow
 def test_before_a_path_is_begun_a_tracker_that_does_not_end_is_not_waited_for(start: Start, tmp_path: Path) -> None:
     run = start(tmp_path / "run.mcap", "--page", "--deaf")
     run.wait_for("confirm")
@@ -321,6 +322,7 @@ def moves_sent(record: Path) -> np.ndarray:
     return np.array([float(str(m["stamp"])) for m in sent if base64.b64decode(str(m["data"]))[1:2] == b"1"])
 
 
+@pytest.mark.slow
 def test_every_button_does_what_it_says_and_the_end_is_told(run: Running, browser: Browser, tmp_path: Path) -> None:
     end = run.wait_for(r"open http://\S+")
     page = browser.page(run.said[:end].rsplit(" ", 1)[1])

@@ -121,6 +121,7 @@ def test_the_needle_goes_aside_for_each_look_and_lays_all_beads() -> None:
         assert max(tip[0] - high[0], path.zone[0][0] - tip[0]) > 24 and tip[2] > high[2] + 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", [150, *slowly(400)])  # on its way up, and at rest above
 def test_in_a_pause_the_needle_goes_aside_when_somebody_looks_and_lays_the_rest_once(asked: int) -> None:
     path = layers()
@@ -382,6 +383,7 @@ def test_a_path_told_other_flows_lays_them(shares: list[float], first: float) ->
     assert volume == pytest.approx(needed, rel=2e-3, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_dispenser_is_told_the_flow_of_the_adapted_layer_and_a_replay_the_same() -> None:
     path = with_looks(layers(2, 1))
     flows: dict[float, list[float]] = {}
@@ -422,6 +424,7 @@ def test_a_live_run_gathers_judges_beside_the_tracking_and_says_so_once() -> Non
     assert begin == pytest.approx(middle[0], abs=1.3) and end - begin > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(320, 180), (96, 54)])
 def test_cameras_of_too_few_pixels_tell_nothing_and_end_nothing(size: tuple[int, int]) -> None:
     rig = arc_rig(focal=0.86 * size[0], size=size)  # 1.7 and 5.6 mm a pixel: coarser than a bead
@@ -451,6 +454,7 @@ def test_relief_is_what_pictures_resolve(size: tuple[int, int], found: bool) -> 
     assert np.abs(inner[:, 2] - scene.shape.heights_at(inner[:, :2])).max(initial=0) < 2.0  # mm, a pixel at 320
 
 
+@pytest.mark.slow
 def test_a_look_that_fails_says_so_and_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     waited_for = threading.Event()
 

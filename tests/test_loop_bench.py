@@ -153,6 +153,7 @@ def test_each_point_is_told() -> None:
     assert [f.value for f in told[:3]] == [10, 20, 40] and told[3].value == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_short_run_measures_every_axis_but_the_rendered_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "WORLD_MINUTES", (0.02, 0.03))
     short = tuple(CostAxis(a.name, a.unit, a.what, a.values[:2], a.cost) for a in axes_for(0.8))

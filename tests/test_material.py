@@ -77,6 +77,7 @@ def gapped(speed: float = 5.0, gap: float = 3.0) -> Path:
     return replace(path, extrude=np.arange(6) % 2 == 1)
 
 
+@pytest.mark.slow
 @given(
     st.floats(0, MAX_DELAY),
     st.floats(0, MAX_DELAY),

@@ -120,6 +120,7 @@ def outside(spans: list[tuple[float, float]], allowed: list[tuple[float, float]]
 BEGIN = [(0.0, Order.AT_HOME), (0.1, Order.ARM)]
 
 
+@pytest.mark.slow
 def test_a_print_switches_the_material_with_its_moves() -> None:
     run = Printing(BEGIN).run(14.0)
     told = run.told()

@@ -272,6 +272,7 @@ def test_a_summary_of_nothing_has_a_text() -> None:
     assert summary["duty"] is None
 
 
+@pytest.mark.slow
 def test_a_long_run_stays_a_small_file_and_is_the_same_twice(tmp_path: File) -> None:
     log = nozzle_log(raster(30, 60), breathing, 0.03, seconds=60.0)
     log.base_from_nozzle[:, :3, 3] += np.random.default_rng(0).normal(size=(len(log), 3)) * 0.1

@@ -267,6 +267,7 @@ def test_another_process_that_holds_the_line_sees_the_last_stop() -> None:
     assert line.last_stop == 1 and line.take() == [OperatorRequest(1, Wish.STOP, 0)]
 
 
+@pytest.mark.slow
 def test_a_page_that_is_killed_while_it_asks_leaves_a_line_that_still_works() -> None:
     line = RequestLine()
     context = multiprocessing.get_context("fork")

@@ -87,6 +87,7 @@ def shown_stage(run: Run, stage: RunStage, **changed: object) -> OperatorView:
     return run.show(stage=stage, reason=LONG * 2, question=STAGE_QUESTIONS[stage], **more, **changed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 def test_nothing_covers_a_question_or_stop_in_any_stage(run: Run, size: tuple[int, int]) -> None:
     page = run.open(size)
@@ -160,6 +161,7 @@ def test_after_a_stop_the_page_says_how_the_tissue_moves_and_that_figures_are_ol
     assert request.wish is Wish.LIFT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING])
 def test_the_chip_says_what_the_nozzle_does_and_why(run: Run, stage: RunStage) -> None:
     page = run.open()
@@ -316,6 +318,7 @@ def test_the_words_of_page_terminal_and_documents_are_one(run: Run) -> None:
     assert WISH_WORDS[Wish.END].lower() in STAGE_QUESTIONS[RunStage.PAUSED]
 
 
+@pytest.mark.slow
 def test_the_chart_knows_the_whole_run_and_is_zoomed_by_hand_and_key(run: Run) -> None:
     page = run.open((1440, 900))
     for k in range(40):

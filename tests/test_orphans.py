@@ -22,7 +22,8 @@ from tests import orphan_processes
 
 if __name__ == "__main__":
     for _ in range(2):
-        process = SPAWN.Process(target=getattr(orphan_processes, sys.argv[1]), args=(orphan_processes.SlowToLoad(sys.argv[2]),))
+        target, argument = getattr(orphan_processes, sys.argv[1]), orphan_processes.SlowToLoad(sys.argv[2])
+        process = SPAWN.Process(target=target, args=(argument,))
         process.start()
         print(process.pid, flush=True)
     time.sleep(60)

@@ -146,6 +146,7 @@ def test_a_point_follows_the_pointer_in_the_near_picture_too(run: Outlined, inde
     assert near(run.points(), wanted)
 
 
+@pytest.mark.slow
 def test_the_path_does_not_move_while_the_outline_is_corrected_and_does_so_afterwards(run: Outlined) -> None:
     page = run.open()
     assert page.js("document.body.dataset.movable") == "no"
@@ -159,6 +160,7 @@ def test_the_path_does_not_move_while_the_outline_is_corrected_and_does_so_after
     assert [request.wish for request in run.served.taken()] == [Wish.MOVE]
 
 
+@pytest.mark.slow
 def test_the_line_gives_a_new_point_delete_takes_one_and_undo_brings_each_back(run: Outlined) -> None:
     page, middle = run.open(), (FOUND[0] + FOUND[1]) / 2
     drag(page, run.place(middle), run.place(middle - [0, 30]))
@@ -180,6 +182,7 @@ def test_the_line_gives_a_new_point_delete_takes_one_and_undo_brings_each_back(r
     assert np.array_equal(run.points(), FOUND)
 
 
+@pytest.mark.slow
 def test_keys_choose_a_point_and_move_it_by_a_pixel_or_ten(run: Outlined) -> None:
     page, wanted = run.open(), FOUND.copy()
     page.key("Period", ".")

@@ -150,6 +150,7 @@ def test_a_finger_scrolls_the_page_up_and_down_and_turns_the_plan_sideways(brows
     page.close()
 
 
+@pytest.mark.slow
 def test_a_scan_in_metres_is_recognised_and_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vertices, triangles = scan_of()
     write_ply(tmp_path / "scan.ply", vertices / 1000, triangles)
@@ -187,6 +188,7 @@ def test_a_contour_that_is_none_is_one_line(tmp_path: Path, text: str, capsys: p
     assert "allowed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_good_scan_turned_over_is_answered_without_flip(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "scan.ply", *scan_of(size=(60.0, 40.0), depth=6.0))
     assert main(["plan", str(tmp_path / "scan.ply"), "-o", str(tmp_path / "path.csv"), "--flip"]) == 2
@@ -344,6 +346,7 @@ def test_every_file_that_a_plan_is_given_is_read_before_the_scan(
     assert f"stillbed: {wrong}: {words}" in told and "scan.ply" not in told and not (tmp_path / "path.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_cloud_of_points_is_planned_as_the_mesh_is(tmp_path: Path) -> None:
     vertices, triangles = scan_of()
     write_ply(tmp_path / "mesh.ply", vertices, triangles)

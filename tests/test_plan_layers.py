@@ -319,6 +319,7 @@ def test_too_little_to_be_a_surface_is_refused(count: int) -> None:
         repair_mesh(vertices, triangles[:count], "scan")
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 10_000), gone=st.floats(0, 0.6), turned=st.floats(0, 0.6), noise=st.floats(0, 1.0),
     spikes=st.integers(0, 60), nan=st.integers(0, 20), double=st.floats(0, 0.3), wild=st.integers(0, 30),

@@ -98,6 +98,7 @@ def test_more_motion_leaves_out_more() -> None:
     assert lengths[0] > lengths[1] > 0
 
 
+@pytest.mark.slow
 def test_a_tool_that_is_clear_nowhere_is_one_error() -> None:
     with pytest.raises(InputError, match="none over which the tool has room"):
         deep_plan(BASE_MARGIN + 5.0)
@@ -139,6 +140,7 @@ def written(folder: Path, vertices: Array, triangles: Array, name: str = "scan.p
 ARM = "tool_mm = [[0, 0.5], [2.5, 0.5], [3.2, 4], [40, 4]]\n" + Path("data/arms/s6h4d.toml").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_commands_say_where_the_tool_has_no_room(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "arm.toml").write_text(ARM, encoding="utf-8")
     scan = written(tmp_path, *scan_of(*DEEP))

@@ -149,6 +149,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_run, "RUN_SECONDS", 40.0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("seed", [0, *slowly(1, 2, 3, 4, 5)])
 def test_a_run_in_which_everything_goes_wrong_breaks_nothing(seed: int) -> None:

@@ -246,6 +246,7 @@ def test_one_camera_or_blank_pictures_match_nothing() -> None:
     assert matched is None or not matched.sure.any()
 
 
+@pytest.mark.slow
 def test_a_wound_is_found_on_its_scan_to_a_tenth_of_a_millimetre() -> None:
     found = place("wound")
     off = np.linalg.norm(over_wound("wound", found), axis=1)
@@ -275,6 +276,7 @@ def test_a_cylinder_stays_open_along_and_about_its_axis() -> None:
     assert abs(slide @ axis) > 0.99 * np.linalg.norm(slide)
 
 
+@pytest.mark.slow
 def test_the_scan_of_another_body_is_no_sure_fit() -> None:
     other = body("chest", Wound((24.0, 40.0)), 5)
     found = ScanPlacing(scan_from_triangles(*other.mesh(1.0))).search(LENSES, *_arguments("wound"))

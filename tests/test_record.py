@@ -182,6 +182,7 @@ def until_written(file: Path, size: int) -> None:
         CLOCK.wait_until(CLOCK.now() + 0.05)
 
 
+@pytest.mark.slow
 def test_a_lost_camera_is_named_the_others_go_on_and_ctrl_c_keeps_all(
     streams: list[HttpCamera], started: Start, tmp_path: Path
 ) -> None:
@@ -202,6 +203,7 @@ def test_a_lost_camera_is_named_the_others_go_on_and_ctrl_c_keeps_all(
     with_reader.close()
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_it_in_words_and_what_was_written_is_kept(
     streams: list[HttpCamera], started: Start, tmp_path: Path
 ) -> None:
@@ -225,6 +227,7 @@ def test_the_recorder_killed_ends_it_and_what_was_written_is_kept(
     assert min(counts(open_session(tmp_path / "x.mcap"))) > 5
 
 
+@pytest.mark.slow
 def test_where_nothing_comes_no_file_is_left_and_it_is_said(tmp_path: Path, streams: list[HttpCamera]) -> None:
     for camera in streams:
         camera.online = False

@@ -265,6 +265,7 @@ def test_what_damage_leaves_says_so(flags: list[str], tmp_path: Path, capsys: py
     assert capsys.readouterr().out.startswith(f"The recording is damaged: {open_session(cut).damage}.\n")
 
 
+@pytest.mark.slow
 def test_a_plan_laid_into_a_damaged_recording_and_masks_of_one_say_so(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

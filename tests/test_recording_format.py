@@ -89,6 +89,7 @@ def test_the_summary_points_at_what_is_there(whole: Path) -> None:
     assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 4
 
 
+@pytest.mark.slow
 def test_no_bit_of_what_a_file_says_of_itself_flips_unseen(whole: Path, tmp_path: Path) -> None:
     """Else a flipped digit would move the time of day of everything."""
     data, told = bytearray(whole.read_bytes()), 0

@@ -187,6 +187,7 @@ def errors_of(poses: Sequence[SurfacePose]) -> np.ndarray:
     return displacement_errors(np.array([p.stamp for p in measured]), np.stack([p.base_from_surface for p in measured]))
 
 
+@pytest.mark.slow
 def test_a_sheet_on_a_table_is_followed_by_its_polygon() -> None:
     settings = RegionSettings(RegionBy.POLYGON, tuple((c.name, drawn(k)) for k, c in enumerate(rig().cameras)))
     step = TrackingStep(rig(), settings.rois(rig(), -np.inf))

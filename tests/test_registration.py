@@ -68,6 +68,7 @@ def test_errors_and_covariance_agree() -> None:
     assert 0.4 < np.mean(squared) < 2.0  # 30 degrees of freedom: 0.46 to 1.79 in 99 %
 
 
+@pytest.mark.slow
 def test_wrong_points_do_not_pull() -> None:
     _, error = found(BODY, 3, noise=0.05, wrong=0.2)
     assert error.mean() < 0.2

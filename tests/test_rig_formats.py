@@ -153,6 +153,7 @@ WORDS = "libGL.so.1", "signal 4", "hangs: not loaded after 2 s", "still loading 
 PASS, WARN, FAIL = CheckVerdict.PASS, CheckVerdict.WARN, CheckVerdict.FAIL
 
 
+@pytest.mark.slow
 def test_here_everything_needed_works_and_is_told_in_words_and_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -164,6 +165,7 @@ def test_here_everything_needed_works_and_is_told_in_words_and_as_json(capsys: p
     assert all(check["remedy"] for part in told.values() for check in part if check["verdict"] != "pass")
 
 
+@pytest.mark.slow
 def test_each_library_that_fails_is_named_however_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lacks_file.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')\n")
     (tmp_path / "dies.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGILL)\n")

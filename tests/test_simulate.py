@@ -95,6 +95,7 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
+@pytest.mark.slow
 def test_pictures_of_an_earlier_run_are_found_again(recorded: Path, rendered: list[int], tmp_path: Path) -> None:
     options = SimulationOptions(cache=recorded / "cache")
     run_simulation(recorded / "scenario.toml", tmp_path / "again", options)

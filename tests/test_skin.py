@@ -135,6 +135,7 @@ def two_pits(depths: tuple[float, float]) -> tuple[Array, Array]:
     return points, np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
 
 
+@pytest.mark.slow
 def test_two_wounds_alike_are_a_question_until_a_number_or_their_colour_tells() -> None:
     scan, _ = repair_mesh(*two_pits((3.0, 2.8)), "scan")
     with pytest.raises(WoundQuestionError, match="2 places") as caught:
@@ -149,6 +150,7 @@ def test_two_wounds_alike_are_a_question_until_a_number_or_their_colour_tells() 
         find_wound(scan, 0.5, "scan", number=3)
 
 
+@pytest.mark.slow
 def test_a_question_is_a_page_with_pictures_and_no_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "scan.ply", *two_pits((3.0, 2.8)))
     out = tmp_path / "path.csv"

@@ -77,6 +77,7 @@ def spared() -> tuple[bool, bool, bool]:
     return bool(dask.config.get("distributed.worker.profile.enabled")), held, not current_process().daemon
 
 
+@pytest.mark.slow
 def test_workers_here_spend_their_time_on_the_work(address: str) -> None:
     with distributed.Client(address) as client:
         assert set(client.run(spared).values()) == {(False, True, True)}

@@ -158,6 +158,7 @@ def write_table(folder: Path, rig: Rig) -> None:
     write_rig(folder / "rig.toml", rig, [ImageSource("images", f"{c.name}/*.png") for c in rig.cameras])
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_was_written_and_says_so(tmp_path: Path) -> None:
     folder, out = endless(tmp_path / "endless"), tmp_path / "out"
     running = started(["track", str(folder), "-o", str(out)])

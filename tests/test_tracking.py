@@ -229,6 +229,7 @@ def test_flow_is_asked_only_where_the_motion_model_is_unsure(struck: list[FrameS
     assert not any(asked[-6:-1]) and asked[-1]
 
 
+@pytest.mark.slow
 def test_a_surface_that_comes_back_elsewhere_is_found(sets: list[FrameSet]) -> None:
     def jump(stamp: float) -> Array:
         return breathing(stamp) if stamp < 1.0 else breathing(stamp) @ se3.exp(np.array([0, 0, 0.35, 25.0, -20.0, 5.0]))

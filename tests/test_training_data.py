@@ -339,6 +339,7 @@ def first_step(sets: Sequence[FrameSet], cameras: Sequence[int]) -> tuple[Region
     return RegionTrackingStep(RIG, made, RegionSearch(RIG, Sees(sets, cameras))), asked
 
 
+@pytest.mark.slow
 def test_the_surface_is_tracked_where_the_wound_was_seen() -> None:
     sets = shot(stamps=np.arange(9) / 10)
     step, asked = first_step(sets, (0, 1, 2))

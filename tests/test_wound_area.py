@@ -169,6 +169,7 @@ def moved(rig: Rig, new_from_old: np.ndarray) -> Rig:
     return Rig(tuple(replace(c, base_from_camera=new_from_old @ c.base_from_camera) for c in rig.cameras))
 
 
+@pytest.mark.slow
 def test_the_area_of_the_same_pictures_goes_with_the_square_of_the_rigs_scale() -> None:
     taken = rendered(14)
     before, after = measured(taken), measured(taken, scaled(taken.rig, 1.2))

@@ -271,6 +271,7 @@ def test_the_same_from_a_shell(folder: Path) -> None:
     assert told.startswith(f"stillbed: {folder}/missing: ")
 
 
+@pytest.mark.slow
 def test_an_unwritable_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
