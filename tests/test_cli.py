@@ -199,6 +199,17 @@ def test_a_full_disk_is_told_with_what_was_to_be_written(
     assert shlex.split(told.partition("then: ")[2]) == ["stillbed", "live", str(tmp_path / "mon day/session.toml")]
 
 
+def test_a_full_disk_under_a_log_names_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("hardware.cli.live._run_arm", full)
+    assert main(["arm", "--virtual", "--log", str(tmp_path / "axes.csv")]) == 2
+    assert capsys.readouterr().err.startswith(f"stillbed: {tmp_path / 'axes.csv'}: no space left on device")
+
+
 def frame_sets(count: int, ending: BaseException | None = None) -> Iterator[FrameSet]:
     for i in range(count):
         yield FrameSet(i / 30, ())
