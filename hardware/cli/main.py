@@ -238,8 +238,9 @@ def _run(arguments: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
         nameless = isinstance(error, OSError) and error.filename is None and error.strerror
-        written = getattr(arguments, "log", None) if out is None else out
-        words = write_error_text(error, written) if nameless else error_text(error)
+        words = write_error_text(error, out) if nameless else error_text(error)
+        if nameless and out is None and getattr(arguments, "log", None) is not None:
+            words = f"{arguments.log}: {words}; its last rows may be missing"
         print(f"stillbed: {painted(words, BAD, sys.stderr)}", file=sys.stderr)
         if out is not None and not was_there:
             with suppress(OSError):
