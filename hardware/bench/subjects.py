@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hardware.bench.figures import Figure
 
 BREATHING = ("breathing_calm", "breathing_deep", "breathing_irregular")  # scenarios
-BREATHING_HELP = f"of {', '.join(BREATHING)} (default: all)"
+BREATHING_HELP = f"scenarios, of {', '.join(BREATHING)} (default: all)"
 MADE = (
     "flat patch, shaking table",
     "flat patch, constant speed in six axes",
@@ -88,78 +88,78 @@ def positive(text: str) -> int:
 
 
 SEED = option("--seed", type=int, default=0)
-SESSIONS = option("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions to show instead")
+SESSIONS = option("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions to use instead")
 
 _SUBJECTS = (
-    _subject("arm-calibration", "calibration", "the arm's place, tool and latency from what cameras see of its tip")(
-        number("--rendered", 1, "N", "arms before rendered cameras; default 1"),
-        number("--runs", 50, "N", "arms on drawn tips; default 50"),
-        number("--seed", 0, None, "of the first arm; default 0"),
+    _subject("arm-calibration", "calibration", "arm calibrated with the cameras: base pose, tool, latency")(
+        number("--rendered", 1, "N", "arms with rendered cameras; default 1"),
+        number("--runs", 50, "N", "arms with random tip observations; default 50"),
+        number("--seed", 0, None, "seed of the first arm; default 0"),
     ),
-    _subject("beside", "live", "the wound network beside the tracker: its share of a core, what it costs a pose")(
-        number("--seconds", 10.0, "S", "of the made recording; default 10"),
+    _subject("beside", "live", "wound network parallel to the tracker: its share of a core, delay of a pose")(
+        number("--seconds", 10.0, "S", "duration of the rendered recording; default 10"),
         option("--scene", choices=MADE, default=MADE[-1], metavar="NAME", help="; ".join(MADE)),
-        option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
+        option("--model", type=Path, metavar="X.onnx", help="network instead of the shipped one"),
     ),
-    _subject("calibration", "calibration", "cameras calibrated from rendered boards, beside the exact rig")(
-        option("--instants", type=positive, default=60, metavar="N", help="frame sets, rendered; default 60"),
+    _subject("calibration", "calibration", "cameras calibrated from rendered boards, compared with the exact rig")(
+        option("--instants", type=positive, default=60, metavar="N", help="rendered frame sets; default 60"),
         number("--runs", 50, "N", "runs without pictures; default 50"),
     ),
-    _subject("latency", "recordings", "from three decoded frames to the pose, by wall clock and processor")(
+    _subject("latency", "recordings", "time from three decoded frames to the pose: wall clock and processor")(
         SESSIONS,
-        number("--seconds", 5.0, "S", "of each made recording; default 5"),
+        number("--seconds", 5.0, "S", "duration of each rendered recording; default 5"),
         option("--scene", nargs="+", choices=MADE, default=[MADE[-1]], metavar="NAME", help="; ".join(MADE)),
     ),
-    _subject("link", "link", "the motion process on a pty while cores are busy: jitter, stops, what arrives")(
-        number("--minutes", 1.0, "M", "of real time; default 1"),
-        number("--seed", 0, None, "of what is halted when"),
-        number("--busy", 1, "N", "processes that saturate a core each; default 1"),
+    _subject("link", "link", "the motion process on a pseudo-terminal with busy cores: jitter, stops, received bytes")(
+        number("--minutes", 1.0, "M", "duration in real time; default 1"),
+        number("--seed", 0, None, "seed of the halts"),
+        number("--busy", 1, "N", "busy processes, a core each; default 1"),
     ),
     _subject("live", "live", "whole runs in real time: frames to wire, stops, nozzle, kills")(
-        number("--minutes", 1.0, "M", "of printing; 0: none; default 1"),
-        number("--stops", 3, "N", "in a run of their own; default 3"),
-        number("--kills", 0, "N", "of random processes; default none"),
-        number("--busy", 0, "N", "processes beside it that saturate a core each; default none"),
-        number("--seed", 0, None, "of what is killed when"),
+        number("--minutes", 1.0, "M", "duration of printing; 0: none; default 1"),
+        number("--stops", 3, "N", "stops, in a separate run; default 3"),
+        number("--kills", 0, "N", "kills of random processes; default none"),
+        number("--busy", 0, "N", "busy processes, a core each; default none"),
+        number("--seed", 0, None, "seed of the kills"),
         option("--pinned", action="store_true", help="motion and recorder on one core, tracking on the other"),
-        option(
-            "--scenario", type=Path, default=Path("data/live/calm.toml"), metavar="SCENARIO.toml", help="which world"
-        ),
+        option("--scenario", type=Path, default=Path("data/live/calm.toml"), metavar="SCENARIO.toml", help="scenario"),
     ),
-    _subject("loop", "prediction", "the closed loop at the nozzle, with and without prediction")(
+    _subject("loop", "prediction", "nozzle error of the closed loop, with and without prediction")(
         option(
             "--scenario", nargs="+", default=list(BREATHING), choices=BREATHING, metavar="NAME", help=BREATHING_HELP
         ),
-        number("--seed", 1, None, "of the tracks' noise (default: 1)"),
-        number("--jobs", 1, None, "processes that share the prints (default: 1)"),
+        number("--seed", 1, None, "seed of the tracks' noise (default: 1)"),
+        number("--jobs", 1, None, "parallel processes (default: 1)"),
     ),
-    _subject("prediction", "prediction", "where a breathing chest will be, 100 to 500 ms ahead")(
+    _subject("prediction", "prediction", "error of the predicted pose of a breathing chest, 100 to 500 ms ahead")(
         option(
             "--traces",
             type=Path,
             metavar="DIR",
             help="folder of traces: breathing*.tum (default: the simulator's breathing)",
         ),
-        option("--pattern", default="breathing*.tum", help="names of the traces in it"),
-        number("--warm-up", 60.0, "S", "beginning that is not judged"),
-        number("--seconds", 240.0, "S", "of the simulator's; default 240"),
+        option("--pattern", default="breathing*.tum", help="file names of the traces in it"),
+        number("--warm-up", 60.0, "S", "start of a trace, without figures"),
+        number("--seconds", 240.0, "S", "duration of the simulated breathing; default 240"),
     ),
-    _subject("segmentation", "pictures", "finding the wound: Dice, silence, a half covered one, time, area")(
+    _subject("segmentation", "pictures", "wound segmentation: Dice, false alarms, covered wounds, time, area")(
         option("dataset", type=Path, nargs="?", metavar="DATASET", help="folder with images/ and labels/"),
-        option("--model", type=Path, metavar="X.onnx", help="another network than the one that comes along"),
-        number("--rendered", 60, "N", "rendered pictures of each kind"),
-        number("--areas", 40, "N", "rendered wounds before three cameras, for areas in mm^2; default 40"),
-        option("--sheet", type=Path, metavar="X.jpg", help="also draw best, median and worst, 8 of each"),
-        number("--seed", 1, "N", "of pieces, covers and sizes drawn"),
+        option("--model", type=Path, metavar="X.onnx", help="network instead of the shipped one"),
+        number("--rendered", 60, "N", "number of rendered pictures of each kind"),
+        number("--areas", 40, "N", "rendered wounds, three cameras, for areas in mm^2; default 40"),
+        option(
+            "--sheet", type=Path, metavar="X.jpg", help="also write a contact sheet: best, median and worst, 8 of each"
+        ),
+        number("--seed", 1, "N", "seed of crops, covers and sizes"),
     ),
-    _subject("thesis", "recordings", "the thesis's estimator beside ours, on the same frame sets")(
+    _subject("thesis", "recordings", "the thesis's estimator compared with stillbed's, on the same frame sets")(
         SESSIONS,
-        number("--seconds", 4.0, "S", "of each made recording; default 4"),
+        number("--seconds", 4.0, "S", "duration of each rendered recording; default 4"),
         option(
             "--method",
             choices=(THESIS_METHOD, THESIS_FLOW_METHOD),
             default=THESIS_METHOD,
-            help="which of the thesis's ways",
+            help="method of the thesis",
         ),
     ),
 )

@@ -47,8 +47,8 @@ def add_calibrate(commands: Commands) -> None:
     command = commands.add(
         "calibrate",
         None,
-        "calibrate cameras from a printed board, the arm, a dispenser: board, cameras, arm, dispenser, import, export",
-        "Print a board, wave it before the cameras, and get a rig that says how far it can be trusted.",
+        "calibrate cameras with a printed board, the arm, a dispenser; import or export calibrations",
+        "Calibrate cameras with a printed board, then the arm and the dispensers. Each result has an uncertainty.",
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
     )
     parts = Commands(command, "WHAT")
@@ -64,63 +64,63 @@ def _add_board(parts: Commands) -> None:
     add = parts.add(
         "board",
         _board,
-        "a printable board at true scale, with a ruler to check the print by",
-        "Draw a calibration board at true scale, and write the board.toml that describes it beside it. Print it at\n"
-        "100 %, measure the ruler and a square, and mount the sheet on something flat.",
+        "draw a calibration board to print, with a ruler to check its scale",
+        "Draw a calibration board at true scale, and write its description, board.toml, to the same folder. Print at\n"
+        "100 %, measure the ruler and a square, and mount the sheet on a flat plate.",
         "stillbed calibrate board -o board.pdf",
         "stillbed calibrate board -o board.svg --page A3 --square-mm 30 --squares 8x11",
     ).add_argument
-    add("-o", "--out", type=Path, required=True, metavar="X.pdf", help=".pdf or .svg; board.toml beside it")
-    add("--kind", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
+    add("-o", "--out", type=Path, required=True, metavar="X.pdf", help="output, .pdf or .svg; board.toml beside it")
+    add("--kind", choices=("charuco", "chessboard"), default="charuco", help="type of the board; default charuco")
     add("--squares", type=_pair, metavar="CxR", help="columns x rows; default: as many as fit the page")
-    add("--square-mm", type=positive, default=25.0, metavar="MM", help="edge of a square; default 25")
-    add("--marker", type=float, default=0.75, metavar="SHARE", help="of a square's edge; default 0.75")
-    add("--dictionary", default="4X4_50", metavar="NAME", help="of the markers; default 4X4_50")
+    add("--square-mm", type=positive, default=25.0, metavar="MM", help="edge length of a square; default 25")
+    add("--marker", type=float, default=0.75, metavar="SHARE", help="edge of a marker / edge of a square; default 0.75")
+    add("--dictionary", default="4X4_50", metavar="NAME", help="dictionary of the markers; default 4X4_50")
     add("--inverted", action="store_true", help="exchange black and white")
-    add("--page", default="A4", metavar="SIZE", help="A5, A4, A3, A2, letter, or WxH in mm; default A4")
-    add("--force", action="store_true", help="overwrite X.pdf and the board.toml beside it")
+    add("--page", default="A4", metavar="SIZE", help="page: A5, A4, A3, A2, letter, or WxH in mm; default A4")
+    add("--force", action="store_true", help="overwrite X.pdf and board.toml")
 
 
 def _add_cameras(parts: Commands) -> None:
     add = parts.add(
         "cameras",
         _cameras,
-        "lenses, places and clock offsets from a waved board, recorded or live",
-        "From a recording, or from live cameras while the board is being waved: it then says where to\n"
-        "hold the board next, here and on a page in the browser, and ends once enough was seen. Ctrl-C keeps the\n"
-        "corners; the same command goes on.",
+        "calibrate lenses, camera poses and clock offsets with a moving board",
+        "Calibrate cameras from a recording of the moving board, or from live cameras. With live cameras, the\n"
+        "terminal and a page in the browser show where to hold the board next; the command ends when the coverage\n"
+        "is sufficient. Ctrl-C keeps the corners; the same command continues.",
         "stillbed calibrate cameras sessions/board --board board.toml -o rig.toml",
         "stillbed calibrate cameras /dev/v4l/by-id/CAMERA_A /dev/v4l/by-id/CAMERA_B --board board.toml -o rig.toml",
     ).add_argument
     which = (
-        "session folder or .mcap (its rig may lack lenses); or live cameras as `stillbed cameras` names them, "
-        "or RIG.toml for all of a rig"
+        "session folder or .mcap file (its rig may lack lenses); or live cameras as named by `stillbed cameras`, "
+        "or RIG.toml for all cameras of a rig"
     )
     add("which", nargs="+", metavar="SESSION_OR_CAMERA", help=which)
-    add("--seconds", type=float, metavar="S", help="watch live cameras so long at most; default: until enough was seen")
-    add("--no-page", action="store_true", help="with live cameras: without the page in the browser")
-    add("--board", type=Path, required=True, metavar="board.toml", help="the board as it was printed")
-    add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write; report beside it")
-    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="predicted error to pass; default 0.1")
-    distance = "two cameras and how far apart they are, to check scale"
+    add("--seconds", type=float, metavar="S", help="maximum time; default: until coverage is sufficient")
+    add("--no-page", action="store_true", help="with live cameras: do not serve the page in the browser")
+    add("--board", type=Path, required=True, metavar="board.toml", help="description of the printed board")
+    add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="output file; report beside it")
+    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="maximum predicted error for PASS; default 0.1")
+    distance = "two cameras and their measured distance, to check the scale"
     add("--distance-mm", type=_distance, metavar="A,B,MM", help=distance)
-    lenses = "take the session's lenses, within their lens_sigma; seek places and clocks"
+    lenses = "keep the session's lenses, within their lens_sigma; estimate camera poses and clock offsets"
     add("--keep-lenses", action="store_true", help=lenses)
     add("--new-rig", action="store_true", help="do not compare with the session's own rig")
-    add("--force", action="store_true", help="overwrite rig.toml and what stands beside it")
+    add("--force", action="store_true", help="overwrite rig.toml and its report")
 
 
 def _add_import(parts: Commands) -> None:
     add = parts.add(
         "import",
         _import,
-        "a rig.toml from another program's calibration",
-        "Turn another program's calibration into a rig.toml. Where each camera's images are is to be added to it.",
+        "convert another program's calibration to a rig.toml",
+        "Convert another program's calibration to a rig.toml. Add the image source of each camera to it by hand.",
         "stillbed calibrate import camchain.yaml --format kalibr -o rig.toml",
     ).add_argument
-    add("file", type=Path, metavar="FILE", help="its file, or folder of a file per camera")
+    add("file", type=Path, metavar="FILE", help="calibration file, or folder with a file per camera")
     add("--format", choices=RIG_FORMATS, required=True, help=RIG_FORMATS_TEXT)
-    add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="file to write")
+    add("-o", "--out", type=Path, required=True, metavar="rig.toml", help="output file")
     add("--force", action="store_true", help="overwrite the file")
 
 
@@ -128,13 +128,13 @@ def _add_export(parts: Commands) -> None:
     add = parts.add(
         "export",
         _export,
-        "a rig.toml in another program's format",
-        "Write a rig.toml as another program reads it: lenses and places, and what else its format can hold.",
+        "convert a rig.toml to another program's format",
+        "Convert a rig.toml to another program's format: lenses, camera poses, and what else the format can store.",
         "stillbed calibrate export rig.toml --format kalibr -o camchain.yaml",
     ).add_argument
     add("rig", type=Path, metavar="rig.toml", help="a calibrated rig")
     add("--format", choices=RIG_FORMATS, required=True, help=RIG_FORMATS_TEXT)
-    add("-o", "--out", type=Path, required=True, metavar="OUT", help="file, or folder, to write")
+    add("-o", "--out", type=Path, required=True, metavar="OUT", help="output file or folder")
     add("--force", action="store_true", help="overwrite the file, or write into a folder that is not empty")
 
 
@@ -223,42 +223,42 @@ def _add_arm(parts: Commands) -> None:
     part = parts.add(
         "arm",
         _calibrate_arm,
-        "where the arm stands before the cameras, where its tip is, how late it is",
-        "Let the arm move its needle before the calibrated cameras, find the tip in the pictures, and get\n"
-        "the arm's place, the tool's offset, dead time and servo lag, each with its doubt, and a verdict. Or do\n"
-        "that again from a recorded folder; or find the place alone from points that the tip has touched.\n"
-        "Ctrl-C stops the arm and keeps what was recorded. Exit code 0: good enough to print with; 1: not.",
+        "calibrate the arm's base pose, tool offset and latency with the cameras",
+        "The arm moves its needle in view of the calibrated cameras; the tip is detected in the pictures. Result:\n"
+        "base pose of the arm, tool offset, dead time and servo lag, each with its uncertainty, and a verdict.\n"
+        "Other sources: a recorded folder; or, for the base pose alone, points touched by the tip.\n"
+        "Ctrl-C stops the arm and keeps the recording. Exit code 0: PASS, 1: FAIL.",
         "stillbed calibrate arm --virtual --record try -o arm.toml",
         "stillbed calibrate arm --device /dev/ttyUSB0 --cameras rig.toml --record moved --yes -o arm.toml",
         "stillbed calibrate arm moved -o arm.toml",
         "stillbed calibrate arm --touched points.toml --cameras rig.toml -o arm.toml",
     )
     add = part.add_argument
-    add("folder", nargs="?", type=Path, metavar="FOLDER", help="a calibration that was recorded before")
-    add("--device", metavar="DEVICE", help="the arm's port: a path, or a URL of pyserial's")
-    add("--virtual", action="store_true", help="an arm and cameras that are simulated, with exact truth")
-    add("--terminal", action="store_true", help="with --virtual: on a pseudo-terminal, in real time, as at a port")
-    add("--touched", type=Path, metavar="POINTS.toml", help="four or more points that the tip has touched")
-    add("-o", "--out", type=Path, required=True, metavar="ARM.toml", help="to write; report beside it")
+    add("folder", nargs="?", type=Path, metavar="FOLDER", help="recording of an earlier calibration")
+    add("--device", metavar="DEVICE", help="port of the arm: a path, or a URL of pyserial")
+    add("--virtual", action="store_true", help="simulated arm and cameras, with the exact truth")
+    add("--terminal", action="store_true", help="with --virtual: in real time, on a pseudo-terminal instead of a port")
+    add("--touched", type=Path, metavar="POINTS.toml", help="four or more points touched by the tip")
+    add("-o", "--out", type=Path, required=True, metavar="ARM.toml", help="output file; report beside it")
     add("--cameras", type=Path, metavar="RIG.toml", help="the calibrated cameras, with their sources")
-    add("--arm", type=Path, metavar="ARM.toml", help="its limits, home, dialect, lag as known so far")
-    add("--record", type=Path, metavar="FOLDER", help="new folder for pictures and commands")
-    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="of the tip, to pass; default 0.1")
-    add("--keep-tool", action="store_true", help="do not seek the tool's offset: nothing is turned")
-    add("--keep-latency", action="store_true", help="do not seek dead time and lag")
+    add("--arm", type=Path, metavar="ARM.toml", help="arm file with limits, home, dialect and, if known, lag")
+    add("--record", type=Path, metavar="FOLDER", help="output folder for pictures and commands, new")
+    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="maximum error of the tip for PASS; default 0.1")
+    add("--keep-tool", action="store_true", help="do not estimate the tool offset: no rotations")
+    add("--keep-latency", action="store_true", help="do not estimate dead time and lag")
     add = part.add_argument_group("the moves").add_argument
-    add("--places", type=int, default=20, metavar="N", help="to rest at; default 20")
-    add("--reach-mm", type=float, default=50.0, metavar="MM", help="along X and Y; default 50")
-    add("--up-mm", type=float, default=45.0, metavar="MM", help="above where it begins; default 45")
-    add("--down-mm", type=float, default=20.0, metavar="MM", help="below it; default 20")
-    add("--turn-deg", type=float, default=35.0, metavar="DEG", help="of A, B and C; default 35")
-    add("--speed-mm-s", type=float, default=80.0, metavar="MM_S", help="at most; default 80")
-    add("--dwell-s", type=float, default=0.6, metavar="S", help="at each place; default 0.6")
-    add("--swing-s", type=float, default=8.0, metavar="S", help="a swing at the end; default 8")
-    add("--stands", metavar="WHERE", help="where a silent arm stands: X,Y,Z,A,B,C or home")
-    add("--yes", action="store_true", help="somebody sees that nobody is within the arm's reach")
-    add("--no-pause-frame", action="store_true", help="its controller knows no frame that stops it")
-    add("--seed", type=int, default=0, metavar="N", help="of the virtual arm's errors; default 0")
+    add("--places", type=int, default=20, metavar="N", help="number of places where the arm rests; default 20")
+    add("--reach-mm", type=float, default=50.0, metavar="MM", help="range along X and Y; default 50")
+    add("--up-mm", type=float, default=45.0, metavar="MM", help="range above the start; default 45")
+    add("--down-mm", type=float, default=20.0, metavar="MM", help="range below the start; default 20")
+    add("--turn-deg", type=float, default=35.0, metavar="DEG", help="range of A, B and C; default 35")
+    add("--speed-mm-s", type=float, default=80.0, metavar="MM_S", help="maximum speed; default 80")
+    add("--dwell-s", type=float, default=0.6, metavar="S", help="rest time at each place; default 0.6")
+    add("--swing-s", type=float, default=8.0, metavar="S", help="duration of the swing at the end; default 8")
+    add("--stands", metavar="WHERE", help="position of an arm without replies: X,Y,Z,A,B,C or home")
+    add("--yes", action="store_true", help="confirm that nobody is within the arm's reach")
+    add("--no-pause-frame", action="store_true", help="the controller does not support the pause frame")
+    add("--seed", type=int, default=0, metavar="N", help="seed of the virtual arm's errors; default 0")
 
 
 def _calibrate_arm(a: argparse.Namespace) -> int:
@@ -332,7 +332,7 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     from hardware.cameras.sources import read_live_rig
 
     if not a.yes:
-        raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
+        raise InputError("arm", "--yes", "missing", "the confirmation that nobody is within the arm's reach")
     check_out(a.out)
     options, clock, profile = _arm_options(a).moves, wall_clock(), arm_profile(a.arm)
     stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)

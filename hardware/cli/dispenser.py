@@ -42,30 +42,30 @@ def add_dispenser(commands: Commands) -> None:
     command = commands.add(
         "dispenser",
         _run_dispenser,
-        "see what answers on a dispenser's line, open it for a moment; or serve a virtual one",
-        "Listen on the line of each dispenser of a file and tell what it says; nothing is sent. With --on S and\n"
-        "--yes, one of them is prepared, opened for S seconds and closed, whatever ends the command. With the word\n"
-        "virtual instead of a file, serve a virtual dispenser on a pseudo-terminal; Ctrl-C ends it with a summary.\n"
-        "Exit code 1 where a line is not there, or the dispenser fails.",
+        "test a dispenser's line, open it for a moment; or serve a virtual dispenser",
+        "Listen on the line of each dispenser of a file and print its messages; nothing is sent. With --on S and\n"
+        "--yes, one dispenser is prepared, opened for S seconds and always closed, even after Ctrl-C. With the word\n"
+        "`virtual` instead of a file, serve a virtual dispenser on a pseudo-terminal; Ctrl-C ends it with a summary.\n"
+        "Exit code 1 if a line does not exist or a dispenser fails.",
         "stillbed dispenser dispenser.toml",
         "stillbed dispenser dispenser.toml --name syringe --on 2 --yes",
         "stillbed dispenser virtual --link ./dispenser --log flow.csv",
     )
-    command.add_argument("which", metavar="DISPENSER.toml", help="a dispenser file, or the word virtual")
+    command.add_argument("which", metavar="DISPENSER.toml", help="dispenser file, or the word `virtual`")
     add = command.add_argument_group("dispensers of a file").add_argument
-    add("--name", metavar="NAME", help="which of them, where there are several")
-    add("--seconds", type=positive, metavar="S", help="to listen; default 5")
-    add("--on", type=positive, metavar="S", help=f"let material out for so long, at most {MAX_OPEN:g} s")
-    add("--flow", type=positive, metavar="MM3_S", help="of a metered one; default: the middle of its range")
-    add("--celsius", type=float, metavar="C", help="its temperature before that")
-    add("--yes", action="store_true", help="somebody sees where the material goes")
+    add("--name", metavar="NAME", help="name of the dispenser, if the file has several")
+    add("--seconds", type=positive, metavar="S", help="listening time; default 5")
+    add("--on", type=positive, metavar="S", help=f"open time, at most {MAX_OPEN:g} s")
+    add("--flow", type=positive, metavar="MM3_S", help="flow of a metered dispenser; default: middle of its range")
+    add("--celsius", type=float, metavar="C", help="temperature to reach before it opens")
+    add("--yes", action="store_true", help="confirm that somebody watches the material")
     add = command.add_argument_group("a virtual one").add_argument
-    add("--preset", metavar="NAME", help="the language it speaks: arduino (the default), new_era or gcode_valve")
-    add("--log", type=Path, metavar="FLOW.csv", help="write its true flow, a row a millisecond")
-    add("--link", type=Path, metavar="LINK", help="a symbolic link to make to the device")
+    add("--preset", metavar="NAME", help="message format: arduino (the default), new_era or gcode_valve")
+    add("--log", type=Path, metavar="FLOW.csv", help="write the true flow, one row per millisecond")
+    add("--link", type=Path, metavar="LINK", help="symbolic link to create to the device")
     add("--delays", type=not_negative, nargs=4, metavar="S", help="on dead time, on lag, off dead time, off lag")
-    add("--ooze", type=not_negative, metavar="MM3", help="volume that follows after off")
-    add("--no-watchdog", action="store_true", help="it stays on when nobody speaks to it any more")
+    add("--ooze", type=not_negative, metavar="MM3", help="volume that flows out after off")
+    add("--no-watchdog", action="store_true", help="without watchdog: it stays on when its messages end")
 
 
 def _run_dispenser(a: argparse.Namespace) -> int:
@@ -118,7 +118,7 @@ def _connect(a: argparse.Namespace) -> int:
     if a.on > MAX_OPEN:
         raise wrong_option("--on", a.on, f"at most {MAX_OPEN:g} s")
     if not a.yes:
-        raise wrong_option("--yes", "missing", "given by whoever sees where the material goes")
+        raise wrong_option("--yes", "missing", "the confirmation that somebody watches the material")
     if found[0].line is None:
         raise wrong_option(
             "--on", found[0].profile.name, "a dispenser with a line of its own; the arm switches this one"
@@ -224,11 +224,11 @@ def add_calibrate_dispenser(parts: Commands) -> None:
     part = parts.add(
         "dispenser",
         _calibrate_dispenser,
-        "how late a dispenser switches, from lines that it draws before the cameras",
-        "Let the arm draw straight lines at several speeds on a sheet of another colour, photograph them, and get\n"
-        "the dispenser's dead times and lags, each with its doubt, and a verdict. The nozzle begins over the middle\n"
-        "of the lines, as high as it prints. If the verdict is PASS the delays are written into the file; of a\n"
-        "virtual one never. Or do that again from a recorded folder; or enter what a ruler says. Exit code 0: PASS;\n"
+        "calibrate a dispenser's delays with lines drawn before the cameras",
+        "The arm draws straight lines at several speeds on a sheet of another colour; the cameras photograph them.\n"
+        "Result: the dispenser's dead times and lags, with uncertainties, and a verdict. Start: the nozzle over the\n"
+        "middle of the lines, at printing height. After PASS the delays are written to the file, except those of a\n"
+        "virtual dispenser. Other sources: a recorded folder, or lengths measured with a ruler. Exit code 0: PASS;\n"
         "1: FAIL.",
         "stillbed calibrate dispenser dispenser.toml --device /dev/ttyUSB0 --arm arm.toml --cameras rig.toml "
         "--record lines --yes",
@@ -237,28 +237,28 @@ def add_calibrate_dispenser(parts: Commands) -> None:
         "stillbed calibrate dispenser dispenser.toml --measured 1.1,0.9,10 --measured 3.2,2.8,30",
     )
     add = part.add_argument
-    add("file", type=Path, metavar="DISPENSER.toml", help="where it is, and where the delays are written to")
-    add("--name", metavar="NAME", help="which of them, where there are several")
-    add("--from", dest="folder", type=Path, metavar="FOLDER", help="lines that were recorded before; nothing moves")
-    add("--device", metavar="DEVICE", help="the arm's port: a path, or a URL of pyserial's")
-    add("--virtual", action="store_true", help="an arm, a dispenser and cameras that are simulated, beside the truth")
-    ruler = "mm from the place of on to half the width, the same of off, and mm/s; once for each line"
+    add("file", type=Path, metavar="DISPENSER.toml", help="dispenser file; the delays are written to it")
+    add("--name", metavar="NAME", help="name of the dispenser, if the file has several")
+    add("--from", dest="folder", type=Path, metavar="FOLDER", help="recorded lines; nothing moves")
+    add("--device", metavar="DEVICE", help="port of the arm: a path, or a URL of pyserial")
+    add("--virtual", action="store_true", help="simulated arm, dispenser and cameras; also prints the truth")
+    ruler = "mm from the switch to half the line's width, at on and at off, and the speed in mm/s; once per line"
     add("--measured", type=_ruled_line, action="append", metavar="START,END,SPEED", help=ruler)
     add("--arm", type=Path, metavar="ARM.toml", help="the calibrated arm")
     add("--cameras", type=Path, metavar="RIG.toml", help="the calibrated cameras, with their sources")
-    add("--record", type=Path, metavar="FOLDER", help="new folder for pictures, commands and switches")
-    add("--celsius", type=float, metavar="C", help="its temperature while it draws")
+    add("--record", type=Path, metavar="FOLDER", help="output folder for pictures, commands and switches, new")
+    add("--celsius", type=float, metavar="C", help="temperature while it draws")
     add = part.add_argument_group("the lines").add_argument
-    add("--speeds", type=_speeds, default=(10.0, 20.0, 30.0), metavar="A,B,C", help="mm/s; default 10,20,30")
-    add("--lines", type=int, default=4, metavar="N", help="at each speed, to and fro in turn; default 4")
-    add("--length-mm", type=positive, default=40.0, metavar="MM", help="from on to off, along the arm's X; default 40")
-    add("--spacing-mm", type=positive, default=6.0, metavar="MM", help="between lines; default 6")
-    add("--height-mm", type=not_negative, default=0.4, metavar="MM", help="of the nozzle over the sheet; default 0.4")
-    add("--area-mm2", type=positive, default=0.4, metavar="MM2", help="of a metered one's bead; default 0.4")
-    add("--away", default="home", metavar="WHERE", help="out of the pictures: X,Y,Z,A,B,C; default home")
-    add("--stands", metavar="WHERE", help="where a silent arm stands: X,Y,Z,A,B,C or home")
-    add("--yes", action="store_true", help="somebody sees that nobody is within reach, and where the material goes")
-    add("--no-pause-frame", action="store_true", help="its controller knows no frame that stops it")
+    add("--speeds", type=_speeds, default=(10.0, 20.0, 30.0), metavar="A,B,C", help="speeds, mm/s; default 10,20,30")
+    add("--lines", type=int, default=4, metavar="N", help="lines at each speed, to and fro in turn; default 4")
+    add("--length-mm", type=positive, default=40.0, metavar="MM", help="length, along the arm's X; default 40")
+    add("--spacing-mm", type=positive, default=6.0, metavar="MM", help="distance of the lines; default 6")
+    add("--height-mm", type=not_negative, default=0.4, metavar="MM", help="nozzle's height over the sheet; default 0.4")
+    add("--area-mm2", type=positive, default=0.4, metavar="MM2", help="bead's cross-section, if metered; default 0.4")
+    add("--away", default="home", metavar="WHERE", help="position outside the pictures: X,Y,Z,A,B,C; default home")
+    add("--stands", metavar="WHERE", help="position of an arm without replies: X,Y,Z,A,B,C or home")
+    add("--yes", action="store_true", help="confirm: nobody is within reach, the material is watched")
+    add("--no-pause-frame", action="store_true", help="the controller does not support the pause frame")
 
 
 def _ruled_line(text: str) -> tuple[float, float, float]:
@@ -310,7 +310,7 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
         return 0
     if a.folder is None:
         if a.device is not None and not a.yes:
-            raise wrong_option("--yes", "missing", "given by whoever sees that nobody is within reach")
+            raise wrong_option("--yes", "missing", "the confirmation that nobody is within reach")
         if settings.line is None:
             raise wrong_option("dispenser", settings.profile.name, "one with a line of its own; of others --measured")
         check_record(a.record)

@@ -35,52 +35,52 @@ def add_live(commands: Commands) -> None:
     command = commands.add(
         "live",
         _run_live,
-        "print on a moving wound: track it, move the arm, record everything",
-        "Print on a wound that moves: check, find it and lay the path on it, approach, print. Space or\n"
-        "Enter in the terminal stops the arm at once, Ctrl-C stops it and ends the run. What was recorded is whole\n"
-        "whatever ends the run, and --resume goes on where it stopped. Exit code 0 where the path is printed, 1 where\n"
-        "the run ended before, 2 for wrong input, 128 and more where a signal ended it.",
+        "print on a moving wound: track it, move the arm, record",
+        "Print on a moving wound: checks, detection of the wound, placement of the path, approach, printing. Space or\n"
+        "Enter in the terminal stops the arm at once; Ctrl-C stops it and ends the run. The recording is complete\n"
+        "however the run ends, and --resume continues a run. Exit code 0: the path is printed, 1: the run ended\n"
+        "earlier, 2: wrong input, 128 or more: a signal ended it.",
         "stillbed live session.toml",
         "stillbed live --simulated data/scenarios/breathing_calm.toml --record run.mcap --yes",
         "stillbed live --resume run.mcap",
         "stillbed live session.toml --page-address 0.0.0.0 --page-cert page.pem --page-key page.key --page-name lab",
     )
-    command.add_argument("settings", nargs="?", type=Path, metavar="session.toml", help="see stillbed init")
-    add = command.add_argument_group("what is printed where").add_argument
-    add("--rig", type=Path, metavar="RIG", help="rig.toml of cameras, or a session shown in real time")
-    add("--simulated", type=named_path, metavar="SCENARIO.toml", help="a scenario, rendered before the run")
+    command.add_argument("settings", nargs="?", type=Path, metavar="session.toml", help="settings; see stillbed init")
+    add = command.add_argument_group("what to print, and where").add_argument
+    add("--rig", type=Path, metavar="RIG", help="rig.toml of live cameras, or a session to play in real time")
+    add("--simulated", type=named_path, metavar="SCENARIO.toml", help="scenario, rendered before the run")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
-    what = 'scan of the surface, in the frame of the path; or "from the cameras", which then scan it before the run'
+    what = 'scan of the surface, in the frame of the path; or "from the cameras": they scan it before the run'
     add("--scan", type=named_path, metavar="SCAN.ply", help=what)
-    add("--arm", metavar="DEVICE", help='a path, a URL of pyserial\'s, or "virtual"')
-    add("--profile", type=named_path, metavar="ARM.toml", help="the arm's place, limits, dialect, lag")
-    add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="what lets material out; else nothing does")
-    add("--record", type=Path, metavar="X.mcap", help="the recording; other files stand beside it")
-    add = add_how = command.add_argument_group("how").add_argument
-    add("--resume", type=Path, metavar="X.mcap", help="go on where the run recorded there stopped")
-    add("--dry-run", action="store_true", default=None, help="extrude nothing, stay above the path")
-    add("--look", metavar="WHEN", help='step aside and look at what was laid after each "layer", or so many beads')
-    add("--adapt", action="store_true", default=None, help="with --look: each layer's flow by what lies under it")
-    add("--lift", type=float, metavar="MM", help="how far above, in a dry run; default 10")
-    add("--yes", action="store_true", default=None, help="nobody confirms the path and the start")
-    add("--stands-home", action="store_true", default=None, help="an arm that does not answer stands so")
-    add("--jpeg-quality", type=int, metavar="Q", help="record unencoded pictures smaller and not exactly")
-    add("--operator", metavar="NAME", help="who runs it, as recording and reports keep it")
-    port = "show the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
-    add("--no-trace", action="store_true", help="record no /trace: where each frame set's time went")
+    add("--arm", metavar="DEVICE", help='port of the arm: a path, a URL of pyserial, or "virtual"')
+    add("--profile", type=named_path, metavar="ARM.toml", help="arm file: base pose, limits, dialect, lag")
+    add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="dispenser file; default: no material")
+    add("--record", type=Path, metavar="X.mcap", help="recording to write; the run's other files go beside it")
+    add = add_how = command.add_argument_group("how to print").add_argument
+    add("--resume", type=Path, metavar="X.mcap", help="recording of a run to continue")
+    add("--dry-run", action="store_true", default=None, help="do not extrude; stay above the path")
+    add("--look", metavar="WHEN", help='inspect the printed beads after each "layer", or after this number of beads')
+    add("--adapt", action="store_true", default=None, help="with --look: adapt the flow to the layer below")
+    add("--lift", type=float, metavar="MM", help="height above the path in a dry run; default 10")
+    add("--yes", action="store_true", default=None, help="do not ask to confirm the path and the start")
+    add("--stands-home", action="store_true", default=None, help="the arm is at home, if it does not answer")
+    add("--jpeg-quality", type=int, metavar="Q", help="JPEG quality for raw pictures; 0: lossless")
+    add("--operator", metavar="NAME", help="name of the operator, for recording and reports")
+    port = "serve the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
+    add("--no-trace", action="store_true", help="do not record /trace, the time of each stage of each frame set")
     add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
     add("--trace", type=Path, metavar="X.json", help="write the recorded /trace for Perfetto; see stillbed trace")
-    add_fault(add, 'of a simulated run, what goes wrong, such as "tracking hang at 5s for 1s"; see docs/faults.md')
+    add_fault(add, 'a fault to inject into a simulated run, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
-    add("--no-page", action="store_true", help="without it")
-    add("--open", action="store_true", help="open it in a browser")
-    add("--page-address", metavar="ADDR", help="serve other machines too, at this address, by TLS alone")
-    add("--page-port", type=int, metavar="N", help="by default any that is free")
-    add("--page-cert", dest="page_certificate", type=Path, metavar="PEM", help="certificate for that")
-    add("--page-key", type=Path, metavar="PEM", help="the certificate's key, without a password")
-    add("--page-name", action="append", metavar="NAME", help="as browsers call this machine; repeatable")
+    add("--no-page", action="store_true", help="do not serve the page")
+    add("--open", action="store_true", help="open the page in a browser")
+    add("--page-address", metavar="ADDR", help="serve other machines too, at this address, with TLS only")
+    add("--page-port", type=int, metavar="N", help="port of the page; default: any free port")
+    add("--page-cert", dest="page_certificate", type=Path, metavar="PEM", help="certificate for TLS")
+    add("--page-key", type=Path, metavar="PEM", help="key of the certificate, without a password")
+    add("--page-name", action="append", metavar="NAME", help="host name of this machine in browsers; repeatable")
     add_how("--force", action="store_true", help="overwrite the recording")
 
 
@@ -89,19 +89,19 @@ def add_record(commands: Commands) -> None:
     add = commands.add(
         "record",
         _run_record,
-        "record live cameras, without an arm",
-        "Record the cameras of a rig.toml, or of a session.toml, as a live run would, with a page that shows their\n"
-        "pictures, rates and how sharp they are. Ctrl-C, the page or --seconds ends it; whatever ends it, what was\n"
-        "written before is kept. track, smooth, segment, plan --session and calibrate take the file. Exit code 1\n"
-        "where nothing came, or the recording ended by a fault.",
+        "record live cameras without an arm",
+        "Record the cameras of a rig.toml, or of a session.toml, as in a live run. A page shows their pictures, rates\n"
+        "and sharpness. Ctrl-C, the page or --seconds ends it; the recording is kept in every case. Input for\n"
+        "track, smooth, segment, plan --session and calibrate. Exit code 1 if no picture came, or if a fault ended\n"
+        "the recording.",
         "stillbed record rig.toml -o try.mcap --seconds 20",
     ).add_argument
-    add("which", type=Path, metavar="RIG.toml", help="its cameras; or a session.toml, with its rig, region and quality")
-    add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
-    add("--seconds", type=positive, metavar="S", help="from the first picture on; default: until Ctrl-C")
-    add("--jpeg-quality", type=int, metavar="Q", help="1 to 100, default 90; 0 keeps the pictures exactly")
+    add("which", type=Path, metavar="RIG.toml", help="rig; or a session.toml, with its rig, region and quality")
+    add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="output file")
+    add("--seconds", type=positive, metavar="S", help="duration from the first picture; default: until Ctrl-C")
+    add("--jpeg-quality", type=int, metavar="Q", help="JPEG quality, 1 to 100, default 90; 0: lossless")
     add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
-    add("--no-page", action="store_true", help="without a page")
+    add("--no-page", action="store_true", help="do not serve the page")
     add("--force", action="store_true", help="overwrite the file")
 
 
@@ -110,14 +110,14 @@ def add_trace(commands: Commands) -> None:
     add = commands.add(
         "trace",
         _run_trace,
-        "where the time of a live run's slowest frame sets went",
-        "Read the trace in the recording of a live run: how long frame sets took from their pixels in memory to the\n"
-        "first move on the wire, and what the processes did meanwhile, for all sets and for the slowest hundredth.",
+        "show the processing times of a live run's slowest frame sets",
+        "Read the trace in the recording of a live run: the time of the frame sets from their pixels in memory to the\n"
+        "first move on the wire, and the work of the processes in that time, for all sets and for the slowest 1 %.",
         "stillbed trace run.mcap -o run.json --page run.trace.html",
     ).add_argument
-    add("recording", type=Path, metavar="X.mcap", help="of a live run")
+    add("recording", type=Path, metavar="X.mcap", help="recording of a live run")
     add("-o", "--out", type=Path, metavar="X.json", help="write it for Perfetto (ui.perfetto.dev), chrome://tracing")
-    add("--page", type=Path, metavar="X.html", help="write a page: the causes, and the slowest sets as lanes")
+    add("--page", type=Path, metavar="X.html", help="write a page: causes, and timelines of the slowest sets")
     add("--force", action="store_true", help="overwrite these files")
 
 
@@ -161,11 +161,11 @@ def add_init(commands: Commands) -> None:
     add = commands.add(
         "init",
         _run_init,
-        "write a commented session.toml to begin with",
-        "Write FOLDER/session.toml, which says everything that a live run is told, with a comment a key.",
+        "write a commented session.toml",
+        "Write FOLDER/session.toml with all settings of a live run, and a comment for each key.",
         "stillbed init monday",
     ).add_argument
-    add("out", type=Path, metavar="FOLDER", help="made if it is not there")
+    add("out", type=Path, metavar="FOLDER", help="output folder; created if it does not exist")
 
 
 def _run_live(a: argparse.Namespace) -> int:
@@ -231,35 +231,35 @@ def add_arm(commands: Commands) -> None:
     command = commands.add(
         "arm",
         _run_arm,
-        "see what answers on the arm's port, home it; or serve a virtual one",
-        "Listen to an arm and tell what answers, how often and from where; nothing moves unless a move is\n"
-        "asked for, and a move needs --yes. Without DEVICE, list the drivers of arms, what each finds, and how\n"
-        "to install what is missing. With --virtual, serve a virtual SEED S6H4D on a pseudo-terminal instead,\n"
-        "for any client that speaks its protocol; Ctrl-C ends it with a summary.",
+        "test the arm on a port, home it, jog it; or serve a virtual arm",
+        "Listen to an arm and print its replies, their rate and its position. It moves only with --home or --jog, and\n"
+        "these need --yes. Without DEVICE, list the drivers, the arms that each finds, and how to install missing\n"
+        "drivers. With --virtual, serve a virtual SEED S6H4D on a pseudo-terminal instead, for any client that\n"
+        "uses its protocol; Ctrl-C ends it with a summary.",
         "stillbed arm",
         "stillbed arm /dev/ttyUSB0",
         "stillbed arm /dev/ttyUSB0 --home --yes",
         "stillbed arm --virtual --link ./arm --replies stream --fault 'stall 600ms at 5s'",
     )
     which = command.add_mutually_exclusive_group()
-    where = "a path, a URL of pyserial's such as socket://, or one of another driver; none: list drivers and arms"
+    where = "path, URL of pyserial such as socket://, or address of another driver; none: list drivers and arms"
     which.add_argument("device", nargs="?", metavar="DEVICE", help=where)
     which.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
-    command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="its home, limits, dialect and baud rate")
+    command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="home, limits, dialect, baud rate")
     add = command.add_argument_group("an arm on a port").add_argument
-    add("--seconds", type=positive, default=5.0, metavar="S", help="to listen; default 5")
+    add("--seconds", type=positive, default=5.0, metavar="S", help="listening time; default 5")
     add("--watch", action="store_true", help="listen until Ctrl-C")
-    add("--home", action="store_true", help="go home, slowly: up, across, down")
-    add("--jog", nargs="+", metavar="AXIS=BY", help="go by so many mm or degrees: X=+5 B=-2.5")
-    add("--stands", metavar="WHERE", help="where an arm that does not answer stands: X,Y,Z,A,B,C or home")
-    add("--origin", metavar="X,Y,Z", help="mm in machine axes: send G54, and what comes after from there")
-    add("--yes", action="store_true", help="somebody sees that nobody is within the arm's reach")
-    add("--no-pause-frame", action="store_true", help="its controller knows no frame that stops it")
+    add("--home", action="store_true", help="move to home, slowly: up, across, down")
+    add("--jog", nargs="+", metavar="AXIS=BY", help="move by mm or degrees: X=+5 B=-2.5")
+    add("--stands", metavar="WHERE", help="position of an arm without replies: X,Y,Z,A,B,C or home")
+    add("--origin", metavar="X,Y,Z", help="origin, mm in machine axes: send G54, and use it for the moves")
+    add("--yes", action="store_true", help="confirm that nobody is within the arm's reach")
+    add("--no-pause-frame", action="store_true", help="the controller does not support the pause frame")
     add = command.add_argument_group("a virtual arm").add_argument
-    add("--link", type=Path, metavar="LINK", help="a symbolic link to make to the device")
-    add("--replies", choices=("off", "stream", "stray"), default="off", help="what the arm sends")
-    add_fault(add, "e.g. 'slow 80%% at 2s for 1s'")
-    add("--log", type=Path, metavar="X.csv", help="write the executed motion, a row a millisecond, at the end")
+    add("--link", type=Path, metavar="LINK", help="symbolic link to create to the device")
+    add("--replies", choices=("off", "stream", "stray"), default="off", help="replies of the arm")
+    add_fault(add, "a fault to inject, such as 'slow 80%% at 2s for 1s'")
+    add("--log", type=Path, metavar="X.csv", help="at the end, write the executed motion, one row per millisecond")
 
 
 def _run_arm(a: argparse.Namespace) -> int:
@@ -316,19 +316,19 @@ def add_cameras(commands: Commands) -> None:
     add = commands.add(
         "cameras",
         _run_cameras,
-        "list cameras; show what they deliver, how steadily and how sharply",
-        "Without a name, list what each driver finds, by names that stay. With names, watch them\n"
-        "for a few seconds and tell of each: rate, jitter, lag, offset, sharpness, brightness, the controls it\n"
-        "took, and the frames that were missing, frozen or black. A camera is named by /dev/v4l/by-id/...,\n"
-        "/dev/v4l/by-path/..., usb:SERIAL, genicam://ID, a URL or a video file; RIG.toml stands for all cameras\n"
-        "of a rig, set up as it says. Exit code 1 where a camera delivers nothing or refuses a control.",
+        "list cameras; measure their rate, jitter and sharpness",
+        "Without a name, list the cameras of each driver, by permanent names. With names, watch them for some seconds\n"
+        "and print of each: rate, jitter, lag, offset, sharpness, brightness, accepted controls, and numbers of\n"
+        "missing, frozen and black frames. Name of a camera: /dev/v4l/by-id/..., /dev/v4l/by-path/..., usb:SERIAL,\n"
+        "genicam://ID, a URL or a video file; RIG.toml: all cameras of a rig, with its controls. Exit code 1 if a\n"
+        "camera delivers nothing or refuses a control.",
         "stillbed cameras",
         "stillbed cameras rig.toml -o sheet.jpg",
         "stillbed cameras rtsp://192.168.0.20/stream --seconds 10",
     ).add_argument
-    add("which", nargs="*", metavar="DEVICE_OR_URL_OR_RIG.toml", help="cameras to watch; none: list")
-    add("--seconds", type=float, default=5.0, metavar="S", help="to watch; default 5")
-    add("-o", "--out", type=Path, metavar="SHEET.jpg", help="write their last pictures on one sheet")
+    add("which", nargs="*", metavar="DEVICE_OR_URL_OR_RIG.toml", help="cameras to watch; none: list all")
+    add("--seconds", type=float, default=5.0, metavar="S", help="duration; default 5")
+    add("-o", "--out", type=Path, metavar="SHEET.jpg", help="write the last pictures on one sheet")
     add("--force", action="store_true", help="overwrite the sheet")
     add("--json", action="store_true", help="print JSON")
 

@@ -53,8 +53,8 @@ def add_bench(commands: Commands) -> None:
     parser = commands.add(
         "bench",
         run_bench,
-        "measure a part, and print each figure beside its target",
-        "Measure a part of stillbed and print each figure beside its target and its reference.",
+        "measure a part of stillbed; print each figure with its target",
+        "Measure a part of stillbed and print each figure with its target and its reference.",
         "stillbed bench latency -o out/latency",
         "stillbed bench --quick",
     )
@@ -65,12 +65,12 @@ def add_bench_options(parser: argparse.ArgumentParser) -> None:
     """What to measure: a subject and its options, or all."""
     add = parser.add_argument
     add("--list", action="store_true", help="list the subjects and exit")
-    add("--all", action="store_true", help="measure all subjects, each in short; what is there is kept")
-    add("--quick", action="store_true", help="the same of fewer subjects, in two minutes")
-    add("--out", "-o", type=Path, default=BENCH_OUT, help=f"with --all or --quick: folder; default {BENCH_OUT}")
-    add("--against", type=Path, metavar="figures.json", help="with --all or --quick: tell what is worse than there")
-    add("subject", nargs="?", metavar="SUBJECT", help="what to measure; see --list")
-    add("rest", nargs=argparse.REMAINDER, metavar="...", help="its options; see SUBJECT --help")
+    add("--all", action="store_true", help="measure all subjects, in a short form; figures that exist in OUT are kept")
+    add("--quick", action="store_true", help="as --all, with fewer subjects: two minutes")
+    add("--out", "-o", type=Path, default=BENCH_OUT, help=f"with --all or --quick: output folder; default {BENCH_OUT}")
+    add("--against", type=Path, metavar="figures.json", help="with --all or --quick: print figures worse than there")
+    add("subject", nargs="?", metavar="SUBJECT", help="subject to measure; see --list")
+    add("rest", nargs=argparse.REMAINDER, metavar="...", help="options of the subject; see SUBJECT --help")
 
 
 def run_bench(arguments: argparse.Namespace, subjects: Subjects | None = None, whole: Whole | None = None) -> None:
@@ -102,7 +102,7 @@ def run_bench(arguments: argparse.Namespace, subjects: Subjects | None = None, w
 def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
     """The options of one subject: where to save, and its own."""
     parser = Parser(prog=f"{subject.program} {name}", description=subject.summary)
-    parser.add_argument("-o", "--out", type=Path, help="folder for figures.json, new or empty")
+    parser.add_argument("-o", "--out", type=Path, help="output folder for figures.json, new or empty")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     subject.add_options(parser)
     return parser
@@ -126,13 +126,13 @@ def add_doctor(commands: Commands) -> None:
     add = commands.add(
         "doctor",
         _run_doctor,
-        "what works on this machine, and what to do about the rest",
-        "Look at the processor, memory, disk, priority, libraries, cameras, serial ports and the shipped\n"
-        "network, and say of each whether a live run can be made with it, and what to do where it cannot. Moves\n"
-        "nothing and writes nothing. Exit code 1 where something fails; a warning does not.",
+        "check this machine; say how to repair what fails",
+        "Check the processor, memory, disk, priority, libraries, cameras, serial ports and the shipped network.\n"
+        "For each: is it sufficient for a live run, and if not, what to do. Moves nothing and writes nothing.\n"
+        "Exit code: 1 if a check fails, 0 if there are only warnings.",
         "stillbed doctor",
     ).add_argument
-    add("--folder", type=Path, default=Path(), metavar="DIR", help="where sessions will be recorded")
+    add("--folder", type=Path, default=Path(), metavar="DIR", help="folder where sessions will be recorded")
     add("--json", action="store_true", help="print JSON")
 
 
@@ -174,14 +174,14 @@ def add_cache(commands: Commands) -> None:
     add = commands.add(
         "cache",
         _run_cache,
-        "how much rendered scenes take, and take them away",
-        "Tell where the scenes lie that `stillbed live --simulated` has rendered, and the pictures of `stillbed\n"
-        "simulate`, and how large each is. They are found again by what is in their files, and rendered anew where\n"
-        "they are gone.",
+        "list the cache of rendered scenes, or clear it",
+        "List the cache: scenes rendered by `stillbed live --simulated`, and pictures rendered by `stillbed\n"
+        "simulate`, with the size of each. The key is the content of the scenario's files; a missing scene is\n"
+        "rendered again.",
         "stillbed cache",
         "stillbed cache --clear",
     ).add_argument
-    add("--clear", action="store_true", help="remove them all")
+    add("--clear", action="store_true", help="remove all of them")
 
 
 def _run_cache(a: argparse.Namespace) -> None:
@@ -284,19 +284,19 @@ def add_simulate(commands: Commands) -> None:
     add = commands.add(
         "simulate",
         _simulate,
-        "print on a simulated wound, and measure the nozzle's error",
-        "Run a scenario in virtual time: the wound moves, cameras see it, tracking and motion are a live run's, a\n"
-        "virtual arm executes, and every millisecond the nozzle is compared with its true checkpoint.\n"
+        "print on a simulated wound; measure the nozzle error",
+        "Run a scenario in virtual time: a moving wound, its cameras, the tracking and motion code of a live run,\n"
+        "and a virtual arm. Every millisecond the nozzle is compared with its true checkpoint.\n"
         "Writes the session (MCAP and folder), tracking/, commands.csv, frames.bin, nozzle.csv, summary.json and\n"
-        "report.html. Exit code 0 where the scenario's own limits are met, 1 where they are not.",
+        "report.html. Exit code: 0 if the limits in the scenario are met, 1 if not.",
         "stillbed simulate data/scenarios/breathing_calm.toml -o out/calm",
     ).add_argument
-    add("scenario", type=named_path, metavar="SCENARIO.toml", help="what is simulated; see data/scenarios")
-    add("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
-    add("--trace", type=Path, metavar="FILE", help="a recorded motion, TUM or CSV, instead of its own")
+    add("scenario", type=named_path, metavar="SCENARIO.toml", help="scenario; see data/scenarios")
+    add("-o", "--out", type=Path, required=True, help="output folder, new or empty")
+    add("--trace", type=Path, metavar="FILE", help="recorded motion, TUM or CSV, instead of the scenario's")
     add_fault(add)
-    add("--threads", type=int, default=2, metavar="N", help="threads that render; results do not vary")
-    add("--open", action="store_true", help="open the page that shows the run in a browser")
+    add("--threads", type=int, default=2, metavar="N", help="rendering threads; they do not change the results")
+    add("--open", action="store_true", help="open the page of the run in a browser")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
 

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from hardware.process.clock import WallClock
 
 Run = Callable[[argparse.Namespace], int | None]  # a command: its exit code, None for 0
-FAULT_TEXT = 'what goes wrong, such as "camera0 stuck at 5s for 2s"; may be given more than once; see docs/faults.md'
-ROI_HELP = "a file with a table [region]: where the surface is in the pictures, see docs/live.md"
-MODEL_HELP = "the network that finds the wound: your own, of stillbed train, or by default the one that comes along"
+FAULT_TEXT = 'a fault to inject, such as "camera0 stuck at 5s for 2s"; repeatable; see docs/faults.md'
+ROI_HELP = "a file with a table [region]: the surface's region in the pictures; see docs/live.md"
+MODEL_HELP = "network that segments the wound, as `stillbed train` writes it; default: the shipped one"
 FAILED = 1  # exit code where a command ran, and its result is not good enough
 WRONG_INPUT = 2  # exit code
 INTERRUPTED = 130  # exit code that a shell expects after Ctrl-C

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 PLAN_TEXT = """\
 Plan the print of a wound. SCAN is a mesh (.ply, .stl, .obj, .off, .gltf, .glb) or a cloud of points (.ply, .pcd,
-.xyz) of the wound with skin around it, or a flat contour (.csv with x_mm,y_mm): one layer. The mesh is repaired, the
-wound found as the depression in the skin, the healthy skin interpolated over it, the volume between cut into layers,
-each filled with beads, and the tool led over them.
+.xyz) of the wound with skin around it, or a flat contour (.csv with x_mm,y_mm) for one layer. Steps: repair the mesh;
+find the wound, a depression in the skin; interpolate the healthy skin over it; divide the volume into layers; fill
+each layer with beads; plan the tool's motion along them.
 
-Writes PATH.csv, whole or not at all, and beside it PATH_layers.csv and PATH.json (coverage, lengths, times, volumes),
-PATH_scan.ply (the scan as repaired), PATH_layers/ (a picture of each layer) and PATH.html (a report with a view in
-three dimensions, without a network). The path is in the scan's frame: a session whose surface.ply is the same scan
-is printed with it as it stands."""
+Writes PATH.csv (atomically), PATH_layers.csv and PATH.json (coverage, lengths, times, volumes), PATH_scan.ply (the
+repaired scan), PATH_layers/ (a picture of each layer) and PATH.html (a report with a 3D view; needs no network).
+The path is in the scan's frame: it needs no further registration for a session whose surface.ply is the same
+scan."""
 
 PLAN_EXAMPLES = (
     "stillbed plan --example forearm -o out/path.csv",
@@ -51,23 +51,23 @@ def add_plan(commands: Commands) -> None:
     summary = "plan the print of a scanned wound: layers, beads, checkpoints"
     command = commands.add("plan", _run_plan, summary, PLAN_TEXT, *PLAN_EXAMPLES)
     add = command.add_argument
-    add("scan", type=Path, nargs="?", metavar="SCAN", help="mesh or points of the wound, or contour")
-    add("-o", "--out", type=Path, required=True, metavar="PATH.csv", help="path to write")
-    add("--example", choices=("forearm", "chest", "foot"), help="a built-in scan instead of SCAN; also written")
+    add("scan", type=Path, nargs="?", metavar="SCAN", help="mesh or point cloud of the wound, or contour")
+    add("-o", "--out", type=Path, required=True, metavar="PATH.csv", help="output file of the path")
+    add("--example", choices=("forearm", "chest", "foot"), help="built-in scan instead of SCAN; it is also written")
     add("--gcode", type=Path, metavar="FILE", help="also write the path as plain G-code text")
     add(
         "--session", type=Path, metavar="SESSION",
-        help="also lay the scan into this session's first pictures, and say how well it fits the wound they show",
+        help="also register the scan to this session's first pictures, and print how well it fits the wound there",
     )  # fmt: skip
     add(
         "--arm", type=named_path, metavar="ARM.toml",
-        help="keep this arm's tool clear of the tissue, turning it or leaving beads out; and ask its joints about each "
-        "checkpoint, for the column `feasible`, which `stillbed reach` adds without it",
+        help="keep this arm's tool clear of the tissue: tilt it, or omit beads; check its joints and add the "
+        "column `feasible`, as `stillbed reach` does",
     )  # fmt: skip
-    motion = "measure --amplitude-mm: a recording, a folder of `stillbed track`, or a trajectory of the surface"
+    motion = "measure --amplitude-mm from a recording, a folder of `stillbed track`, or a trajectory of the surface"
     add("--motion", metavar="SESSION", help=motion)
-    add("--no-pictures", action="store_true", help="write neither pictures nor the report")
-    add("--force", action="store_true", help="overwrite PATH.csv and what stands beside it")
+    add("--no-pictures", action="store_true", help="do not write pictures and report")
+    add("--force", action="store_true", help="overwrite PATH.csv and the other output files")
     _add_scan(command)
     _add_layers(command)
     _add_pattern(command)
@@ -76,73 +76,79 @@ def add_plan(commands: Commands) -> None:
 
 def _add_scan(command: argparse.ArgumentParser) -> None:
     add = command.add_argument_group("the scan").add_argument
-    add("--unit", choices=("mm", "cm", "m", "inch"), default="mm", help="of SCAN's numbers; default mm")
-    add("--flip", action="store_true", help="turn SCAN over, whose normals point inwards")
-    outline = "outline of the wound, x_mm,y_mm[,z_mm] in SCAN's frame, mm; default: found"
+    add("--unit", choices=("mm", "cm", "m", "inch"), default="mm", help="unit of SCAN; default mm")
+    add("--flip", action="store_true", help="reverse the normals of SCAN, if they point inwards")
+    outline = "outline of the wound, x_mm,y_mm[,z_mm] in SCAN's frame; default: automatic"
     add("--outline", type=Path, metavar="CSV", help=outline)
-    clicks = "three places or more on the wound's rim, in SCAN's frame, mm, instead of an outline"
+    clicks = "three or more points on the wound's rim, in SCAN's frame, mm, instead of an outline"
     add("--clicks", metavar="X,Y,Z/X,Y,Z/X,Y,Z", help=clicks)
-    add("--wound", type=int, metavar="N", help="which of the places, where a plan was refused with PATH_question.html")
+    add("--wound", type=int, metavar="N", help="number of the wound in PATH_question.html")
 
 
 def _add_layers(command: argparse.ArgumentParser) -> None:
     add = command.add_argument_group("layers").add_argument
     add(
         "--layers", choices=("skin", "conformal", "horizontal"), default="skin",
-        help="parallel to the restored skin; from the bed blending into the skin; flat, as the thesis; default skin",
+        help="skin: parallel to the restored skin; conformal: blended from bed to skin; horizontal: flat (thesis); "
+        "default skin",
     )  # fmt: skip
     add(
         "--tissue", action="append", default=[], metavar="NAME=THICKNESS:MATERIAL[:TEMPERATURE[:SPEED[:HEIGHT]]]",
-        help="bottom up, mm (or 'rest'), degrees C, mm/s, mm of a layer; "
+        help="tissue, repeatable, from the bottom: mm (or 'rest'), degrees C, mm/s, mm; "
         "default hypodermis=rest, dermis=1.6, epidermis=0.4",
     )  # fmt: skip
-    add("--material", default="1,2,3", metavar="M[,M,M]", help="of all, or of each default tissue; default 1,2,3")
-    add("--layer-height", type=float, metavar="MM", help="about; default: as wide as a bead")
+    add("--material", default="1,2,3", metavar="M[,M,M]", help="material, or one per default tissue; default 1,2,3")
+    add("--layer-height", type=float, metavar="MM", help="approximate height; default: the bead's width")
     add(
         "--bump", type=float, metavar="MM",
-        help="bumps of the bed that stand over a layer by this at most are gone over, higher ones round; default half "
-        "a layer, so that the layer above still has room over them",
+        help="print over bumps of the bed up to this height above a layer; avoid higher ones; default: half "
+        "a layer, which leaves room for the next layer",
     )  # fmt: skip
     add(
         "--bump-clearance", type=float, metavar="MM",
-        help="left free around bumps that are gone round; default half a bead, room for a needle's outside",
+        help="distance from avoided bumps; default: half a bead, for the needle's outside",
     )  # fmt: skip
-    add("--temperature", type=float, default=20.0, metavar="C", help="degrees C; default 20")
+    add("--temperature", type=float, default=20.0, metavar="C", help="temperature, degrees C; default 20")
 
 
 def _add_pattern(command: argparse.ArgumentParser) -> None:
     add = command.add_argument_group("pattern").add_argument
     add(
         "--pattern", choices=("zigzag", "raster", "contour", "spiral", "hybrid", "best"), default="contour",
-        help="contour: closed lines, nothing left open; zigzag, raster: straight lines, the quickest to plan; hybrid: "
+        help="contour: closed lines, no gaps; zigzag, raster: straight lines, the fastest to plan; hybrid: "
         "rims around a zigzag; spiral: closed lines joined; best: the faster of contour and spiral; default contour",
     )  # fmt: skip
     add(
         "--angle", default="fastest", metavar="DEG",
-        help="of the lines, or 'shorter' (of 0 and 90) or 'fastest' (of 12), judged on the largest layer; "
+        help="angle of the lines; shorter: of 0 and 90; fastest: of 12, both for the largest layer; "
         "default fastest",
     )  # fmt: skip
-    add("--parallel", action="store_true", help="lines of all layers alike, not every second across")
-    add("--bead", type=float, default=0.4, metavar="MM", help="width of a bead; default 0.4")
-    add("--overlap-percent", type=float, default=0.0, metavar="P", help="of neighbours; default 0")
-    add("--inset", type=float, default=0.0, metavar="MM", help="left free along the rim; default 0")
-    add("--rims", type=int, default=1, metavar="N", help="closed lines of hybrid; default 1")
+    add("--parallel", action="store_true", help="same direction in all layers, instead of crossed in turn")
+    add("--bead", type=float, default=0.4, metavar="MM", help="bead width; default 0.4")
+    add("--overlap-percent", type=float, default=0.0, metavar="P", help="overlap of adjacent beads; default 0")
+    add("--inset", type=float, default=0.0, metavar="MM", help="margin along the wound's rim; default 0")
+    add("--rims", type=int, default=1, metavar="N", help="closed lines of the hybrid pattern; default 1")
 
 
 def _add_way(command: argparse.ArgumentParser) -> None:
-    add = command.add_argument_group("the tool's way").add_argument
+    add = command.add_argument_group("tool motion").add_argument
     for name, default, metavar, text in (
-        ("--speed", 20.0, "MM/S", "of printing"),
-        ("--travel", 60.0, "MM/S", "between beads"),
-        ("--lift", 2.0, "MM", "along the tool, for travels"),
-        ("--wait", 0.0, "S", "before each further layer, lifted off the last"),
-        ("--spacing", 1.0, "MM", "between checkpoints: the shortest length the ink can be laid over"),
-        ("--chord", 0.02, "MM", "by which straight ways may depart from curves: where they would, nearer checkpoints"),
-        ("--sideways", 200.0, "MM/S2", "acceleration in bends, which are slowed down to it"),
-        ("--tilt-deg", 30.0, "DEG", "most the tool leans off the plane's normal"),
-        ("--turning-deg-mm", 5.0, "DEG/MM", "most it turns on its way"),
-        ("--spin-deg", 0.0, "DEG", "about its own axis, free for a round nozzle"),
-        ("--amplitude-mm", 0.0, "MM", "by which the tissue moves, kept free around the tool of --arm beside 0.5 mm"),
+        ("--speed", 20.0, "MM/S", "printing speed"),
+        ("--travel", 60.0, "MM/S", "speed between beads"),
+        ("--lift", 2.0, "MM", "lift between beads, along the tool"),
+        ("--wait", 0.0, "S", "pause before each further layer, with the tool lifted"),
+        ("--spacing", 1.0, "MM", "distance of checkpoints: shortest length that the ink can bridge"),
+        ("--chord", 0.02, "MM", "maximum deviation of segments from curves"),
+        ("--sideways", 200.0, "MM/S2", "maximum lateral acceleration; limits the speed in bends"),
+        ("--tilt-deg", 30.0, "DEG", "maximum tilt of the tool from the plane's normal"),
+        ("--turning-deg-mm", 5.0, "DEG/MM", "maximum rotation of the tool per mm"),
+        ("--spin-deg", 0.0, "DEG", "tool angle about its own axis; any value for a round nozzle"),
+        (
+            "--amplitude-mm",
+            0.0,
+            "MM",
+            "amplitude of the tissue's motion, added to the clearance of --arm's tool, 0.5 mm",
+        ),
     ):
         add(name, type=float, default=default, metavar=metavar, help=f"{text}; default {default:g}")
 
@@ -169,24 +175,24 @@ def add_reach(commands: Commands) -> None:
     add = commands.add(
         "reach",
         _run_reach,
-        "check, before printing, that an arm can print a path",
-        "Check each checkpoint of a path against the arm's joints: reach, ranges, speeds, singularities,\n"
-        "on the surface at rest and wherever it moves to. Prints a table; with -o also writes path.csv (the path with\n"
-        "the column `feasible`), reach.csv (joints and distances of each checkpoint) and reach.html (pictures).\n"
-        "Exit code 0 where all can be printed, 1 where not.",
+        "check, before printing, if an arm can print a path",
+        "Check each checkpoint of a path with the arm's kinematics: reach, joint ranges, joint speeds,\n"
+        "singularities, on the surface at rest and in motion. Prints a table. With -o, writes path.csv (the path with\n"
+        "the column `feasible`), reach.csv (joint angles and clearances of each checkpoint) and reach.html.\n"
+        "Exit code: 0 if all checkpoints are feasible, 1 if not.",
         "stillbed reach data/paths/wound_raster.csv --arm data/arms/s6h4d.toml --amplitude-mm 10",
     ).add_argument
     add("path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
-    add("--arm", type=named_path, required=True, metavar="ARM.toml", help="with a table [kinematics]")
-    surface = "the surface at rest in the arm's frame, mm and degrees; default: level, under the default arm's home"
+    add("--arm", type=named_path, required=True, metavar="ARM.toml", help="arm file with a table [kinematics]")
+    surface = "pose of the surface at rest, in the arm's frame, mm and degrees; default: level, under the default home"
     add("--surface", type=_six_numbers, metavar="X,Y,Z,A,B,C", help=surface)
-    add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="of its motion along its normal")
-    add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="of its motion about x, y and z")
-    add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="of that motion; default 0.25")
-    scan = "that the tool must stay out of, in the path's frame; default: PATH_scan.ply, where plan wrote it"
+    add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="motion amplitude along the normal")
+    add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="motion amplitude about x, y and z")
+    add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="frequency of the motion; default 0.25")
+    scan = "obstacle for the tool, a scan in the path's frame; default: PATH_scan.ply, if it exists"
     add("--scan", type=named_path, metavar="SCAN", help=scan)
-    add("--spin", action="store_true", help="let the tool spin about its own axis where that helps")
-    add("-o", "--out", type=Path, metavar="OUT", help="folder to write to, new or empty")
+    add("--spin", action="store_true", help="allow rotation of the tool about its own axis")
+    add("-o", "--out", type=Path, metavar="OUT", help="output folder, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
 
@@ -214,26 +220,26 @@ def add_segment(commands: Commands) -> None:
     add = commands.add(
         "segment",
         _run_segment,
-        "find the wound in pictures, a video or a session",
-        "Find the wound in pictures, folders of pictures, videos or sessions. Writes a PNG mask (0 or 255) of each\n"
-        "picture's own size and name, and wounds.csv: confidence, area, centroid, box and time of each. A picture\n"
-        "without a wound gets an empty mask. Of a session, where two calibrated cameras or more show the whole wound,\n"
-        "it prints the area in mm^2 with a 95 % interval, and areas.csv has it at nine instants. Ctrl-C keeps what\n"
-        "is done.",
+        "segment the wound in pictures, a video or a session",
+        "Segment the wound in pictures, folders of pictures, videos or sessions. Writes a PNG mask (0 or 255) of each\n"
+        "picture, with its size and name, and wounds.csv: confidence, area, centroid, box and time. The mask of a\n"
+        "picture without a wound is empty. If two or more calibrated cameras of a session see the whole wound, prints\n"
+        "its area in mm^2 with a 95 % interval, and writes areas.csv, the area at nine instants. Ctrl-C keeps the\n"
+        "results so far.",
         "stillbed segment photos/ -o masks --overlay",
         "stillbed segment try.mcap -o masks",
         "stillbed segment ward.mp4 -o masks --method shape",
     ).add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, video, or SESSION")
-    add("-o", "--out", type=Path, required=True, metavar="MASKS", help="folder, new or empty")
-    methods = "unet: a trained network; shape: outlines like the scan's"
+    add("-o", "--out", type=Path, required=True, metavar="MASKS", help="output folder, new or empty")
+    methods = "unet: trained network; shape: matching of outlines"
     add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=methods)
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
-    add("--version", action=_NetworkVersion, nargs=0, help="print the network's name, licence and source, and exit")
-    add("--scan", type=Path, metavar="SCAN", help="with --method shape: of the wound, z upwards")
-    add("--overlay", action="store_true", help="also write the pictures with the outlines drawn in")
-    add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for areas in wounds.csv")
-    add("--threads", type=int, default=2, metavar="N", help="of the network; results do not vary")
+    add("--version", action=_NetworkVersion, nargs=0, help="print name, licence and source of the network, and exit")
+    add("--scan", type=Path, metavar="SCAN", help="with --method shape: scan of the wound, z upwards")
+    add("--overlay", action="store_true", help="also write the pictures with outlines")
+    add("--mm-per-px", type=float, metavar="S", help="scale at the wound, for the areas in wounds.csv")
+    add("--threads", type=int, default=2, metavar="N", help="threads of the network; they do not change results")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
 
@@ -257,35 +263,35 @@ def add_train(commands: Commands) -> None:
         "train",
         _run_train,
         "train the wound network on labelled pictures",
-        "Train the wound network. Each DATASET holds images/ and labels/, a mask of the same name and\n"
-        "size for each picture. The pictures of the first are grouped by what they show and parted into folds;\n"
-        "for each fold a network is trained that never sees it, which judges the recipe and sets the thresholds;\n"
-        "the network that is written learns from all.\n"
+        "Train the wound network. Each DATASET contains images/ and labels/, a mask of the same name and\n"
+        "size for each picture. The pictures of the first are grouped by wound and divided into folds. For each\n"
+        "fold, a network is trained without it: cross-validation, which also sets the thresholds. The written\n"
+        "network is trained with all pictures.\n"
         "Writes X.onnx, X.toml (hash and settings), X.md (model card), X_curves.png, X_reliability.png and\n"
-        "X_trained.txt (the pictures learned from); X_PART.ckpt lets a run that was broken off go on.\n"
-        "Six networks take hours of a processor, or minutes of a large GPU.\n"
+        "X_trained.txt (list of the training pictures); an interrupted training continues from X_PART.ckpt.\n"
+        "Six networks take hours on a processor, or minutes on a large GPU.\n"
         "Needs the extra [train]: pip install 'stillbed[train]'.",
         "stillbed train data/fuseg data/medetec -o wound.onnx",
         "stillbed train data/fuseg -o ward.onnx --add monday.mcap tuesday.mcap",
         "stillbed train data/fuseg data/medetec -o wound.onnx --part 0",
     ).add_argument
-    add("datasets", type=Path, nargs="+", metavar="DATASET", help="the first is what the recipe is judged by")
-    add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="file to write")
-    own = "recordings of live runs: pictures whose outline an operator corrected join the first data set"
+    add("datasets", type=Path, nargs="+", metavar="DATASET", help="data sets; cross-validation uses the first")
+    add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="output file")
+    own = "recordings of live runs: adds the pictures with outlines corrected by an operator to the first data set"
     add("--add", type=Path, nargs="+", default=[], metavar="RECORDING", help=own)
-    networks = "thesis: the U-Net of its 3.3; shape: no network, but what segment --method shape needs, X.toml"
+    networks = "thesis: U-Net of section 3.3; shape: no network, the outlines for segment --method shape (X.toml)"
     add("--network", choices=("wound", "thesis", "shape"), default="wound", help=networks)
-    add("--rounds", type=int, metavar="N", help="of 200 steps (thesis: 100); more take longer")
-    add("--rendered", type=int, default=140, metavar="N", help="rendered pictures to add")
-    add("--folds", type=int, default=5, metavar="N", help="that the first data set is parted into")
-    only = "train only the network without fold 0, 1, ... or the one of all, and stop: processes can share the work"
+    add("--rounds", type=int, metavar="N", help="training rounds of 200 steps (thesis: 100)")
+    add("--rendered", type=int, default=140, metavar="N", help="number of rendered pictures to add")
+    add("--folds", type=int, default=5, metavar="N", help="folds of the first data set")
+    only = "train only one network, without fold 0, 1, ... or `all`, and stop: for several processes"
     add("--part", metavar="PART", help=only)
-    add("--device", choices=("cpu", "cuda"), help="by default cuda where torch sees a GPU; results differ between them")
-    add("--licence", metavar="TEXT", help="under which the network may be used, written into X.toml")
-    add("--source", metavar="TEXT", help="of its pictures, written into X.toml")
-    add("--threads", type=int, default=1, metavar="N", help="of torch")
-    add("--seed", type=int, default=1, metavar="N", help="of the weights and of all that is drawn")
-    add("--force", action="store_true", help="overwrite X.onnx; checkpoints of the same training are gone on from")
+    add("--device", choices=("cpu", "cuda"), help="default: cuda if torch has a GPU; results differ")
+    add("--licence", metavar="TEXT", help="licence of the network, written to X.toml")
+    add("--source", metavar="TEXT", help="source of the pictures, written to X.toml")
+    add("--threads", type=int, default=1, metavar="N", help="threads of torch")
+    add("--seed", type=int, default=1, metavar="N", help="seed of the weights and of all random numbers")
+    add("--force", action="store_true", help="overwrite X.onnx; continue from checkpoints of the same training")
 
 
 def _run_segment(a: argparse.Namespace) -> int:
@@ -335,20 +341,20 @@ def add_scan(commands: Commands) -> None:
     add = commands.add(
         "scan",
         _run_scan,
-        "scan the surface with the calibrated cameras themselves",
-        "Scan the surface with the calibrated cameras: it is tracked for a breath, and pictures of some instants are\n"
-        "fused into a mesh with colour and a standard deviation a vertex, in the surface frame of that session. What\n"
-        "two cameras do not see alike stays open. X.html beside it shows it from three sides, says how much of the\n"
-        "region was seen and how well, and where to put another camera. Ctrl-C fuses what was seen until then.",
+        "scan the surface with the calibrated cameras",
+        "Scan the surface with the calibrated cameras: track it for some seconds; fuse the pictures of some instants\n"
+        "to a mesh with a colour and a standard deviation per vertex, in the surface frame of that session. Parts\n"
+        "without agreement of two cameras remain open. X.html shows it from three sides, the coverage and accuracy\n"
+        "of the region, and the best place for another camera. Ctrl-C ends the tracking early and fuses.",
         "stillbed scan rig.toml -o wound.ply",
         "stillbed scan try.mcap -o wound.ply --sets 12",
         "stillbed scan data/scenarios/breathing_calm.toml -o wound.ply",
     ).add_argument
-    what = "rig.toml or session.toml of live cameras, a scenario.toml, a session folder or an .mcap file"
+    what = "rig.toml or session.toml of live cameras, scenario.toml, session folder or .mcap file"
     add("source", type=named_path, metavar="RIG_OR_SESSION", help=what)
-    add("-o", "--out", type=Path, required=True, metavar="X.ply", help="file to write, with X.html beside it")
-    add("--sets", type=int, default=6, metavar="N", help="instants whose pictures are fused, 2 to 40; default 6")
-    add("--seconds", type=positive, default=4.0, metavar="S", help="in which they are taken; default 4, a breath")
+    add("-o", "--out", type=Path, required=True, metavar="X.ply", help="output file; X.html beside it")
+    add("--sets", type=int, default=6, metavar="N", help="number of fused instants, 2 to 40; default 6")
+    add("--seconds", type=positive, default=4.0, metavar="S", help="tracking time; default 4, a breath")
     add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--force", action="store_true", help="overwrite the files")
 

@@ -16,19 +16,19 @@ def add_track(commands: Commands) -> None:
     add = commands.add(
         "track",
         _track,
-        "follow the surface through a session",
-        "Follow the surface through a recorded session, causally: the pose of a frame set uses nothing after it.\n"
-        "Writes, as it goes, poses.csv and poses.tum, and at the end report.html and summary.json.",
+        "track the surface through a recorded session",
+        "Track the surface through a recorded session, causally: the pose of a frame set uses no later frame set.\n"
+        "Writes poses.csv and poses.tum during the run, and report.html and summary.json at the end.",
         "stillbed track sessions/monday -o out/monday",
     ).add_argument
     add("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
-    add("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    add("-o", "--out", type=Path, required=True, help="output folder, new or empty")
     methods = "; ".join(f"{name}: {what}" for name, what in TRACKING_METHODS.items())
     add("--method", choices=TRACKING_METHODS, default=MAP_METHOD, help=methods)
-    add("--arm", type=named_path, metavar="ARM.toml", help="what tool hangs on the session's arm")
-    prefilter = "done to each picture first: the thesis's bilateral filter (4.6), 50 ms a picture"
+    add("--arm", type=named_path, metavar="ARM.toml", help="arm file with the tool of the session's arm")
+    prefilter = "filter for each picture before tracking; bilateral: as in the thesis (4.6), 50 ms a picture"
     add("--prefilter", choices=("none", "bilateral"), default="none", help=prefilter)
-    add("--wound", action="store_true", help="also segment the wound beside it, into wound.csv")
+    add("--wound", action="store_true", help="also segment the wound; writes wound.csv")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
     add("--graph", type=Path, metavar="X.dot", help="also write the factor graph of the last poses, for Graphviz")
@@ -40,21 +40,21 @@ def add_replay(commands: Commands) -> None:
     add = commands.add(
         "replay",
         _replay,
-        "run tracking and motion on a session under a simulated clock",
-        "Run tracking and motion on a recorded session under a simulated clock, as a live run would, without an arm.\n"
-        "Writes commands.csv, frames.bin, the bytes the arm would get, and arm.toml, what was assumed of the arm.\n"
-        "Same input, same bytes. Without --path, the recording of a live run is replayed as it was: from its poses\n"
-        "and ticks planner and guard decide anew, and each frame is compared. Any other recording knows no arm:\n"
-        "without --arm the default one is placed so that the first surface lies under its home.",
+        "run tracking and motion on a session with a simulated clock",
+        "Run tracking and motion on a recorded session with a simulated clock, as in a live run, without an arm.\n"
+        "Writes commands.csv, frames.bin (the bytes for the arm) and arm.toml (the assumed arm).\n"
+        "The same input gives the same bytes. Without --path, SESSION is the recording of a live run: planner and\n"
+        "guard run again on its poses and ticks, and each frame is compared with the recorded one. Other\n"
+        "recordings contain no arm: without --arm, the default arm is placed with its home above the first surface.",
         "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
     ).add_argument
     add("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
-    path = "checkpoints on the surface; left out: those of a recorded run"
+    path = "checkpoints on the surface; default: those of the recorded run"
     add("--path", type=named_path, metavar="PATH.csv", help=path)
-    add("--arm", type=named_path, metavar="ARM.toml", help="the arm's place, limits and dialect of the link")
-    add("--resume", type=Path, metavar="PROGRESS.toml", help="go on where an earlier run stopped")
+    add("--arm", type=named_path, metavar="ARM.toml", help="arm file: base pose, limits, dialect of the link")
+    add("--resume", type=Path, metavar="PROGRESS.toml", help="continue at the place where an earlier run stopped")
     add_fault(add)
-    add("-o", "--out", type=Path, required=True, help="folder to write to, new or empty")
+    add("-o", "--out", type=Path, required=True, help="output folder, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
 
 
@@ -63,13 +63,13 @@ def add_import(commands: Commands) -> None:
     add = commands.add(
         "import",
         _import,
-        "turn a session folder into one MCAP file",
-        "Turn a session folder (rig.toml, frames.csv, a video or images per camera) into one MCAP file.",
+        "convert a session folder to one MCAP file",
+        "Convert a session folder (rig.toml, frames.csv, a video or images per camera) to one MCAP file.",
         "stillbed import sessions/monday -o monday.mcap",
     ).add_argument
     add("folder", type=Path, metavar="FOLDER", help="session folder")
-    add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="file to write")
-    add("--jpeg-quality", type=int, metavar="Q", help="store images smaller and not exactly, 0 to 100")
+    add("-o", "--out", type=Path, required=True, metavar="X.mcap", help="output file")
+    add("--jpeg-quality", type=int, metavar="Q", help="JPEG quality of images, 0 to 100; default: lossless")
     add("--force", action="store_true", help="overwrite the file")
 
 
@@ -78,8 +78,8 @@ def add_export(commands: Commands) -> None:
     add = commands.add(
         "export",
         _export,
-        "turn an MCAP file into a session folder",
-        "Turn an MCAP file into a session folder: rig.toml, frames.csv and the images of each camera.",
+        "convert an MCAP file to a session folder",
+        "Convert an MCAP file to a session folder: rig.toml, frames.csv and the images of each camera.",
         "stillbed export monday.mcap -o sessions/monday",
     ).add_argument
     add("mcap", type=Path, metavar="X.mcap", help="recording")
@@ -162,34 +162,34 @@ def add_smooth(commands: Commands) -> None:
     add = commands.add(
         "smooth",
         _smooth,
-        "the best estimate of recorded sessions, from all frame sets at once",
-        "Estimate all poses of a recorded session, its landmarks and its cameras' clocks at once, looking\n"
-        "ahead as well as back. Tracks are those of the recording; where it has none, its images are tracked first.\n"
-        "Then all images are searched for landmarks that the tracks do not have there, and all is smoothed again.\n"
-        "Writes smoothed.tum, smoothed.csv (covariances and twists), rig.toml (the cameras as corrected), map.ply,\n"
-        "summary.json, report.html and, of an .mcap file, smoothed.mcap: a copy with the channel /smoothed.\n"
-        "Of several sessions, and of those in a folder of sessions, each gets a folder of its own; one that fails\n"
-        "does not stop the others (exit code 1), and sessions.csv has a line for each. What is done already is not\n"
-        "done again. With --scheduler they are smoothed on a Dask cluster, a task each.",
+        "smooth recorded sessions: all poses from all frame sets at once",
+        "Estimate all poses, landmarks and camera clock offsets of a recorded session at once, from past and\n"
+        "future frame sets. Uses the recorded tracks; if there are none, the images are tracked first.\n"
+        "Then all images are searched for further observations of the landmarks, and the session is smoothed again.\n"
+        "Writes smoothed.tum, smoothed.csv (covariances and twists), rig.toml (corrected cameras), map.ply,\n"
+        "summary.json, report.html and, for an .mcap file, smoothed.mcap: a copy with the channel /smoothed.\n"
+        "Several sessions, or a folder of sessions: each gets its own output folder. A failure does not stop the\n"
+        "others (exit code 1). sessions.csv has a line for each. Finished sessions are not smoothed again. With\n"
+        "--scheduler, a Dask cluster smooths them, one task per session.",
         "stillbed smooth out/calm/session.mcap -o out/smoothed --rate 1000",
         "stillbed smooth sessions/ -o out/all --scheduler local --workers 4",
     ).add_argument
-    add("sessions", type=Path, nargs="+", metavar="SESSION", help="session folder, .mcap file, or a folder of such")
-    add("-o", "--out", type=Path, required=True, help="folder to write to")
-    add("--rate", type=float, metavar="HZ", help="rows of smoothed.csv a second; default: the stamps")
-    refine = "let the recording also correct the cameras' places and lenses, with their calibration as prior"
+    add("sessions", type=Path, nargs="+", metavar="SESSION", help="session folder, .mcap file, or a folder of these")
+    add("-o", "--out", type=Path, required=True, help="output folder")
+    add("--rate", type=float, metavar="HZ", help="rate of smoothed.csv's rows; default: frame sets")
+    refine = "also estimate camera poses and lenses, with the calibration as prior"
     add("--refine-cameras", action="store_true", help=refine)
     no_relink = (
-        "take the tracks as they are; without it, all images are searched for landmarks that the tracks do not "
-        "say to be seen, such as before they joined the map"
+        "use only the given tracks: do not search the images for further observations of the landmarks, such as "
+        "before they joined the map"
     )
     add("--no-relink", action="store_true", help=no_relink)
     scheduler = (
-        "of a Dask scheduler, such as tcp://host:8786, whose workers reach sessions and OUT under the same paths; "
-        "local: start one here; needs the extra [cluster]"
+        "Dask scheduler, such as tcp://host:8786, whose workers see the sessions and OUT under the same paths; "
+        "local: start one on this machine; needs the extra [cluster]"
     )
     add("--scheduler", metavar="ADDRESS", help=scheduler)
-    add("--workers", type=int, metavar="N", help="processes of --scheduler local; default: the cores")
+    add("--workers", type=int, metavar="N", help="worker processes of --scheduler local; default: number of cores")
 
 
 def _smooth(a: argparse.Namespace) -> int:
@@ -214,17 +214,17 @@ def add_compare(commands: Commands) -> None:
     add = commands.add(
         "compare",
         _compare,
-        "one trajectory judged by another: APE, RPE, NEES",
-        "Judge poses by others of the same instants, in the numbers that evo gives: absolute and relative\n"
-        "errors, translation and rotation, as they stand and aligned, without scale; and NEES where there are\n"
-        "covariances. Each of the two is a TUM or CSV file, an .mcap file, or a folder that stillbed wrote; of an\n"
-        ".mcap file FILE:smoothed, FILE:pose or FILE:truth. Writes report.html and compare.json with -o.",
+        "compare a trajectory with a reference: APE, RPE, NEES",
+        "Compare poses with reference poses of the same instants, with the error figures of evo: absolute and\n"
+        "relative errors, translation and rotation, unaligned and aligned (without scale); and NEES if there are\n"
+        "covariances. A and B: a TUM or CSV file, an .mcap file, or a folder written by stillbed. Poses of an\n"
+        ".mcap file: FILE:smoothed, FILE:pose or FILE:truth. With -o, writes report.html and compare.json.",
         "stillbed compare out/smoothed out/calm/session/truth.tum -o out/compared",
     ).add_argument
-    add("estimated", metavar="A", help="the poses that are judged")
-    add("reference", metavar="B", nargs="?", help="what they are judged by; default: the truth in A")
-    add("--delta", type=int, default=1, metavar="N", help="poses over which relative errors are counted; default 1")
-    add("-o", "--out", type=Path, help="folder to write report.html and compare.json to")
+    add("estimated", metavar="A", help="estimated poses")
+    add("reference", metavar="B", nargs="?", help="reference poses; default: the truth in A")
+    add("--delta", type=int, default=1, metavar="N", help="step of the relative errors, in poses; default 1")
+    add("-o", "--out", type=Path, help="output folder for report.html and compare.json")
 
 
 def _compare(a: argparse.Namespace) -> int:
@@ -240,18 +240,18 @@ def add_view(commands: Commands) -> None:
     add = commands.add(
         "view",
         _view,
-        "a recorded session in a browser, with a slider over its time",
-        "Show a recorded or smoothed session in a browser of this machine: the cameras' pictures with the\n"
-        "tracks, the surface in three dimensions with cameras, trajectory, path and nozzle, and the state, at any of\n"
-        "its instants. Prints the address to open; nothing is written. Ctrl-C ends it.",
+        "show a recorded session in a browser, with a time slider",
+        "Show a recorded or smoothed session in a browser on this machine: the cameras' pictures with the\n"
+        "tracks, a 3D view of surface, cameras, trajectory, path and nozzle, and the tracking state, at any time.\n"
+        "Prints the address to open. Writes nothing. Ctrl-C ends it.",
         "stillbed view out/smoothed",
     ).add_argument
-    what = "session folder, .mcap file, or what stillbed smooth wrote of one"
+    what = "session folder, .mcap file, or output folder of `stillbed smooth`"
     add("session", type=Path, metavar="SESSION", help=what)
-    add("--poses", metavar="FILE", help="other poses than the recording's, as stillbed compare reads")
-    add("--path", type=Path, metavar="PATH.csv", help="the path, where the recording has none")
-    add("--port", type=int, default=0, metavar="N", help="of 127.0.0.1; default: whichever is free")
-    add("--open", action="store_true", help="open it in a browser")
+    add("--poses", metavar="FILE", help="poses to show instead of the recording's; formats as for `stillbed compare`")
+    add("--path", type=Path, metavar="PATH.csv", help="printing path, if the recording has none")
+    add("--port", type=int, default=0, metavar="N", help="port of 127.0.0.1; default: any free port")
+    add("--open", action="store_true", help="open the page in a browser")
 
 
 def _view(a: argparse.Namespace) -> None:

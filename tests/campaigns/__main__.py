@@ -1,8 +1,8 @@
-"""python -m tests.campaigns NAME: what developers measure, and long campaigns; without a name, a list.
+"""python -m tests.campaigns NAME: developers' measurements and long campaigns; without a name, a list.
 
-A campaign draws from a seed what goes wrong and judges what came of it, which the suite can only touch. Each prints a
-table of figures beside their targets and, with -o FOLDER, writes them and a page there. --all measures what
-docs/measured.md tells, the subjects of `stillbed bench` among it.
+A campaign draws faults or inputs from a seed and checks the results, in larger numbers than the suite. Each prints a
+table of figures with their targets and, with -o FOLDER, writes them and a page there. --all measures the figures of
+docs/measured.md, which include the subjects of `stillbed bench`.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from hardware.cli.main import add_bench_options, run_bench
 from hardware.cli.parser import Parser
 
 PROGRAM = "python -m tests.campaigns"
-DESCRIPTION = "Measure what developers ask of stillbed, or run a long campaign; print each figure beside its target."
+DESCRIPTION = "Run a developers' measurement or a long campaign; print each figure with its target."
 MOVEMENTS = ("still", "breathing", "irregular", "steps", "turns", "sway", "lively")  # of synthetic worlds
 RENDERED = (
     *("still", *BREATHING, "shaking_table_0_5_hz", "steps_300um"),
     *("turns", "hand", "camera_lost", "clock_offsets", "wet_glare", "deformation"),
 )  # scenarios
 BODIES = ("chest", "forearm", "foot")  # that the simulator has
-MAPS = ("told", "seen")  # whose map the estimator has: the world's own, or one that it made
+MAPS = ("told", "seen")  # map of the estimator: true map of the world, or map from its own frames
 
 
 def _campaign(name: str, module: str, summary: str) -> Callable[..., tuple[str, Subject]]:
@@ -51,128 +51,170 @@ def _campaign(name: str, module: str, summary: str) -> Callable[..., tuple[str, 
 
 CAMPAIGNS: Subjects = dict(
     (
-        _campaign("bumps", "detection", "cameras knocked and lenses turned by little: found, named, false alarms")(
-            number("--count", 9, "N", "of each knock; default 9"),
-            number("--minutes", 10.0, "M", "of calm; default 10"),
-            number("--seed", 0, None, "of motions and noise; default 0"),
+        _campaign("bumps", "detection", "small shifts of cameras and lenses: detection, identification, false alarms")(
+            number("--count", 9, "N", "shifts of each kind; default 9"),
+            number("--minutes", 10.0, "M", "duration without shifts; default 10"),
+            number("--seed", 0, None, "seed of motions and noise; default 0"),
         ),
-        _campaign("cameras", "detection", "frames of live cameras put into sets: complete, wrong, waited for")(
-            number("--minutes", 10.0, None, "of three cameras at 30 fps; default 10"), SEED
+        _campaign("cameras", "detection", "pairing of live frames into sets: complete sets, wrong sets, waiting time")(
+            number("--minutes", 10.0, None, "duration of three cameras at 30 fps; default 10"), SEED
         ),
-        _campaign("consistency", "estimator", "poses from pictures: are errors as large as is claimed?")(
-            number("--scenes", 2, "N", "rendered first, some 10 s each; default 2"),
-            number("--seed", 300, None, "of the first scene (default: 300)"),
-            number("--seconds", 5.0, "S", "of each scene; default 5"),
+        _campaign("consistency", "estimator", "poses from pictures: errors against reported covariance (NEES)")(
+            number("--scenes", 2, "N", "scenes, rendered first in some 10 s each; default 2"),
+            number("--seed", 300, None, "seed of the first scene (default: 300)"),
+            number("--seconds", 5.0, "S", "duration of each scene; default 5"),
         ),
-        _campaign(
-            "deceit", "deceit.campaign", "sessions made to fool the tracker: silently wrong, and back again after"
-        )(
+        _campaign("deceit", "deceit.campaign", "sessions made to deceive the tracker: undetected errors, recovery")(
             number("--count", 200, "N", "sessions, of all kinds in turn; default 200"),
-            number("--seed", 1, None, "of all that is drawn; default 1"),
-            number("--jobs", 1, None, "processes that share the sessions; default 1"),
-            option("--kind", action="append", metavar="NAME", help="only this kind; may be given again"),
-            option("--index", type=int, action="append", metavar="N", help="only this session; may be given again"),
-            option("--size", type=int, nargs=2, default=(640, 480), metavar="PX", help="of pictures; default 640 480"),
+            number("--seed", 1, None, "seed of all random numbers; default 1"),
+            number("--jobs", 1, None, "parallel processes; default 1"),
+            option("--kind", action="append", metavar="NAME", help="only this kind; repeatable"),
+            option("--index", type=int, action="append", metavar="N", help="only this session; repeatable"),
+            option(
+                "--size",
+                type=int,
+                nargs=2,
+                default=(640, 480),
+                metavar="PX",
+                help="size of the pictures; default 640 480",
+            ),
         ),
-        _campaign("estimator", "estimator", "the estimator on synthetic tracks: accuracy, honesty, time")(
-            option("--only", default="*", metavar="PATTERN", help="scenes by name, e.g. 'breathing, c*'"),
-            option("--maps", nargs="+", choices=MAPS, default=MAPS, help="whose map"),
-            number("--seeds", 3, "N", "worlds of each scene"),
-            option("--seconds", type=float, metavar="S", help="length of each world; 10 s or more without"),
-            option("--soak", type=float, metavar="HOURS", help="instead: one long run of breathing"),
+        _campaign("estimator", "estimator", "the estimator on synthetic tracks: accuracy, consistency, time")(
+            option("--only", default="*", metavar="PATTERN", help="patterns of scene names, e.g. 'breathing, c*'"),
+            option("--maps", nargs="+", choices=MAPS, default=MAPS, help="map: of the world, or from its own frames"),
+            number("--seeds", 3, "N", "number of worlds of each scene"),
+            option("--seconds", type=float, metavar="S", help="duration of each world; default: 10 s or more"),
+            option("--soak", type=float, metavar="HOURS", help="instead of the scenes: one long run of breathing"),
         ),
-        _campaign("faults", "faults", "prints in which everything goes wrong: said, harmless, back soon?")(
+        _campaign("faults", "faults", "prints with injected faults: detection, safety, recovery")(
             number("--count", 60, None, "faults, of all kinds in turn (default: 60)"),
-            number("--seed", 1, None, "of all that chance decides (default: 1)"),
-            number("--jobs", 1, None, "processes that share the runs (default: 1)"),
-            option("--log", type=Path, metavar="X.csv", help="what came of each fault; runs in it are not repeated"),
+            number("--seed", 1, None, "seed of all random numbers (default: 1)"),
+            number("--jobs", 1, None, "parallel processes (default: 1)"),
+            option(
+                "--log", type=Path, metavar="X.csv", help="result of each fault; faults in this file are not repeated"
+            ),
         ),
-        _campaign("fill", "fill", "beads laid into contours and random wounds: coverage and time")(
-            option("contours", nargs="*", type=Path, metavar="CSV", help="x_mm,y_mm; two own without"),
-            number("--count", 1000, "N", "random wounds; default 1000"),
+        _campaign("fill", "fill", "beads in contours and random wounds: coverage and time")(
+            option(
+                "contours", nargs="*", type=Path, metavar="CSV", help="contours, x_mm,y_mm; default: two built-in ones"
+            ),
+            number("--count", 1000, "N", "number of random wounds; default 1000"),
             SEED,
-            option("--picture", type=Path, metavar="SVG", help="also draw all patterns side by side"),
+            option("--picture", type=Path, metavar="SVG", help="also write a picture of all patterns"),
         ),
-        _campaign("fuzz", "fuzz", "every reader of what comes from outside, given what is nearly valid")(
-            number("--count", 20_000, None, "inputs, of all readers in equal shares (default: 20000)"),
-            number("--seed", 1, None, "of what is made wrong (default: 1)"),
-            option("--only", metavar="READER", help="one reader; see the table for their names"),
-            number("--jobs", 1, None, "readers at a time, a process each (default: 1)"),
+        _campaign("fuzz", "fuzz", "nearly valid inputs for each reader of external data")(
+            number("--count", 20_000, None, "inputs, in equal shares for all readers (default: 20000)"),
+            number("--seed", 1, None, "seed of the errors (default: 1)"),
+            option("--only", metavar="READER", help="only this reader; names as in the table"),
+            number("--jobs", 1, None, "parallel processes, one reader each (default: 1)"),
             option(
                 "--log",
                 type=Path,
                 metavar="X.csv",
-                help="how far each reader is, and what went wrong; goes on from there",
+                help="progress and failures of each reader; the campaign continues from this file",
             ),
         ),
-        _campaign("growth", "growth", "how cost grows: with tracks, cameras, pixels, checkpoints, minutes")(
-            number("--seconds", 4.0, "S", "of each world; default 4"),
-            option("--no-pictures", action="store_true", help="leave out resolution, which has to be rendered"),
+        _campaign("growth", "growth", "processing time against tracks, cameras, pixels, checkpoints, minutes")(
+            number("--seconds", 4.0, "S", "duration of each world; default 4"),
+            option("--no-pictures", action="store_true", help="omit the resolution, which needs rendering"),
         ),
-        _campaign("guard", "guard", "random commands on and beside all limits before the guard")(
-            number("--commands", 100_000, "N", "random ones (default: 100000)"), SEED
+        _campaign("guard", "guard", "random commands at all limits of the guard")(
+            number("--commands", 100_000, "N", "number of random commands (default: 100000)"), SEED
         ),
-        _campaign("link", "link", "the arm's line in virtual time with everything going wrong")(
-            number("--hours", 1.0, "H", "of virtual time; default 1"),
+        _campaign("link", "link", "the arm's link in virtual time with injected faults")(
+            number("--hours", 1.0, "H", "duration in virtual time; default 1"),
             SEED,
         ),
-        _campaign("look", "scan", "layers of gel, as a look between layers measures them; clogs found")(
-            number("--layers", 36, "N", "on bare beds, every sixth with a clog; default 36"),
-            number("--stacks", 8, "N", "of three layers each, three of four with a clog; default 8"),
+        _campaign("look", "scan", "layers of gel measured by the inspection between layers; clog detection")(
+            number("--layers", 36, "N", "layers on empty beds, every sixth with a clog; default 36"),
+            number("--stacks", 8, "N", "stacks of three layers, three of four with a clog; default 8"),
         ),
-        _campaign("map", "mapping", "landmarks off the true surface beside their claim, and the map's growth")(
-            number("--seconds", 3.0, "S", "of each still standing; default 3")
-        ),
-        _campaign("outages", "outages", "cameras covered, dead, frozen, swapped, bumped: lost in silence?")(
+        _campaign(
+            "map", "mapping", "landmarks: distance from the true surface against reported sigma; growth of the map"
+        )(number("--seconds", 3.0, "S", "duration of each rest; default 3")),
+        _campaign("outages", "outages", "cameras covered, dead, frozen, swapped, shifted: undetected loss, recovery")(
             option("--count", type=positive, default=66, help="outages, of all kinds in turn (default: 66)"),
-            number("--seed", 0, None, "of scenes, motions and outages (default: 0)"),
-            option("--processes", type=positive, default=2, help="that share the scenes (default: 2)"),
+            number("--seed", 0, None, "seed of scenes, motions and outages (default: 0)"),
+            option("--processes", type=positive, default=2, help="parallel processes (default: 2)"),
         ),
-        _campaign("plan", "fill", "a whole plan of a large wound: time, memory, coverage, ink")(
-            option("--body", choices=BODIES, default="forearm", help="default forearm")
+        _campaign("plan", "fill", "complete plan of a large wound: time, memory, coverage, ink")(
+            option("--body", choices=BODIES, default="forearm", help="body; default forearm")
         ),
-        _campaign("planner", "planner", "random poses into planner and guard: limits kept, cost of a step")(
-            number("--updates", 10_000, "N", "in all; default 10000"),
-            number("--seed", 0, None, "of the streams; runs with other seeds may go side by side"),
+        _campaign("planner", "planner", "random poses for planner and guard: limits, time of a step")(
+            number("--updates", 10_000, "N", "total number of poses; default 10000"),
+            number("--seed", 0, None, "seed of the streams; runs with other seeds can run in parallel"),
         ),
-        _campaign("registration", "mapping", "a scan laid into the first pictures: error and verdict")(
-            number("--seeds", 2, "N", "bodies of each kind; default 2")
+        _campaign("registration", "mapping", "registration of a scan to the first pictures: error and verdict")(
+            number("--seeds", 2, "N", "number of bodies of each kind; default 2")
         ),
-        _campaign("scan", "scan", "what the cameras scan themselves, wet and dry, off the true surface")(
+        _campaign("scan", "scan", "scans by the cameras, wet and dry: distance from the true surface")(
             option(
-                "--bodies", nargs="+", choices=BODIES, default=BODIES, metavar="NAME", help=f"of {', '.join(BODIES)}"
+                "--bodies",
+                nargs="+",
+                choices=BODIES,
+                default=BODIES,
+                metavar="NAME",
+                help=f"bodies, of {', '.join(BODIES)}",
             ),
-            number("--sets", 6, "N", "frame sets that are fused; default 6"),
+            number("--sets", 6, "N", "fused frame sets; default 6"),
         ),
-        _campaign("smoothing", "smoothing", "smoothed poses beside causal ones, clocks, time by length")(
+        _campaign("smoothing", "smoothing", "smoothed poses compared with causal poses; clock offsets; time")(
             option(
-                "--movements", nargs="*", choices=MOVEMENTS, default=MOVEMENTS, help="of the worlds; none: no worlds"
-            ),
-            option("--scenarios", nargs="*", choices=RENDERED, default=RENDERED, help="rendered, tracked and smoothed"),
-            number("--rendered", 8.0, "S", "of each scenario; kept rendered; default 8"),
-            number("--seeds", 4, "N", "worlds of each movement; default 4"),
-            number("--seconds", 6.0, "S", "of each world; default 6"),
-            number("--count", 100, "N", "landmarks; default 100"),
-            option(
-                "--minutes", type=float, nargs="*", default=[1.0, 3.0, 10.0], metavar="M", help="runs that are timed"
+                "--movements",
+                nargs="*",
+                choices=MOVEMENTS,
+                default=MOVEMENTS,
+                help="movements of the worlds; none: no worlds",
             ),
             option(
-                "--landmarks", type=int, nargs="*", default=[200, 400], metavar="N", help="of more runs, a minute each"
+                "--scenarios",
+                nargs="*",
+                choices=RENDERED,
+                default=RENDERED,
+                help="scenarios to render, track and smooth",
             ),
-            number("--adjusted", 4.0, "S", "of the bundle adjustment beside Ceres's; default 4, 0: none"),
-            number("--sessions", 40, "N", "smoothed by one and by two workers; default 40, 0: none"),
+            number("--rendered", 8.0, "S", "duration of each scenario; renderings are cached; default 8"),
+            number("--seeds", 4, "N", "number of worlds of each movement; default 4"),
+            number("--seconds", 6.0, "S", "duration of each world; default 6"),
+            number("--count", 100, "N", "number of landmarks; default 100"),
+            option(
+                "--minutes",
+                type=float,
+                nargs="*",
+                default=[1.0, 3.0, 10.0],
+                metavar="M",
+                help="durations of timed runs",
+            ),
+            option(
+                "--landmarks",
+                type=int,
+                nargs="*",
+                default=[200, 400],
+                metavar="N",
+                help="numbers of landmarks of further runs, a minute each",
+            ),
+            number(
+                "--adjusted", 4.0, "S", "duration of the comparison with Ceres's bundle adjustment; default 4, 0: none"
+            ),
+            number("--sessions", 40, "N", "sessions, smoothed by one and by two workers; default 40, 0: none"),
         ),
-        _campaign("steps", "detection", "movements of 300 um and 0.1 degree: how soon flagged, how often falsely")(
-            number("--steps", 2000, None, "of each kind (default: %(default)s)"),
-            number("--hours", 1.0, None, "at rest (default: %(default)s)"),
+        _campaign("steps", "detection", "motion steps of 300 um and 0.1 degree: detection time, false alarms")(
+            number("--steps", 2000, None, "steps of each kind (default: %(default)s)"),
+            number("--hours", 1.0, None, "duration at rest (default: %(default)s)"),
             SEED,
         ),
-        _campaign("views", "views", "skin that deforms, grazing views with glare, a cube's edges")(
-            number("--seconds", 8.0, "S", "of each sequence; default 8")
+        _campaign("views", "views", "deforming skin, grazing views with glare, edges of a cube")(
+            number("--seconds", 8.0, "S", "duration of each sequence; default 8")
         ),
-        _campaign("wounds", "wounds", "wounds carved into bodies: found, the skin restored, its volume and its normal")(
-            option("bodies", nargs="*", type=Path, metavar="MESH", help="of persons or limbs, mm; five own without"),
-            number("--count", 40, "N", "wounds; default 40"),
+        _campaign("wounds", "wounds", "wounds in bodies: detection, restored skin, volume, normal")(
+            option(
+                "bodies",
+                nargs="*",
+                type=Path,
+                metavar="MESH",
+                help="meshes of bodies or limbs, mm; default: five built-in ones",
+            ),
+            number("--count", 40, "N", "number of wounds; default 40"),
             SEED,
         ),
     )
