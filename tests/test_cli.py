@@ -128,7 +128,7 @@ def test_a_simulation_ended_by_ctrl_c_keeps_what_there_was(tmp_path: Path) -> No
     assert len(sessions[0]) == len(sessions[1]) > 3
     assert all(session.truth is not None and session.damage == "" for session in sessions)
     assert not json.loads((out / "summary.json").read_text())["complete"]
-    assert "cut short" in (out / "report.html").read_text()
+    assert "incomplete" in (out / "report.html").read_text()
 
 
 def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:

@@ -822,7 +822,7 @@ def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
     assert [rows[name] for name in parts] == ["12.50", "2.50", "40.00", "5.00"]
     assert rows["since the approach"] == "60.00"
     assert b64encode(b"near").decode() in page and "<figcaption>right</figcaption>" in page
-    figures = "true error, 95 % / largest", "within what was predicted", "printed by the runs before"
+    figures = "true error, 95 % / largest", "within the predicted 95 % bound", "printed by earlier runs"
     for words in (*figures, "the beads from above", "var(--amber)"):
         assert words in page
     summary = json.loads((tmp_path / "run.summary.json").read_text())

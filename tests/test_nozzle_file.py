@@ -161,7 +161,7 @@ def test_limits_are_read_in_their_order() -> None:
     limits = limits_from_table("x.toml", {"duty": 1, "p95_mm": 0.5})
     assert limits == {"duty": 1.0, "p95_mm": 0.5}
     assert limits_from_table("x.toml", {}) == {}
-    assert [v.bound.label for v in check_limits(limits, figures())] == ["duty", "position error, 95 %"]
+    assert [v.bound.label for v in check_limits(limits, figures())] == ["duty cycle", "position error, 95 %"]
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,16 @@ def test_the_page_is_well_formed_and_says_what_happened() -> None:
     tracking = evaluate(*run(60, sigma=np.full(6, 0.01)), "monday")
     result = judged(limits=LIMITS, tracking=tracking, files=(("nozzle.csv", "every millisecond"),))
     text = text_of_page(nozzle_page(result))
-    said = ("monday <1>", REASON, "1 of 3 limits missed", "✗ missed", "✓ met", "limits missed", "duty", "Tracking")
+    said = (
+        "monday <1>",
+        REASON,
+        "1 of 3 limits missed",
+        "✗ missed",
+        "✓ met",
+        "limits missed",
+        "duty cycle",
+        "Tracking",
+    )
     for words in (*said, "every millisecond", "as planned", "outside", "across the path", "NEES"):
         assert words in text
 
@@ -218,7 +227,7 @@ def empty_plan() -> Path:
 def test_a_run_of_next_to_nothing_has_a_page_without_a_number_that_is_none(rows: int, path: Path) -> None:
     log = part(nozzle_log(path, breathing), slice(0, rows))
     html = nozzle_page(judged(log, path, limits=LIMITS, complete=False))
-    assert "cut short" in text_of_page(html)
+    assert "incomplete" in text_of_page(html)
     assert not re.search(r'[" ML](nan|inf|-inf)\b', html)
 
 
@@ -237,7 +246,7 @@ def test_a_perfect_run_meets_its_limits_and_has_a_page() -> None:
     text = text_of_page(nozzle_page(result))
     assert "All 3 limits were met." in text
     assert "limits missed" not in text
-    assert "The arm never held." in text
+    assert "No holds." in text
 
 
 def test_a_run_cut_short_is_never_a_success() -> None:
@@ -249,7 +258,7 @@ def test_a_run_cut_short_is_never_a_success() -> None:
 
 def test_a_missed_limit_is_told_with_what_was_reached_and_allowed() -> None:
     sentence = nozzle_verdict(judged(limits=limits_from_table("x", {"duty": 0.99, "p95_mm": 9})))[-1]
-    assert re.fullmatch(r"1 of 2 limits missed: duty 9\d\.\d %, at least 99 %\.", sentence)
+    assert re.fullmatch(r"1 of 2 limits missed: duty cycle 9\d\.\d %, at least 99 %\.", sentence)
 
 
 def test_the_summary_is_plain_json_and_the_terminal_says_the_same() -> None:

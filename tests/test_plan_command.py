@@ -32,7 +32,7 @@ from hardware.plan.order import (
     order_of,
     subject_of,
 )
-from hardware.plan.run import MAX_MIDDLE_DISTANCE, WoundSighting, _sighting, placement_lines
+from hardware.plan.run import MAX_CENTROID_DISTANCE, WoundSighting, _sighting, placement_lines
 from hardware.report.page import document, figures_table, section
 from perception.lens import Lenses
 from planning.command import MotionLimits, Move
@@ -307,17 +307,17 @@ def seen(camera: int, outline: Array) -> np.ndarray[tuple[int, ...], np.dtype[np
 @pytest.mark.parametrize("camera", range(3))
 def test_a_plan_on_the_wound_is_near_its_middle(camera: int) -> None:
     found = _sighting(arc_rig().cameras[camera], seen(camera, OUTLINE), BASE_FROM_REST, OUTLINE)
-    assert found.off < 0.5 and found.share > 0.9
+    assert found.distance < 0.5 and found.share > 0.9
 
 
 @given(st.floats(4, 15), st.floats(0, 2 * np.pi))
 @settings(max_examples=10)
 def test_a_plan_beside_the_wound_is_off_by_as_much(away: float, angle: float) -> None:
     moved = OUTLINE + away * np.array([np.cos(angle), np.sin(angle), 0.0])
-    offs = [_sighting(arc_rig().cameras[c], seen(c, OUTLINE), BASE_FROM_REST, moved).off for c in range(3)]
+    offs = [_sighting(arc_rig().cameras[c], seen(c, OUTLINE), BASE_FROM_REST, moved).distance for c in range(3)]
     assert 0.85 * away < max(offs) < 1.15 * away + 0.5
     lines = placement_lines("TRACKING", [WoundSighting("top", max(offs), 1.0)])
-    assert (f"more than {MAX_MIDDLE_DISTANCE:g} mm" in lines[1]) == (max(offs) > MAX_MIDDLE_DISTANCE)
+    assert (f"more than {MAX_CENTROID_DISTANCE:g} mm" in lines[1]) == (max(offs) > MAX_CENTROID_DISTANCE)
 
 
 def test_a_camera_that_shows_no_wound_says_so() -> None:

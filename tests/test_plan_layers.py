@@ -237,12 +237,12 @@ def test_pictures_summary_and_report_show_the_bumps(tmp_path: Path, capsys: pyte
     out = tmp_path / "path.csv"
     line = ["plan", str(tmp_path / "scan.ply"), "-o", str(out), "--bead", "0.8", "--bump", "0.1"]
     assert main([*line, "--bump-clearance", "0.6"]) == 0
-    assert "gone round with 0.60 mm between in layer" in capsys.readouterr().out
+    assert "avoided with a clearance of 0.60 mm in layer" in capsys.readouterr().out
     facts = json.loads(out.with_suffix(".json").read_text())
     assert facts["bumps"]["clearance_mm"] == 0.6 and facts["bumps"]["layers"][0]["around_mm2"] > 5
     assert "--arm" in facts["feasible"] and "--arm" in out.with_suffix(".html").read_text()
     first = (tmp_path / "path_layers" / "layer_001.svg").read_text()
-    assert 'class="around"' in first and "gone round" in first
+    assert 'class="around"' in first and "avoided bump" in first
     assert "bumps of the bed" in out.with_suffix(".html").read_text()
 
 

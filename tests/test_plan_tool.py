@@ -148,7 +148,7 @@ def test_the_commands_say_where_the_tool_has_no_room(tmp_path: Path, capsys: pyt
     assert main([*line, "-o", str(tmp_path / "p.csv"), "--arm", str(tmp_path / "arm.toml")]) == 0
     told = capsys.readouterr().out
     note = next(text for text in told.splitlines() if text.startswith("note: tool: "))
-    assert "left out" in note and "the syringe would come too near" in note and " mm" in note
+    assert "omitted" in note and "the syringe is too near" in note and " mm" in note
     facts = json.loads((tmp_path / "p.json").read_text(encoding="utf-8"))["tool"]
     assert facts["margin_mm"] == BASE_MARGIN and facts["left_out"] and facts["turned_checkpoints"] > 0
     assert main([*line, "-o", str(tmp_path / "q.csv")]) == 0

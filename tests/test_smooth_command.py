@@ -103,7 +103,7 @@ def test_rig_map_and_copy_can_be_read_again(recording: Path, out: Path) -> None:
 
 def test_the_report_says_what_was_found(out: Path) -> None:
     text = (out / "report.html").read_text(encoding="utf-8")
-    for part in ("Trajectory", "Live against smoothed", "Residuals", "Spectrum", "Had the loop", "Calibration drift"):
+    for part in ("Trajectory", "Live minus smoothed", "Residuals", "Spectrum", "Error by delay", "Calibration drift"):
         assert f"<h2>{part}" in text
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["poses"] == 60 and summary["landmarks"] == 40 and 0 < summary["live_rms_mm"] < 0.2

@@ -174,4 +174,4 @@ def test_ctrl_c_keeps_what_was_written_and_says_so(tmp_path: Path) -> None:
     assert "Traceback" not in said
     assert 5 <= len(read_poses(out / "poses.csv")) < 2000
     assert json.loads((out / "summary.json").read_text())["complete"] is False
-    assert "cut short" in (out / "report.html").read_text()
+    assert "incomplete" in (out / "report.html").read_text()

@@ -332,7 +332,7 @@ def test_the_command_writes_page_and_figures(tmp_path: Path, capsys: pytest.Capt
     assert figures["pairs"] == 90 and figures["reference_is_exact"]
     plain, aligned = (figures[name]["ape"]["translation_mm"]["rmse"] for name in ALIGNMENTS[:2])
     assert aligned < plain and f"{plain:#.3g} mm" in told
-    assert told.partition(". ")[0].endswith("apart (RMSE) over 90 of 90 poses, in the surface frame that fits best")
+    assert told.partition(". ")[0].endswith("over 90 of 90 poses, in a common surface frame")
     page = (out / "report.html").read_text()
     assert "Absolute pose error" in page and "NEES" not in page and "http" not in page.replace("http://www.w3.org", "")
 

@@ -323,16 +323,16 @@ class RunOutcome:
         limit, count, coverage = task.profile.limits.pose_error, len(timeline.stamps), self.statistics.coverage
         tiles = [
             tile(percent(self.printed), "", f"printed, checkpoint {self.place:.1f} of {len(task.path) - 1}"),
-            tile(percent(duty) if duty == duty else "–", "", "of the time material left the nozzle"),
+            tile(percent(duty) if duty == duty else "–", "", "duty cycle"),
         ]
         for name in ("true", "predicted"):
             if (error := summary[f"{name}_error_mm"])["p95"] is not None:
                 values = f"{figure(error['p95'])} / {figure(error['max'])}"
                 tiles.append(tile(values, "mm", f"{name} error, 95 % / largest"))
-        coverage_tile = tile(percent(coverage), "", "of the true errors within what was predicted for 95 %")
+        coverage_tile = tile(percent(coverage), "", "of the true errors within the predicted 95 % bound")
         tiles += [coverage_tile] if coverage == coverage else []
         tiles += [tile(figure(self.statistics.ink), "mm³", "of ink")] if self.inked else []
-        tiles += [tile(percent(self.printed_before), "", "printed by the runs before")] if task.start else []
+        tiles += [tile(percent(self.printed_before), "", "printed by earlier runs")] if task.start else []
         rows = [
             [s.name, str(s.count), *(f"{1000 * seconds:.1f}" for seconds in (s.median, s.p99, s.largest))]
             for s in self.timings()

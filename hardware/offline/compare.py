@@ -35,7 +35,10 @@ from hardware.report.evaluation import (
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
 from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components
 
-ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")
+ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")  # keys of compare.json
+ALIGNMENT_LABELS = dict(
+    zip(ALIGNMENTS, ("unaligned", "aligned, SE(3)", "common surface frame", "frame of one pose"), strict=True)
+)
 FIXED_POSE_SIGMA_MM = 1e-3  # mm, of all axes: only the pose that a smoothed run holds fixed has a smaller one
 UNFITTED_ALIGNMENTS = ALIGNMENTS[0], ALIGNMENTS[3]  # those that covariances can be checked under: nothing is fitted
 RowNumbers = NDArray[np.int64]
@@ -73,6 +76,11 @@ class AlignedErrors:
     reference: Array  # (M, 4, 4) mm
     absolute: PoseErrors  # APE and NEES
     relative: RelativeErrors  # RPE
+
+    @property
+    def label(self) -> str:
+        """The alignment in texts."""
+        return ALIGNMENT_LABELS[self.name]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +138,7 @@ def compare(estimated: PoseSeries, reference: PoseSeries, delta: int = 1) -> Tra
     stamps, their_stamps = estimated.trajectory.stamps, reference.trajectory.stamps
     rows, theirs = _one_to_one(*associate(stamps, their_stamps), stamps, their_stamps)
     if len(rows) < max(MIN_PAIRS, delta + 1):
-        need = f"{max(MIN_PAIRS, delta + 1)} or more: are both of the same recording, and on one clock?"
+        need = f"{max(MIN_PAIRS, delta + 1)} or more: are both of the same recording, with the same clock?"
         raise InputError(estimated.name, f"poses at instants of {reference.name}", len(rows), need)
     ours, covariance = estimated.trajectory.base_from_surface[rows], estimated.covariance[rows]
     target = reference.trajectory.base_from_surface[theirs]
@@ -180,35 +188,37 @@ def _rotation_determined(a: Array, b: Array) -> bool:
 
 
 TABLE_HEAD = ("", "RMSE", "mean", "median", "std", "max")
-ALIGNMENT_STYLES = dict(zip(ALIGNMENTS, ("series c3", "series c1", "series c0", "series c2"), strict=True))
+ALIGNMENT_STYLES = dict(
+    zip(ALIGNMENT_LABELS.values(), ("series c3", "series c1", "series c0", "series c2"), strict=True)
+)
 ALIGNMENT_TEXT = (
-    "As they stand: nothing is fitted. Aligned, SE(3): the base of the first is moved until the positions lie nearest "
-    "(Umeyama, without scale; evo_ape -a). One surface frame: the two runs' surface frames differ by a constant, the "
-    "one that fits best is taken out, or the one that one pose tells."
+    "Unaligned: nothing is fitted. Aligned, SE(3): rigid motion of the base that fits the positions best "
+    "(Umeyama, without scale; evo_ape -a). Common surface frame: the best constant transform between the two runs' "
+    "surface frames is removed. Frame of one pose: that transform is computed from one pose."
 )
 
 
 Errors = PoseErrors | RelativeErrors
-ErrorLine = tuple[str, Array, Errors]  # name of the alignment, stamps (M,) s, errors (M,)
+ErrorLine = tuple[str, Array, Errors]  # label of the alignment, stamps (M,) s, errors (M,)
 
 
 def comparison_verdict(comparison: TrajectoryComparison) -> str:
     """The verdict in a few sentences."""
     fit = [error_statistics(values).rmse for _, values in _by_unit(comparison.fitted.absolute)]
     paired = f"over {len(comparison.stamps)} of {len(comparison.estimated)} poses"
-    texts = [f"{figure(fit[0])} mm and {figure(fit[1])}° apart (RMSE) {paired}, in the surface frame that fits best."]
+    texts = [f"RMSE: {figure(fit[0])} mm and {figure(fit[1])}° {paired}, in a common surface frame."]
     if comparison.gap > 1e-6:
-        texts.append(f"Their stamps lie {figure(1000 * comparison.gap)} ms apart (median).")
+        texts.append(f"Difference of the stamps: {figure(1000 * comparison.gap)} ms (median).")
     for aligned in comparison.alignments[:-1]:
         off = [error_statistics(values).rmse for _, values in _by_unit(aligned.absolute)]
         if aligned is not comparison.fitted:
-            name = aligned.name.capitalize().replace("se(3)", "SE(3)")
-            texts.append(f"{name}: {figure(off[0])} mm, {figure(off[1])}°.")
+            label = aligned.label.capitalize().replace("se(3)", "SE(3)")
+            texts.append(f"{label}: {figure(off[0])} mm, {figure(off[1])}°.")
     if comparison.of(ALIGNMENTS[1]) is None:
-        texts.append("The positions lie on a line and determine no SE(3) alignment.")
+        texts.append("No SE(3) alignment: the positions lie on a line.")
     nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        texts.append(f"NEES/6: {figure(nees)} laid at one pose, {calibration_words(nees)}.")
+        texts.append(f"NEES/6: {figure(nees)} in the frame of one pose, {calibration_words(nees)}.")
     return " ".join(texts)
 
 
@@ -264,17 +274,17 @@ def _tiles(comparison: TrajectoryComparison) -> str:
     tiles = [tile(str(len(comparison.stamps)), "", "pairs of poses")]
     for aligned in comparison.alignments[:-1]:
         rmse = error_statistics(aligned.absolute.translation).rmse
-        tiles.append(tile(figure(1000 * rmse), "µm", f"APE {aligned.name}, RMSE"))
+        tiles.append(tile(figure(1000 * rmse), "µm", f"APE {aligned.label}, RMSE"))
     nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        tiles.append(tile(figure(nees), "", f"NEES / 6, {comparison.at_one_pose.name}"))
+        tiles.append(tile(figure(nees), "", f"NEES / 6, {comparison.at_one_pose.label}"))
     return row_of_tiles(tiles)
 
 
 def _trajectory(comparison: TrajectoryComparison) -> str:
     fitted = comparison.fitted
     values, expected = (components(poses, fitted.reference[0]) for poses in (fitted.estimated, fitted.reference))
-    names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
+    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
     plots = []
     for i in (0, 3, 1, 4, 2, 5):
         scale = spanning([values[:, i], expected[:, i]], 0.12, 0.5)
@@ -284,21 +294,21 @@ def _trajectory(comparison: TrajectoryComparison) -> str:
         plots.append(plot.svg())
     sources = ("estimate", comparison.estimated), ("truth", comparison.reference)
     keys = legend([line_key(style, _short(series.name)) for style, series in sources])
-    words = "The surface's origin in base and its rotation since the first pose, in one surface frame. Time in s."
+    words = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
     return section("Trajectories", words, f'{keys}<div class="two">{"".join(plots)}</div>')
 
 
 def _absolute(comparison: TrajectoryComparison) -> str:
-    plots = _error_plots(comparison, [(j.name, comparison.stamps, j.absolute) for j in comparison.alignments])
+    plots = _error_plots(comparison, [(j.label, comparison.stamps, j.absolute) for j in comparison.alignments])
     table = figures_table(TABLE_HEAD, _error_rows(comparison, "absolute"))
     return section("Absolute pose error (APE)", ALIGNMENT_TEXT, plots + table)
 
 
 def _relative(comparison: TrajectoryComparison) -> str:
-    name, errors = comparison.fitted.name, comparison.fitted.relative
-    plots = _error_plots(comparison, [(name, comparison.stamps[errors.rows], errors)])
+    label, errors = comparison.fitted.label, comparison.fitted.relative
+    plots = _error_plots(comparison, [(label, comparison.stamps[errors.rows], errors)])
     over, table = _poses(comparison.delta), figures_table(TABLE_HEAD, _error_rows(comparison, "relative"))
-    words = f"How far the change over {over} is off; an alignment of the base alone changes none of it."
+    words = f"Error of the pose change over {over}. An alignment of the base does not affect it."
     return section("Relative pose error (RPE)", words, plots + table)
 
 
@@ -323,17 +333,17 @@ def _consistency(comparison: TrajectoryComparison) -> str:
         return ""
     high = max(float(nees[shown].max()) * 1.3, 2 * NEES_BOUND)
     low = max(float(np.percentile(nees[shown], 1)) / 2, 1e-2)
-    label = f"NEES, {comparison.at_one_pose.name}"
+    label = f"NEES, {comparison.at_one_pose.label}"
     plot = Plot(PAGE_CHART_WIDTH, 170, comparison.span, (min(low, 1.0), high), log_y=True, label=label)
     plot.line(comparison.stamps[shown], nees[shown], "estimate")
     plot.level(NEES_BOUND, "95 %", "limit")
     plot.level(6.0, "6", "median")
     unfitted = [aligned for aligned in comparison.alignments if aligned.name in UNFITTED_ALIGNMENTS]
-    rows = [[j.name, figure(j.absolute.mean_nees / 6), percent(j.absolute.nees_inside)] for j in unfitted]
-    words = "Squared errors in parts of the covariance that is claimed; six on average where that is honest."
+    rows = [[j.label, figure(j.absolute.mean_nees / 6), percent(j.absolute.nees_inside)] for j in unfitted]
+    words = "Squared errors relative to the reported covariance. Mean of a consistent covariance: 6."
     if not comparison.reference.trajectory.exact:
-        words += " The reference is no exact truth: its own error counts as well."
-    table = figures_table(["", "NEES / 6", f"under {NEES_BOUND:.1f}, where 95 % should be"], rows)
+        words += " The reference is not exact: its error is included."
+    table = figures_table(["", "NEES / 6", f"under {NEES_BOUND:.1f} (expected: 95 %)"], rows)
     return section("Consistency (NEES)", words, plot.svg() + table)
 
 
@@ -343,7 +353,7 @@ def _error_rows(comparison: TrajectoryComparison, kind: Literal["absolute", "rel
     for aligned in comparison.alignments:
         for unit, values in _by_unit(aligned.absolute if kind == "absolute" else aligned.relative):
             s = error_statistics(values)
-            rows.append([f"{aligned.name}, {unit}", *(figure(v) for v in (s.rmse, s.mean, s.median, s.std, s.max))])
+            rows.append([f"{aligned.label}, {unit}", *(figure(v) for v in (s.rmse, s.mean, s.median, s.std, s.max))])
     return rows
 
 
@@ -362,7 +372,7 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     ours = read_pose_series(estimated)
     theirs = read_truth_series(estimated) if reference is None else read_pose_series(reference)
     if theirs.name == ours.name:
-        raise InputError(ours.name, "poses", "the very ones they are judged by", "two different trajectories")
+        raise InputError(ours.name, "poses", "the same as the reference", "two different trajectories")
     comparison = compare(ours, theirs, delta)
     report = comparison_text(comparison)
     if out is None:

@@ -165,14 +165,14 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The verdict in a few sentences."""
     texts = [
         f"{len(result)} poses and {len(result.map)} landmarks over {result.stamps[-1] - result.stamps[0]:.1f} s; "
-        f"an axis of a position is known to {figure(evaluation.sigma)} mm (median, one sigma)."
+        f"sigma of the position per axis: {figure(evaluation.sigma)} mm (median)."
     ]
     if evaluation.live is not None:
-        texts.append(f"The live run stood {figure(evaluation.live_rms)} mm off (RMS).")
+        texts.append(f"Difference of live and smoothed poses: {figure(evaluation.live_rms)} mm RMS.")
     if evaluation.errors is not None:
         ours, live = (None if rmse is None else figure(rmse) for rmse in evaluation.rmse)
         live_text = "" if live is None else f", live {live} mm"
-        texts.append(f"Against the {_reference_name(evaluation)}: {ours} mm{live_text} (RMS, aligned).")
+        texts.append(f"Error against the {_reference_name(evaluation)}: smoothed {ours} mm{live_text} (RMS, aligned).")
         nees = evaluation.errors[0].mean_nees / 6
         texts += [f"NEES/6: {figure(nees)}, {calibration_words(nees)}."] if np.isfinite(nees) else []
     texts += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
@@ -192,9 +192,9 @@ def _reference_name(evaluation: SmoothEvaluation) -> str:
 
 
 def _tiles(evaluation: SmoothEvaluation) -> str:
-    tiles = [tile(figure(1000 * evaluation.sigma), "µm", "one sigma of an axis, median")]
+    tiles = [tile(figure(1000 * evaluation.sigma), "µm", "sigma of the position per axis, median")]
     if evaluation.live is not None:
-        tiles.append(tile(figure(1000 * evaluation.live_rms), "µm", "live against smoothed, RMS"))
+        tiles.append(tile(figure(1000 * evaluation.live_rms), "µm", "difference of live and smoothed, RMS"))
     labels = {"breathing": "breaths a minute", "pulse": "beats a minute"}
     found = [(name, rhythm) for name, rhythm in evaluation.spectrum.rhythms if not rhythm.why]
     tiles += [tile(rhythm.per_minute, "", labels[name]) for name, rhythm in found]
@@ -204,14 +204,14 @@ def _tiles(evaluation: SmoothEvaluation) -> str:
 def _trajectory(result: Smoothed, evaluation: SmoothEvaluation) -> str:
     values = components(result.states.poses, result.states.poses[0])
     sigma = 2 * deviations(result.states.poses, result.covariance[:, :6, :6])
-    names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
+    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
     plots = []
     for i in (0, 3, 1, 4, 2, 5):
         plot = Plot(HALF_CHART_WIDTH, 165, _span(result), spanning([values[:, i]], 0.12, 0.5), label=names[i])
         plot.band(result.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
         plot.line(result.stamps, values[:, i], "estimate")
         plots.append(plot.svg())
-    text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
+    text = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
     keys = legend([line_key("estimate", "smoothed, with two standard deviations")])
     return section("Trajectory", text, f'{keys}<div class="two">{"".join(plots)}</div>')
 
@@ -237,10 +237,10 @@ def _live(result: Smoothed, evaluation: SmoothEvaluation) -> str:
         plot = Plot(PAGE_CHART_WIDTH, 150, _span(result), scale, label=name)
         plot.line(stamps, values, "estimate")
         plots.append(plot.svg())
-        rows.append(_spread_row(f"live from smoothed, {unit}", values))
+        rows.append(_spread_row(f"live minus smoothed, {unit}", values))
     table = figures_table(SPREAD_HEAD, rows)
-    text = "The causal run's measured poses, after the constant between the two surface frames that fits best."
-    return section("Live against smoothed", text, "".join(plots) + table)
+    text = "Measured poses of the live run minus smoothed poses, in a common surface frame."
+    return section("Live minus smoothed", text, "".join(plots) + table)
 
 
 def _errors(evaluation: SmoothEvaluation) -> str:
@@ -251,7 +251,7 @@ def _errors(evaluation: SmoothEvaluation) -> str:
         if errors is not None:
             rows.append(_spread_row(f"{name}, mm", errors.translation))
             rows.append(_spread_row(f"{name}, °", np.degrees(errors.rotation)))
-    text = f"Against the {_reference_name(evaluation)}, aligned: the best constant over the run."
+    text = f"Errors against the {_reference_name(evaluation)}, aligned by the best constant transform of the run."
     return section("Errors", text, figures_table(SPREAD_HEAD, rows))
 
 
@@ -267,8 +267,8 @@ def _residuals(result: Smoothed) -> str:
         keys.append(line_key(f"series c{i % 5}", camera.name))
         by_part = [_root_mean_square(rms[part, i]) for part in parts]
         rows.append([camera.name, *(figure(v) for v in by_part), f"{100 * used[i] / max(seen[i], 1):.1f} %"])
-    head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(RESIDUAL_PARTS)), "tracks that agree"]
-    text = "What is left of the pixels of the tracks that agree, camera by camera."
+    head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(RESIDUAL_PARTS)), "inlier tracks"]
+    text = "Reprojection error of the inlier tracks of each camera."
     return section("Residuals", text, legend(keys) + plot.svg() + figures_table(head, rows))
 
 
@@ -290,7 +290,7 @@ def _spectrum(spectrum: MotionSpectrum) -> str:
         if not rhythm.why:
             plot.mark(rhythm.rate, f"{name} {rhythm.per_minute}/min", "median")
     along = ", ".join(f"{v:.2f}" for v in spectrum.direction)
-    text = f"Of the origin's motion along the direction in which it moves most, ({along}) in base; frequency in Hz. "
+    text = f"Spectrum of the origin's motion along its main direction, ({along}) in base; frequency in Hz. "
     text += " ".join(rhythm.words(name) for name, rhythm in spectrum.rhythms)
     return section("Spectrum", text, plot.svg())
 
@@ -298,12 +298,12 @@ def _spectrum(spectrum: MotionSpectrum) -> str:
 def _errors_by_delay(evaluation: SmoothEvaluation) -> str:
     pairs = zip(LOOP_DELAYS_S, evaluation.by_delay, strict=True)
     rows = [[f"{1000 * delay:.0f} ms", *(figure(1000 * v) for v in row)] for delay, row in pairs]
-    head = ["delay", "held, µm RMS", "95 %", "carried on, µm RMS", "95 %"]
+    head = ["delay", "last pose, µm RMS", "95 %", "constant twist, µm RMS", "95 %"]
     text = (
-        "How far the nozzle, over the middle of the map, would be off by the loop's delay alone, from exposure to "
-        "arrival: were the last pose held, or carried on along its twist. The pose itself is taken as known."
+        "Error of a nozzle over the middle of the map that the loop's delay alone would cause, from exposure to "
+        "arrival: with the last pose, or with the pose extrapolated by its twist. The pose is assumed exact."
     )
-    return section("Had the loop been faster or slower", text, figures_table(head, rows))
+    return section("Error by delay of the loop", text, figures_table(head, rows))
 
 
 def _cameras(result: Smoothed) -> str:
@@ -315,10 +315,10 @@ def _cameras(result: Smoothed) -> str:
         values = [1000 * float(np.linalg.norm(shift[:3])), float(np.linalg.norm(shift[3:])), lens[0, 0], lens[0, 2]]
         clock = f"{1000 * result.offsets[i]:.2f} ± {1000 * result.offset_sigma[i]:.2f}"
         rows.append([camera.name, clock, *(f"{v:.3f}" for v in (*values, lens[1, 2]))])
-    head = ["camera", "exposes later, ms", "turned, mrad", "moved, mm", "fx, px", "cx, px", "cy, px"]
+    head = ["camera", "clock offset, ms", "rotation, mrad", "shift, mm", "fx, px", "cx, px", "cy, px"]
     text = (
-        "How the cameras stand to their calibration, as this recording has it: clocks against the mean of all, with "
-        f"one sigma; places and lenses only with --refine-cameras. Exposures jitter by "
-        f"{1000 * result.fitted.jitter:.2f} ms, images by {result.fitted.unrest:.3f} px from frame set to frame set."
+        "Cameras as estimated from this recording, minus their calibration: clock offsets relative to the mean, with "
+        f"one sigma; poses and lenses only with --refine-cameras. Jitter of the exposures: "
+        f"{1000 * result.fitted.jitter:.2f} ms; of the images: {result.fitted.unrest:.3f} px between frame sets."
     )
     return section("Calibration drift", text, figures_table(head, rows))

@@ -81,13 +81,13 @@ LAYER_CHOOSER = """<div class="plan-bar"><input id="layer-at" type="range" min="
   at.addEventListener("input", show); show();
 }})();</script>"""
 LAYER_TEXT = (
-    "Covered and twice are shares of the layer's area, each bead taken as wide as it is meant to be; open is what no "
-    "bead reaches, and over half a bead and over a bead the parts of that into which a disc so wide would fit."
+    "Covered, twice: shares of the layer's area, with the planned bead width. Beside: area outside the layer. Open: "
+    "area without a bead. Over half a bead, over a bead: the part of the open area where a disc of this width fits."
 )
 
 
 def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, float, float, float]) -> str:
-    """The picture of a layer. bounds: of what all pictures of a plan show, mm in the chart, low x, low y, high x, y."""
+    """The picture of a layer. bounds: common to all pictures of a plan, mm in the chart: low x, y, high x, y."""
     low_x, low_y, high_x, high_y = bounds
     width, depth = high_x - low_x, high_y - low_y
     scale = min((PICTURE_WIDTH - 2 * PICTURE_MARGIN) / max(width, 1e-3), MAX_DRAWING_HEIGHT / max(depth, 1e-3))
@@ -130,9 +130,9 @@ def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: flo
     bar = round_step(60 / scale)
     at = height - 16
     keys = f"{bar:g} mm · beads at their true width · red: open · dashed: travel · green: start · black: end"
-    keys += "" if layer.around.is_empty else " · brown: bump, gone round"
-    keys += " · white: no room for the tool" if layer.left_out else ""
-    keys += "" if layer.over.is_empty else " · dotted: bump, gone over"
+    keys += "" if layer.around.is_empty else " · brown: avoided bump"
+    keys += " · white: no space for the tool" if layer.left_out else ""
+    keys += "" if layer.over.is_empty else " · dotted: bump printed over"
     return (
         f'<text x="{PICTURE_MARGIN}" y="21" font-weight="600">{escape(title)}</text>'
         f'<text class="soft" x="{PICTURE_WIDTH - PICTURE_MARGIN}" y="21" text-anchor="end">{escape(facts)}</text>'
@@ -142,7 +142,7 @@ def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: flo
 
 
 def len_text(millimetres: float) -> str:
-    """A length as people say it: 31.4 mm, 2.71 m."""
+    """A length as a text: 31.4 mm, 2.71 m."""
     return f"{millimetres:.1f} mm" if millimetres < 1000 else f"{millimetres / 1000:.2f} m"
 
 
@@ -156,7 +156,7 @@ def _line(points: Array) -> str:
 
 
 def _bumps(layer: PlannedLayer) -> list[str]:
-    """Bumps that are gone round, as areas, and those that are gone over, as outlines on the beads."""
+    """Avoided bumps as areas, and bumps printed over as outlines on the beads."""
     shapes = {name: shape for name, shape in (("around", layer.around), ("over", layer.over)) if not shape.is_empty}
     return [f'<path class="{name}" fill-rule="evenodd" d="{_areas(shape)}"/>' for name, shape in shapes.items()]
 
@@ -178,13 +178,13 @@ def _beads(beads: tuple[Bead, ...]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportText:
-    """The texts of the report beside the plan's figures."""
+    """Texts of the report."""
 
-    title: str  # what was planned
-    findings: Sequence[tuple[str, str]]  # of the wound, as (what, value)
-    repairs: Sequence[tuple[str, int]]  # of the scan, as (what, count)
-    order: Sequence[tuple[str, str]]  # what was asked for, as (what, value)
-    notes: Sequence[str]  # what somebody should look at
+    title: str  # of the plan
+    findings: Sequence[tuple[str, str]]  # of the wound: (name, value)
+    repairs: Sequence[tuple[str, int]]  # of the scan: (name, count)
+    settings: Sequence[tuple[str, str]]  # (name, value)
+    notes: Sequence[str]  # to check before printing
 
 
 def page_text(
@@ -199,29 +199,29 @@ def page_text(
     body = [f"<style>{PAGE_STYLE}</style>", row_of_tiles(_tiles(layers, total))]
     if text.notes:
         notes = "".join(f'<div class="plan-note">{escape(note)}</div>' for note in text.notes)
-        body.append(f"<section><h2>Look at this before printing</h2>{notes}</section>")
+        body.append(f"<section><h2>Check before printing</h2>{notes}</section>")
     script = (files("hardware.plan") / "view.js").read_text(encoding="utf-8")
     view = f'<script type="application/json" id="plan-data">{_data(plan, moments)}</script><script>{script}</script>'
     help_text = (
-        "Drag to turn, shift and drag to move, wheel to come nearer. By touch one finger turns it or scrolls the page, "
-        "two come nearer and tilt. The slider prints as far as it is moved; its times are of a surface at rest."
+        "Drag to rotate, Shift and drag to move, wheel to zoom. Touch: one finger rotates or scrolls the page, "
+        "two fingers zoom and tilt. The slider shows the print up to a time, for a surface at rest."
     )
     body.append(section("The beads", help_text, VIEW_CONTROLS + view))
     body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
     if pictures:
         shown = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
-        unrolled = "" if plan.order.mode == "horizontal" else " They are unrolled to the lengths on the skin."
-        words = f"Seen from outside, the scan's x to the right.{unrolled}"
+        unrolled = "" if plan.order.mode == "horizontal" else " Layers are unwrapped: lengths are those on the skin."
+        words = f"View from outside, the scan's x to the right.{unrolled}"
         body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=shown)))
-    body.append(section("The wound", "As found in the scan.", figures_table(("", "value"), text.findings)))
+    body.append(section("The wound", "Measured in the scan.", figures_table(("", "value"), text.findings)))
     if text.repairs:
         rows = [(what, str(count)) for what, count in text.repairs]
-        body.append(section("The scan", "What was found wrong with it, and put right.", figures_table(("", ""), rows)))
-    body.append(section("What was asked for", "All settings, defaults included.", figures_table(("", ""), text.order)))
+        body.append(section("The scan", "Repaired defects.", figures_table(("", ""), rows)))
+    body.append(section("Settings", "All settings, with defaults.", figures_table(("", ""), text.settings)))
     inks = ", ".join(f"{volume / 1000:.2f} ml of {material_text(name)}" for name, volume in total.volume)
     lead = (
         f"{count_text(len(layers), 'layer')}, {len_text(total.printed)} of bead, "
-        f"{duration_text(total.seconds)} to print: {inks}. "
+        f"printing time {duration_text(total.seconds)}: {inks}. "
         f"{total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
     )
     return document("plan", text.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
@@ -230,8 +230,8 @@ def page_text(
 def _tiles(layers: Sequence[LayerFigures], total: PlanTotal) -> list[str]:
     return [
         tile(f"{100 * total.covered:.2f}", "%", "covered"),
-        tile(f"{100 * total.double:.2f}", "%", "laid twice"),
-        tile(*_clock(total.seconds), "to print"),
+        tile(f"{100 * total.double:.2f}", "%", "covered twice"),
+        tile(*_clock(total.seconds), "printing time"),
         tile(str(len(layers)), "", "layers"),
         tile(f"{sum(v for _, v in total.volume) / 1000:.2f}", "ml", "bio-ink"),
         tile(f"{sum(f.checkpoints for f in layers)}", "", "checkpoints"),
@@ -249,7 +249,7 @@ def _clock(seconds: float) -> tuple[str, str]:
 
 
 def material_text(name: str) -> str:
-    """A material as it is named in a sentence: collagen, material 2."""
+    """A material in a sentence: collagen, material 2."""
     return f"material {name}" if name.isdecimal() else name
 
 
@@ -325,7 +325,7 @@ def _sheet(plan: Plan, heights: Array) -> dict[str, Any]:
 
 
 def layers_text(numbers: list[int]) -> str:
-    """Layers as people name them: layer 3, layers 2 to 5, layers 1, 4, 6."""
+    """Layer numbers as a text: layer 3, layers 2 to 5, layers 1, 4, 6."""
     if len(numbers) == 1:
         return f"layer {numbers[0]}"
     if len(numbers) > 2 and numbers[-1] - numbers[0] + 1 == len(numbers):
@@ -334,12 +334,12 @@ def layers_text(numbers: list[int]) -> str:
 
 
 def tool_text(plan: Plan) -> str:
-    """What was done to keep the tool clear of the tissue, in words."""
+    """The clearance between tool and tissue as a text, with tilts and omitted beads."""
     done = plan.clearance
     if done is None:
-        return "not checked, as no arm was given: --arm ARM.toml describes its tool"
+        return "clearance not checked without --arm ARM.toml"
     turned = (
-        f", turned by up to {np.rad2deg(done.most):.1f} degrees at {done.turned} checkpoints" if done.turned else ""
+        f", tilted by up to {np.rad2deg(done.most):.1f} degrees at {done.turned} checkpoints" if done.turned else ""
     )
     text = f"{done.margin:.1f} mm or more from the tissue{turned}"
     if not done.left_out:
@@ -347,8 +347,8 @@ def tool_text(plan: Plan) -> str:
     layers = layers_text(sorted({each.layer + 1 for each in done.left_out}))
     length, worst = sum(each.length for each in done.left_out), max(done.left_out, key=lambda each: each.short)
     return (
-        f"{text}; {len_text(length)} of bead in {layers} left out, {count_text(len(done.left_out), 'piece')}: "
-        f"at any allowed tilt the {worst.part} would come too near, upright by up to {worst.short:.1f} mm, as at "
+        f"{text}; {len_text(length)} of bead in {layers} omitted, {count_text(len(done.left_out), 'piece')}: "
+        f"at any allowed tilt the {worst.part} is too near, upright by up to {worst.short:.1f} mm, such as at "
         f"{_place_text(worst.place)}"
     )
 
@@ -369,11 +369,11 @@ def tool_facts(plan: Plan) -> dict[str, Any] | None:
 
 
 def unscanned_text(beads: Unscanned) -> str:
-    """Beads over places that the scan does not show, in words."""
-    where = "over a hole of the scan" if beads.hole else "beyond the scan's rim"
+    """A text about beads over places without scan data."""
+    where = "over a hole of the scan" if beads.hole else "outside the scan"
     layers = layers_text([number + 1 for number in beads.layers])
     place = _place_text(beads.place)
-    return f"{len_text(beads.length)} of bead in {layers} lie {where}, as at {place}: the bed there is guessed"
+    return f"{len_text(beads.length)} of bead in {layers} lie {where}, such as at {place}, over an interpolated bed"
 
 
 def _place_text(place: Array) -> str:
@@ -381,7 +381,7 @@ def _place_text(place: Array) -> str:
 
 
 def volume_text(findings: WoundFindings) -> str:
-    """The volume, and its 95 % interval where the skin's place leaves it open."""
+    """The volume, with its 95 % interval if the restored skin is uncertain."""
     spread = SIGMA_95 * findings.volume_sigma
     interval = f" (95 %: {max(findings.volume - spread, 0):.0f} to {findings.volume + spread:.0f})" if spread else ""
     return f"{findings.volume:.0f} mm^3{interval}"

@@ -63,11 +63,11 @@ if TYPE_CHECKING:
     from hardware.files.session import Session
     from perception.frames import FrameSet
 
-# off the normal: a bead is then pushed aside by a fifth of its width, as the tip is no point
+# from the normal: the finite tip then pushes a bead aside by a fifth of its width
 MAX_TILT_OFF_NORMAL_DEG = 35.0
-NO_ARM_GIVEN = "no arm was asked, so there is no column feasible; --arm ARM.toml asks one, stillbed reach one later"
-MAX_FRAME_SETS = 12  # frame sets that are tried: the first map, its confirmation, the averaging, and some that fail
-MAX_MIDDLE_DISTANCE = 3.0  # mm between the two middles: a wound seen aslant by a network is drawn to about a millimetre
+NO_ARM_TEXT = "no column `feasible` without --arm ARM.toml; `stillbed reach` can add it"
+MAX_FRAME_SETS = 12  # for the first map, its confirmation, averaging, and some failures
+MAX_CENTROID_DISTANCE = 3.0  # mm between the centroids: a network's outline of an oblique wound is good to about 1 mm
 LAYER_COLUMNS = (
     "layer", "tissue", "material", "area_mm2", "covered", "double", "over", "gap_mm2", "gap_over_half_a_bead_mm2",
     "gap_over_a_bead_mm2", "runs", "checkpoints", "printed_mm", "travelled_mm", "time_s", "volume_mm3",
@@ -76,9 +76,9 @@ REPAIRED_SCAN_STEP = 0.5  # mm between the vertices of the repaired scan that is
 
 
 def run_plan(request: PlanRequest) -> tuple[str, str]:
-    """Plan, and write all files, the path first; returns a summary, and what was lost of the session's file, as texts.
+    """Plan, and write all files, the path first; returns a summary and the damage of the session's file, as texts.
 
-    InputError for whatever is wrong with a file, before the long work.
+    InputError for wrong files, before the long work.
     """
     from hardware.recording.session_reader import open_session
 
@@ -87,19 +87,19 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
         _check_scan_options(request)
     order = replace(order_of(request.settings, flat), tool=tool_of(request))
     if request.arm is not None:
-        read_jointed_arm(request.arm)  # what is wrong with it is told before the long work
+        read_jointed_arm(request.arm)  # reports a wrong file before the long work
     damage = ""
     if request.session is not None:
         if flat:
-            allowed = "nothing with a contour: it has no shape to be found by"
+            allowed = "no session with a contour: a contour cannot be registered"
             raise InputError("command line", "--session", request.session, allowed)
-        damage = open_session(request.session).damage  # what is wrong with it is told before anything is written
+        damage = open_session(request.session).damage  # reports a wrong file before anything is written
     check_out(request)
-    with _progress("scan", "steps (read, repaired, wound found)") as progress:
+    with _progress("scan", "steps (read, repair, find the wound)") as progress:
         subject = subject_of(request, flat, progress)
     with _progress("plan", "layers") as progress:
         plan = make_plan(subject.wound, order, subject.name, progress)
-    path, arm = (plan.path, NO_ARM_GIVEN) if request.arm is None else with_feasible(plan.path, request.arm)
+    path, arm = (plan.path, NO_ARM_TEXT) if request.arm is None else with_feasible(plan.path, request.arm)
     check_path(path)
     PlanFiles(request.out).remove_companions()
     write_atomically(request.out, lambda file: write_path(file, path))
@@ -133,7 +133,7 @@ def _check_scan_options(request: PlanRequest) -> None:
 def _tables(
     request: PlanRequest, plan: Plan, subject: PlanSubject, layers: Sequence[LayerFigures], total: PlanTotal, arm: str
 ) -> list[str]:  # fmt: skip
-    """Write the coverage of each layer, the summary, the scan as it was repaired, and an example's; their names."""
+    """Write the table of layers, the summary, the repaired scan, and an example's scan; their names."""
     files = PlanFiles(request.out)
     written = [files.layer_table.name, files.summary.name]
     write_atomically(files.layer_table, lambda file: _write_layers(file, layers))
@@ -168,7 +168,7 @@ def _write_layers(file: Path, layers: Sequence[LayerFigures]) -> None:
 
 
 def _surface(wound: WoundVolume) -> tuple[Array, Index]:
-    """The scan around the wound as it was used, its holes closed: vertices (V, 3) mm, scan frame, triangles (T, 3)."""
+    """The used scan around the wound, holes closed: vertices (V, 3) mm, scan frame, and triangles (T, 3)."""
     every = max(1, round(REPAIRED_SCAN_STEP / wound.grid.step))
     nodes = np.dstack([wound.grid.nodes, wound.bed])[::every, ::every]
     number = np.arange(nodes.shape[0] * nodes.shape[1]).reshape(nodes.shape[:2])
@@ -193,7 +193,7 @@ def _pictures(
             (folder / name).write_text(pictures[-1], encoding="utf-8")
             progress(i + 1, len(layers))
     repairs = [] if subject.repairs is None else subject.repairs.rows()
-    findings = [*findings_rows(plan), ("what an arm can print", arm), ("the tool and the tissue", tool_text(plan))]
+    findings = [*findings_rows(plan), ("reachable checkpoints", arm), ("clearance of the tool", tool_text(plan))]
     text = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
     page = page_text(plan, layers, total, text, pictures, moments)
     write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
@@ -204,7 +204,7 @@ def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path,
     f = plan.wound.findings
     lines = [
         f"wound: {f.area:.0f} mm^2, up to {f.depth:.2f} mm deep, {volume_text(f)}"
-        + ("" if f.given else f"; outline found where the scan is {f.level:.2f} mm deep"),
+        + ("" if f.given else f"; outline detected at a depth of {f.level:.2f} mm"),
         f"path: {count_text(sum(bool(layer.beads) for layer in plan.layers), 'layer')}, {len(plan.path)} checkpoints, "
         f"{len_text(total.printed)} of bead, {len_text(total.travelled)} of travel, {duration_text(total.seconds)}",
         f"coverage: {total.covered:.2%} covered, {total.double:.2%} twice, {total.over:.2%} beside, "
@@ -225,13 +225,13 @@ def _progress(what: str, unit: str) -> Progress:
 
 
 def findings_rows(plan: Plan) -> list[tuple[str, str]]:
-    """Rows about the wound and its scan: what, value."""
+    """Rows about the wound and its scan: name, value."""
     f = plan.wound.findings
     low_tilt, high_tilt = (np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
     rows = [
-        ("outline", "given" if f.given else f"found: where the scan is {f.level:.2f} mm deep"),
-        ("area over which it is open", f"{f.area:.1f} mm²"),
-        ("greatest depth under the restored skin", f"{f.depth:.2f} mm"),
+        ("outline", "given" if f.given else f"detected, at a depth of {f.level:.2f} mm"),
+        ("open area", f"{f.area:.1f} mm²"),
+        ("largest depth under the restored skin", f"{f.depth:.2f} mm"),
         ("volume up to the restored skin", volume_text(f)),
         ("volume of the beads", f"{plan.points.volume.sum():.0f} mm³"),
     ]
@@ -240,40 +240,40 @@ def findings_rows(plan: Plan) -> list[tuple[str, str]]:
         return rows
     return rows + [
         ("noise of the scan", f"{f.noise:.3f} mm, smoothed over {f.smoothing:.2f} mm"),
-        ("skin around off the restored surface", f"{f.scatter:.3f} mm"),
-        ("restored skin's standard deviation, at most", f"{f.skin_sigma:.2f} mm"),
-        ("skin left out along the rim", f"{f.margin:.1f} mm"),
-        ("guessed in holes of the scan", f"{f.closed:.1f} mm²"),
+        ("deviation of the skin around the wound from the restored skin", f"{f.scatter:.3f} mm"),
+        ("largest standard deviation of the restored skin", f"{f.skin_sigma:.2f} mm"),
+        ("margin of skin not used along the rim", f"{f.margin:.1f} mm"),
+        ("interpolated holes of the scan", f"{f.closed:.1f} mm²"),
         ("hidden under overhangs", f"{f.hidden:.1f} mm²"),
-        ("tool off the normal, at worst, first and last layer", f"{low_tilt:.1f}°, {high_tilt:.1f}°"),
+        ("largest angle between tool and normal, first and last layer", f"{low_tilt:.1f}°, {high_tilt:.1f}°"),
     ]
 
 
 def notes_of(plan: Plan) -> list[str]:
-    """What somebody should look at before printing."""
+    """Notes to check before printing."""
     notes = list(plan.wound.findings.notes)
     if plan.clearance is not None and plan.clearance.left_out:
         notes.append(f"tool: {tool_text(plan)}")
     notes += [unscanned_text(each) for each in unscanned_beads(plan)]
     if plan.stack.missing:
-        notes.append(f"not printed, as the wound is not deep enough: {', '.join(plan.stack.missing)}")
+        notes.append(f"not printed, because the wound is too shallow: {', '.join(plan.stack.missing)}")
     off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
     if off_deg > MAX_TILT_OFF_NORMAL_DEG:
-        tilt = f"the tool stands up to {off_deg:.0f} degrees off the normal"
-        notes.append(f"{tilt}, as its limits ask for: on the steepest walls")
+        tilt = f"the tool is tilted up to {off_deg:.0f} degrees from the normal"
+        notes.append(f"{tilt} on the steepest walls, because of its limits")
     empty = sum(not layer.beads for layer in plan.layers)
     if empty:
-        notes.append(f"{empty} of {len(plan.layers)} layers have no room for a bead and are left out")
+        notes.append(f"{empty} of {len(plan.layers)} layers have no space for a bead and are omitted")
     return notes
 
 
 def layers_with_bumps(plan: Plan) -> list[PlannedLayer]:
-    """The layers over which something of the bed stands."""
+    """The layers with bumps of the bed."""
     return [p for p in plan.layers if not (p.over.is_empty and p.around.is_empty)]
 
 
 def bump_facts(plan: Plan) -> dict[str, Any]:
-    """How bumps are passed, and those of each layer (counted from 1). mm, mm2."""
+    """The clearance to bumps, and the bumps of each layer (counted from 1). mm, mm2."""
     passing, width = plan.order.passing, plan.order.pattern.width
     bumps = [
         {
@@ -287,63 +287,63 @@ def bump_facts(plan: Plan) -> dict[str, Any]:
 
 
 def bumps_text(plan: Plan) -> str:
-    """Bumps in words: how many layers go over some, and round some."""
+    """A text about the bumps: layers that print over some, and layers that avoid some."""
     over = [p.layer.number + 1 for p in plan.layers if not p.over.is_empty]
     around = [p.layer.number + 1 for p in plan.layers if not p.around.is_empty]
     parts = []
     if over:
-        parts.append(f"gone over in {layers_text(over)}")
+        parts.append(f"printed over in {layers_text(over)}")
     if around:
         clear = plan.order.passing.clear(plan.order.pattern.width)
         highest = max(p.layer.bumps.highest for p in plan.layers if not p.around.is_empty)
-        text = f"gone round with {clear:.2f} mm between in {layers_text(around)}"
-        parts.append(f"{text}, up to {highest:.2f} mm over it")
+        text = f"avoided with a clearance of {clear:.2f} mm in {layers_text(around)}"
+        parts.append(f"{text}, height up to {highest:.2f} mm over the layer")
     return "; ".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
 class WoundSighting:
-    """The wound that one camera shows, beside the planned one."""
+    """The wound in one camera's picture, compared with the planned wound."""
 
     camera: str
-    off: float  # mm between the two middles, across the camera's view; NaN where it shows no wound
-    share: float  # of the two outlines' areas, the smaller over the larger
+    distance: float  # mm between the centroids, across the camera's view; NaN without a wound
+    share: float  # smaller area / larger area of the two outlines
 
 
 def placement_lines(verdict: str, sightings: Sequence[WoundSighting]) -> list[str]:
-    """Where the scan lies in a session, for a person: the registration's verdict, and each camera's sighting."""
-    lines = [f"placed: {verdict}"]
+    """The placement of the scan in a session as lines: verdict of the registration, and each camera's sighting."""
+    lines = [f"placement: {verdict}"]
     for sighting in sightings:
-        if not np.isfinite(sighting.off):
-            lines.append(f"placed: {sighting.camera} shows no wound")
+        if not np.isfinite(sighting.distance):
+            lines.append(f"placement: no wound in the picture of {sighting.camera}")
             continue
-        doubt = f", more than {MAX_MIDDLE_DISTANCE:g} mm: is it the same wound?"
-        far = doubt if sighting.off > MAX_MIDDLE_DISTANCE else ""
+        far = sighting.distance > MAX_CENTROID_DISTANCE
+        hint = f", more than {MAX_CENTROID_DISTANCE:g} mm: is it the same wound?" if far else ""
         lines.append(
-            f"placed: in {sighting.camera} the wound's middle is {sighting.off:.2f} mm from the plan's{far}; "
-            f"their areas are as {sighting.share:.2f} to 1"
+            f"placement: the wound's centroid in {sighting.camera} is {sighting.distance:.2f} mm from the plan's{hint}; "
+            f"ratio of the areas: {sighting.share:.2f}"
         )
     return lines
 
 
 def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> tuple[str, list[WoundSighting]]:
-    """Register a scan in a session's first pictures, as a live run does: verdict, and sightings where it is certain.
+    """Register a scan in a session's first pictures, as a live run does: verdict, and sightings if it is registered.
 
     outline: (N, 3) mm, of the planned wound, scan frame.
     """
     session, pose, placement, frames = register_in_session(session_path, scan_file, outline.mean(axis=0))
     if placement is None or pose is None or frames is None:
         why = "no frame set in the session" if pose is None else pose.reason or pose.state.value
-        return f"not placed: {why}", []
+        return f"not registered: {why}", []
     return placement.verdict, _sightings(session.rig.cameras, frames, pose.base_from_surface, outline)
 
 
 def register_in_session(
     session_path: Path, scan_file: Path, middle: Array
 ) -> tuple[Session, SurfacePose | None, PathPlacement | None, FrameSet | None]:
-    """Where a scan lies in a session's first pictures: its pose and placement at the last frame set looked at.
+    """Registration of a scan in a session's first pictures: pose and placement at the last frame set used.
 
-    middle: (3,) mm, of what is planned, scan frame. No placement where no pose was measured.
+    middle: (3,) mm, of the planned wound, scan frame. No placement without a measured pose.
     """
     from hardware.offline.track import tracker  # loads gtsam and cv2, which a plan alone does not need
     from hardware.recording.session_reader import open_session
@@ -380,15 +380,15 @@ def _sighting(camera: Camera, mask: NDArray[np.bool_], pose: Array, outline: Arr
         return WoundSighting(camera.name, float("nan"), float("nan"))
     points_camera = se3.transform_points(se3.inverse(camera.base_from_camera) @ pose, outline)
     pixels = points_camera[:, :2] / points_camera[:, 2:] * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
-    area, middle = _middle(pixels)
-    off = np.linalg.norm(undistort(camera, centroid(mask)[None])[0] - middle)
+    area, middle = _area_and_centroid(pixels)
+    distance = np.linalg.norm(undistort(camera, centroid(mask)[None])[0] - middle)
     scale = float(points_camera[:, 2].mean()) / float(camera.matrix[0, 0])  # mm per px
     areas = sorted([area, float(mask.sum())])
-    return WoundSighting(camera.name, float(off) * scale, areas[0] / max(areas[1], 1e-9))
+    return WoundSighting(camera.name, float(distance) * scale, areas[0] / max(areas[1], 1e-9))
 
 
-def _middle(ring: Array) -> tuple[float, Array]:
-    """Area and middle (2,) of what a ring (N, 2) encloses."""
+def _area_and_centroid(ring: Array) -> tuple[float, Array]:
+    """Area and centroid (2,) inside a ring (N, 2)."""
     (x, y), (u, v) = ring.T, np.roll(ring, -1, axis=0).T
     cross = x * v - u * y
     area = float(cross.sum()) / 2

@@ -94,42 +94,50 @@ _ON_LINE = (_SIMULATE, _ARM)
 Part, Kind = FaultPart, FaultKind  # short, for the table
 FAULT_SPECS: dict[tuple[FaultPart, FaultKind], FaultSpec] = {
     (Part.CAMERA, Kind.OFF): FaultSpec("delivers nothing", _PICTURED),
-    (Part.CAMERA, Kind.STUCK): FaultSpec("delivers its last picture again and again, with new stamps", _PICTURED),
-    (Part.CAMERA, Kind.SLOW): FaultSpec("its pictures arrive later by that much", (_SIMULATE,), "s", 0.001, 10, 0.1),
-    (Part.CAMERA, Kind.GARBLE): FaultSpec("its encoded pictures are damaged on the way", (_SIMULATE,)),
-    (Part.CAMERA, Kind.SWAP): FaultSpec("its cable is exchanged with that of the next camera", _PICTURED),
-    (Part.CAMERA, Kind.BUMP): FaultSpec("stands aside by that much", (_SIMULATE,), "mm", 0.01, 100, 2.0),
+    (Part.CAMERA, Kind.STUCK): FaultSpec("delivers its last picture repeatedly, with new stamps", _PICTURED),
+    (Part.CAMERA, Kind.SLOW): FaultSpec("its pictures arrive late by this delay", (_SIMULATE,), "s", 0.001, 10, 0.1),
+    (Part.CAMERA, Kind.GARBLE): FaultSpec("its encoded pictures are corrupted in transit", (_SIMULATE,)),
+    (Part.CAMERA, Kind.SWAP): FaultSpec("its cable is swapped with the next camera's", _PICTURED),
+    (Part.CAMERA, Kind.BUMP): FaultSpec("is shifted by this distance", (_SIMULATE,), "mm", 0.01, 100, 2.0),
     (Part.CAMERA, Kind.BLACK): FaultSpec("its pictures are black", _PICTURED),
     (Part.CAMERA, Kind.FLASH): FaultSpec("its pictures are white", _PICTURED, lasts=0.1),
     (Part.CLOCK, Kind.JUMP): FaultSpec(
-        "the stamps of all pictures jump by that much", (_SIMULATE,), "s", -3600, 3600, 1.0
+        "the stamps of all pictures jump by this time", (_SIMULATE,), "s", -3600, 3600, 1.0
     ),
-    (Part.TRACKING, Kind.KILL): FaultSpec("the tracking ends and does not come back", _PICTURED),
-    (Part.TRACKING, Kind.HANG): FaultSpec("the tracking stands still", _PICTURED),
+    (Part.TRACKING, Kind.KILL): FaultSpec("the tracking process ends and is not restarted", _PICTURED),
+    (Part.TRACKING, Kind.HANG): FaultSpec("the tracking process hangs", _PICTURED),
     (Part.TRACKING, Kind.SLOW): FaultSpec(
-        "the tracking has that share of its speed", (_SIMULATE, _LIVE), "%", 0.1, 100, 20.0
+        "the tracking process runs at this share of its speed", (_SIMULATE, _LIVE), "%", 0.1, 100, 20.0
     ),
-    (Part.MOTION, Kind.KILL): FaultSpec("the motion ends and does not come back", _PICTURED),
-    (Part.MOTION, Kind.HANG): FaultSpec("the motion stands still", _PICTURED),
-    (Part.ARM, Kind.STALL): FaultSpec("the controller does nothing; what comes in is queued", _ON_LINE, lasts=None),
-    (Part.ARM, Kind.DROP): FaultSpec("a frame, or each of that time, is lost on the line", _ON_LINE, lasts=0.0),
+    (Part.MOTION, Kind.KILL): FaultSpec("the motion process ends and is not restarted", _PICTURED),
+    (Part.MOTION, Kind.HANG): FaultSpec("the motion process hangs", _PICTURED),
+    (Part.ARM, Kind.STALL): FaultSpec(
+        "the controller executes nothing; received frames are queued", _ON_LINE, lasts=None
+    ),
+    (Part.ARM, Kind.DROP): FaultSpec(
+        "one frame, or each frame during the fault, is lost on the line", _ON_LINE, lasts=0.0
+    ),
     (Part.ARM, Kind.GARBLE): FaultSpec(
-        "one to eight bits of a frame, or of each, flip on the line", _ON_LINE, lasts=0.0
+        "one to eight bits of one frame, or of each frame during the fault, flip on the line", _ON_LINE, lasts=0.0
     ),
-    (Part.ARM, Kind.UNPLUG): FaultSpec("nothing goes in or out", (*_ON_LINE, _LIVE)),
-    (Part.ARM, Kind.SLOW): FaultSpec("moves go at that share of their feed", _ON_LINE, "%", 0.1, 100, None),
-    (Part.DISK, Kind.FULL): FaultSpec("the recording's file can grow no more", (_LIVE,)),
-    (Part.PAGE, Kind.FLOOD): FaultSpec("more windows than may be, each saying as much as it can", (_LIVE,)),
+    (Part.ARM, Kind.UNPLUG): FaultSpec("the line is disconnected", (*_ON_LINE, _LIVE)),
+    (Part.ARM, Kind.SLOW): FaultSpec("moves run at this share of their feed", _ON_LINE, "%", 0.1, 100, None),
+    (Part.DISK, Kind.FULL): FaultSpec("no more bytes can be written to the recording", (_LIVE,)),
+    (Part.PAGE, Kind.FLOOD): FaultSpec(
+        "more windows than allowed, each sending messages as fast as possible", (_LIVE,)
+    ),
     (Part.SURFACE, Kind.FAST): FaultSpec(
-        "the surface runs away and comes back, that fast at most", (_SIMULATE,), "mm/s", 1, 1000, 80.0, 1.0
+        "the surface moves away and back, with this maximum speed", (_SIMULATE,), "mm/s", 1, 1000, 80.0, 1.0
     ),
-    (Part.SURFACE, Kind.FOLD): FaultSpec("a ridge that high rises and falls", (_SIMULATE,), "mm", 0.1, 20, 3.0, 1.0),
-    (Part.SURFACE, Kind.COVER): FaultSpec("something lies over the wound, before all cameras", (_SIMULATE,)),
-    (Part.DISPENSER, Kind.UNPLUG): FaultSpec("its line is gone", (_SIMULATE,)),
-    (Part.DISPENSER, Kind.BLOCK): FaultSpec("its line takes nothing", (_SIMULATE,)),
-    (Part.DISPENSER, Kind.DROP): FaultSpec("what it is told is lost on the line", (_SIMULATE,)),
+    (Part.SURFACE, Kind.FOLD): FaultSpec(
+        "a ridge of this height rises and falls", (_SIMULATE,), "mm", 0.1, 20, 3.0, 1.0
+    ),
+    (Part.SURFACE, Kind.COVER): FaultSpec("an object covers the wound for all cameras", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.UNPLUG): FaultSpec("its line is disconnected", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.BLOCK): FaultSpec("writes to its line block", (_SIMULATE,)),
+    (Part.DISPENSER, Kind.DROP): FaultSpec("messages to it are lost on the line", (_SIMULATE,)),
     (Part.DISPENSER, Kind.CLOG): FaultSpec(
-        "its needle is clogged: that share of the flow does not leave", (_SIMULATE,), "%", 1, 100, 100.0
+        "its needle is clogged: this share of the flow is lost", (_SIMULATE,), "%", 1, 100, 100.0
     ),
 }
 

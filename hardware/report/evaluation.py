@@ -24,7 +24,8 @@ from hardware.files.pose_file import PoseTable
 from hardware.files.session import damage_text
 from hardware.process.system import provenance
 
-MAX_TRACKING_ERROR_MM = 10.0  # a pose further off than this while the state says TRACKING is a lie, not an error
+MAX_TRACKING_ERROR_MM = 10.0  # of a pose in state TRACKING: above it the state itself is wrong
+INCOMPLETE_TEXT = "The run is incomplete: it was interrupted. The figures describe its finished part."
 NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
 CALIBRATED_NEES = (0.8, 1.25)  # of NEES/6: between them a covariance may be used as it is
 
@@ -33,8 +34,8 @@ def calibration_words(nees: float) -> str:
     """What a mean NEES/6 says of the covariances."""
     low, high = CALIBRATED_NEES
     if low <= nees <= high:
-        return "which is 1 where covariances are honest"
-    return f"so the covariances are not calibrated: errors are {nees**0.5:.2g} times what they claim"
+        return "consistent covariances (1 is ideal)"
+    return f"inconsistent covariances: errors are {nees**0.5:.2g} times the reported sigma"
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,16 +225,16 @@ def verdict(result: Evaluation) -> list[str]:
     """The run in a few sentences."""
     counted = int(np.sum(result.table.stamps >= result.since - 1e-6))
     followed = round(measured_share(result) * counted)
-    sentences = [f"The surface was followed in {followed} of {counted} frame sets ({percent(measured_share(result))})."]
+    sentences = [f"The surface was tracked in {followed} of {counted} frame sets ({percent(measured_share(result))})."]
     if not result.complete:
-        sentences.insert(0, "This run was cut short; what follows is about the part that was done.")
+        sentences.insert(0, INCOMPLETE_TEXT)
     if result.damage:
         sentences.insert(0, damage_text(result.damage))
     if result.comparison is not None:
         sentences += _judgement(result.comparison)
     if len(result.latency.total):
         middle, tail = result.latency.p50[-1], result.latency.p99[-1]
-        sentences.append(f"A pose took {middle:.1f} ms (median), {tail:.1f} ms at the 99th percentile.")
+        sentences.append(f"Latency of a pose: {middle:.1f} ms median, {tail:.1f} ms at 99 %.")
     if clocks_learned(result.table):
         sentences.append(_clocks(result.table))
     return sentences
@@ -248,18 +249,18 @@ def _clocks(table: PoseTable) -> str:
     """What was known at the end of when the cameras expose."""
     offsets, sigmas = 1000 * table.offsets[-1], 1000 * table.offset_sigmas[-1]
     if not offsets.any():
-        return f"No camera exposes clearly earlier or later than the others (known to {sigmas.max():.1f} ms)."
+        return f"No camera has a significant clock offset (one sigma: {sigmas.max():.1f} ms)."
     each = [f"{n} {o:+.1f} ± {s:.1f} ms" for n, o, s in zip(table.cameras, offsets, sigmas, strict=True)]
-    return f"Against the mean of their clocks the cameras expose at {', '.join(each)}."
+    return f"Clock offsets of the cameras, relative to their mean: {', '.join(each)}."
 
 
 def _judgement(comparison: Comparison) -> list[str]:
     error = spread(comparison.start.translation)
     turn = math.degrees(spread(comparison.start.rotation).median)
     against = "exact truth" if comparison.exact else "measured reference"
-    sentences = [f"Against the {against} it was off by {figure(error.median)} mm and {figure(turn)}° (median)."]
-    many = {0: "No pose was", 1: "One pose was"}.get(len(comparison.off), f"{len(comparison.off)} poses were")
-    return [*sentences, f"{many} off by more than {MAX_TRACKING_ERROR_MM:.0f} mm while the state said TRACKING."]
+    sentences = [f"Error against the {against}: {figure(error.median)} mm and {figure(turn)}° (median)."]
+    many = {0: "No pose had", 1: "One pose had"}.get(len(comparison.off), f"{len(comparison.off)} poses had")
+    return [*sentences, f"{many} an error above {MAX_TRACKING_ERROR_MM:.0f} mm in state TRACKING."]
 
 
 def percent(share: float) -> str:
@@ -346,7 +347,7 @@ def text_of(summary: dict[str, Any]) -> str:
     lines = list(summary["verdict"])
     if summary["errors"] is not None:
         lines += ["", f"{'error':<22}{'median':>9}{'RMSE':>9}{'95 %':>9}{'max':>9}"]
-        for name, kind in (("from the start", "start"), ("aligned", "aligned")):
+        for name, kind in (("first pose", "start"), ("aligned", "aligned")):
             for unit, key in (("mm", "translation_mm"), ("deg", "rotation_deg")):
                 figures = summary["errors"][kind][key]
                 cells = "".join(f"{figures[part]:>9.3f}" for part in ("median", "rmse", "p95", "max"))

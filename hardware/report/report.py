@@ -51,11 +51,13 @@ def sections(result: Evaluation) -> list[str]:
 
 
 def _tiles(result: Evaluation) -> str:
-    tiles = [page.tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets followed")]
+    tiles = [page.tile(percent(measured_share(result)).removesuffix(" %"), "%", "of the frame sets tracked")]
     if result.comparison is not None:
         start, aligned = result.comparison.start, result.comparison.aligned
-        tiles.append(page.tile(figure(spread(start.translation).median), "mm", "median error from the start"))
-        tiles.append(page.tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error from the start"))
+        tiles.append(page.tile(figure(spread(start.translation).median), "mm", "median error, first pose's frame"))
+        tiles.append(
+            page.tile(figure(math.degrees(spread(start.rotation).median)), "°", "median error, first pose's frame")
+        )
         tiles.append(page.tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
     if len(result.latency.total):
         late = result.latency
@@ -79,15 +81,15 @@ def _followed(result: Evaluation) -> tuple[float, float]:
 def _states(result: Evaluation) -> str:
     table = result.table
     if not len(table):
-        return page.section("States", "No frame set was given.", "")
+        return page.section("States", "The session has no frame sets.", "")
     last = table.stamps[-1] + (np.median(np.diff(table.stamps)) if len(table) > 1 else 1.0)
     names = [state.value for state in table.states]
     titles = [f"{s:.2f} s: {n}. {why}" for s, n, why in zip(table.stamps, names, table.reasons, strict=True)]
     strip = page.ribbon(np.append(table.stamps, last), names, titles, time_range(table.stamps), PAGE_CHART_WIDTH)
     keys = [page.area_key(name, f"{name} {percent(share)}") for name, share in result.shares.items() if share > 0]
-    text = "TRACKING and DEGRADED are measured, COASTING is predicted, LOST is of no use."
+    text = "TRACKING and DEGRADED: measured pose. COASTING: predicted pose. LOST: no usable pose."
     if math.isfinite(result.since):
-        text += f" Shares count from {round(result.since, 2) + 0.0:.2f} s, the instant of the roi."
+        text += f" Shares are counted from {round(result.since, 2) + 0.0:.2f} s, the instant of the region of interest."
     return page.section("States", text, strip + page.legend(keys) + _events(result))
 
 
@@ -102,7 +104,7 @@ def _events(result: Evaluation) -> str:
     )
     more = len(changes) - MAX_EVENT_ROWS
     rest = f"<p>and {more} more, all in poses.csv</p>" if more > 0 else ""
-    return f"<details><summary>{len(changes)} states in a row, and why</summary><table>{rows}</table>{rest}</details>"
+    return f"<details><summary>{len(changes)} states, with reasons</summary><table>{rows}</table>{rest}</details>"
 
 
 def components(poses: Array, origin: Array) -> Array:
@@ -135,7 +137,7 @@ def _trajectory(result: Evaluation) -> str:
         target = comparison.expected @ comparison.start.truth_surface_from_estimated_surface
         truth[comparison.rows] = components(target, origin)
         keys.append(page.line_key("truth", "truth" if comparison.exact else "reference"))
-    names = ("x, mm", "y, mm", "z, mm", "turn about x, °", "turn about y, °", "turn about z, °")
+    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
     plots = []
     for name, value, two_sigma, true_value in zip(names, values.T, sigma.T, truth.T, strict=True):
         limits = page.spanning([value, true_value], 0.12, 0.5)
@@ -145,7 +147,7 @@ def _trajectory(result: Evaluation) -> str:
         plot.line(table.stamps, value, "estimate")
         plots.append(plot.svg())
     pairs = "".join(plots[i] for i in (0, 3, 1, 4, 2, 5))
-    text = "Position of the surface's origin in base, and its rotation since the first pose. Time in s."
+    text = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
     return page.section("Trajectory", text, f'{page.legend(keys)}<div class="two">{pairs}</div>')
 
 
@@ -155,7 +157,7 @@ def _motion(result: Evaluation) -> str:
     if not len(table):
         return ""
     moved = np.where(table.measured, table.moved, np.nan)
-    label = "away from the last place of rest, mm"
+    label = "distance from the last place of rest, mm"
     plot = page.Plot(PAGE_CHART_WIDTH, 150, _followed(result), page.spanning([moved], 0.1, 0.3), label=label)
     plot.line(table.stamps, moved, "estimate")
     onsets = np.unique(table.onset[np.isfinite(table.onset)])
@@ -163,27 +165,27 @@ def _motion(result: Evaluation) -> str:
         plot.dots(onsets, np.zeros(len(onsets)), "off", 3)
     share = float(np.mean(table.moving[table.measured])) if table.measured.any() else float("nan")
     still = "was never at rest" if share == 1 else f"moved in {100 * share:.0f} % of the measured frame sets"
-    began = {0: "no movement was seen to begin", 1: "one movement was seen to begin"}
+    began = {0: "no start of a movement was detected", 1: "one start of a movement was detected"}
     text = (
-        f"The surface {still}; {began.get(len(onsets), f'{len(onsets)} movements were seen to begin')}. A movement is "
-        "0.3 mm or 0.1°, and a dot marks the first pose of each."
+        f"The surface {still}; {began.get(len(onsets), f'{len(onsets)} starts of movements were detected')}. "
+        "A movement is 0.3 mm or 0.1°; a dot marks the first pose of each."
     )
-    keys = [page.line_key("estimate", "middle of the surface since it was last at rest")]
+    keys = [page.line_key("estimate", "middle of the surface, relative to its last place of rest")]
     return page.section("Motion", text, page.legend(keys) + plot.svg())
 
 
 def _errors(result: Evaluation) -> str:
     comparison = result.comparison
     if comparison is None:
-        missing = "The session has neither truth.tum nor reference.tum, or no measured pose beside it."
+        missing = "The session has no truth.tum or reference.tum, or no measured pose at its instants."
         return page.section("Errors", missing, "")
     translation, rotation = comparison.start.translation, np.degrees(comparison.start.rotation)
-    plots = _error_plot(result, comparison, translation, "distance from the start on, mm", MAX_TRACKING_ERROR_MM)
-    plots += _error_plot(result, comparison, rotation, "angle from the start on, °")
+    plots = _error_plot(result, comparison, translation, "distance, frame of the first pose, mm", MAX_TRACKING_ERROR_MM)
+    plots += _error_plot(result, comparison, rotation, "angle, frame of the first pose, °")
     text = (
-        f"Against the {'exact truth' if comparison.exact else 'measured reference, whose own error is part of this'}, "
-        f"at {len(comparison.rows)} measured poses. From the start: the constant transform between the two surface "
-        "frames is taken at the first TRACKING pose, nothing is fitted. Aligned: the best constant over the run."
+        f"Against the {'exact truth' if comparison.exact else 'measured reference, whose error is included'}, "
+        f"at {len(comparison.rows)} measured poses. First pose's frame: the transform between the surface "
+        "frames is that of the first TRACKING pose; nothing is fitted. Aligned: best constant transform of the run."
     )
     return page.section("Errors", text, plots + _error_table(comparison) + _consistency(comparison))
 
@@ -206,7 +208,7 @@ def _error_plot(result: Evaluation, comparison: Comparison, errors: Array, label
 
 def _error_table(comparison: Comparison) -> str:
     rows = []
-    for name, errors in (("from the start", comparison.start), ("aligned", comparison.aligned)):
+    for name, errors in (("first pose", comparison.start), ("aligned", comparison.aligned)):
         for unit, values in (("mm", errors.translation), ("°", np.degrees(errors.rotation))):
             s = spread(values)
             rows.append([f"{name}, {unit}", *(figure(v) for v in (s.median, s.rmse, s.p95, s.max))])
@@ -217,14 +219,14 @@ def _consistency(comparison: Comparison) -> str:
     start, aligned = comparison.start, comparison.aligned
     inside = percent(aligned.nees_inside) if math.isfinite(aligned.nees_inside) else "–"
     text = (
-        f"NEES / 6: {figure(start.mean_nees / 6)} from the start, with the first pose's own error in all poses, "
+        f"NEES / 6: {figure(start.mean_nees / 6)} in the frame of the first pose, whose error is in all poses, "
         f"and {figure(aligned.mean_nees / 6)} aligned. "
-        f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}, where 95 % should be. "
+        f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}; expected: 95 %. "
     )
     if comparison.exact and math.isfinite(aligned.mean_nees):
         text += f"Aligned, {calibration_words(aligned.mean_nees / 6)}. "
     if not comparison.exact:
-        text += "It says little here: it holds the reference's own error against the tracker's covariance."
+        text += "It is of little use here: it includes the error of the reference."
     return f'<p class="note">{escape(text)}</p>'
 
 
@@ -239,7 +241,7 @@ def _tracks(result: Evaluation) -> str:
         plot.line(table.stamps, np.where(counted, table.used[:, i], np.nan), f"series c{i % 5}")
         middle = np.median(table.used[counted, i]) if counted.any() else 0
         keys.append(page.line_key(f"series c{i % 5}", f"{name}, median {middle:.0f}"))
-    text = "Tracks that carry the pose, per camera."
+    text = "Tracks used for the pose, per camera."
     return page.section("Tracks", text, page.legend(keys) + plot.svg())
 
 
@@ -251,17 +253,17 @@ def _clocks(result: Evaluation) -> str:
     shown = np.where(table.is_state(TrackState.INITIALISING), np.nan, 1.0)
     offsets, sigmas = 1000 * table.offsets * shown[:, None], 1000 * table.offset_sigmas
     limits, keys = page.spanning([offsets], 0.15, 2.0), []
-    plot = page.Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="later than stamped, ms")
+    plot = page.Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="clock offset, ms")
     for i, name in enumerate(table.cameras):
         plot.line(table.stamps, offsets[:, i], f"series c{i % 5}")
         final = f"{name}, at the end {1000 * table.offsets[-1, i]:+.1f} ± {sigmas[-1, i]:.1f} ms"
         keys.append(page.line_key(f"series c{i % 5}", final))
     text = (
-        "How much later than stamped each camera exposes, against the mean of all, and one standard deviation. It "
-        "shows where the surface moves, and is corrected once it is clearly there."
+        "Clock offset of each camera (exposure minus stamp), relative to the mean of all, and one standard deviation. "
+        "It is observable only while the surface moves, and is corrected once it is significant."
     )
     if not np.nan_to_num(offsets).any():
-        text += " Here chance explains what was seen, and nothing was corrected."
+        text += " Here the offsets are not significant, and nothing was corrected."
         return page.section("Clocks", text, page.legend(keys))
     return page.section("Clocks", f"{text} Until then a line stays at zero.", page.legend(keys) + plot.svg())
 
@@ -269,8 +271,8 @@ def _clocks(result: Evaluation) -> str:
 def _latency(result: Evaluation) -> str:
     late = result.latency
     text = (
-        "From the decoded frames to the pose, without the map refinement that no pose waits for. The first "
-        f"{late.initial_sets} frame sets, up to the first map, took {late.initialisation:.0f} ms and are not counted."
+        "From the decoded frames to the pose, without the map refinement, which runs in parallel. The first "
+        f"{late.initial_sets} frame sets, until the first map, took {late.initialisation:.0f} ms and are not counted."
     )
     if not len(late.total):
         return page.section("Latency", text, "")
@@ -285,7 +287,7 @@ def _latency(result: Evaluation) -> str:
     plot.bars(edges, counts.astype(float), "bar")
     plot.mark(float(late.p50[-1]), "median", "median")
     plot.mark(float(late.p99[-1]), "99 %", "median")
-    caption = '<div class="caption">frame sets by their total, ms</div>'
+    caption = '<div class="caption">frame sets by total time, ms</div>'
     return page.section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
 
 

@@ -21,8 +21,8 @@ from hardware.simulator.nozzle_error import NEAR_ERROR, BeadEnds, NozzleLag, pro
 from hardware.simulator.nozzle_summary import SPREAD_COLUMNS, NozzleResult, nozzle_verdict, rows_of_errors, share
 
 PAGE_FOOTER = (
-    "Lengths in mm, time in s of the simulation's own clock. The error is the nozzle's tip less the place on the true "
-    "surface that was due at that instant, both known exactly; nothing in the loop sees either."
+    "Lengths in mm, time in s of the simulation's clock. Nozzle error: position of the tip minus its target on "
+    "the true surface at that instant. Both are exact, and unknown to the closed loop."
 )
 MET_MARKS = {True: '<span class="met">✓ met</span>', False: '<span class="missed">✗ missed</span>'}
 MAX_LAYERS = 6  # bead maps shown
@@ -125,7 +125,7 @@ def way_picture(result: NozzleResult, width: float) -> str:
         colour = np.searchsorted(ERROR_STEPS, np.nan_to_num(worst, nan=np.inf))
         for start, end in pairwise(np.append(np.flatnonzero(np.diff(colour, prepend=-1)), len(colour))):
             lines.append(_polyline(f"e{colour[start]}", tip[rows[start : end + 1]]))
-    return view.svg("".join(lines), "the way of the nozzle by its error")
+    return view.svg("".join(lines), "path of the nozzle, coloured by its error")
 
 
 def way_legend() -> list[tuple[str, str]]:
@@ -164,10 +164,10 @@ def nozzle_page(result: NozzleResult) -> str:
 def _tiles(result: NozzleResult) -> str:
     f = result.figures.nozzle
     tiles = (
-        (figure(f.position.p95), "mm", "error, 95 % of the time"),
-        (figure(f.position.max), "mm", "error, at most"),
-        (share(f.duty).removesuffix(" %"), "%", "duty: printed of the time it had"),
-        (figure(np.degrees(f.angle.p95)), "°", "angle, 95 % of the time"),
+        (figure(f.position.p95), "mm", "nozzle error, 95 %"),
+        (figure(f.position.max), "mm", "nozzle error, largest"),
+        (share(f.duty).removesuffix(" %"), "%", "duty cycle"),
+        (figure(np.degrees(f.angle.p95)), "°", "angle error, 95 %"),
         (figure(1000 * f.lag.seconds), "ms", "lag"),
         (share(result.figures.deposit.coverage).removesuffix(" %"), "%", "of the planned area covered"),
     )
@@ -181,12 +181,12 @@ def _figures(result: NozzleResult) -> str:
     ]
     offset = ", ".join(figure(v) for v in result.figures.nozzle.offset)
     f = result.figures.nozzle
-    time = f"of the {f.extruding:.2f} s it printed, of {f.printing:.2f} s it had"
+    time = f"of {f.extruding:.2f} s of printing (planned printing time: {f.printing:.2f} s)"
     within = f"Within {NEAR_ERROR:g} mm for {share(f.near)} {time}"
-    more = f"{within}; mean error {offset} mm along x, y and z of the surface."
+    more = f"{within}. Mean error along x, y and z of the surface: {offset} mm."
     errors = page.figures_table(["", *SPREAD_COLUMNS.values()], rows) + f'<p class="note">{escape(more)}</p>'
-    text = "Over the milliseconds in which material left the nozzle; parts of the error are without their sign."
-    limits = page.section("Limits", "What the scenario asks of a run.", _limits(result)) if result.verdicts else ""
+    text = "Over all milliseconds with extrusion. Components of the error are absolute values."
+    limits = page.section("Limits", "Limits of the scenario.", _limits(result)) if result.verdicts else ""
     return limits + page.section("Error while printing", text, errors)
 
 
@@ -231,11 +231,11 @@ def _over_time(result: NozzleResult) -> str:
     _draw_line(plot, log.stamps, np.where(log.extrude, distance, np.nan), "estimate")
     keys = [
         page.line_key("estimate", "error while printing"),
-        page.line_key("aside", "while not printing, where a place was due"),
+        page.line_key("aside", "error while not printing, if there is a target"),
         page.area_key("extruding", "printing"),
-        page.area_key("holding", "holding; point at it for the reason"),
+        page.area_key("holding", "hold; point at it for the reason"),
     ]
-    text = "From the nozzle's tip to where it should have been, over time in s; what is higher is cut off."
+    text = "Distance of the nozzle's tip from its target, over time in s. Higher values are cut off."
     return page.section("Error over time", text, page.legend(keys) + plot.svg())
 
 
@@ -254,8 +254,8 @@ def _parts(result: NozzleResult) -> str:
         plot = page.Plot(PAGE_CHART_WIDTH, height, time_range(log.stamps), y, label=name, x_ticks=i == 3)
         _draw_line(plot, log.stamps, value, f"series c{i}")
         plots.append(plot.svg())
-    text = "Ahead, to the left and out of the surface are positive; the angle is that to the axis of the target."
-    return page.section("Parts of the error", text, "".join(plots))
+    text = "Positive: ahead, to the left, out of the surface. Angle: between the axes of nozzle and target."
+    return page.section("Components of the error", text, "".join(plots))
 
 
 def _spread(result: NozzleResult) -> str:
@@ -271,18 +271,18 @@ def _spread(result: NozzleResult) -> str:
     bars.bars(edges, percents, "bar")
     bars.mark(f.position.median, "median", "median")
     bars.mark(f.position.p95, "95 %", "median")
-    caption = '<div class="caption">% of the time it printed, by error in mm</div>'
+    caption = '<div class="caption">share of the printing time in %, by error in mm</div>'
     charts = f"<div>{caption}{bars.svg()}</div><div>{_lag(f.lag)}</div>"
     text = (
-        "Left: how often the error was how large. Right: how far the nozzle is from the target (RMS) if one is shifted "
-        "against the other in time; where that is least is the lag, positive when the nozzle is late."
+        "Left: distribution of the error. Right: RMS distance of nozzle and target, with one of them shifted in time. "
+        "The shift with the least distance is the lag; positive: the nozzle is late."
     )
-    return page.section("Spread and lag", text, f'<div class="two">{charts}</div>')
+    return page.section("Distribution and lag", text, f'<div class="two">{charts}</div>')
 
 
 def _lag(lag: NozzleLag) -> str:
     if not len(lag.shifts):
-        return '<div class="caption">The target moved too little, or not long enough, to tell a lag.</div>'
+        return '<div class="caption">No lag: the motion of the target is too small or too short.</div>'
     milliseconds = 1000 * lag.shifts
     top = float(lag.distance.max()) * 1.1
     plot = page.Plot(HALF_CHART_WIDTH, 230, (float(milliseconds[0]), float(milliseconds[-1])), (0.0, max(top, 0.01)))
@@ -310,9 +310,9 @@ def _pictures(result: NozzleResult) -> str:
     both = f"<div>{maps}{kinds}</div><div>{way_picture(result, width)}{colours}</div>"
     text = (
         f"The surface from above, x to the right. Beads are {result.run.bead:g} mm wide, {f.area:.0f} mm² are planned: "
-        f"{share(f.coverage)} got their material, {share(f.gaps)} are gaps (half a bead or more is missing), "
+        f"{share(f.coverage)} are covered, {share(f.gaps)} are gaps (half a bead or more is missing), "
         f"{share(f.overlap)} overlap (1.5 times the plan or more), and an area of {share(f.outside)} lies outside. "
-        "Beside it, the way of the tip while it printed, coloured by the error."
+        "The other picture shows the path of the tip while printing, coloured by the error."
     )
     more = len(deposit.layers) - MAX_LAYERS
     rest = f'<p class="note">and {more} more layers</p>' if more > 0 else ""
@@ -328,24 +328,24 @@ def _ends(result: NozzleResult) -> str:
     if not len(m.beginnings.error):
         return ""
     rows, charts = [], []
-    for name, ends in (("begin", m.beginnings), ("end", m.ends)):
+    for name, ends in (("start", m.beginnings), ("end", m.ends)):
         missing, excess = int(np.isnan(ends.error).sum()), float(ends.excess.mean()) if len(ends.excess) else np.nan
         values = ends.median, ends.size.p95, ends.size.max, excess, ends.blob
-        rows.append([f"{name}: {len(ends.error)}, {missing} not laid", *map(figure, values)])
-        charts.append(f"<div>{ends_chart(ends, f'about where beads {name}', HALF_CHART_WIDTH)}</div>")
-    head = ("", "median, mm", "95 %, mm", "max, mm", "too much, mean, mm³", "most, mm³")
+        rows.append([f"{name}: {len(ends.error)}, {missing} not printed", *map(figure, values)])
+        charts.append(f"<div>{ends_chart(ends, f'around the {name} of beads', HALF_CHART_WIDTH)}</div>")
+    head = ("", "median, mm", "95 %, mm", "max, mm", "excess, mean, mm³", "excess, max, mm³")
     open_text = "not known" if np.isnan(m.open_outside) else f"{1000 * m.open_outside:.0f} ms"
     note = (
-        f"{m.volume:.1f} of {m.planned_volume:.1f} mm³ were laid, {figure(m.ooze)} mm³ of it beside all beads. For "
-        f"{1000 * m.flow_outside:.0f} ms material flowed while the motion did not print; told to was it then for "
+        f"Deposit: {m.volume:.1f} of {m.planned_volume:.1f} mm³, {figure(m.ooze)} mm³ outside beads. Flow outside "
+        f"of printing moves: {1000 * m.flow_outside:.0f} ms; dispenser commanded open outside of them: "
         f"{open_text}."
     )
     text = (
-        "Errors along the path: above 0, material begins or ends farther on than planned. Too much: what lies within "
-        "1 mm of a bead's end, less what is planned there. Below, laid of the planned about each, by mm of the path."
+        "Errors along the path: above 0, material starts or ends later than planned. Excess: material within 1 mm of a "
+        "bead's end minus the plan. Charts: deposited / planned material around each start and end, by mm of the path."
     )
     body = page.figures_table(head, rows) + f'<p class="note">{escape(note)}</p>'
-    return page.section("Where beads begin and end", text, body + f'<div class="two">{"".join(charts)}</div>')
+    return page.section("Starts and ends of beads", text, body + f'<div class="two">{"".join(charts)}</div>')
 
 
 def ends_chart(ends: BeadEnds, label: str, width: int) -> str:
@@ -366,14 +366,14 @@ def ends_chart(ends: BeadEnds, label: str, width: int) -> str:
 def _holds(result: NozzleResult) -> str:
     holds = result.figures.nozzle.holds
     if not holds:
-        return page.section("Holds", "The arm never held.", "")
+        return page.section("Holds", "No holds.", "")
     rows = [(h.reason, str(h.count), *(f"{v:.3f}" for v in (h.seconds, h.longest, h.first))) for h in holds]
-    text = "Why the arm stood still until the path was finished; … stands for a number that was not always the same."
-    head = ("reason", "times", "in all, s", "longest, s", "first at, s")
+    text = "Reasons for holds until the end of the path. … stands for a varying number."
+    head = ("reason", "count", "total, s", "longest, s", "first at, s")
     return page.section("Holds", text, page.figures_table(head, rows))
 
 
 def _camera_pictures(result: NozzleResult) -> str:
     if not result.run.pictures:
         return ""
-    return page.section("What the cameras saw", "One instant of the run.", page.camera_pictures(result.run.pictures))
+    return page.section("Camera pictures", "One instant of the run.", page.camera_pictures(result.run.pictures))

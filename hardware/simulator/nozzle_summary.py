@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from hardware.process import checks
+from hardware.process.progress import count_text
 from hardware.recording.messages import message_from_look
-from hardware.report.evaluation import Evaluation, Spread, figure, finite, percent, spread
+from hardware.report.evaluation import INCOMPLETE_TEXT, Evaluation, Spread, figure, finite, percent, spread
 from hardware.simulator.deposit import (
     DepositFigures,
     DepositMap,
@@ -73,16 +74,18 @@ BOUNDS = {  # key in [limits]: with its unit
     "angle_p95_deg": Bound("angle, 95 %", "°", False, lambda f: math.degrees(f.nozzle.angle.p95)),
     "angle_max_deg": Bound("angle, largest", "°", False, lambda f: math.degrees(f.nozzle.angle.max)),
     "near": Bound("extruding time within 0.5 mm", "", True, lambda f: f.nozzle.near),
-    "duty": Bound("duty", "", True, lambda f: f.nozzle.duty),
+    "duty": Bound("duty cycle", "", True, lambda f: f.nozzle.duty),
     "hold_s": Bound("longest hold", "s", False, lambda f: max((h.longest for h in f.nozzle.holds), default=0.0)),
     "lag_ms": Bound("lag", "ms", False, lambda f: 1000 * abs(f.nozzle.lag.seconds)),
     "coverage": Bound("coverage", "", True, lambda f: f.deposit.coverage),
     "gaps": Bound("gaps", "", False, lambda f: f.deposit.gaps),
     "overlap": Bound("overlap", "", False, lambda f: f.deposit.overlap),
     "outside": Bound("material outside", "", False, lambda f: f.deposit.outside),
-    "bead_begin_p95_mm": Bound("beads begin off the plan, 95 %", "mm", False, lambda f: f.material.beginnings.size.p95),
-    "bead_stop_p95_mm": Bound("beads end off the plan, 95 %", "mm", False, lambda f: f.material.ends.size.p95),
-    "told_outside_ms": Bound("told to flow while not printing", "ms", False, lambda f: 1000 * f.material.open_outside),
+    "bead_begin_p95_mm": Bound("error of bead starts, 95 %", "mm", False, lambda f: f.material.beginnings.size.p95),
+    "bead_stop_p95_mm": Bound("error of bead ends, 95 %", "mm", False, lambda f: f.material.ends.size.p95),
+    "told_outside_ms": Bound(
+        "commanded open outside of printing", "ms", False, lambda f: 1000 * f.material.open_outside
+    ),
     "tracking_rms_mm": Bound("tracking error, RMS", "mm", False, _tracking("rmse")),
     "tracking_p95_mm": Bound("tracking error, 95 %", "mm", False, _tracking("p95")),
     "tracking_max_mm": Bound("tracking error, largest", "mm", False, _tracking("max")),
@@ -194,7 +197,7 @@ def rows_of_errors(result: NozzleResult) -> list[tuple[str, str, Spread, float]]
         ("along the path, mm", "along_mm", f.along, 1.0),
         ("across the path, mm", "across_mm", f.across, 1.0),
         ("along the normal, mm", "normal_mm", f.normal, 1.0),
-        ("off the printed line, mm", "path_mm", f.path, 1.0),
+        ("distance from the printed line, mm", "path_mm", f.path, 1.0),
         ("angle, °", "angle_deg", f.angle, math.degrees(1.0)),
     ]
 
@@ -202,23 +205,23 @@ def rows_of_errors(result: NozzleResult) -> list[tuple[str, str, Spread, float]]
 def nozzle_verdict(result: NozzleResult) -> list[str]:
     """The run in a few sentences."""
     f, deposit = result.figures.nozzle, result.figures.deposit
-    sentences = [] if result.run.complete else ["This run was cut short; what follows is about the part that was done."]
+    sentences = [] if result.run.complete else [INCOMPLETE_TEXT]
     if not math.isfinite(f.position.p95):
-        return [*sentences, "Nothing was printed, so there is no error to tell.", *_limit_sentences(result)]
+        return [*sentences, "Nothing was printed: there is no nozzle error.", *_limit_sentences(result)]
     sentences.append(
-        f"While it printed, the nozzle was {figure(f.position.rmse)} mm from its place (RMS), 95 % of the time within "
-        f"{figure(f.position.p95)} mm and never more than {figure(f.position.max)} mm away."
+        f"Nozzle error while printing: {figure(f.position.rmse)} mm RMS, {figure(f.position.p95)} mm at 95 %, "
+        f"{figure(f.position.max)} mm largest."
     )
-    sentences.append(f"It printed for {share(f.duty)} of the time it had{'' if f.finished else ' and did not finish'}.")
+    sentences.append(f"Duty cycle: {share(f.duty)}{'' if f.finished else '; the path was not finished'}.")
     if math.isfinite(deposit.coverage):
-        sentences.append(f"{share(deposit.coverage)} of the planned area got its material.")
+        sentences.append(f"Coverage: {share(deposit.coverage)} of the planned area.")
     material = result.figures.material
     if material.open_outside > 0:
         sentences.append(
-            f"For {1000 * material.open_outside:.0f} ms a dispenser was told to be open while nothing was printed."
+            f"A dispenser was commanded open for {1000 * material.open_outside:.0f} ms outside of printing."
         )
     if f.without_target > 0:
-        sentences.append(f"For {f.without_target:.3f} s material left the nozzle where nothing was due.")
+        sentences.append(f"Material left the nozzle for {f.without_target:.3f} s outside of the planned beads.")
     return sentences + _limit_sentences(result)
 
 
@@ -227,7 +230,7 @@ def _limit_sentences(result: NozzleResult) -> list[str]:
     if not result.verdicts:
         return ["The scenario sets no limits."]
     if not missed:
-        return [f"All {len(result.verdicts)} limits were met." if len(result.verdicts) > 1 else "Its limit was met."]
+        return [f"All {len(result.verdicts)} limits were met." if len(result.verdicts) > 1 else "The limit was met."]
     details = "; ".join(f"{v.bound.label} {v.value_text}, {v.limit_text}" for v in missed)
     return [f"{len(missed)} of {len(result.verdicts)} limits missed: {details}."]
 
@@ -310,18 +313,19 @@ def nozzle_text(summary: dict[str, Any]) -> str:
         name, _, unit = key.rpartition("_")
         lines.append(f"{f'{name}, {unit}':<26}" + "".join(f"{_number(figures[part]):>9}" for part in SPREAD_COLUMNS))
     deposit, lag = summary["deposit"], summary["lag_ms"]
-    parts = [("duty", summary["duty"]), *((name, deposit[name]) for name in ("coverage", "gaps", "overlap", "outside"))]
+    parts = [
+        ("duty cycle", summary["duty"]),
+        *((name, deposit[name]) for name in ("coverage", "gaps", "overlap", "outside")),
+    ]
     shares = [f"{name} {share(np.nan if value is None else value)}" for name, value in parts]
     lines += ["", ", ".join([*shares, f"lag {'–' if lag is None else f'{lag:.1f}'} ms"])]
     for name, end in ((name, summary["material"][name]) for name in ("begin", "stop")):
         if end["count"]:
-            off = f"off by {_number(end['median_mm'])} mm (median), {_number(end['p95_mm'])} mm (95 %)"
-            lines.append(
-                f"beads that {name}: {end['count']}, {off}; most too much {_number(end['excess_max_mm3'])} mm3"
-            )
-    lines += [f"look at {look['stamp']:.1f} s: {look['text']}" for look in summary["looks"]]
+            off = f"error {_number(end['median_mm'])} mm (median), {_number(end['p95_mm'])} mm (95 %)"
+            lines.append(f"{name} of beads: {end['count']}, {off}; largest excess {_number(end['excess_max_mm3'])} mm3")
+    lines += [f"inspection at {look['stamp']:.1f} s: {look['text']}" for look in summary["looks"]]
     for hold in summary["holds"]:
-        lines.append(f"held {hold['count']} x, {hold['total_s']:.2f} s in all: {hold['reason']}")
+        lines.append(f"{count_text(hold['count'], 'hold')}, {hold['total_s']:.2f} s: {hold['reason']}")
     for limit in summary["limits"]:
         word = "met   " if limit["met"] else "MISSED"
         lines.append(f"{word}  {limit['name']:<18}{_number(limit['reached']):>9}  allowed {limit['allowed']:g}")

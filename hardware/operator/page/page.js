@@ -283,7 +283,7 @@ function progress(seen) {
   const words = [`${share.toFixed(1)} %`, `checkpoint ${Math.min(Math.floor(far.fraction) + 1, far.total)} of ${far.total}`];
   if (far.begun && CHECKED.includes(seen.stage)) words[0] = `goes on at ${words[0]}`;
   if (far.layers) words.push(`layer ${far.layer} of ${far.layers}`);
-  if (far.duty !== null) words.push(`printing ${(100 * far.duty).toFixed(0)} %`);
+  if (far.duty !== null) words.push(`duty cycle ${(100 * far.duty).toFixed(0)} %`);
   if (far.ink !== null) words.push(`ink ${far.ink.toFixed(far.ink < 10 ? 2 : 0)} mm³`);
   by("place").textContent = words.join(" · ");
   const [low, high] = far.spread || [null, null], until = high === null ? "or more" : `to ${about(high)}`;

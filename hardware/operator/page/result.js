@@ -30,7 +30,7 @@ export class ResultView {
     const tiles = [
       [(100 * result.printed).toFixed(result.printed < 1 ? 1 : 0), "%", `printed, checkpoint ${Math.floor(result.fraction)} of ${result.total}`],
       ...two(result.true_error, "true"), ...two(result.error, "predicted"),
-      [result.duty === null ? "–" : (100 * result.duty).toFixed(0), result.duty === null ? "" : "%", "of the time material left"],
+      [result.duty === null ? "–" : (100 * result.duty).toFixed(0), result.duty === null ? "" : "%", "duty cycle"],
       [duration(result.seconds), "", "since the approach"],
       ...(result.ink === null ? [] : [[result.ink.toFixed(result.ink < 10 ? 2 : 0), "mm³", "of ink"]]),
       ...(result.begun ? [[`${((100 * result.begun) / result.total).toFixed(0)} %`, "", "where this run went on"]] : []),
