@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,75 +39,77 @@ GRID_PER_BEAD = 0.6  # of a bead between nodes of the wound's grid: finer change
 MIN_GRID_STEP, MAX_GRID_STEP = 0.1, 0.5  # mm
 EXAMPLE_STEP = 0.75  # mm between the vertices of an example scan, as of a handheld scanner
 EXAMPLE_SIZE, EXAMPLE_DEPTH, EXAMPLE_SEED = (42.0, 31.0), 3.5, 1  # mm
-DEFAULT_TEXTS = {
-    "tissues": "hypodermis=rest, dermis=1.6, epidermis=0.4", "layer_height": "as wide as a bead",
-    "bump": "half a layer", "bump_clearance": "half a bead",
-}  # fmt: skip
-SETTING_UNITS = {
-    "layer_height": "mm", "angle": "°", "bead": "mm", "overlap_percent": "%", "inset": "mm", "speed": "mm/s",
-    "travel": "mm/s", "temperature": "°C", "spacing": "mm", "chord": "mm", "lift": "mm", "wait": "s",
-    "sideways": "mm/s²", "tilt_deg": "°", "turning_deg_mm": "°/mm", "spin_deg": "°", "bump": "mm",
-    "bump_clearance": "mm", "amplitude_mm": "mm",
-}  # fmt: skip
-UNIT_SUFFIXES = ("_percent", "_deg_mm", "_deg", "_mm")
-SETTING_RANGES = (
-    ("bead", 0.01, 20), ("inset", 0, 100), ("rims", 0, 100),
-    ("layer_height", 0.02, 20), ("overlap_percent", 0, 90), ("speed", 0.1, MAX_SPEED), ("travel", 0.1, MAX_SPEED),
-    ("temperature", MIN_TEMPERATURE, MAX_TEMPERATURE), ("spacing", 0.05, 50), ("chord", 0.001, 1), ("lift", 0, 50),
-    ("wait", 0, 3600), ("sideways", 1, 100_000), ("tilt_deg", 0, 60), ("turning_deg_mm", 0.01, 90),
-    ("spin_deg", -360, 360), ("bump", 0, 20), ("bump_clearance", 0, 20), ("amplitude_mm", 0, 100),
-)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SettingInfo:
+    """The metadata of one setting, under "setting"."""
+
+    label: str  # on the page
+    unit: str = ""
+    limits: tuple[float, float] | None = None  # lowest and highest value; None: checked elsewhere
+    default: str = ""  # text of the value None or ()
+
+
+def _setting(
+    default: Any, label: str, unit: str = "", low: float = math.nan, high: float = math.nan, text: str = ""
+) -> Any:
+    limits = None if math.isnan(low) else (low, high)
+    return field(default=default, metadata={"setting": SettingInfo(label, unit, limits, text)})
 
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """The command line's own words: lengths mm, speeds mm/s, angles degrees. angle: degrees, shorter or fastest."""
+    """The options of the command line: lengths mm, speeds mm/s, angles degrees. angle: degrees, shorter or fastest."""
 
-    material: str = "1,2,3"
-    tissues: tuple[str, ...] = ()
-    layers: str = "skin"
-    layer_height: float | None = None
-    pattern: str = "contour"
-    angle: str = "fastest"
-    parallel: bool = False
-    bead: float = 0.4
-    overlap_percent: float = 0.0
-    inset: float = 0.0
-    rims: int = 1
-    speed: float = 20.0
-    travel: float = 60.0
-    temperature: float = 20.0
-    spacing: float = 1.0
-    chord: float = 0.02
-    lift: float = 2.0
-    wait: float = 0.0
-    sideways: float = 200.0
-    tilt_deg: float = 30.0
-    turning_deg_mm: float = 5.0
-    spin_deg: float = 0.0
-    bump: float | None = None
-    bump_clearance: float | None = None
-    amplitude_mm: float = 0.0
+    material: str = _setting("1,2,3", "material")
+    tissues: tuple[str, ...] = _setting((), "tissues", text="hypodermis=rest, dermis=1.6, epidermis=0.4")
+    layers: str = _setting("skin", "shape of the layers")
+    layer_height: float | None = _setting(None, "layer height", "mm", 0.02, 20, "as wide as a bead")
+    pattern: str = _setting("contour", "pattern")
+    angle: str = _setting("fastest", "angle of the lines", "°")
+    parallel: bool = _setting(False, "same direction in all layers")
+    bead: float = _setting(0.4, "bead width", "mm", 0.01, 20)
+    overlap_percent: float = _setting(0.0, "overlap of beads", "%", 0, 90)
+    inset: float = _setting(0.0, "margin along the rim", "mm", 0, 100)
+    rims: int = _setting(1, "closed lines of the hybrid pattern", "", 0, 100)
+    speed: float = _setting(20.0, "printing speed", "mm/s", 0.1, MAX_SPEED)
+    travel: float = _setting(60.0, "speed between beads", "mm/s", 0.1, MAX_SPEED)
+    temperature: float = _setting(20.0, "temperature", "°C", MIN_TEMPERATURE, MAX_TEMPERATURE)
+    spacing: float = _setting(1.0, "distance of checkpoints", "mm", 0.05, 50)
+    chord: float = _setting(0.02, "maximum deviation from curves", "mm", 0.001, 1)
+    lift: float = _setting(2.0, "lift between beads", "mm", 0, 50)
+    wait: float = _setting(0.0, "pause before a layer", "s", 0, 3600)
+    sideways: float = _setting(200.0, "maximum lateral acceleration", "mm/s²", 1, 100_000)
+    tilt_deg: float = _setting(30.0, "maximum tilt of the tool", "°", 0, 60)
+    turning_deg_mm: float = _setting(5.0, "maximum rotation of the tool", "°/mm", 0.01, 90)
+    spin_deg: float = _setting(0.0, "spin of the tool", "°", -360, 360)
+    bump: float | None = _setting(None, "height of bumps to print over", "mm", 0, 20, "half a layer")
+    bump_clearance: float | None = _setting(None, "distance from other bumps", "mm", 0, 20, "half a bead")
+    amplitude_mm: float = _setting(0.0, "amplitude of the tissue", "mm", 0, 100)
 
     def rows(self) -> list[tuple[str, str]]:
-        """Each setting and its value with its unit, as text."""
-        return [(self._label(f.name), self._text(f.name)) for f in fields(self)]
-
-    @staticmethod
-    def _label(name: str) -> str:
-        suffix = next((suffix for suffix in UNIT_SUFFIXES if name.endswith(suffix)), "")
-        return name.removesuffix(suffix).replace("_", " ")
+        """Each setting with its option, and its value with unit, as texts."""
+        return [(f"{info.label}, {option_of(name)}", self._text(name)) for name, info in SETTINGS.items()]
 
     def _text(self, name: str) -> str:
-        value = getattr(self, name)
+        value, info = getattr(self, name), SETTINGS[name]
         if value is None or value == ():
-            return DEFAULT_TEXTS[name]
+            return info.default
         if isinstance(value, bool):
             return "yes" if value else "no"
         if isinstance(value, tuple):
             return "; ".join(value)
         number = f"{value:g}" if isinstance(value, float) else str(value)
-        return number if number in get_args(AngleChoice) else f"{number} {SETTING_UNITS.get(name, '')}".rstrip()
+        return number if number in get_args(AngleChoice) else f"{number} {info.unit}".rstrip()
+
+
+SETTINGS: dict[str, SettingInfo] = {each.name: each.metadata["setting"] for each in fields(PlanSettings)}
+
+
+def option_of(name: str) -> str:
+    """The option of the command line for a setting."""
+    return "--tissue" if name == "tissues" else "--" + name.replace("_", "-")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +146,10 @@ class PlanSubject:
 def order_of(settings: PlanSettings, flat: bool) -> PlanOrder:
     """What is to be planned. flat: one layer of one tissue."""
     s = settings
-    for name, low, high in SETTING_RANGES:
+    for name, info in SETTINGS.items():
         value = getattr(s, name)
-        if value is not None and not low <= value <= high:
-            raise InputError(COMMAND_LINE, "--" + name.replace("_", "-"), value, f"{low:g} to {high:g}")
+        if value is not None and info.limits is not None and not info.limits[0] <= value <= info.limits[1]:
+            raise InputError(COMMAND_LINE, option_of(name), value, "{:g} to {:g}".format(*info.limits))
     pattern = Pattern(
         kind=cast(PatternKind, s.pattern), width=s.bead, overlap=s.overlap_percent / 100, inset=s.inset,
         angle=_angle(s.angle), rims=s.rims,
@@ -280,10 +282,12 @@ def measured_amplitude(motion: str) -> float:
     if not len(places):
         raise InputError(motion, "poses", "none", "a trajectory of the surface")
     ends = np.percentile(places, [100 - AMPLITUDE_SHARE, AMPLITUDE_SHARE], axis=0)
-    off = np.linalg.norm(places - ends.mean(axis=0), axis=1)
-    amplitude, most = float(np.percentile(off, AMPLITUDE_SHARE)), max(row[2] for row in SETTING_RANGES[-1:])
-    if not amplitude <= most:
-        raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", f"{most:g} mm or less: of tissue, not of a camera")
+    distance = np.linalg.norm(places - ends.mean(axis=0), axis=1)
+    amplitude, limits = float(np.percentile(distance, AMPLITUDE_SHARE)), SETTINGS["amplitude_mm"].limits
+    assert limits is not None
+    if not amplitude <= limits[1]:
+        allowed = f"{limits[1]:g} mm or less: of tissue, not of a camera"
+        raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", allowed)
     if amplitude < MIN_AMPLITUDE:
         allowed = f"{MIN_AMPLITUDE:g} mm or more; places are in mm, not m; of tissue at rest: --amplitude-mm 0"
         raise InputError(motion, "amplitude", f"{amplitude:.2g} mm", allowed)

@@ -320,7 +320,7 @@ def placement_lines(verdict: str, sightings: Sequence[WoundSighting]) -> list[st
         far = sighting.distance > MAX_CENTROID_DISTANCE
         hint = f", more than {MAX_CENTROID_DISTANCE:g} mm: is it the same wound?" if far else ""
         lines.append(
-            f"placement: the wound's centroid in {sighting.camera} is {sighting.distance:.2f} mm from the plan's{hint}; "
+            f"placement: the wound's centre in {sighting.camera} is {sighting.distance:.2f} mm from the plan's{hint}; "
             f"ratio of the areas: {sighting.share:.2f}"
         )
     return lines
