@@ -147,7 +147,7 @@ def test_the_command_replays_a_simulated_session(
 ) -> None:
     file, sink = recordings["a recall"]
     assert main(["replay", str(file), "-o", str(tmp_path / "out")]) == 0
-    assert "all as they were given" in capsys.readouterr().out
+    assert "all equal to the recorded ones" in capsys.readouterr().out
     assert (tmp_path / "out" / "frames.bin").read_bytes() == sink.sent
     assert "called back" in (tmp_path / "out" / "commands.csv").read_text(encoding="utf-8")
 

@@ -25,9 +25,9 @@ from hardware.simulator.nozzle_report import (
     CELL_KINDS,
     bead_picture,
     cell_kinds,
+    error_legend,
     nozzle_page,
-    way_legend,
-    way_picture,
+    nozzle_path_picture,
     whole_map_view,
 )
 from hardware.simulator.nozzle_summary import (
@@ -318,9 +318,9 @@ def test_the_bead_map_has_x_to_the_right_and_y_up_and_each_kind_in_its_colour() 
 
 
 def test_the_way_is_coloured_by_the_worst_error() -> None:
-    assert len(way_legend()) == 5
+    assert len(error_legend()) == 5
     for off, style in ((0.0, "e0"), (0.2, "e1"), (0.4, "e2"), (0.9, "e3"), (5.0, "e4")):
-        svg = way_picture(judged(nozzle_log(straight(), offset=np.array([0, off, 0])), straight()), 400)
+        svg = nozzle_path_picture(judged(nozzle_log(straight(), offset=np.array([0, off, 0])), straight()), 400)
         assert re.findall(r'class="(e\d)"', svg) == [style]
 
 

@@ -29,7 +29,7 @@ from hardware.plan.order import (
     PlanRequest,
     PlanSettings,
     in_mm,
-    order_of,
+    plan_order,
     subject_of,
 )
 from hardware.plan.run import MAX_CENTROID_DISTANCE, WoundSighting, _sighting, placement_lines
@@ -285,9 +285,9 @@ def test_the_right_unit_is_taken_and_a_wrong_one_is_answered_with_it(unit: str, 
 def test_every_setting_is_refused_just_beyond_its_range(name: str, above: bool) -> None:
     low, high = SETTINGS[name].limits
     inside, outside = (high, np.nextafter(high, np.inf)) if above else (low, np.nextafter(low, -np.inf))
-    order_of(PlanSettings(**{name: inside}), flat=False)
+    plan_order(PlanSettings(**{name: inside}), flat=False)
     with pytest.raises(InputError, match="--" + name.replace("_", "-")):
-        order_of(PlanSettings(**{name: float(outside)}), flat=False)
+        plan_order(PlanSettings(**{name: float(outside)}), flat=False)
 
 
 def test_a_contour_may_be_closed_and_repeat_points(tmp_path: Path) -> None:

@@ -243,7 +243,7 @@ def test_the_recordings_that_can_be_asked_for_are_those_that_can_be_made() -> No
 
 @pytest.mark.parametrize("name", [name for name, (body, _) in thesis_scenes.MADE_RECORDINGS.items() if body is None])
 def test_a_made_recording_is_the_same_each_time_and_moves(name: str) -> None:
-    shown = thesis_scenes.made_recording(name, 2.0)
+    shown = thesis_scenes.rendered_recording(name, 2.0)
     first = [next(iter(shown.frame_sets())) for _ in range(2)]
     for a, b in zip(first[0].frames, first[1].frames, strict=True):
         assert np.array_equal(a.image, b.image)

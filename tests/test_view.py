@@ -30,7 +30,7 @@ from hardware.offline.trajectory_files import PoseSeries, read_pose_series
 from hardware.offline.viewer import PictureReader, Playback, instant_text, open_playback, serve, session_text
 from hardware.operator.settings import OperatorSettings
 from hardware.recording.recorder import Recorder
-from hardware.report.evaluation import calibration_words
+from hardware.report.evaluation import consistency_text
 from perception.frames import Frame
 from planning.command import Hold, Move
 from tests.browser import Browser, axe_findings
@@ -367,6 +367,6 @@ def test_errors_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.parametrize(("nees", "honest"), [(0.79, False), (0.81, True), (1.24, True), (1.81, False)])
 def test_covariances_that_are_not_calibrated_are_said_not_to_be(nees: float, honest: bool) -> None:
-    words = calibration_words(nees)
+    words = consistency_text(nees)
     assert ("not calibrated" in words) is not honest
     assert honest or f"{nees**0.5:.2g} times" in words

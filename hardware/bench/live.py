@@ -27,7 +27,7 @@ from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.bench.figures import TOO_SHORT, Figure, append_rows, at_least, at_most, memory_growth, with_progress
 from hardware.bench.link import burning
-from hardware.bench.recordings import FRAME_RATE, beside_figures, made_recording, packed_sets, unpacked_set
+from hardware.bench.recordings import FRAME_RATE, beside_figures, packed_sets, rendered_recording, unpacked_set
 from hardware.bench.whole import LiveSession
 from hardware.files.path_file import read_path, write_path
 from hardware.live.prepared import RunFiles
@@ -334,7 +334,7 @@ def run_beside(options: argparse.Namespace) -> list[Figure]:
     """Two trackers of the same pictures in turn, one with the network: its share of a core, and the time of a pose."""
     clock, cpu = WallClock(), CpuClock()
     looks, wall = list[float](), 0.0  # s of processor for each picture segmented; s of the blocks in which they were
-    recording = made_recording(options.scene, options.seconds)
+    recording = rendered_recording(options.scene, options.seconds)
     packed = packed_sets(recording)
     network = WoundNetwork(shipped_model() if options.model is None else options.model, 1)
     segmenter = NetworkSegmenter(network, network.settings)

@@ -68,7 +68,7 @@ class Recording:
     surface: Path | None = None
 
 
-def made_recording(name: str, seconds: float, rig: Rig | None = None) -> Recording:
+def rendered_recording(name: str, seconds: float, rig: Rig | None = None) -> Recording:
     """The recording `name` of MADE; rig: three cameras as in the thesis, if no other."""
     table, motion = MADE_RECORDINGS[name]
     if table is None:
@@ -97,7 +97,7 @@ def chosen_recordings(options: argparse.Namespace, names: Iterable[str]) -> list
     """The recorded sessions that the options name, or rendered recordings of these names."""
     sessions = [(path.name, open_session(path)) for path in options.sessions]
     recordings = [Recording(name, s.rig, s.roi, s.truth, s.frame_sets, s.surface) for name, s in sessions]
-    return recordings or [made_recording(name, options.seconds) for name in names]
+    return recordings or [rendered_recording(name, options.seconds) for name in names]
 
 
 MIN_ACCURACY_RATIO, MIN_SPEED_RATIO = 10.0, 5.0  # times better than the thesis's, which ours is to be

@@ -18,10 +18,10 @@ from hardware.cli.parser import (
     Commands,
     arm_profile,
     damage_code,
+    option_error,
     positive,
     progress_bar,
     wall_clock,
-    wrong_option,
 )
 from hardware.process.progress import check_new, left_files_text
 
@@ -38,7 +38,7 @@ RIG_FORMATS = {
     "anipose": "aniposelib's and caliscope's TOML, mm",
 }
 RIG_FORMATS_TEXT = "; ".join(f"{name}: {text}" for name, text in RIG_FORMATS.items())
-# of an arm's calibration, and the options that each needs
+# sources of an arm's calibration, and the options that each needs
 ARM_SOURCES = {"folder": (), "device": ("cameras", "record"), "virtual": ("record",), "touched": ("cameras",)}
 
 
@@ -167,17 +167,17 @@ def _cameras(a: argparse.Namespace) -> int:
 
     clock = wall_clock()
     check_new(a.out, a.force)
-    path = Path(a.which[0])  # of the one recording that is named, or of a live camera
+    path = Path(a.which[0])  # a recording, or a live camera
     recorded = path if len(a.which) == 1 and (path.is_dir() or path.suffix == ".mcap") else None
     options = CalibrationOptions(a.limit_mm, a.distance_mm, a.keep_lenses, a.new_rig)
     if a.seconds is not None and (recorded is not None or not a.seconds >= 0):
-        raise wrong_option("--seconds", a.seconds, "0 or more, with live cameras")
+        raise option_error("--seconds", a.seconds, "0 or more, with live cameras")
     try:
         with progress_bar("corners", "frame sets") as progress:
             if recorded is not None:
                 outcome = run_calibration(recorded, a.board, a.out, options, progress)
             else:
-                open_page = nullcontext if a.no_page else partial(_opened_page, clock)
+                open_page = nullcontext if a.no_page else partial(_open_waving_page, clock)
                 outcome = run_live(a.which, a.board, a.out, options, a.seconds, clock, progress, open_page)
     except KeyboardInterrupt:
         message = f"the corners so far are in {corners_of(a.out)}; the same command goes on from there"
@@ -188,8 +188,8 @@ def _cameras(a: argparse.Namespace) -> int:
     return code if outcome.verdict.passed else FAILED
 
 
-def _opened_page(clock: Clock) -> WavingPage:
-    """The page, and where it is."""
+def _open_waving_page(clock: Clock) -> WavingPage:
+    """The page; its address is printed."""
     from hardware.calibration.live import WavingPage
 
     page = WavingPage(clock)
@@ -265,13 +265,13 @@ def _calibrate_arm(a: argparse.Namespace) -> int:
     sources = [name for name in ARM_SOURCES if getattr(a, name)]
     if len(sources) != 1:
         allowed = "one of a recorded FOLDER, --device, --virtual or --touched"
-        raise wrong_option("calibrate arm", " and ".join(sources) or "nothing", allowed)
+        raise option_error("calibrate arm", " and ".join(sources) or "nothing", allowed)
     if a.terminal and not a.virtual:
-        raise wrong_option("--terminal", "given", "with --virtual: a --device is at its own port")
+        raise option_error("--terminal", "given", "with --virtual: a --device is at its own port")
     source = sources[0]
     for name in ARM_SOURCES[source]:
         if getattr(a, name) is None:
-            raise wrong_option(f"--{name}", "missing", f"given with {source}")
+            raise option_error(f"--{name}", "missing", f"given with {source}")
     try:
         outcome = {"device": _from_device, "virtual": _virtual, "touched": _touched, "folder": _folder}[source](a)
     except KeyboardInterrupt:
@@ -293,14 +293,14 @@ def _arm_options(a: argparse.Namespace) -> ArmCalibrationOptions:
     from hardware.calibration.arm_record import MoveOptions
     from hardware.calibration.arm_run import ArmCalibrationOptions
 
-    turn = 0.0 if a.keep_tool else float(np.deg2rad(a.turn_deg))
+    max_rotation = 0.0 if a.keep_tool else float(np.deg2rad(a.turn_deg))
     swing = 0.0 if a.keep_latency else a.swing_s
-    moves = MoveOptions(a.places, a.reach_mm, a.up_mm, a.down_mm, turn, a.speed_mm_s, a.dwell_s, swing)
+    moves = MoveOptions(a.places, a.reach_mm, a.up_mm, a.down_mm, max_rotation, a.speed_mm_s, a.dwell_s, swing)
     return ArmCalibrationOptions(a.limit_mm, ArmUnknowns(tool=not a.keep_tool, latency=not a.keep_latency), moves)
 
 
 def _folder(a: argparse.Namespace, truth: ArmTruth | None = None) -> ArmCalibrationResult:
-    """Solve the folder that is named, or the one that was recorded just now. truth: of a virtual arm."""
+    """Solve the named folder, or the one that was just recorded. truth: of a virtual arm."""
     from hardware.calibration.arm_run import run_folder
 
     with progress_bar("tips", "frame sets") as progress:
@@ -335,7 +335,7 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
         raise InputError("arm", "--yes", "missing", "the confirmation that nobody is within the arm's reach")
     check_out(a.out)
     options, clock, profile = _arm_options(a).moves, wall_clock(), arm_profile(a.arm)
-    stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
+    position = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
     rig, sources = read_live_rig(a.cameras)
     check_record(a.record)
     copy_rig_json(a.cameras, a.record)
@@ -343,7 +343,7 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     try:
         with progress_bar("moves", "ticks") as moves:
             live = LiveCameras(rig, sources, clock)
-            record_live(live, rig, driver, profile, clock, a.record, stands, options, moves, link)
+            record_live(live, rig, driver, profile, clock, a.record, position, options, moves, link)
     finally:
         driver.release()
     return _folder(a)

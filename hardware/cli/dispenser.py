@@ -14,10 +14,10 @@ from hardware.cli.parser import (
     Commands,
     arm_profile,
     not_negative,
+    option_error,
     positive,
     progress_bar,
     wall_clock,
-    wrong_option,
 )
 from perception import named_path
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 VIRTUAL = "virtual"
 MAX_OPEN = 60.0  # s: longer than any test of a nozzle
-PREPARE_TIME = 600.0  # s to be ready: a heated syringe takes minutes
+PREPARE_TIME = 600.0  # s to get ready: a heated syringe takes minutes
 DISPENSER_POLL = 0.002  # s, as the motion loop
 VIRTUAL_OPTIONS = ("preset", "log", "link", "delays", "ooze", "no_watchdog")
-# of a dispenser's calibration, and the options that each needs
+# sources of a dispenser's calibration, and the options that each needs
 LINE_SOURCES = {"folder": (), "device": ("cameras", "arm", "record"), "virtual": ("record",), "measured": ()}
 DEVICE_OPTIONS = ("name", "seconds", "on", "flow", "celsius", "yes")
 
@@ -73,7 +73,7 @@ def _run_dispenser(a: argparse.Namespace) -> int:
     for name in DEVICE_OPTIONS if virtual else VIRTUAL_OPTIONS:
         if value := getattr(a, name):
             option, kind = f"--{name.replace('_', '-')}", "dispensers of a file" if virtual else "a virtual one"
-            raise wrong_option(option, value, f"only for {kind}")
+            raise option_error(option, value, f"only for {kind}")
     return _serve(a) if virtual else _connect(a)
 
 
@@ -86,7 +86,7 @@ def _serve(a: argparse.Namespace) -> int:
 
     preset = a.preset or "arduino"
     if preset not in DIALECTS:
-        raise wrong_option("--preset", preset, one_of_text(preset, list(DIALECTS)))
+        raise option_error("--preset", preset, one_of_text(preset, list(DIALECTS)))
     watchdog = None if a.no_watchdog else PRESETS[preset].watchdog
     settings = VirtualDispenserSettings(preset, ooze=a.ooze or 0.0, watchdog=watchdog or float("inf"))
     if a.delays is not None:
@@ -100,58 +100,58 @@ def _connect(a: argparse.Namespace) -> int:
     from hardware.files.dispenser_file import dispenser_from_settings, read_dispensers
 
     path = named_path(a.which)
-    found = read_dispensers(path)
+    dispensers = read_dispensers(path)
     if a.name is not None:
-        names = [each.profile.name for each in found]
-        found = tuple(each for each in found if each.profile.name == a.name)
-        if not found:
-            raise wrong_option("--name", a.name, f"one of {', '.join(names)}")
+        names = [each.profile.name for each in dispensers]
+        dispensers = tuple(each for each in dispensers if each.profile.name == a.name)
+        if not dispensers:
+            raise option_error("--name", a.name, f"one of {', '.join(names)}")
     if a.on is None:
         for option in ("flow", "celsius", "yes"):
             if getattr(a, option):
-                raise wrong_option(f"--{option}", getattr(a, option), "only with --on S")
-        return max(listen(each, a.seconds or 5.0, wall_clock()) for each in found)
+                raise option_error(f"--{option}", getattr(a, option), "only with --on S")
+        return max(listen(each, a.seconds or 5.0, wall_clock()) for each in dispensers)
     if a.seconds is not None:
-        raise wrong_option("--seconds", a.seconds, "only without --on S")
-    if len(found) > 1:
-        raise wrong_option("--name", "missing", f"one of {', '.join(each.profile.name for each in found)}")
+        raise option_error("--seconds", a.seconds, "only without --on S")
+    if len(dispensers) > 1:
+        raise option_error("--name", "missing", f"one of {', '.join(each.profile.name for each in dispensers)}")
     if a.on > MAX_OPEN:
-        raise wrong_option("--on", a.on, f"at most {MAX_OPEN:g} s")
+        raise option_error("--on", a.on, f"at most {MAX_OPEN:g} s")
     if not a.yes:
-        raise wrong_option("--yes", "missing", "the confirmation that somebody watches the material")
-    if found[0].line is None:
-        raise wrong_option(
-            "--on", found[0].profile.name, "a dispenser with a line of its own; the arm switches this one"
+        raise option_error("--yes", "missing", "the confirmation that somebody watches the material")
+    if dispensers[0].line is None:
+        raise option_error(
+            "--on", dispensers[0].profile.name, "a dispenser with a line of its own; the arm switches this one"
         )
-    return open_for(dispenser_from_settings(found[0]), a.on, a.flow, a.celsius, wall_clock())
+    return open_for(dispenser_from_settings(dispensers[0]), a.on, a.flow, a.celsius, wall_clock())
 
 
 def description(settings: DispenserSettings) -> str:
-    """What a dispenser is by its file, in a few lines."""
+    """A description of a dispenser from its file, in a few lines."""
     profile, line = settings.profile, settings.line
     by_arm = "switched by the arm's frames" if settings.extruder is None else "pushed by the arm's own axis"
-    where = by_arm if line is None else f"at {line.port}"
-    without = watchdog_text(profile) if settings.extruder is None else "flows in moves alone: without them it rests"
+    connection = by_arm if line is None else f"at {line.port}"
+    watchdog = watchdog_text(profile) if settings.extruder is None else "flows in moves alone: without them it rests"
     if profile.metered:
         flow = f"metered, {profile.flow_range[0]:g} to {profile.flow_range[1]:g} mm^3/s"
     else:
         flow = f"not metered, about {profile.flow:g} mm^3/s"
     return (
-        f"{profile.name} ({settings.preset}, {where}): {', '.join(profile.materials)}; {flow}\n"
+        f"{profile.name} ({settings.preset}, {connection}): {', '.join(profile.materials)}; {flow}\n"
         f"  half its flow {1000 * profile.on_delay:.0f} ms after on, {1000 * profile.off_delay:.0f} ms after off\n"
-        f"  {without}"
+        f"  {watchdog}"
     )
 
 
 def watchdog_text(profile: DispenserProfile) -> str:
-    """What becomes of it when nobody speaks to it any more."""
+    """The behaviour of a dispenser when its messages end."""
     if profile.watchdog:
         return f"switches itself off {1000 * profile.watchdog:.0f} ms after its last message"
     return "HAS NO WATCHDOG: it stays on when this machine or its cable fails; have a switch at hand"
 
 
 def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Callable[[str], None] = print) -> int:
-    """Tell what a device says by itself, and send nothing; exit code."""
+    """Print the messages of a device, and send nothing; exit code."""
     from hardware.dispenser.dispenser import DispenserState
     from hardware.dispenser.line_dispenser import LineDispenser
 
@@ -164,13 +164,13 @@ def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Calla
     while clock.now() < start + seconds and dispenser.status.state is DispenserState.CLOSED:
         dispenser.poll(clock.now())
         clock.wait_until(clock.now() + DISPENSER_POLL)
-    status, heard = dispenser.status, list(dispenser.heard)
+    status, messages = dispenser.status, list(dispenser.heard)
     dispenser.hang_up()
     if status.state is DispenserState.FAILED:
         say(f"  failed: {status.reason}")
         return FAILED
-    say(f"  its line is open; it said {len(heard)} lines in {seconds:g} s, and was sent nothing")
-    for stamp, text in heard:
+    say(f"  its line is open; it said {len(messages)} lines in {seconds:g} s, and was sent nothing")
+    for stamp, text in messages:
         say(f"  {stamp - start:.3f} s: {text}")
     return 0
 
@@ -183,7 +183,7 @@ def open_for(
     clock: Clock,
     say: Callable[[str], None] = print,
 ) -> int:
-    """Prepare a dispenser, let material out for so long, and close it however that ends; exit code."""
+    """Prepare a dispenser, open it for `seconds` s, and close it in every case; exit code."""
     from hardware.dispenser.dispenser import Dispensers, DispenserState, close_dispensers
 
     start, profile = clock.now(), dispenser.profile
@@ -203,15 +203,15 @@ def open_for(
     say(watchdog_text(profile))
     try:
         dispenser.prepare(start, celsius)
-        done = wait(start + PREPARE_TIME, DispenserState.PREPARING)
-        if done and (reason := dispenser.on(flow, clock.now())):
+        succeeded = wait(start + PREPARE_TIME, DispenserState.PREPARING)
+        if succeeded and (reason := dispenser.on(flow, clock.now())):
             say(reason)
-            done = False
-        done = done and wait(clock.now() + seconds, DispenserState.ON)
+            succeeded = False
+        succeeded = succeeded and wait(clock.now() + seconds, DispenserState.ON)
     finally:
-        left = close_dispensers(Dispensers([dispenser]), clock)
+        failure = close_dispensers(Dispensers([dispenser]), clock)
         _tell(dispenser, start, say)
-    return 0 if done and not left else FAILED
+    return 0 if succeeded and not failure else FAILED
 
 
 def _tell(dispenser: Dispenser, start: float, say: Callable[[str], None]) -> None:
@@ -272,13 +272,13 @@ def _speeds(text: str) -> tuple[float, ...]:
     return _numbers(text, text.count(",") + 1, "speeds, as 10,20,30")
 
 
-def _numbers(text: str, count: int, words: str) -> tuple[float, ...]:
+def _numbers(text: str, count: int, syntax: str) -> tuple[float, ...]:
     try:
         numbers = tuple(map(float, text.split(",")))
     except ValueError:
         numbers = ()
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise argparse.ArgumentTypeError(f"{text!r}, needed is {words}")
+        raise argparse.ArgumentTypeError(f"{text!r}, needed is {syntax}")
     return numbers
 
 
@@ -291,28 +291,28 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
     sources = [name for name in LINE_SOURCES if getattr(a, name)]
     if len(sources) != 1:
         got, allowed = " and ".join(sources) or "nothing", "one of --from, --device, --virtual or --measured"
-        raise wrong_option("calibrate dispenser", got, allowed)
+        raise option_error("calibrate dispenser", got, allowed)
     for name in LINE_SOURCES[sources[0]]:
         if getattr(a, name) is None:
-            raise wrong_option(f"--{name}", "missing", f"given with --{sources[0]}")
+            raise option_error(f"--{name}", "missing", f"given with --{sources[0]}")
     options = LineOptions(a.speeds, a.lines, a.length_mm, a.spacing_mm, a.height_mm, a.area_mm2)
     settings = _named(a)
     if a.virtual:
         from dataclasses import replace
 
-        # its own name, lest `--from` take its delays for the real one's
+        # another name, so that `--from` does not use its delays for the real dispenser
         settings = replace(settings, profile=replace(settings.profile, name=VIRTUAL))
     if a.measured:
-        found = delays_by_hand(a.measured, settings.profile)
-        write_delays(a.file, settings.profile.name, found)
-        late = f"{1e3 * found.on_delay:.0f} ms after on, {1e3 * found.off_delay:.0f} ms after off"
-        print(f"{a.file}: half the flow of {settings.profile.name} {late}, was written")
+        delays = delays_by_hand(a.measured, settings.profile)
+        write_delays(a.file, settings.profile.name, delays)
+        delay_text = f"{1e3 * delays.on_delay:.0f} ms after on, {1e3 * delays.off_delay:.0f} ms after off"
+        print(f"{a.file}: half the flow of {settings.profile.name} {delay_text}, was written")
         return 0
     if a.folder is None:
         if a.device is not None and not a.yes:
-            raise wrong_option("--yes", "missing", "the confirmation that nobody is within reach")
+            raise option_error("--yes", "missing", "the confirmation that nobody is within reach")
         if settings.line is None:
-            raise wrong_option("dispenser", settings.profile.name, "one with a line of its own; of others --measured")
+            raise option_error("dispenser", settings.profile.name, "one with a line of its own; of others --measured")
         check_record(a.record)
         print(_draw_virtual(a, settings, options) if a.virtual else _draw(a, settings, options))
     verdict, text = calibrate_lines(a.folder or a.record, a.file, settings.profile, a.height_mm, not a.virtual)
@@ -321,14 +321,16 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
 
 
 def _named(a: argparse.Namespace) -> DispenserSettings:
-    """The one dispenser that is meant."""
+    """The dispenser of the file that --name selects."""
     from hardware.files.dispenser_file import read_dispensers
 
-    found = read_dispensers(a.file)
-    chosen = [each for each in found if a.name in (None, each.profile.name)]
-    if len(chosen) != 1:
-        raise wrong_option("--name", a.name or "missing", f"one of {', '.join(each.profile.name for each in found)}")
-    return chosen[0]
+    dispensers = read_dispensers(a.file)
+    selected = [each for each in dispensers if a.name in (None, each.profile.name)]
+    if len(selected) != 1:
+        raise option_error(
+            "--name", a.name or "missing", f"one of {', '.join(each.profile.name for each in dispensers)}"
+        )
+    return selected[0]
 
 
 def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
@@ -338,7 +340,7 @@ def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: L
     from hardware.simulator.watched_arm import watched_arm
 
     if settings.preset not in DIALECTS:
-        raise wrong_option("--virtual", settings.preset, f"a preset {one_of_text(settings.preset, list(DIALECTS))}")
+        raise option_error("--virtual", settings.preset, f"a preset {one_of_text(settings.preset, list(DIALECTS))}")
     flow = options.area * sum(options.speeds) / len(options.speeds)
     watchdog = settings.profile.watchdog or math.inf
     true = VirtualDispenserSettings(settings.preset, *VIRTUAL_DELAYS, flow=flow, watchdog=watchdog)
@@ -358,8 +360,8 @@ def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptio
     from hardware.files.dispenser_file import dispenser_from_settings
 
     clock, profile = wall_clock(), arm_profile(a.arm)
-    stands = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
-    where = stands, axes_from_text(a.away, profile.arm.home)
+    start = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
+    places = start, axes_from_text(a.away, profile.arm.home)
     rig, sources = read_live_rig(a.cameras)
     dispenser = dispenser_from_settings(settings)
     driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
@@ -367,7 +369,7 @@ def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptio
         with progress_bar("lines", "ticks") as progress:
             live = LiveCameras(rig, sources, clock)
             record_live(
-                live, rig, driver, profile, dispenser, clock, a.record, where, options, a.celsius, progress, link
+                live, rig, driver, profile, dispenser, clock, a.record, places, options, a.celsius, progress, link
             )
     finally:
         driver.release()

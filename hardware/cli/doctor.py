@@ -1,6 +1,6 @@
 """The checks of `stillbed doctor`: the machine, its libraries, its devices.
 
-Each library is loaded in a process of its own, which may die of it. Device checks are called where the libraries load.
+Each library is loaded in a separate process, which may crash. Device checks run only if the libraries load.
 """
 
 from __future__ import annotations
@@ -30,40 +30,40 @@ if TYPE_CHECKING:
     from hardware.cameras.sources import CameraDevice
 
 FILE_SYSTEM_ROOT = Path("/")
-NO_ANSWER = "nothing was granted"  # of a process that did not come to asking
+NO_ANSWER = "no priority granted"  # of a process that ended before the request
 MIN_CORES = 2  # one for tracking, one for motion, recorder and page
 MIN_MEMORY_GB = 4.0  # GB: a live run takes under 2, planning a large wound half a one
-# GB: below, nothing can be recorded; below, not for long (a minute of three cameras takes 0.1 to 1)
+# GB: minimum, and recommended (a minute of three cameras takes 0.1 to 1)
 MIN_DISK_GB = (1.0, 10.0)
-MIN_SHARED_GB = 0.1  # GB: pictures of three 1280x720 cameras go round between two processes, four sets deep
-CPU_FLAGS = ("avx2", "fma")  # what compiled loops and networks are fast with
-TICK_PERIOD, PROBE_TICKS = 0.02, 50  # s; a second of the ticks that motion is sent by
+MIN_SHARED_GB = 0.1  # GB: pictures of three 1280x720 cameras, four sets
+CPU_FLAGS = ("avx2", "fma")  # for fast compiled loops and networks
+TICK_PERIOD, PROBE_TICKS = 0.02, 50  # s, and a second of ticks
 MAX_LATE_MS = 2.0  # ms: a tenth of a tick
-PROBE_PIECES = 6000  # of work: two seconds or three, as what disturbs a machine comes every other second
+PROBE_PIECES = 6000  # pieces of work: 2 to 3 s, because disturbances occur every other second
 MAX_SLOW_SHARE = 0.005  # share of the time: once a minute for a third of a second
 PRIORITY_REMEDY = (
     "as root: echo 'USER - rtprio 20' > /etc/security/limits.d/stillbed.conf, with your name; then log in anew"
 )
 JOIN_GROUP = "sudo usermod -aG {group} $USER, then log in anew"
-RUN_EXTRAS = {  # of stillbed, that a lab may need, and for what
+RUN_EXTRAS = {  # extras for a lab, and their use
     **{"franka": "a Franka arm", "foxglove": "live runs in Foxglove", "cluster": "smoothing on many machines"},
     **{"train": "training the wound network", "bench": "the comparison with Ceres"},
 }
 LOAD_TIMEOUT = 60.0  # s for all of them on a slow disk
-LOADED_MARK = "loaded"  # the word by which the process tells of each
+LOADED_MARK = "loaded"  # printed by the process for each module
 LOADER = f"""import importlib, sys
 for name in sys.argv[1:]:
     importlib.import_module(name)
     print({LOADED_MARK!r}, name, flush=True)
 """
-REINSTALL = "make a new environment and `pip install .` there again, with constraints.txt"
-SLOW_REMEDY = "ask again while less runs on this machine"
-SYSTEM_REMEDY = "install the system's package that has this file: `apt-file search` with its name tells which"
+REINSTALL = "create a new environment and repeat `pip install .` with constraints.txt"
+SLOW_REMEDY = "repeat with less load on this machine"
+SYSTEM_REMEDY = "install the system package with this file: `apt-file search NAME` finds it"
 OPEN3D_REMEDY = f"on Debian: sudo apt-get install -y {SHARED_LIBRARIES}"
 
 
 def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) -> list[Check]:
-    """All checks of the machine. folder: where sessions would be recorded. root: of the file system."""
+    """All checks of the machine. folder: of the recordings. root: of the file system."""
     return [
         python_check(),
         processor_check(root),
@@ -77,93 +77,96 @@ def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) ->
     ]
 
 
-def _check(name: str, good: bool, text: str, remedy: str, otherwise: CheckVerdict = CheckVerdict.WARN) -> Check:
-    """PASS where `good`; otherwise that verdict, with what to do."""
-    return Check(name, CheckVerdict.PASS, text) if good else Check(name, otherwise, text, remedy)
+def _check(name: str, passed: bool, text: str, remedy: str, failure: CheckVerdict = CheckVerdict.WARN) -> Check:
+    """PASS if `passed`; else the verdict `failure`, with the remedy."""
+    return Check(name, CheckVerdict.PASS, text) if passed else Check(name, failure, text, remedy)
 
 
 def python_check(release: tuple[int, ...] = sys.version_info[:3]) -> Check:
-    """Python, by its version."""
+    """The version of Python."""
     text = f"{'.'.join(map(str, release))} on {platform.system()} {platform.machine()}"
     if release < (3, 11):
         return Check("python", CheckVerdict.FAIL, text, "install Python 3.11 or newer: make PYTHON=python3.12")
-    remedy = "live runs are made for Linux; recordings and planning work here"
+    remedy = "live runs need Linux; recordings and planning work here"
     return _check("python", sys.platform == "linux", text, remedy)
 
 
 def processor_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
-    """Cores that this process may use, and the instructions that compiled loops are fast with."""
+    """Cores of this process, and CPU instructions for fast compiled loops."""
     machine = this_machine()
     text = f"{machine.cpu}, {machine.cores} cores"
     flags = _kernel_values(root / "proc/cpuinfo", "flags")
     missing = " and ".join(name for name in CPU_FLAGS if flags and name not in flags[0].split())
     if missing:
-        return Check("processor", CheckVerdict.WARN, f"{text}, without {missing}", "poses will take longer")
-    remedy = "track recordings here, print on a machine with two cores"
+        return Check("processor", CheckVerdict.WARN, f"{text}, without {missing}", "poses take longer")
+    remedy = "use this machine for recordings; print on a machine with two cores"
     return _check("processor", machine.cores >= MIN_CORES, text, remedy)
 
 
 def memory_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
-    """Memory that programs may still take."""
+    """Free memory."""
     values = _kernel_values(root / "proc/meminfo", "MemAvailable")
     if not values:
-        return Check("memory", CheckVerdict.WARN, "this system does not tell", f"have {MIN_MEMORY_GB:g} GB free")
+        return Check("memory", CheckVerdict.WARN, "unknown on this system", f"have {MIN_MEMORY_GB:g} GB free")
     free = int(values[0].split()[0]) / 1e6
-    remedy = f"close programs until {MIN_MEMORY_GB:g} GB are"
+    remedy = f"close programs until {MIN_MEMORY_GB:g} GB are free"
     return _check("memory", free >= MIN_MEMORY_GB, f"{free:.1f} GB free", remedy)
 
 
 def disk_check(folder: Path) -> Check:
-    """Room for recordings."""
-    free, (least, enough) = _free_gb(folder), MIN_DISK_GB
-    text, remedy = f"{free:.1f} GB free in {folder.resolve()}", f"record where there are {enough:g} GB, or make room"
-    return _check("disk", free >= enough, text, remedy, CheckVerdict.FAIL if free < least else CheckVerdict.WARN)
+    """Free disk space for recordings."""
+    free, (minimum, recommended) = _free_gb(folder), MIN_DISK_GB
+    text, remedy = (
+        f"{free:.1f} GB free in {folder.resolve()}",
+        f"use a disk with {recommended:g} GB free, or free space",
+    )
+    return _check("disk", free >= recommended, text, remedy, CheckVerdict.FAIL if free < minimum else CheckVerdict.WARN)
 
 
 def shared_check(root: Path = FILE_SYSTEM_ROOT) -> Check:
-    """Room for the pictures that go from one process to another."""
+    """Shared memory for the pictures between processes."""
     folder = root / "dev/shm"
     free = _free_gb(folder if folder.is_dir() else Path(tempfile.gettempdir()))
-    good = free >= MIN_SHARED_GB
-    text = f"{free:.1f} GB free" if good else f"{1000 * free:.0f} MB free"
+    passed = free >= MIN_SHARED_GB
+    text = f"{free:.1f} GB free" if passed else f"{1000 * free:.0f} MB free"
     remedy = "in a container: --shm-size 1g; elsewhere: mount -o remount,size=1g /dev/shm"
-    return _check("shared memory", good, text, remedy, CheckVerdict.FAIL)
+    return _check("shared memory", passed, text, remedy, CheckVerdict.FAIL)
 
 
 def priority_check() -> Check:
-    """The priority that the motion would be granted: asked for in another process, so that this one keeps its own."""
-    ask = "from hardware.process.system import ask_for_real_time; print(ask_for_real_time())"
-    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=20, check=False)
-    text = done.stdout.strip() or NO_ANSWER
+    """The priority of the motion process, requested in a separate process."""
+    code = "from hardware.process.system import ask_for_real_time; print(ask_for_real_time())"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20, check=False)
+    text = process.stdout.strip() or NO_ANSWER
     return _check("priority", text not in (NO_PRIORITY, NO_ANSWER), text, PRIORITY_REMEDY)
 
 
 def punctuality_check(clock: Clock, ticks: int = PROBE_TICKS) -> Check:
-    """How late this machine wakes a process that asked for a tick."""
-    late = Histogram()
-    begun = clock.now()
+    """The lateness of ticks on this machine."""
+    lateness = Histogram()
+    start = clock.now()
     for k in range(1, ticks + 1):
-        clock.wait_until(begun + k * TICK_PERIOD)
-        late.add(clock.now() - (begun + k * TICK_PERIOD))
-    half, worst = (1000 * late.percentile(share) for share in (50, 98))
-    text = f"{ticks} ticks of {1000 * TICK_PERIOD:g} ms: {half:.1f} ms late, {worst:.1f} at the worst"
-    return _check("clock", worst <= MAX_LATE_MS, text, "stop other work on this machine; let it not save power")
+        clock.wait_until(start + k * TICK_PERIOD)
+        lateness.add(clock.now() - (start + k * TICK_PERIOD))
+    median, p98 = (1000 * lateness.percentile(share) for share in (50, 98))
+    text = f"{ticks} ticks of {1000 * TICK_PERIOD:g} ms: {median:.1f} ms late, {p98:.1f} at the worst"
+    return _check("clock", p98 <= MAX_LATE_MS, text, "stop other programs; disable power saving")
 
 
 def evenness_check(clock: Clock, pieces: int = PROBE_PIECES) -> Check:
-    """Whether the same work takes the same time."""
+    """The variation of the time for equal work."""
     result = measure_evenness(clock, pieces)
-    remedy = "stop other work; where nothing else runs, it is the machine: print with one that shares nothing"
+    remedy = "stop other programs; if nothing else runs, use a machine that is not shared"
     return _check("evenness", result.slow <= MAX_SLOW_SHARE, str(result), remedy)
 
 
 def loopback_check(host: str = "127.0.0.1") -> Check:
-    """Whether the operator's page could be served to this machine's own browser."""
+    """Whether the operator's page can be served to a browser on this machine."""
     try:
         with socket.create_server((host, 0)):
             return Check("operator's page", CheckVerdict.PASS, f"{host} takes connections")
     except OSError as error:
-        remedy = "let programs listen on the loopback address"
+        remedy = "allow programs to listen on the loopback address"
         return Check("operator's page", CheckVerdict.FAIL, f"{host}: {error}", remedy)
 
 
@@ -172,7 +175,7 @@ def _free_gb(folder: Path) -> float:
 
 
 def _kernel_values(file: Path, key: str) -> list[str]:
-    """The values of `key:` in a file of /proc; none where there is no such file."""
+    """The values of `key:` in a file of /proc; none without the file."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux
@@ -182,28 +185,28 @@ def _kernel_values(file: Path, key: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class LoadFailure:
-    """Why a module did not load."""
+    """The reason why a module did not load."""
 
     reason: str
-    slow: bool = False  # it was still loading when the time was up, which says nothing against it
-    shared_object: bool = False  # the dynamic loader complains of a shared object
+    slow: bool = False  # it was still loading at the timeout
+    shared_object: bool = False  # the dynamic loader reports a shared object
 
 
 def library_checks(names: list[str] | None = None) -> list[Check]:
-    """A check for each library. names: of distributions; without them, all that stillbed needs here, extras apart."""
+    """A check for each library. names: of distributions; default: all requirements except extras."""
     if names is None:
         try:
             requirements = [Requirement(line) for line in requires("stillbed") or []]
         except PackageNotFoundError:
-            return [Check("stillbed", CheckVerdict.FAIL, "runs from its sources, not installed", "pip install .")]
+            return [Check("stillbed", CheckVerdict.FAIL, "not installed, runs from its sources", "pip install .")]
         names = [r.name for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
-    known = modules_of(names)
-    failed = load_failures(list(known.values()))
-    return [_library_check(name, known.get(name, ""), failed) for name in names]
+    modules = modules_of(names)
+    failures = load_failures(list(modules.values()))
+    return [_library_check(name, modules.get(name, ""), failures) for name in names]
 
 
 def modules_of(names: list[str]) -> dict[str, str]:
-    """The module that each installed distribution is imported by: of several the one of its own name, or the first."""
+    """The import name of each installed distribution: the module with its own name, or the first one."""
     by_name: dict[str, list[str]] = {name: [] for name in names}
     for module, distributions in packages_distributions().items():
         for name in {distribution.lower() for distribution in distributions} & set(names):
@@ -214,14 +217,14 @@ def modules_of(names: list[str]) -> dict[str, str]:
 
 
 def extras_check(extras: dict[str, list[str]] | None = None) -> Check:
-    """Which extras are not installed, and how to install each. extras: distributions of each; without it stillbed's."""
+    """Missing extras, and how to install them. extras: distributions of each; default: stillbed's extras."""
     if extras is None:
         try:
             lines = [Requirement(line) for line in requires("stillbed") or []]
         except PackageNotFoundError:
             lines = []
-        known = [(extra, r.name) for r in lines for extra in RUN_EXTRAS if r.marker and _is_of(r, extra)]
-        extras = {extra: names for extra in RUN_EXTRAS if (names := [name for of, name in known if of == extra])}
+        requirements = [(extra, r.name) for r in lines for extra in RUN_EXTRAS if r.marker and _is_of(r, extra)]
+        extras = {extra: names for extra in RUN_EXTRAS if (names := [name for of, name in requirements if of == extra])}
     missing = [extra for extra, names in extras.items() if not all(map(_is_installed, names))]
     have = [extra for extra in extras if extra not in missing]
     text = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(missing) or 'none'}"
@@ -243,9 +246,9 @@ def _is_installed(name: str) -> bool:
 
 
 def load_failures(modules: list[str], patience: float = LOAD_TIMEOUT) -> dict[str, LoadFailure]:
-    """Why modules did not load, by name. What kills or stops the process that loads it is named; the rest is tried.
+    """Failures of modules that did not load, by name, including crashes and hangs of the loading process.
 
-    patience: s for all that one process loads.
+    patience: s for all modules of one process.
     """
     failures: dict[str, LoadFailure] = {}
     while modules:
@@ -257,51 +260,51 @@ def load_failures(modules: list[str], patience: float = LOAD_TIMEOUT) -> dict[st
 
 
 def _load_until_failure(modules: list[str], patience: float) -> tuple[int, LoadFailure]:
-    """How many of the modules a process loaded before it ended, and why it went no further."""
+    """Number of modules that a process loaded, and the reason why it ended."""
     command = [sys.executable, "-c", LOADER, *modules]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             text, errors = process.communicate(timeout=patience)
-            complaint = _failure_text(process.returncode, errors)
-            trouble = LoadFailure(complaint, shared_object=".so" in complaint)  # as the dynamic loader names it
+            message = _failure_text(process.returncode, errors)
+            failure = LoadFailure(message, shared_object=".so" in message)  # a message of the dynamic loader
         except subprocess.TimeoutExpired:
-            trouble = _timeout_failure(process.pid, patience)
+            failure = _timeout_failure(process.pid, patience)
             process.kill()
             text, _ = process.communicate()
-    return sum(line.startswith(LOADED_MARK) for line in text.splitlines()), trouble
+    return sum(line.startswith(LOADED_MARK) for line in text.splitlines()), failure
 
 
 def _timeout_failure(process: int, patience: float) -> LoadFailure:
-    """Of a process that has not ended: slow where it computes, or waits for processor or disk; else it hangs."""
+    """The failure of a process that has not ended: slow if it computes or waits for the disk; else it hangs."""
     state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     if state in ("R", "D"):
         return LoadFailure(f"still loading after {patience:g} s", slow=True)
-    return LoadFailure(f"hangs: not loaded after {patience:g} s, and waits for something")
+    return LoadFailure(f"hangs: not loaded after {patience:g} s")
 
 
-def _failure_text(code: int, complaint: str) -> str:
+def _failure_text(code: int, message: str) -> str:
     if code < 0:
-        return f"signal {-code} ends the process that loads it: this processor may lack what it was built for"
-    return (complaint.strip().splitlines() or [f"exit code {code}"])[-1]
+        return f"signal {-code} ended the loading process: the processor may lack required instructions"
+    return (message.strip().splitlines() or [f"exit code {code}"])[-1]
 
 
-def _library_check(name: str, module: str, failed: dict[str, LoadFailure]) -> Check:
+def _library_check(name: str, module: str, failures: dict[str, LoadFailure]) -> Check:
     try:
-        have = version(name)
+        release = version(name)
     except PackageNotFoundError:
         return Check(name, CheckVerdict.FAIL, "not installed", REINSTALL)
-    if module not in failed:
-        return Check(name, CheckVerdict.PASS, have)
-    trouble = failed[module]
-    if trouble.slow:
-        return Check(name, CheckVerdict.WARN, f"{have}: {trouble.reason}", SLOW_REMEDY)
+    if module not in failures:
+        return Check(name, CheckVerdict.PASS, release)
+    failure = failures[module]
+    if failure.slow:
+        return Check(name, CheckVerdict.WARN, f"{release}: {failure.reason}", SLOW_REMEDY)
     by_system = OPEN3D_REMEDY if module == "open3d" else SYSTEM_REMEDY
-    remedy = by_system if trouble.shared_object else REINSTALL
-    return Check(name, CheckVerdict.FAIL, f"{have}: {trouble.reason}", remedy)
+    remedy = by_system if failure.shared_object else REINSTALL
+    return Check(name, CheckVerdict.FAIL, f"{release}: {failure.reason}", remedy)
 
 
 def device_checks() -> list[Check]:
-    """Cameras, arm, lock, videos, network. It imports what needs the libraries: called where these load."""
+    """Cameras, arm, lock, videos, network. Imports the libraries: called only if these load."""
     from hardware.arm.port import lock_folder, serial_ports
     from hardware.cameras.genicam import aravis_python
     from hardware.cameras.sources import list_devices
@@ -312,15 +315,15 @@ def device_checks() -> list[Check]:
 
 
 def camera_check(devices: tuple[CameraDevice, ...]) -> Check:
-    """What is plugged in, and whether this user may open it."""
+    """The connected cameras, and whether this user may open them."""
     if not devices:
-        return Check("cameras", CheckVerdict.WARN, "none is plugged in", "plug them in; `stillbed cameras` says more")
+        return Check("cameras", CheckVerdict.WARN, "none connected", "connect cameras; see `stillbed cameras`")
     names = ", ".join(device.name or str(device.node) for device in devices)
     return _access_check("cameras", [(str(device.node), names) for device in devices], names, "video")
 
 
 def aravis_check(python: str | None) -> Check:
-    """Whether industrial cameras can be read: the Python that has Aravis's binding, None: none has."""
+    """Whether industrial cameras can be read. python: with Aravis's binding; None: not found."""
     from hardware.cameras.genicam import INSTALL
 
     if python is None:
@@ -329,42 +332,44 @@ def aravis_check(python: str | None) -> Check:
 
 
 def arm_check(ports: list[tuple[str, str]]) -> Check:
-    """Serial ports, as (device, what calls itself so), and whether this user may open them."""
+    """Serial ports, as (device, name), and whether this user may open them."""
     if not ports:
-        remedy = "plug in the arm's adapter; without one, `stillbed arm --virtual` answers as an arm does"
+        remedy = "connect the arm's adapter; without one, use `stillbed arm --virtual`"
         return Check("arm", CheckVerdict.WARN, "no serial port", remedy)
     return _access_check("arm", ports, ", ".join(f"{device} ({name})" for device, name in ports), "dialout")
 
 
 def lock_check(folder: Path) -> Check:
-    """Where a port's lock is kept, so that two programs never write to one arm."""
+    """The folder of port locks, which keep two programs from writing to one arm."""
     if os.access(folder, os.W_OK):
         return Check("port locks", CheckVerdict.PASS, f"kept in {folder}")
-    return Check("port locks", CheckVerdict.FAIL, f"{folder} cannot be written to", f"let this user write to {folder}")
+    return Check(
+        "port locks", CheckVerdict.FAIL, f"{folder} is not writable", f"give this user write access to {folder}"
+    )
 
 
 def video_check() -> Check:
     """Whether recorded videos can be read."""
     from hardware.cameras.capture import reads_videos
 
-    good = reads_videos()
-    text = "read by FFmpeg" if good else "this OpenCV has no FFmpeg"
-    return _check("videos", good, text, "pip install --force-reinstall opencv-python-headless")
+    readable = reads_videos()
+    text = "read by FFmpeg" if readable else "this OpenCV has no FFmpeg"
+    return _check("videos", readable, text, "pip install --force-reinstall opencv-python-headless")
 
 
 def network_check() -> Check:
-    """Whether the network that finds the wound is there, whole and runs."""
+    """Whether the wound network exists, is undamaged and runs."""
     from perception.wound.network import WoundNetwork, shipped_model
 
     try:
         network = WoundNetwork(shipped_model())
     except StillbedError as error:
-        return Check("wound network", CheckVerdict.FAIL, str(error), "install stillbed anew, with its data")
-    text = f"{network.size / 1e6:.1f} MB, its hash is right; licence: {network.terms.licence}"
+        return Check("wound network", CheckVerdict.FAIL, str(error), "reinstall stillbed with its data")
+    text = f"{network.size / 1e6:.1f} MB, hash correct; licence: {network.terms.licence}"
     return Check("wound network", CheckVerdict.PASS, text)
 
 
 def _access_check(name: str, nodes: list[tuple[str, str]], text: str, group: str) -> Check:
     closed = ", ".join(node for node, _ in nodes if not os.access(node, os.R_OK | os.W_OK))
-    text = f"{closed} may not be opened by this user" if closed else text
+    text = f"this user may not open {closed}" if closed else text
     return _check(name, not closed, text, JOIN_GROUP.format(group=group), CheckVerdict.FAIL)

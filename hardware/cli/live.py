@@ -8,7 +8,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, positive, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, option_error, positive
 from hardware.process.progress import check_new, json_text, write_atomically
 from perception import named_path
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 SETTINGS_FLAGS = ("rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift",
     "stands_home", "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port",
     "page_certificate", "page_key", "look", "adapt")  # fmt: skip
-NO_CAMERA_TEXT = """no camera is plugged in, or this user may not see it
-  plug one in: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
-  in a container, hand it in (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
+NO_CAMERA_TEXT = """no camera is connected, or this user may not see it
+  connect one: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
+  in a container, pass it (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
   a camera on the network is named by its URL: stillbed cameras rtsp://ADDRESS/PATH"""
-NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not looked for: Aravis is not installed"
+NO_ARAVIS_TEXT = "industrial cameras (GigE Vision, USB3 Vision) were not searched: Aravis is not installed"
 LIVE_ALLOWED = """a session.toml, of which `stillbed init FOLDER` writes one to begin with; or --rig and --path; or \
 --simulated data/live/small.toml --record run.mcap, to see a run without any device"""
-SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to judge focus by
+SHEET_JPEG_QUALITY = 90  # of JPEG: fine enough to check the focus
 
 
 def add_live(commands: Commands) -> None:
@@ -52,8 +52,8 @@ def add_live(commands: Commands) -> None:
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--region", type=Path, metavar="FILE.toml", help=ROI_HELP)
     add("--path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
-    what = 'scan of the surface, in the frame of the path; or "from the cameras": they scan it before the run'
-    add("--scan", type=named_path, metavar="SCAN.ply", help=what)
+    scan_help = 'scan of the surface, in the frame of the path; or "from the cameras": they scan it before the run'
+    add("--scan", type=named_path, metavar="SCAN.ply", help=scan_help)
     add("--arm", metavar="DEVICE", help='port of the arm: a path, a URL of pyserial, or "virtual"')
     add("--profile", type=named_path, metavar="ARM.toml", help="arm file: base pose, limits, dialect, lag")
     add("--dispensers", type=named_path, metavar="DISPENSER.toml", help="dispenser file; default: no material")
@@ -68,9 +68,9 @@ def add_live(commands: Commands) -> None:
     add("--stands-home", action="store_true", default=None, help="the arm is at home, if it does not answer")
     add("--jpeg-quality", type=int, metavar="Q", help="JPEG quality for raw pictures; 0: lossless")
     add("--operator", metavar="NAME", help="name of the operator, for recording and reports")
-    port = "serve the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
+    port_help = "serve the run to Foxglove on this machine, at ws://127.0.0.1:PORT"
     add("--no-trace", action="store_true", help="do not record /trace, the time of each stage of each frame set")
-    add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port)
+    add("--foxglove", dest="foxglove_port", type=int, metavar="PORT", help=port_help)
     add("--trace", type=Path, metavar="X.json", help="write the recorded /trace for Perfetto; see stillbed trace")
     add_fault(add, 'a fault to inject into a simulated run, such as "tracking hang at 5s for 1s"; see docs/faults.md')
     add = command.add_argument_group("the operator's page (docs/operator.md)").add_argument
@@ -179,19 +179,19 @@ def _run_live(a: argparse.Namespace) -> int:
     traces = False if a.no_trace else True if a.trace is not None else None
     flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": traces}
     if a.trace is not None and a.no_trace:
-        raise wrong_option("--trace", a.trace, "left out beside --no-trace")
+        raise option_error("--trace", a.trace, "left out beside --no-trace")
     if a.trace is not None and a.trace.exists() and not a.force:
-        raise wrong_option("--trace", a.trace, "a new file, or --force")
+        raise option_error("--trace", a.trace, "a new file, or --force")
     if a.region is not None:
         flags["region"] = read_region(a.region)
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is not None and (a.settings is not None or a.record is not None):
-        raise wrong_option("--resume", a.resume, "without session.toml and --record")
+        raise option_error("--resume", a.resume, "without session.toml and --record")
     if a.resume is None and a.settings is None and a.rig is None and a.simulated is None:
-        raise wrong_option("session.toml", "missing", LIVE_ALLOWED)
+        raise option_error("session.toml", "missing", LIVE_ALLOWED)
     settings, where = LiveSettings() if a.settings is None else read_settings(a.settings), a.settings or "command line"
-    from hardware.live.prepared import prepare, prepare_resumed  # which loads for a second, the run for two more
+    from hardware.live.prepared import prepare, prepare_resumed  # slow imports: 1 s, and 2 s for the run
     from hardware.live.run import LiveRun
     from hardware.live.view import Console
 
@@ -241,10 +241,10 @@ def add_arm(commands: Commands) -> None:
         "stillbed arm /dev/ttyUSB0 --home --yes",
         "stillbed arm --virtual --link ./arm --replies stream --fault 'stall 600ms at 5s'",
     )
-    which = command.add_mutually_exclusive_group()
-    where = "path, URL of pyserial such as socket://, or address of another driver; none: list drivers and arms"
-    which.add_argument("device", nargs="?", metavar="DEVICE", help=where)
-    which.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
+    target = command.add_mutually_exclusive_group()
+    device_help = "path, URL of pyserial such as socket://, or address of another driver; none: list drivers and arms"
+    target.add_argument("device", nargs="?", metavar="DEVICE", help=device_help)
+    target.add_argument("--virtual", action="store_true", help="serve a virtual arm on a pseudo-terminal")
     command.add_argument("--arm", type=named_path, metavar="ARM.toml", help="home, limits, dialect, baud rate")
     add = command.add_argument_group("an arm on a port").add_argument
     add("--seconds", type=positive, default=5.0, metavar="S", help="listening time; default 5")
@@ -359,7 +359,7 @@ def _cameras_table(devices: tuple[CameraDevice, ...], industrial: tuple[Industri
 
 
 def list_text(devices: tuple[CameraDevice, ...], industrial: tuple[IndustrialCamera, ...] = ()) -> str:
-    """A paragraph a camera, or what to do where there is none."""
+    """A paragraph for each camera, or what to do without one."""
     if not devices and not industrial:
         return NO_CAMERA_TEXT
     lines = [
@@ -382,9 +382,9 @@ def _watch_cameras(a: argparse.Namespace) -> int:
     from hardware.process.clock import WallClock
 
     if not 0 < a.seconds <= 3600:
-        raise wrong_option("--seconds", a.seconds, "0 < seconds <= 3600")
+        raise option_error("--seconds", a.seconds, "0 < seconds <= 3600")
     if a.out is not None and a.out.suffix.lower() not in (".jpg", ".jpeg", ".png"):
-        raise wrong_option("--out", a.out, "a file that ends in .jpg or .png")
+        raise option_error("--out", a.out, "a file that ends in .jpg or .png")
     if a.out is not None:
         check_new(a.out, a.force)
     rig, sources = sources_named(a.which)

@@ -1,6 +1,6 @@
 """The command line `stillbed`: all commands, and `simulate`, `bench` and `doctor` themselves.
 
-Imports lazily, the other commands too: nobody waits for the options of a command that he does not call.
+Imports lazily, also the other commands: only the called command's options are loaded.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from hardware.cli.parser import (
     Parser,
     add_fault,
     error_text,
+    option_error,
     wall_clock,
-    wrong_option,
 )
 from hardware.process.progress import (
     BAD,
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
     from hardware.operator.view import CheckVerdict
 
 BENCH_OUT = Path("out/bench")
-WRITTEN_OPTIONS = ("out", "record", "log", "link", "gcode")  # paths of the command line that are written to
+WRITTEN_OPTIONS = ("out", "record", "log", "link", "gcode")  # output paths
 
 
 def add_bench(commands: Commands) -> None:
-    """Add the sub-command `bench`; what follows its subject is read once the subject's module is loaded."""
+    """Add the sub-command `bench`; the options after the subject are parsed after its module is loaded."""
     parser = commands.add(
         "bench",
         run_bench,
@@ -62,7 +62,7 @@ def add_bench(commands: Commands) -> None:
 
 
 def add_bench_options(parser: argparse.ArgumentParser) -> None:
-    """What to measure: a subject and its options, or all."""
+    """Add the options: a subject and its options, or all subjects."""
     add = parser.add_argument
     add("--list", action="store_true", help="list the subjects and exit")
     add("--all", action="store_true", help="measure all subjects, in a short form; figures that exist in OUT are kept")
@@ -74,7 +74,7 @@ def add_bench_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_bench(arguments: argparse.Namespace, subjects: Subjects | None = None, whole: Whole | None = None) -> None:
-    """List the subjects, or measure one or all, print the table and, where a folder was named, save it there.
+    """List the subjects, or measure one or all, print the table and, with a folder, save it there.
 
     subjects, whole: by default those of `stillbed bench`.
     """
@@ -92,15 +92,15 @@ def run_bench(arguments: argparse.Namespace, subjects: Subjects | None = None, w
     elif name not in subjects:
         from hardware.process.checks import one_of_text
 
-        raise wrong_option("SUBJECT", name, one_of_text(name, list(subjects)) + whole.elsewhere)
+        raise option_error("SUBJECT", name, one_of_text(name, list(subjects)) + whole.elsewhere)
     else:
         options = subject_parser(name, subjects[name]).parse_args(arguments.rest)
-        arguments.out = options.out  # told where the run is interrupted
+        arguments.out = options.out  # for the message after an interrupt
         _measure_subject(name, subjects[name], options)
 
 
 def subject_parser(name: str, subject: Subject) -> argparse.ArgumentParser:
-    """The options of one subject: where to save, and its own."""
+    """The parser of one subject: output folder, and its own options."""
     parser = Parser(prog=f"{subject.program} {name}", description=subject.summary)
     parser.add_argument("-o", "--out", type=Path, help="output folder for figures.json, new or empty")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
@@ -144,7 +144,7 @@ def _run_doctor(a: argparse.Namespace) -> int:
     from hardware.operator.view import CheckVerdict
 
     if not a.folder.is_dir():
-        raise wrong_option("--folder", a.folder, "a folder that exists")
+        raise option_error("--folder", a.folder, "a folder that exists")
     libraries = [*library_checks(), extras_check()]
     machine = machine_checks(a.folder, wall_clock())
     broken = any(check.verdict is CheckVerdict.FAIL for check in libraries)
@@ -159,14 +159,14 @@ def _run_doctor(a: argparse.Namespace) -> int:
 
 
 def _verdict_text(verdicts: list[CheckVerdict], broken: bool) -> str:
-    failed, warned = (sum(v.value == word for v in verdicts) for word in ("fail", "warn"))
+    failed, warned = (sum(v.value == verdict_name for v in verdicts) for verdict_name in ("fail", "warn"))
     if broken:
-        return "libraries are missing; devices were not looked at. Mend these first, then ask again"
+        return "libraries are missing; devices were not checked. Repair the libraries first, then repeat"
     if failed:
-        return f"{failed} failed: stillbed does not work here until that is mended"
+        return f"{failed} failed: stillbed does not work here until this is repaired"
     if warned:
-        return f"all that stillbed needs works; {warned} to look at before a live run"
-    return "all works; try: make demo, or stillbed init FOLDER"
+        return f"all requirements are met; {warned} to check before a live run"
+    return "all checks passed; next: make demo, or stillbed init FOLDER"
 
 
 def add_cache(commands: Commands) -> None:
@@ -205,16 +205,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     0, 1 where a simulation misses its limits, 2 for wrong input (one line on stderr), 130 after Ctrl-C.
     """
     fill_standard_streams()
-    words = sys.argv[1:] if argv is None else argv
+    argv_words = sys.argv[1:] if argv is None else argv
     try:
-        commands = parser(words[0] if words else "")
-        if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word may be
+        commands = parser(argv_words[0] if argv_words else "")
+        if "_ARGCOMPLETE" in os.environ:  # completion by a shell
             import argcomplete
 
             argcomplete.autocomplete(commands)
-        arguments = commands.parse_args(words)
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads only spin over such matrices
-        with nullcontext() if argv is not None else FirstWord(arguments.command):  # where the process is the command's
+        arguments = commands.parse_args(argv_words)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: threads do not help for small matrices
+        with nullcontext() if argv is not None else FirstWord(arguments.command):  # only in a process of its own
             return _run(arguments)
     except KeyboardInterrupt:  # before the command has begun
         print("\nstillbed: interrupted; nothing was written", file=sys.stderr)
@@ -222,52 +222,52 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Run the command that was read; its exit code."""
+    """Run the parsed command; its exit code."""
     from hardware.process.system import state_inputs
 
     state_inputs(input_files(arguments))
     code: int | None = None
     out = written_path(arguments)
-    was_there = out is not None and out.exists()
+    existed = out is not None and out.exists()
     try:
-        if threading.current_thread() is threading.main_thread():  # elsewhere, signals are somebody else's part
+        if threading.current_thread() is threading.main_thread():  # signals need the main thread
             signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends this process as Ctrl-C does
         code = arguments.run(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:  # nobody reads on, as after `| head`; the files are written all the same
+    except BrokenPipeError:  # as after `| head`; the files are written
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (StillbedError, OSError) as error:
         nameless = isinstance(error, OSError) and error.filename is None and error.strerror
-        words = write_error_text(error, out) if nameless else error_text(error)
+        message = write_error_text(error, out) if nameless else error_text(error)
         if nameless and out is None and getattr(arguments, "log", None) is not None:
-            words = f"{arguments.log}: {words}; its last rows may be missing"
-        print(f"stillbed: {painted(words, BAD, sys.stderr)}", file=sys.stderr)
-        if out is not None and not was_there:
+            message = f"{arguments.log}: {message}; its last rows may be missing"
+        print(f"stillbed: {painted(message, BAD, sys.stderr)}", file=sys.stderr)
+        if out is not None and not existed:
             with suppress(OSError):
-                out.rmdir()  # made for what was not done; what holds anything stays
+                out.rmdir()  # created for nothing; only if empty
         return WRONG_INPUT
     except (KeyboardInterrupt, ImportError) as error:
         if isinstance(error, ImportError) and not isinstance(error.__cause__, KeyboardInterrupt):
-            raise  # gtsam makes this of Ctrl-C while it loads
+            raise  # Ctrl-C while gtsam loads
         print(f"\nstillbed: interrupted; {left_files_text(written_path(arguments))}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
 
 
 def written_path(arguments: argparse.Namespace) -> Path | None:
-    """Where the command writes: its folder or file of results, else its recording; None if it has none."""
+    """The output path of the command: folder or file of results, else its recording; None without one."""
     return next((path for name in WRITTEN_OPTIONS[:2] if (path := getattr(arguments, name, None)) is not None), None)
 
 
 def input_files(arguments: argparse.Namespace) -> list[Path]:
-    """The files and folders of the command line that are there already and are not written to."""
-    given = [value for name, value in vars(arguments).items() if name not in WRITTEN_OPTIONS]
-    named = [each for value in given for each in (value if isinstance(value, list) else [value])]
-    return [each for each in named if isinstance(each, Path) and each != Path() and each.exists()]
+    """Existing files and folders of the command line that are not written to."""
+    values = [value for name, value in vars(arguments).items() if name not in WRITTEN_OPTIONS]
+    candidates = [each for value in values for each in (value if isinstance(value, list) else [value])]
+    return [each for each in candidates if isinstance(each, Path) and each != Path() and each.exists()]
 
 
 class _Version(argparse.Action):
-    """Prints the installed version; asks for it only then."""
+    """Prints the installed version."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from hardware.process.system import stillbed_version
@@ -305,7 +305,7 @@ def _simulate(a: argparse.Namespace) -> int:
     from hardware.process.checks import read_toml
     from hardware.process.faults import faults_from_texts
 
-    read_toml(a.scenario)  # what cannot be one is told before the simulator is loaded
+    read_toml(a.scenario)  # reports a wrong file before the simulator is loaded
     load_scipy()
     from hardware.simulator.simulate import SimulationOptions, run_simulation
 
@@ -317,7 +317,7 @@ def _simulate(a: argparse.Namespace) -> int:
 
 
 def _elsewhere(place: str) -> Callable[[Commands], None]:
-    """What adds a command, by the module of this folder and the name there; loaded once it is called."""
+    """The function that adds a command, from its module in this folder and its name; imported when called."""
 
     def add(commands: Commands) -> None:
         module, name = place.split(":")
@@ -326,7 +326,7 @@ def _elsewhere(place: str) -> Callable[[Commands], None]:
     return add
 
 
-COMMANDS = {  # what adds each
+COMMANDS = {  # functions that add each
     "simulate": add_simulate,
     "track": _elsewhere("sessions:add_track"),
     "smooth": _elsewhere("sessions:add_smooth"),
@@ -355,7 +355,7 @@ COMMANDS = {  # what adds each
 
 
 def parser(command: str = "") -> Parser:
-    """The whole command line; with a command's name, that command's alone."""
+    """The parser of all commands; with the name of a command, only of that command."""
     top = Parser(
         prog="stillbed",
         description="Make a moving wound look like a still print bed.",

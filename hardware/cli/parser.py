@@ -1,4 +1,4 @@
-"""What all commands share: parsers, option types, error texts, and the entry of scripts such as docs/examples."""
+"""Common code of all commands: parsers, option types, error texts, and the entry of scripts (docs/examples)."""
 
 from __future__ import annotations
 
@@ -21,42 +21,46 @@ Run = Callable[[argparse.Namespace], int | None]  # a command: its exit code, No
 FAULT_TEXT = 'a fault to inject, such as "camera0 stuck at 5s for 2s"; repeatable; see docs/faults.md'
 ROI_HELP = "a file with a table [region]: the surface's region in the pictures; see docs/live.md"
 MODEL_HELP = "network that segments the wound, as `stillbed train` writes it; default: the shipped one"
-FAILED = 1  # exit code where a command ran, and its result is not good enough
+FAILED = 1  # exit code of a command whose result is not good enough
 WRONG_INPUT = 2  # exit code
-INTERRUPTED = 130  # exit code that a shell expects after Ctrl-C
-WRONG_CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")  # as argparse says it
+INTERRUPTED = 130  # exit code after Ctrl-C
+WRONG_CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")  # message of argparse
 USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of the docstring
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports a wrong command line in one line, as all wrong input, and refers to --help."""
+    """Reports a wrong command line in one line, like all wrong input, and refers to --help."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As its base does; an option that a command does not know is told first, with the one that is near."""
-        known, takes_rest = list(self._option_string_actions), any(a.nargs == argparse.REMAINDER for a in self._actions)
-        for word in () if self._subparsers is not None or takes_rest else args or ():
+        """As its base; an unknown option is reported first, with a similar known option."""
+        options, has_remainder = (
+            list(self._option_string_actions),
+            any(a.nargs == argparse.REMAINDER for a in self._actions),
+        )
+        for word in () if self._subparsers is not None or has_remainder else args or ():
             name = word.partition("=")[0]
             if word == "--":
                 break
-            if name.startswith("--") and not any(each.startswith(name) for each in known):  # a beginning will do
-                self.error(f"unknown option {name}{near_text(name, known)}")
+            abbreviates = any(each.startswith(name) for each in options)
+            if name.startswith("--") and not abbreviates:
+                self.error(f"unknown option {name}{suggestion_text(name, options)}")
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print the line, and exit."""
-        if (choice := WRONG_CHOICE.search(message)) is not None:  # all the others stand in the help
-            known = re.findall(r"'([^']+)'", choice[2])
-            message = f"{message[: choice.start()]}{choice[1]!r} is none{near_text(choice[1], known)}"
+        if (choice := WRONG_CHOICE.search(message)) is not None:  # the help lists all
+            choices = re.findall(r"'([^']+)'", choice[2])
+            message = f"{message[: choice.start()]}{choice[1]!r} is none{suggestion_text(choice[1], choices)}"
         print(f"{self.prog}: {painted(message, BAD, sys.stderr)}; see {self.prog} --help", file=sys.stderr)
         sys.exit(WRONG_INPUT)
 
 
-def near_text(word: str, known: Sequence[str]) -> str:
-    """What was meant by a word, if one that is known is near; else ""."""
-    import difflib  # as inspect and the clock below: a tenth of what a command line loads for its help
+def suggestion_text(word: str, choices: Sequence[str]) -> str:
+    """A suggestion for a misspelt word, if one of the choices is similar; else ""."""
+    import difflib  # slow import, as inspect and the clock below
 
-    near = difflib.get_close_matches(word.partition("=")[0], known, 1)
-    return f"; did you mean {near[0]}?" if near else ""
+    matches = difflib.get_close_matches(word.partition("=")[0], choices, 1)
+    return f"; did you mean {matches[0]}?" if matches else ""
 
 
 class Commands:
@@ -66,7 +70,7 @@ class Commands:
         self._parsers = parser.add_subparsers(metavar=metavar, required=True)
 
     def add(self, name: str, run: Run | None, summary: str, text: str, *examples: str) -> argparse.ArgumentParser:
-        """Add one: what runs it, its line in the list of commands, what it does, and how it is called."""
+        """Add one: its function, its line in the list of commands, its description, and examples."""
         lines = "".join(f"\n  {example}" for example in examples)
         parser = self._parsers.add_parser(
             name,
@@ -80,22 +84,22 @@ class Commands:
 
 
 def error_text(error: Exception) -> str:
-    """The message of an error, of a system error with a file the file first, and what may have been meant by a name."""
+    """The message of an error (a system error begins with its file), with a suggestion for a misspelt name."""
     from hardware.process.checks import near_file_text
 
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror.lower()}{near_file_text(error.filename)}"
-    near = near_file_text(error.got, error.where) if isinstance(error, InputError) else ""
-    return f"{error}{near}"
+    suggestion = near_file_text(error.got, error.where) if isinstance(error, InputError) else ""
+    return f"{error}{suggestion}"
 
 
-def wrong_option(option: str, got: object, allowed: str) -> InputError:
+def option_error(option: str, got: object, allowed: str) -> InputError:
     """The error about an option of the command line."""
     return InputError("command line", option, got, allowed)
 
 
 def damage_code(damage: str) -> int:
-    """Print what is damaged in a recording, where something is; the exit code of a command that used it."""
+    """Print the damage of a recording, if any; the exit code of a command that used it."""
     from hardware.files.session import damage_text
 
     if text := damage_text(damage):
@@ -123,23 +127,23 @@ def arm_profile(path: Path | None) -> ArmProfile:
     return ArmProfile() if path is None else read_arm(path)
 
 
-def _number_that(good: Callable[[float], bool], words: str) -> Callable[[str], float]:
-    """A type of an option: a finite number that is good, in words."""
+def _number_type(accepts: Callable[[float], bool], allowed: str) -> Callable[[str], float]:
+    """An option type: finite numbers for which `accepts` is true. allowed: the condition as a text."""
 
     def number(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not (math.isfinite(value) and good(value)):
-            raise argparse.ArgumentTypeError(f"{text!r}, needed is {words}")
+        if not (math.isfinite(value) and accepts(value)):
+            raise argparse.ArgumentTypeError(f"{text!r}, needed is {allowed}")
         return value
 
     return number
 
 
-positive = _number_that(lambda value: value > 0, "a number above 0")
-not_negative = _number_that(lambda value: value >= 0, "a number, 0 or more")
+positive = _number_type(lambda value: value > 0, "a number above 0")
+not_negative = _number_type(lambda value: value >= 0, "a number, 0 or more")
 
 
 def add_fault(add: Callable[..., Any], text: str = FAULT_TEXT) -> None:
@@ -147,21 +151,21 @@ def add_fault(add: Callable[..., Any], text: str = FAULT_TEXT) -> None:
     add("--fault", action="append", default=[], metavar="FAULT", help=text)
 
 
-def run_script(main: Callable[..., None], text: str | None, words: Sequence[str] | None = None) -> NoReturn:
-    """Call `main` with the words of the command line, and exit: 0, or 2 for wrong input, which is told in one line.
+def run_script(main: Callable[..., None], text: str | None, arguments: Sequence[str] | None = None) -> NoReturn:
+    """Call `main` with the arguments of the command line, and exit: 0, or 2 for wrong input, reported in one line.
 
-    text: the program's docstring, which shows how it is started: printed for --help; that line alone where words are
-    missing, too many, or no number where `main` has one.
+    text: the program's docstring with its usage line: printed for --help; only the usage line if arguments are
+    missing, too many, or not a number for a parameter of `main` that is one.
     """
-    sys.exit(_run(main, (text or "").strip(), sys.argv[1:] if words is None else words))
+    sys.exit(_run(main, (text or "").strip(), sys.argv[1:] if arguments is None else arguments))
 
 
-def _run(main: Callable[..., None], text: str, words: Sequence[str]) -> int:
-    if {"-h", "--help"} & set(words):
+def _run(main: Callable[..., None], text: str, arguments: Sequence[str]) -> int:
+    if {"-h", "--help"} & set(arguments):
         print(text)
         return 0
     try:
-        values = _read(main, words)
+        values = _read(main, arguments)
     except (TypeError, ValueError):
         usage = USAGE.search(text)
         print(f"usage: {text if usage is None else usage[0]}", file=sys.stderr)
@@ -174,14 +178,14 @@ def _run(main: Callable[..., None], text: str, words: Sequence[str]) -> int:
     return 0
 
 
-def _read(main: Callable[..., None], words: Sequence[str]) -> list[Any]:
-    """The words, those that stand for a number as numbers; TypeError or ValueError where they are none of main's."""
+def _read(main: Callable[..., None], arguments: Sequence[str]) -> list[Any]:
+    """The arguments, converted to numbers where main expects them; TypeError or ValueError for wrong arguments."""
     import inspect
 
     signature = inspect.signature(main)
-    signature.bind(*words)
-    if any(word.startswith("--") for word in words):
+    signature.bind(*arguments)
+    if any(argument.startswith("--") for argument in arguments):
         raise ValueError
     parameters = signature.parameters.values()
     numbers = [isinstance(parameter.default, float) for parameter in parameters]
-    return [float(word) if number else word for word, number in zip(words, numbers, strict=False)]
+    return [float(argument) if number else argument for argument, number in zip(arguments, numbers, strict=False)]

@@ -15,8 +15,8 @@ from hardware.cli.parser import (
     Commands,
     damage_code,
     not_negative,
+    option_error,
     positive,
-    wrong_option,
 )
 from perception import named_path
 
@@ -71,7 +71,7 @@ def add_plan(commands: Commands) -> None:
     _add_scan(command)
     _add_layers(command)
     _add_pattern(command)
-    _add_way(command)
+    _add_tool_motion(command)
 
 
 def _add_scan(command: argparse.ArgumentParser) -> None:
@@ -130,7 +130,7 @@ def _add_pattern(command: argparse.ArgumentParser) -> None:
     add("--rims", type=int, default=1, metavar="N", help="closed lines of the hybrid pattern; default 1")
 
 
-def _add_way(command: argparse.ArgumentParser) -> None:
+def _add_tool_motion(command: argparse.ArgumentParser) -> None:
     add = command.add_argument_group("tool motion").add_argument
     for name, default, metavar, text in (
         ("--speed", 20.0, "MM/S", "printing speed"),
@@ -161,11 +161,11 @@ def _run_plan(a: argparse.Namespace) -> int:
 
     values = {f.name: getattr(a, f.name) for f in fields(PlanSettings) if f.name != "tissues"}
     settings = PlanSettings(tissues=tuple(a.tissue), **values)
-    source = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
-    order = PlanRequest(
-        *source, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, motion=a.motion, settings=settings
+    sources = a.out, a.scan, a.example, a.outline, a.unit, a.flip, a.gcode, a.session
+    request = PlanRequest(
+        *sources, not a.no_pictures, a.force, a.arm, clicks=a.clicks, wound=a.wound, motion=a.motion, settings=settings
     )
-    text, damage = run_plan(order)
+    text, damage = run_plan(request)
     print(text)
     return damage_code(damage)
 
@@ -184,13 +184,15 @@ def add_reach(commands: Commands) -> None:
     ).add_argument
     add("path", type=named_path, metavar="PATH.csv", help="checkpoints on the surface")
     add("--arm", type=named_path, required=True, metavar="ARM.toml", help="arm file with a table [kinematics]")
-    surface = "pose of the surface at rest, in the arm's frame, mm and degrees; default: level, under the default home"
-    add("--surface", type=_six_numbers, metavar="X,Y,Z,A,B,C", help=surface)
+    surface_help = (
+        "pose of the surface at rest, in the arm's frame, mm and degrees; default: level, under the default home"
+    )
+    add("--surface", type=_six_numbers, metavar="X,Y,Z,A,B,C", help=surface_help)
     add("--amplitude-mm", type=not_negative, default=0.0, metavar="MM", help="motion amplitude along the normal")
     add("--turn-deg", type=not_negative, default=0.0, metavar="DEG", help="motion amplitude about x, y and z")
     add("--rate-hz", type=not_negative, default=0.25, metavar="HZ", help="frequency of the motion; default 0.25")
-    scan = "obstacle for the tool, a scan in the path's frame; default: PATH_scan.ply, if it exists"
-    add("--scan", type=named_path, metavar="SCAN", help=scan)
+    scan_help = "obstacle for the tool, a scan in the path's frame; default: PATH_scan.ply, if it exists"
+    add("--scan", type=named_path, metavar="SCAN", help=scan_help)
     add("--spin", action="store_true", help="allow rotation of the tool about its own axis")
     add("-o", "--out", type=Path, metavar="OUT", help="output folder, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
@@ -198,7 +200,7 @@ def add_reach(commands: Commands) -> None:
 
 def _six_numbers(text: str) -> tuple[float, ...]:
     try:
-        values = tuple(float(word) for word in text.split(","))
+        values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 6:
@@ -209,10 +211,10 @@ def _six_numbers(text: str) -> tuple[float, ...]:
 def _run_reach(a: argparse.Namespace) -> int:
     from hardware.offline.reach import ReachQuestion, run_reach
 
-    question = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin, a.scan)
-    answer = run_reach(a.path, a.arm, question, a.out, a.force)
-    print(answer.text)
-    return 0 if answer.feasible else FAILED
+    request = ReachQuestion(a.surface, a.amplitude_mm, a.turn_deg, a.rate_hz, a.spin, a.scan)
+    result = run_reach(a.path, a.arm, request, a.out, a.force)
+    print(result.text)
+    return 0 if result.feasible else FAILED
 
 
 def add_segment(commands: Commands) -> None:
@@ -232,8 +234,8 @@ def add_segment(commands: Commands) -> None:
     ).add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="picture, folder of pictures, video, or SESSION")
     add("-o", "--out", type=Path, required=True, metavar="MASKS", help="output folder, new or empty")
-    methods = "unet: trained network; shape: matching of outlines"
-    add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=methods)
+    method_help = "unet: trained network; shape: matching of outlines"
+    add("--method", choices=(UNET_METHOD, SHAPE_METHOD), default=UNET_METHOD, help=method_help)
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--version", action=_NetworkVersion, nargs=0, help="print name, licence and source of the network, and exit")
     add("--scan", type=Path, metavar="SCAN", help="with --method shape: scan of the wound, z upwards")
@@ -244,7 +246,7 @@ def add_segment(commands: Commands) -> None:
 
 
 class _NetworkVersion(argparse.Action):
-    """Prints what the network is: the shipped one, or that of a --model that stands before it."""
+    """Prints the terms of the network: the shipped one, or that of a preceding --model."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: object) -> None:
         from perception.wound.network import WoundNetwork, shipped_model
@@ -277,15 +279,15 @@ def add_train(commands: Commands) -> None:
     ).add_argument
     add("datasets", type=Path, nargs="+", metavar="DATASET", help="data sets; cross-validation uses the first")
     add("-o", "--out", type=Path, required=True, metavar="X.onnx", help="output file")
-    own = "recordings of live runs: adds the pictures with outlines corrected by an operator to the first data set"
-    add("--add", type=Path, nargs="+", default=[], metavar="RECORDING", help=own)
-    networks = "thesis: U-Net of section 3.3; shape: no network, the outlines for segment --method shape (X.toml)"
-    add("--network", choices=("wound", "thesis", "shape"), default="wound", help=networks)
+    add_help = "recordings of live runs: adds the pictures with outlines corrected by an operator to the first data set"
+    add("--add", type=Path, nargs="+", default=[], metavar="RECORDING", help=add_help)
+    network_help = "thesis: U-Net of section 3.3; shape: no network, the outlines for segment --method shape (X.toml)"
+    add("--network", choices=("wound", "thesis", "shape"), default="wound", help=network_help)
     add("--rounds", type=int, metavar="N", help="training rounds of 200 steps (thesis: 100)")
     add("--rendered", type=int, default=140, metavar="N", help="number of rendered pictures to add")
     add("--folds", type=int, default=5, metavar="N", help="folds of the first data set")
-    only = "train only one network, without fold 0, 1, ... or `all`, and stop: for several processes"
-    add("--part", metavar="PART", help=only)
+    part_help = "train only one network, without fold 0, 1, ... or `all`, and stop: for several processes"
+    add("--part", metavar="PART", help=part_help)
     add("--device", choices=("cpu", "cuda"), help="default: cuda if torch has a GPU; results differ")
     add("--licence", metavar="TEXT", help="licence of the network, written to X.toml")
     add("--source", metavar="TEXT", help="source of the pictures, written to X.toml")
@@ -298,13 +300,13 @@ def _run_segment(a: argparse.Namespace) -> int:
     from hardware.offline.segment import SegmentOptions, run_segment
 
     if a.mm_per_px is not None and not 0 < a.mm_per_px < 100:
-        raise wrong_option("--mm-per-px", a.mm_per_px, "above 0 and below 100")
+        raise option_error("--mm-per-px", a.mm_per_px, "above 0 and below 100")
     if not 1 <= a.threads <= 64:
-        raise wrong_option("--threads", a.threads, "1 to 64")
+        raise option_error("--threads", a.threads, "1 to 64")
     if a.method == SHAPE_METHOD and a.model is not None:
-        raise wrong_option("--model", a.model, "nothing with --method shape, which has no network")
+        raise option_error("--model", a.model, "nothing with --method shape, which has no network")
     if a.method == UNET_METHOD and a.scan is not None:
-        raise wrong_option("--scan", a.scan, "a scan only with --method shape")
+        raise option_error("--scan", a.scan, "a scan only with --method shape")
     segmenter = _segmenter(a)
     text, damage = run_segment(a.inputs, a.out, segmenter, SegmentOptions(a.overlay, a.mm_per_px, a.force))
     print(text)
@@ -312,8 +314,7 @@ def _run_segment(a: argparse.Namespace) -> int:
 
 
 def _segmenter(a: argparse.Namespace) -> Segmenter:
-    """The segmenter of the method. The network is the one that comes along unless another is named; the scan of the
-    wound gives its outline, and its size where the scale is known."""
+    """The segmenter of the method. A scan gives the outline, and with a known scale also its size."""
     from hardware.files.mesh_file import read_mesh
     from perception.wound.network import WoundNetwork, shipped_model
     from perception.wound.segmentation import NetworkSegmenter
@@ -324,8 +325,8 @@ def _segmenter(a: argparse.Namespace) -> Segmenter:
         return NetworkSegmenter(network, network.settings)
     pattern, area = None, None
     if a.scan is not None:
-        pattern, across = scan_outline(read_mesh(a.scan).scan)
-        area = None if a.mm_per_px is None else across / a.mm_per_px**2
+        pattern, outline_area = scan_outline(read_mesh(a.scan).scan)
+        area = None if a.mm_per_px is None else outline_area / a.mm_per_px**2
     return ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")), pattern, area)
 
 
@@ -350,8 +351,8 @@ def add_scan(commands: Commands) -> None:
         "stillbed scan try.mcap -o wound.ply --sets 12",
         "stillbed scan data/scenarios/breathing_calm.toml -o wound.ply",
     ).add_argument
-    what = "rig.toml or session.toml of live cameras, scenario.toml, session folder or .mcap file"
-    add("source", type=named_path, metavar="RIG_OR_SESSION", help=what)
+    source_help = "rig.toml or session.toml of live cameras, scenario.toml, session folder or .mcap file"
+    add("source", type=named_path, metavar="RIG_OR_SESSION", help=source_help)
     add("-o", "--out", type=Path, required=True, metavar="X.ply", help="output file; X.html beside it")
     add("--sets", type=int, default=6, metavar="N", help="number of fused instants, 2 to 40; default 6")
     add("--seconds", type=positive, default=4.0, metavar="S", help="tracking time; default 4, a breath")
@@ -368,10 +369,10 @@ def _run_scan(a: argparse.Namespace) -> None:
 
 
 def scanned_settings(settings: LiveSettings, where: object, force: bool) -> LiveSettings:
-    """The settings of a run that scans for itself, with the scan that its cameras make now and the path planned on it.
+    """The settings of a run with "from the cameras", completed by a scan made now and a path planned on it.
 
-    Both stand beside the recording. Without a path it is planned with `plan`'s defaults, and at a terminal the operator
-    says whether those layers are to be printed. InputError, StillbedError where that is not said.
+    Both are written beside the recording. A missing path is planned with the defaults of `plan`; at a terminal the
+    operator confirms it. InputError for wrong settings, StillbedError if it is not confirmed.
     """
     from dataclasses import replace
 
@@ -393,7 +394,7 @@ def scanned_settings(settings: LiveSettings, where: object, force: bool) -> Live
         return replace(settings, scan=scan)
     print(run_plan(PlanRequest(path, scan, force=True))[0], flush=True)
     if not settings.unattended and sys.stdin.isatty():
-        answer = input(f"The layers are in {path.with_suffix('.html')}. Are they to be printed? yes or no: ")
+        answer = input(f"The layers are in {path.with_suffix('.html')}. Print them? yes or no: ")
         if answer.strip().lower() not in ("y", "yes"):
-            raise StillbedError(f"not printed, as you said. The plan is kept: {path}, on {scan}")
+            raise StillbedError(f"not confirmed. The plan is kept: {path}, on {scan}")
     return replace(settings, scan=scan, path=path)

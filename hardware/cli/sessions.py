@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, damage_code, progress_bar, wrong_option
+from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, damage_code, option_error, progress_bar
 from hardware.process.progress import prepare_out
 from perception import named_path
 from perception.tracking import MAP_METHOD, TRACKING_METHODS
@@ -23,11 +23,11 @@ def add_track(commands: Commands) -> None:
     ).add_argument
     add("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
     add("-o", "--out", type=Path, required=True, help="output folder, new or empty")
-    methods = "; ".join(f"{name}: {what}" for name, what in TRACKING_METHODS.items())
-    add("--method", choices=TRACKING_METHODS, default=MAP_METHOD, help=methods)
+    method_help = "; ".join(f"{name}: {what}" for name, what in TRACKING_METHODS.items())
+    add("--method", choices=TRACKING_METHODS, default=MAP_METHOD, help=method_help)
     add("--arm", type=named_path, metavar="ARM.toml", help="arm file with the tool of the session's arm")
-    prefilter = "filter for each picture before tracking; bilateral: as in the thesis (4.6), 50 ms a picture"
-    add("--prefilter", choices=("none", "bilateral"), default="none", help=prefilter)
+    prefilter_help = "filter for each picture before tracking; bilateral: as in the thesis (4.6), 50 ms a picture"
+    add("--prefilter", choices=("none", "bilateral"), default="none", help=prefilter_help)
     add("--wound", action="store_true", help="also segment the wound; writes wound.csv")
     add("--model", type=Path, metavar="X.onnx", help=MODEL_HELP)
     add("--record", type=Path, metavar="X.mcap", help="also record images, tracks and poses as MCAP")
@@ -49,8 +49,8 @@ def add_replay(commands: Commands) -> None:
         "stillbed replay sessions/monday --path data/paths/square_10mm.csv -o out/replay",
     ).add_argument
     add("session", type=Path, metavar="SESSION", help="session folder or .mcap file")
-    path = "checkpoints on the surface; default: those of the recorded run"
-    add("--path", type=named_path, metavar="PATH.csv", help=path)
+    path_help = "checkpoints on the surface; default: those of the recorded run"
+    add("--path", type=named_path, metavar="PATH.csv", help=path_help)
     add("--arm", type=named_path, metavar="ARM.toml", help="arm file: base pose, limits, dialect of the link")
     add("--resume", type=Path, metavar="PROGRESS.toml", help="continue at the place where an earlier run stopped")
     add_fault(add)
@@ -94,7 +94,7 @@ def _track(a: argparse.Namespace) -> int:
     from hardware.offline.track import run_track
 
     if a.graph is not None and a.method != MAP_METHOD:
-        raise wrong_option("--graph", "given", f"with --method {MAP_METHOD}: no other method has a graph")
+        raise option_error("--graph", "given", f"with --method {MAP_METHOD}: only this method has a graph")
     tool = None if a.arm is None else read_arm(a.arm).tool
     paths = a.session, a.out, a.record
     text, damage = run_track(*paths, a.force, a.method, tool, a.prefilter, a.wound, a.model, a.graph)
@@ -112,10 +112,10 @@ def _replay(a: argparse.Namespace) -> int:
     faults = faults_from_texts("command line", "--fault", a.fault)
     if a.path is None:
         if faults:
-            raise wrong_option("--fault", str(faults[0]), "with --path: what was recorded is over")
+            raise option_error("--fault", str(faults[0]), "with --path: faults cannot change a recorded run")
         return _replay_run(a)
     session = open_session(a.session)
-    path = read_path(a.path)  # what is wrong with it is told before anything is made
+    path = read_path(a.path)  # reports a wrong file before anything is written
     if a.resume is not None:
         read_progress(a.resume, path)
     profile = None if a.arm is None else read_arm(a.arm)
@@ -131,11 +131,13 @@ def _replay_run(a: argparse.Namespace) -> int:
     from hardware.live.recorded_run import write_replay
 
     count = write_replay(a.session, a.out, a.force)
-    same = "all as they were given" if not count.other else f"{count.other} of them not as they were given"
+    agreement = (
+        "all equal to the recorded ones" if not count.other else f"{count.other} different from the recorded ones"
+    )
     code = damage_code(count.damage)
-    print(f"{count.frames} frames, {same}: commands.csv and frames.bin in {a.out}")
+    print(f"{count.frames} frames, {agreement}: commands.csv and frames.bin in {a.out}")
     if count.parted:
-        print(f"then the replay ended: {count.parted}")
+        print(f"the replay ended early: {count.parted}")
     return FAILED if count.other or count.parted else code
 
 
@@ -195,12 +197,12 @@ def add_smooth(commands: Commands) -> None:
 def _smooth(a: argparse.Namespace) -> int:
     from hardware.files.session import check_exists
 
-    if len(a.sessions) == 1:  # of several, one that is missing stops no other
+    if len(a.sessions) == 1:  # of several, a missing one does not stop the others
         check_exists(a.sessions[0])
     from hardware.offline.smooth import Cluster, SmoothOptions, run_smooth
 
     if a.workers is not None and a.scheduler != "local":
-        raise wrong_option("--workers", a.workers, "with --scheduler local")
+        raise option_error("--workers", a.workers, "with --scheduler local")
     cluster = None if a.scheduler is None else Cluster(a.scheduler, a.workers)
     options, failed = SmoothOptions(a.rate, a.refine_cameras, relink=not a.no_relink), 0
     for outcome in run_smooth(a.sessions, a.out, options, cluster):
@@ -246,8 +248,8 @@ def add_view(commands: Commands) -> None:
         "Prints the address to open. Writes nothing. Ctrl-C ends it.",
         "stillbed view out/smoothed",
     ).add_argument
-    what = "session folder, .mcap file, or output folder of `stillbed smooth`"
-    add("session", type=Path, metavar="SESSION", help=what)
+    session_help = "session folder, .mcap file, or output folder of `stillbed smooth`"
+    add("session", type=Path, metavar="SESSION", help=session_help)
     add("--poses", metavar="FILE", help="poses to show instead of the recording's; formats as for `stillbed compare`")
     add("--path", type=Path, metavar="PATH.csv", help="printing path, if the recording has none")
     add("--port", type=int, default=0, metavar="N", help="port of 127.0.0.1; default: any free port")

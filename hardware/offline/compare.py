@@ -26,7 +26,7 @@ from hardware.report.evaluation import (
     PoseErrors,
     associate,
     best_constant,
-    calibration_words,
+    consistency_text,
     errors_under,
     figure,
     finite,
@@ -218,7 +218,7 @@ def comparison_verdict(comparison: TrajectoryComparison) -> str:
         texts.append("No SE(3) alignment: the positions lie on a line.")
     nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        texts.append(f"NEES/6: {figure(nees)} in the frame of one pose, {calibration_words(nees)}.")
+        texts.append(f"NEES/6: {figure(nees)} in the frame of one pose, {consistency_text(nees)}.")
     return " ".join(texts)
 
 

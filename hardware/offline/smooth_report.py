@@ -16,7 +16,7 @@ from hardware.report.evaluation import (
     PoseErrors,
     associate,
     best_constant,
-    calibration_words,
+    consistency_text,
     errors_under,
     figure,
     spread,
@@ -174,7 +174,7 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
         live_text = "" if live is None else f", live {live} mm"
         texts.append(f"Error against the {_reference_name(evaluation)}: smoothed {ours} mm{live_text} (RMS, aligned).")
         nees = evaluation.errors[0].mean_nees / 6
-        texts += [f"NEES/6: {figure(nees)}, {calibration_words(nees)}."] if np.isfinite(nees) else []
+        texts += [f"NEES/6: {figure(nees)}, {consistency_text(nees)}."] if np.isfinite(nees) else []
     texts += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
     return " ".join(texts)
 

@@ -16,7 +16,7 @@ from estimation.se3 import Array
 from hardware.files.arm_file import read_arm, tool_body_of
 from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import read_contour
-from hardware.plan.question import clicks_of, scan_colour, write_question
+from hardware.plan.question import parse_clicks, scan_colour, write_question
 from hardware.process.progress import ProgressReport, check_apart, no_progress
 from planning.clearance import BASE_MARGIN, ToolBody
 from planning.fill import PatternKind
@@ -143,7 +143,7 @@ class PlanSubject:
     example: tuple[Array, Index] | None = None  # vertices and triangles of a built-in scan, written beside the path
 
 
-def order_of(settings: PlanSettings, flat: bool) -> PlanOrder:
+def plan_order(settings: PlanSettings, flat: bool) -> PlanOrder:
     """What is to be planned. flat: one layer of one tissue."""
     s = settings
     for name, info in SETTINGS.items():
@@ -155,9 +155,13 @@ def order_of(settings: PlanSettings, flat: bool) -> PlanOrder:
         angle=_angle(s.angle), rims=s.rims,
     )  # fmt: skip
     tool = ToolLimits(*(math.radians(v) for v in (s.tilt_deg, s.turning_deg_mm, s.spin_deg)))
-    way = CheckpointSettings(s.spacing, s.chord, s.sideways, travel=s.travel, lift=s.lift, wait=s.wait, tool=tool)
+    checkpoints = CheckpointSettings(
+        s.spacing, s.chord, s.sideways, travel=s.travel, lift=s.lift, wait=s.wait, tool=tool
+    )
     mode: LayerMode = "skin" if flat else cast(LayerMode, s.layers)
-    return PlanOrder(_tissues(s, flat), pattern, mode, way, not s.parallel, BumpPassing(s.bump, s.bump_clearance))
+    return PlanOrder(
+        _tissues(s, flat), pattern, mode, checkpoints, not s.parallel, BumpPassing(s.bump, s.bump_clearance)
+    )
 
 
 def _angle(text: str) -> float | AngleChoice:
@@ -203,15 +207,15 @@ def _is_material_name(name: str) -> bool:
 
 
 def _tissue(text: str, settings: PlanSettings, height: float) -> Tissue:
-    name, _, rest = text.partition("=")
-    words = [word.strip() for word in rest.split(":")]
-    if not _is_material_name(name.strip()) or not 2 <= len(words) <= 5 or not _is_material_name(words[1]):
+    name, _, field_text = text.partition("=")
+    fields = [word.strip() for word in field_text.split(":")]
+    if not _is_material_name(name.strip()) or not 2 <= len(fields) <= 5 or not _is_material_name(fields[1]):
         raise InputError(COMMAND_LINE, "--tissue", text, TISSUE_SYNTAX)
-    thickness = None if words[0] == "rest" else _number(text, words[0], 0.02, 100)
+    thickness = None if fields[0] == "rest" else _number(text, fields[0], 0.02, 100)
     limits = ((MIN_TEMPERATURE, MAX_TEMPERATURE), (0.1, MAX_SPEED), (0.02, 20.0))
-    numbers = [_number(text, word, *limit) for word, limit in zip(words[2:], limits, strict=False)]
+    numbers = [_number(text, word, *limit) for word, limit in zip(fields[2:], limits, strict=False)]
     values = numbers + [settings.temperature, settings.speed, height][len(numbers) :]
-    return Tissue(name.strip(), thickness, words[1], *values)
+    return Tissue(name.strip(), thickness, fields[1], *values)
 
 
 def _number(text: str, word: str, low: float, high: float) -> float:
@@ -235,18 +239,20 @@ def in_mm(vertices: Array, triangles: Index, unit: str, where: object) -> Array:
     used = used[np.isfinite(used).all(axis=1)]
     if not len(used):
         raise InputError(where, "vertices", "none that is finite", "a scan with finite coordinates")
-    away = (np.abs(vertices) > MAX_COORDINATE / SCAN_UNITS[unit]).any(axis=1) & np.isfinite(vertices).all(axis=1)
-    far = np.flatnonzero(away)
-    if len(far):
+    outside = (np.abs(vertices) > MAX_COORDINATE / SCAN_UNITS[unit]).any(axis=1) & np.isfinite(vertices).all(axis=1)
+    outliers = np.flatnonzero(outside)
+    if len(outliers):
         allowed = f"coordinates within {MAX_COORDINATE:g} mm, or not finite ones, which are left out"
-        raise InputError(where, f"vertex {far[0]}", vertices[far[0]].tolist(), allowed)
+        raise InputError(where, f"vertex {outliers[0]}", vertices[outliers[0]].tolist(), allowed)
     low, high = np.percentile(used, [1, 99], axis=0)  # without stray vertices
     longest = float((high - low).max())
     size = longest * SCAN_UNITS[unit]
     if MIN_SCAN_WITH_SKIN <= size <= MAX_SCAN_WITH_SKIN:
         return np.asarray(vertices * SCAN_UNITS[unit])
-    fitting = [name for name, mm in SCAN_UNITS.items() if MIN_SCAN_WITH_SKIN <= longest * mm <= MAX_SCAN_WITH_SKIN]
-    units = " or ".join(f"--unit {name} ({longest * SCAN_UNITS[name]:.0f} mm)" for name in fitting)
+    fitting_units = [
+        name for name, mm in SCAN_UNITS.items() if MIN_SCAN_WITH_SKIN <= longest * mm <= MAX_SCAN_WITH_SKIN
+    ]
+    units = " or ".join(f"--unit {name} ({longest * SCAN_UNITS[name]:.0f} mm)" for name in fitting_units)
     hint = f"; its numbers look like another unit: say {units}" if units else ""
     allowed = f"{MIN_SCAN_WITH_SKIN:g} to {MAX_SCAN_WITH_SKIN:g} mm{hint}"
     raise InputError(where, "size of the scan", f"{size:.4g} mm along its longest side, read as {unit}", allowed)
@@ -355,11 +361,11 @@ def subject_of(request: PlanRequest, flat: bool, progress: ProgressReport = no_p
         if contour.shape[1] != 2:
             raise InputError(request.scan, "header", "x_mm,y_mm,z_mm", "x_mm,y_mm: a flat contour")
         return PlanSubject(request.scan.name, flat_wound(contour, height, request.scan), None)
-    ways = [request.outline, request.clicks, request.wound]
-    if sum(way is not None for way in ways) > 1:
+    sources = [request.outline, request.clicks, request.wound]
+    if sum(source is not None for source in sources) > 1:
         raise InputError(COMMAND_LINE, "--outline, --clicks, --wound", "more than one", "one that says where it is")
     drawn = None if request.outline is None else read_contour(request.outline)
-    clicks = None if request.clicks is None else clicks_of(request.clicks, "--clicks")
+    clicks = None if request.clicks is None else parse_clicks(request.clicks, "--clicks")
     raw = read_raw_mesh(request.scan)
     progress(1, SCAN_STEPS)
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)
@@ -384,8 +390,8 @@ def _outline(points: Array, vertices: Array) -> Array:
     """An outline (N, 3), mm, of points (N, 2 or 3); without z it is laid on the scan as seen along the scan's z."""
     if points.shape[1] == 3:
         return points
-    near = [int(np.argmin(np.sum((vertices[:, :2] - point) ** 2, axis=1))) for point in points]
-    return np.column_stack([points, vertices[near, 2]])
+    nearest = [int(np.argmin(np.sum((vertices[:, :2] - point) ** 2, axis=1))) for point in points]
+    return np.column_stack([points, vertices[nearest, 2]])
 
 
 def example_scan(kind: str) -> tuple[Array, Index]:

@@ -92,8 +92,8 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
     width, depth = high_x - low_x, high_y - low_y
     scale = min((PICTURE_WIDTH - 2 * PICTURE_MARGIN) / max(width, 1e-3), MAX_DRAWING_HEIGHT / max(depth, 1e-3))
     height = HEAD_HEIGHT + depth * scale + FOOT_HEIGHT + PICTURE_MARGIN
-    left = (PICTURE_WIDTH - width * scale) / 2
-    turn = f"matrix({scale:.5f} 0 0 {-scale:.5f} {left - low_x * scale:.3f} {HEAD_HEIGHT + high_y * scale:.3f})"
+    offset = (PICTURE_WIDTH - width * scale) / 2
+    transform = f"matrix({scale:.5f} 0 0 {-scale:.5f} {offset - low_x * scale:.3f} {HEAD_HEIGHT + high_y * scale:.3f})"
     travels = "".join(_line(np.stack([a.points[-1], b.points[0]])) for a, b in pairwise(layer.beads))
     shapes = [
         f'<path class="region" fill-rule="evenodd" d="{_areas(layer.region)}"/>',
@@ -104,19 +104,19 @@ def layer_svg(layer: PlannedLayer, figures: LayerFigures, bounds: tuple[float, f
         f'<path class="travel" d="{travels}"/>',
     ]
     ends = np.array([layer.beads[0].points[0], layer.beads[-1].points[-1]])
-    ends = ends * [scale, -scale] + [left - low_x * scale, HEAD_HEIGHT + high_y * scale]
+    ends = ends * [scale, -scale] + [offset - low_x * scale, HEAD_HEIGHT + high_y * scale]
     title = f"Layer {figures.number + 1}: {figures.tissue}, material {figures.material}"
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {PICTURE_WIDTH:g} {height:.0f}" role="img" '
         f'aria-label="{escape(title)}"><style>{PICTURE_STYLE}</style><rect class="page" width="100%" height="100%"/>'
-        f'<g transform="{turn}">{"".join(shapes)}</g>'
+        f'<g transform="{transform}">{"".join(shapes)}</g>'
         f'<rect class="end" x="{ends[1, 0] - 5:.1f}" y="{ends[1, 1] - 5:.1f}" width="10" height="10"/>'
         f'<circle class="start" cx="{ends[0, 0]:.1f}" cy="{ends[0, 1]:.1f}" r="6.5"/>'
         f"{_captions(title, layer, figures, scale, height)}</svg>"
     )
 
 
-def bounds_of(layers: Iterable[PlannedLayer]) -> tuple[float, float, float, float]:
+def layer_bounds(layers: Iterable[PlannedLayer]) -> tuple[float, float, float, float]:
     """Low and high corner, mm, of all layers' regions."""
     low_x, low_y, high_x, high_y = shapely.total_bounds([layer.region for layer in layers]).tolist()
     return low_x, low_y, high_x, high_y
@@ -128,7 +128,7 @@ def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: flo
         f"{len_text(figures.printed)} of bead in {figures.beads} runs, {len_text(figures.travelled)} of travel"
     )
     bar = round_step(60 / scale)
-    at = height - 16
+    baseline = height - 16
     keys = f"{bar:g} mm · beads at their true width · red: open · dashed: travel · green: start · black: end"
     keys += "" if layer.around.is_empty else " · brown: avoided bump"
     keys += " · white: no space for the tool" if layer.left_out else ""
@@ -136,8 +136,8 @@ def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: flo
     return (
         f'<text x="{PICTURE_MARGIN}" y="21" font-weight="600">{escape(title)}</text>'
         f'<text class="soft" x="{PICTURE_WIDTH - PICTURE_MARGIN}" y="21" text-anchor="end">{escape(facts)}</text>'
-        f'<path class="bar" d="M{PICTURE_MARGIN} {at - 4:.1f}v4h{bar * scale:.1f}v-4"/>'
-        f'<text class="soft" x="{PICTURE_MARGIN + bar * scale + 10:.1f}" y="{at:.1f}">{escape(keys)}</text>'
+        f'<path class="bar" d="M{PICTURE_MARGIN} {baseline - 4:.1f}v4h{bar * scale:.1f}v-4"/>'
+        f'<text class="soft" x="{PICTURE_MARGIN + bar * scale + 10:.1f}" y="{baseline:.1f}">{escape(keys)}</text>'
     )
 
 
@@ -209,10 +209,10 @@ def page_text(
     body.append(section("The beads", help_text, VIEW_CONTROLS + view))
     body.append(section("Layers", LAYER_TEXT, f'<div class="sideways">{_layer_table(layers, total)}</div>'))
     if pictures:
-        shown = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
+        cards = "".join(f'<div class="layer-picture">{picture}</div>' for picture in pictures)
         unrolled = "" if plan.order.mode == "horizontal" else " Layers are unwrapped: lengths are those on the skin."
         words = f"View from outside, the scan's x to the right.{unrolled}"
-        body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=shown)))
+        body.append(section("Each layer", words, LAYER_CHOOSER.format(count=len(pictures), pictures=cards)))
     body.append(section("The wound", "Measured in the scan.", figures_table(("", "value"), text.findings)))
     if text.repairs:
         rows = [(what, str(count)) for what, count in text.repairs]
@@ -335,19 +335,24 @@ def layers_text(numbers: list[int]) -> str:
 
 def tool_text(plan: Plan) -> str:
     """The clearance between tool and tissue as a text, with tilts and omitted beads."""
-    done = plan.clearance
-    if done is None:
+    clearance = plan.clearance
+    if clearance is None:
         return "clearance not checked without --arm ARM.toml"
-    turned = (
-        f", tilted by up to {np.rad2deg(done.most):.1f} degrees at {done.turned} checkpoints" if done.turned else ""
+    tilts = (
+        f", tilted by up to {np.rad2deg(clearance.most):.1f} degrees at {clearance.turned} checkpoints"
+        if clearance.turned
+        else ""
     )
-    text = f"{done.margin:.1f} mm or more from the tissue{turned}"
-    if not done.left_out:
+    text = f"{clearance.margin:.1f} mm or more from the tissue{tilts}"
+    if not clearance.left_out:
         return text
-    layers = layers_text(sorted({each.layer + 1 for each in done.left_out}))
-    length, worst = sum(each.length for each in done.left_out), max(done.left_out, key=lambda each: each.short)
+    layers = layers_text(sorted({each.layer + 1 for each in clearance.left_out}))
+    length, worst = (
+        sum(each.length for each in clearance.left_out),
+        max(clearance.left_out, key=lambda each: each.short),
+    )
     return (
-        f"{text}; {len_text(length)} of bead in {layers} omitted, {count_text(len(done.left_out), 'piece')}: "
+        f"{text}; {len_text(length)} of bead in {layers} omitted, {count_text(len(clearance.left_out), 'piece')}: "
         f"at any allowed tilt the {worst.part} is too near, upright by up to {worst.short:.1f} mm, such as at "
         f"{_place_text(worst.place)}"
     )
@@ -355,17 +360,22 @@ def tool_text(plan: Plan) -> str:
 
 def tool_facts(plan: Plan) -> dict[str, Any] | None:
     """The same as numbers; layers counted from 1, mm, degrees, scan frame."""
-    if (done := plan.clearance) is None:
+    if (clearance := plan.clearance) is None:
         return None
-    left = [
+    omitted = [
         {
             "layer": each.layer + 1, "length_mm": each.length, "place_mm": each.place.tolist(), "part": each.part,
             "short_mm": each.short,
         }
-        for each in done.left_out
+        for each in clearance.left_out
     ]  # fmt: skip
-    most = float(np.rad2deg(done.most))
-    return {"margin_mm": done.margin, "turned_checkpoints": done.turned, "most_deg": most, "left_out": left}
+    max_tilt = float(np.rad2deg(clearance.most))
+    return {
+        "margin_mm": clearance.margin,
+        "turned_checkpoints": clearance.turned,
+        "most_deg": max_tilt,
+        "left_out": omitted,
+    }
 
 
 def unscanned_text(beads: Unscanned) -> str:

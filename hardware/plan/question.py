@@ -41,7 +41,7 @@ CLICK_SCRIPT = """<script>(function () {
 })();</script>"""
 
 
-def seen_from_above(scan: Scan, where: object) -> HeightMap:
+def scan_heights_from_above(scan: Scan, where: object) -> HeightMap:
     """The heights of a scan over its mean plane, a picture's pixel apart or more."""
     axes = axes_along(mean_normal(scan.vertices, scan.triangles, where), np.eye(3)[0])
     return height_map(scan, se3.make(axes, scan.vertices.mean(axis=0)), PIXEL)
@@ -57,8 +57,8 @@ def picture_of(above: HeightMap, points: Array, colours: Colours | None) -> Colo
         image = np.repeat(shade[..., None], 3, axis=-1)
     else:
         nodes = points_on(above, above.grid.nodes.reshape(-1, 2))
-        _, near = cKDTree(points).query(nodes)
-        image = colours[near][:, ::-1].reshape(*above.grid.shape, 3).copy()
+        _, nearest = cKDTree(points).query(nodes)
+        image = colours[nearest][:, ::-1].reshape(*above.grid.shape, 3).copy()
     image[~above.known] = 255
     return np.ascontiguousarray(image[::-1])
 
@@ -70,7 +70,7 @@ def scan_colour(scan: Scan, points: Array, colours: Colours | None, where: objec
     from perception.wound.network import WoundNetwork, shipped_model
     from perception.wound.segmentation import NetworkSegmenter  # loads onnxruntime
 
-    above = seen_from_above(scan, where)
+    above = scan_heights_from_above(scan, where)
     network = WoundNetwork(shipped_model(), threads=1)
     mask = NetworkSegmenter(network, network.settings)(picture_of(above, points, colours)).mask[::-1]
     if not mask.any():
@@ -79,7 +79,7 @@ def scan_colour(scan: Scan, points: Array, colours: Colours | None, where: objec
     return ScanColour(points_on(above, above.grid.nodes[known]), mask[known].astype(float))
 
 
-def clicks_of(text: str, what: str) -> Array:
+def parse_clicks(text: str, what: str) -> Array:
     """Points (N, 3) mm of a text X,Y,Z/X,Y,Z/X,Y,Z with three places or more."""
     try:
         points = np.array([[float(word) for word in place.split(",")] for place in text.split("/")])
@@ -96,15 +96,15 @@ def write_question(
     file: Path, scan: Scan, points: Array, colours: Colours | None, question: WoundQuestionError
 ) -> None:
     """Write the page that asks which place is the wound."""
-    above = seen_from_above(scan, question.where)
+    above = scan_heights_from_above(scan, question.where)
     image = picture_of(above, points, colours)
     whole = _view(above, image, question.places, None, "scan-view")
     parts = [section("The scan from above", "Click three places on the wound's rim to name it by them.", whole)]
     parts[0] += f'<p><code id="scan-clicks">--clicks=...</code></p>{_click_data(above)}{CLICK_SCRIPT}'
     for number, place in enumerate(question.places, 1):
         colour = "" if np.isnan(place.colour) else f", {place.colour:.0%} of it coloured like a wound"
-        words = f"{place.area:.0f} mm², {place.depth:.1f} mm deep{colour}. It is this one: --wound {number}"
-        parts.append(section(f"Place {number}", words, _view(above, image, [place], place, f"place-{number}")))
+        caption = f"{place.area:.0f} mm², {place.depth:.1f} mm deep{colour}. It is this one: --wound {number}"
+        parts.append(section(f"Place {number}", caption, _view(above, image, [place], place, f"place-{number}")))
     title = "Which is the wound?"
     lead = "Nothing was planned: the wound is not clear. Say which place it is, and plan again."
     file.write_text(document("plan", title, lead, parts, str(question.where)), encoding="utf-8")
@@ -122,8 +122,8 @@ def _view(
 
     def pixels(place: WoundPlace) -> Array:
         flat = se3.transform_points(se3.inverse(above.surface_from_plane), place.outline)[:, :2]
-        at = (flat - above.grid.origin) / above.grid.step
-        return np.column_stack([at[:, 0], image.shape[0] - 1 - at[:, 1]])
+        nodes = (flat - above.grid.origin) / above.grid.step
+        return np.column_stack([nodes[:, 0], image.shape[0] - 1 - nodes[:, 1]])
 
     box = (0.0, 0.0, float(image.shape[1]), float(image.shape[0]))
     if zoom is not None:

@@ -25,10 +25,10 @@ from hardware.files.arm_file import read_arm
 from hardware.files.mesh_file import write_ply
 from hardware.files.path_file import gcode_text, write_path
 from hardware.offline.reach import read_jointed_arm, with_feasible
-from hardware.plan.order import Index, PlanFiles, PlanRequest, PlanSubject, check_out, order_of, subject_of, tool_of
+from hardware.plan.order import Index, PlanFiles, PlanRequest, PlanSubject, check_out, plan_order, subject_of, tool_of
 from hardware.plan.page import (
     ReportText,
-    bounds_of,
+    layer_bounds,
     layer_svg,
     layers_text,
     len_text,
@@ -85,7 +85,7 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     flat = request.scan is not None and request.scan.suffix.lower() == ".csv"
     if flat or request.example is not None:
         _check_scan_options(request)
-    order = replace(order_of(request.settings, flat), tool=tool_of(request))
+    order = replace(plan_order(request.settings, flat), tool=tool_of(request))
     if request.arm is not None:
         read_jointed_arm(request.arm)  # reports a wrong file before the long work
     damage = ""
@@ -113,10 +113,10 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     written = [request.out.name, *_tables(request, plan, subject, layers, total, arm)]
     if request.pictures:
         written += _pictures(request, plan, subject, layers, total, arm, moments)
-    placed = []
+    placement = []
     if request.session is not None:
-        placed = placement_lines(*scan_placement(request.session, PlanFiles(request.out).scan, plan.wound.rim))
-    return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placed]), damage
+        placement = placement_lines(*scan_placement(request.session, PlanFiles(request.out).scan, plan.wound.rim))
+    return "\n".join([_summary_text(plan, subject, total, request.out, written), arm, *placement]), damage
 
 
 def _check_scan_options(request: PlanRequest) -> None:
@@ -184,7 +184,7 @@ def _pictures(
     """Write a picture of each layer and the report; their names. moments: times (N,), s, of the checkpoints."""
     folder, report = PlanFiles(request.out).pictures, PlanFiles(request.out).report
     folder.mkdir(exist_ok=True)
-    bounds = bounds_of(plan.layers)
+    bounds = layer_bounds(plan.layers)
     pictures: list[str] = []
     with _progress("draw", "layers") as progress:
         for i, figures in enumerate(layers):
@@ -194,7 +194,7 @@ def _pictures(
             progress(i + 1, len(layers))
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("reachable checkpoints", arm), ("clearance of the tool", tool_text(plan))]
-    text = ReportText(subject.name, findings, repairs, request.settings.rows(), notes_of(plan))
+    text = ReportText(subject.name, findings, repairs, request.settings.rows(), plan_notes(plan))
     page = page_text(plan, layers, total, text, pictures, moments)
     write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
     return [f"{folder.name}/ ({len(pictures)} pictures)", report.name]
@@ -213,15 +213,15 @@ def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path,
     ]
     lines += [f"bumps: {bumps_text(plan)}"] if layers_with_bumps(plan) else []
     lines += [f"tool: {tool_text(plan)}"] if plan.clearance is not None and not plan.clearance.left_out else []
-    done = [] if subject.repairs is None else [f"{what} ({n})" for what, n in subject.repairs.rows()[2:] if n]
-    if done:
-        lines.append("scan: " + ", ".join(done))
-    lines += [f"note: {note}" for note in notes_of(plan)]
+    repairs = [] if subject.repairs is None else [f"{what} ({n})" for what, n in subject.repairs.rows()[2:] if n]
+    if repairs:
+        lines.append("scan: " + ", ".join(repairs))
+    lines += [f"note: {note}" for note in plan_notes(plan)]
     return "\n".join([*lines, f"in {out.parent}: {', '.join(written)}"])
 
 
-def _progress(what: str, unit: str) -> Progress:
-    return Progress(what, unit, WallClock().now)
+def _progress(task: str, unit: str) -> Progress:
+    return Progress(task, unit, WallClock().now)
 
 
 def findings_rows(plan: Plan) -> list[tuple[str, str]]:
@@ -249,7 +249,7 @@ def findings_rows(plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
-def notes_of(plan: Plan) -> list[str]:
+def plan_notes(plan: Plan) -> list[str]:
     """Notes to check before printing."""
     notes = list(plan.wound.findings.notes)
     if plan.clearance is not None and plan.clearance.left_out:
@@ -257,9 +257,9 @@ def notes_of(plan: Plan) -> list[str]:
     notes += [unscanned_text(each) for each in unscanned_beads(plan)]
     if plan.stack.missing:
         notes.append(f"not printed, because the wound is too shallow: {', '.join(plan.stack.missing)}")
-    off_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
-    if off_deg > MAX_TILT_OFF_NORMAL_DEG:
-        tilt = f"the tool is tilted up to {off_deg:.0f} degrees from the normal"
+    tilt_deg = max(np.rad2deg(t.departure) for t in (plan.ground.low, plan.ground.high))
+    if tilt_deg > MAX_TILT_OFF_NORMAL_DEG:
+        tilt = f"the tool is tilted up to {tilt_deg:.0f} degrees from the normal"
         notes.append(f"{tilt} on the steepest walls, because of its limits")
     empty = sum(not layer.beads for layer in plan.layers)
     if empty:
@@ -333,8 +333,8 @@ def scan_placement(session_path: Path, scan_file: Path, outline: Array) -> tuple
     """
     session, pose, placement, frames = register_in_session(session_path, scan_file, outline.mean(axis=0))
     if placement is None or pose is None or frames is None:
-        why = "no frame set in the session" if pose is None else pose.reason or pose.state.value
-        return f"not registered: {why}", []
+        reason = "no frame set in the session" if pose is None else pose.reason or pose.state.value
+        return f"not registered: {reason}", []
     return placement.verdict, _sightings(session.rig.cameras, frames, pose.base_from_surface, outline)
 
 

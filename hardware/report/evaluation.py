@@ -30,7 +30,7 @@ NEES_BOUND = 12.592  # chi-square of 6 degrees of freedom, 95 %
 CALIBRATED_NEES = (0.8, 1.25)  # of NEES/6: between them a covariance may be used as it is
 
 
-def calibration_words(nees: float) -> str:
+def consistency_text(nees: float) -> str:
     """What a mean NEES/6 says of the covariances."""
     low, high = CALIBRATED_NEES
     if low <= nees <= high:
@@ -114,10 +114,10 @@ def associate(stamps: Array, truth_stamps: Array) -> tuple[NDArray[np.int64], ND
 def compare(table: PoseTable, truth: Trajectory) -> Comparison | None:
     """The run's measured poses beside the truth; None where no measured pose has a true one beside it."""
     measured = np.flatnonzero(table.measured)
-    near, true_rows = associate(table.stamps[measured], truth.stamps)
-    if not len(near):
+    own_rows, true_rows = associate(table.stamps[measured], truth.stamps)
+    if not len(own_rows):
         return None
-    rows = measured[near]
+    rows = measured[own_rows]
     estimate, covariance = table.base_from_surface[rows], table.covariance[rows]
     expected = truth.base_from_surface[true_rows]
     changes = se3.inverse(expected) @ estimate  # (M, 4, 4)
@@ -173,9 +173,9 @@ def latency(table: PoseTable) -> Latency:
     percentiles = np.full((4, len(table.stages)), np.nan)
     if len(milliseconds):
         percentiles = np.percentile(milliseconds, [50, 95, 99, 100], axis=0)
-    spent = float(1000 * table.seconds[:first, -1].sum())
+    initial_ms = float(1000 * table.seconds[:first, -1].sum())
     p50, p95, p99, top = percentiles
-    return Latency(table.stages, p50, p95, p99, top, spent, first, milliseconds[:, -1])
+    return Latency(table.stages, p50, p95, p99, top, initial_ms, first, milliseconds[:, -1])
 
 
 def state_shares(table: PoseTable, since: float = -np.inf) -> dict[str, float]:
@@ -224,8 +224,8 @@ def measured_share(result: Evaluation) -> float:
 def verdict(result: Evaluation) -> list[str]:
     """The run in a few sentences."""
     counted = int(np.sum(result.table.stamps >= result.since - 1e-6))
-    followed = round(measured_share(result) * counted)
-    sentences = [f"The surface was tracked in {followed} of {counted} frame sets ({percent(measured_share(result))})."]
+    tracked = round(measured_share(result) * counted)
+    sentences = [f"The surface was tracked in {tracked} of {counted} frame sets ({percent(measured_share(result))})."]
     if not result.complete:
         sentences.insert(0, INCOMPLETE_TEXT)
     if result.damage:
@@ -256,11 +256,11 @@ def _clocks(table: PoseTable) -> str:
 
 def _judgement(comparison: Comparison) -> list[str]:
     error = spread(comparison.start.translation)
-    turn = math.degrees(spread(comparison.start.rotation).median)
+    rotation = math.degrees(spread(comparison.start.rotation).median)
     against = "exact truth" if comparison.exact else "measured reference"
-    sentences = [f"Error against the {against}: {figure(error.median)} mm and {figure(turn)}° (median)."]
-    many = {0: "No pose had", 1: "One pose had"}.get(len(comparison.off), f"{len(comparison.off)} poses had")
-    return [*sentences, f"{many} an error above {MAX_TRACKING_ERROR_MM:.0f} mm in state TRACKING."]
+    sentences = [f"Error against the {against}: {figure(error.median)} mm and {figure(rotation)}° (median)."]
+    subject = {0: "No pose had", 1: "One pose had"}.get(len(comparison.off), f"{len(comparison.off)} poses had")
+    return [*sentences, f"{subject} an error above {MAX_TRACKING_ERROR_MM:.0f} mm in state TRACKING."]
 
 
 def percent(share: float) -> str:
@@ -277,8 +277,8 @@ def figure(value: float) -> str:
 
 def as_dict(result: Evaluation) -> dict[str, Any]:
     """The summary as plain values, ready for JSON; a figure that does not exist is None."""
-    late = result.latency
-    percentiles = zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
+    timings = result.latency
+    percentiles = zip(timings.stages, timings.p50, timings.p95, timings.p99, timings.max, strict=True)
     summary: dict[str, Any] = {
         "session": result.title,
         "method": result.method,
@@ -290,8 +290,8 @@ def as_dict(result: Evaluation) -> dict[str, Any]:
         "measured_share": measured_share(result),
         "latency_ms": {name: {"p50": a, "p95": b, "p99": c, "max": d} for name, a, b, c, d in percentiles},
         "clocks_ms": None,
-        "initialisation_ms": late.initialisation,
-        "initialisation_frame_sets": late.initial_sets,
+        "initialisation_ms": timings.initialisation,
+        "initialisation_frame_sets": timings.initial_sets,
         "errors": None,
     }
     if clocks_learned(table := result.table):

@@ -56,20 +56,20 @@ def figures_table(head: Sequence[str], rows: Sequence[Sequence[str]], last_total
     return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
 
 
-def line_key(style: str, words: str) -> str:
+def line_key(style: str, text: str) -> str:
     """An entry of a legend: a line in a CSS class, and what it is."""
-    return f'<span><svg viewBox="0 0 18 10"><path class="{style}" d="M0 5H18"/></svg>{escape(words)}</span>'
+    return f'<span><svg viewBox="0 0 18 10"><path class="{style}" d="M0 5H18"/></svg>{escape(text)}</span>'
 
 
-def dot_key(style: str, words: str) -> str:
+def dot_key(style: str, text: str) -> str:
     """An entry of a legend: a dot in a CSS class, and what it is."""
-    return f'<span><svg viewBox="0 0 18 10"><circle class="{style}" cx="9" cy="5" r="4"/></svg>{escape(words)}</span>'
+    return f'<span><svg viewBox="0 0 18 10"><circle class="{style}" cx="9" cy="5" r="4"/></svg>{escape(text)}</span>'
 
 
-def area_key(style: str, words: str) -> str:
+def area_key(style: str, text: str) -> str:
     """An entry of a legend: a patch in a CSS class, and what it is."""
     patch = f'<svg viewBox="0 0 18 10"><rect class="{style}" width="18" height="10" rx="2"/></svg>'
-    return f"<span>{patch}{escape(words)}</span>"
+    return f"<span>{patch}{escape(text)}</span>"
 
 
 def legend(keys: Sequence[str]) -> str:
@@ -120,29 +120,29 @@ def round_step(rough: float) -> float:
     return next(k * power for k in (1.0, 2.0, 5.0, 10.0) if k * power >= rough * (1 - 1e-9))
 
 
-def spanning(values: Sequence[Array], margin: float = 0.06, least: float = 1e-3) -> tuple[float, float]:
+def spanning(values: Sequence[Array], margin: float = 0.06, min_span: float = 1e-3) -> tuple[float, float]:
     """Low and high that hold all finite `values` with a margin; a span under `least` is widened to it."""
     flat = np.concatenate([np.ravel(v) for v in values]) if values else np.empty(0)
     flat = flat[np.isfinite(flat)]
     if not len(flat):
         return 0.0, 1.0
     low, high = float(flat.min()), float(flat.max())
-    if high - low < least:
+    if high - low < min_span:
         middle = (low + high) / 2
-        low, high = middle - least / 2, middle + least / 2
+        low, high = middle - min_span / 2, middle + min_span / 2
     pad = margin * (high - low)
     return low - pad, high + pad
 
 
-def thinned(y: Array, most: int = MAX_LINE_POINTS) -> NDArray[np.int64]:
+def thinned(y: Array, max_count: int = MAX_LINE_POINTS) -> NDArray[np.int64]:
     """Rows (M,) of y (N,) that keep the look of a line: all, or the extremes of each of most / 2 stretches."""
-    if len(y) <= most:
+    if len(y) <= max_count:
         return np.arange(len(y))
-    kept: list[int] = []
-    for rows in np.array_split(np.arange(len(y)), most // 2):
+    selected: list[int] = []
+    for rows in np.array_split(np.arange(len(y)), max_count // 2):
         filled = np.where(np.isfinite(y[rows]), y[rows], 0.0)
-        kept += sorted({int(rows[filled.argmin()]), int(rows[filled.argmax()])})
-    return np.array(kept)
+        selected += sorted({int(rows[filled.argmin()]), int(rows[filled.argmax()])})
+    return np.array(selected)
 
 
 def stretches(usable: NDArray[np.bool_]) -> list[slice]:
@@ -186,13 +186,13 @@ class Plot:
     def _grid(self, x_ticks: bool) -> None:
         right = self.width - self.right
         for value in self.y.ticks(max(2, int((self._floor - self.top) / 22))):
-            at = self.y(np.array([value]))[0]
-            self._parts.append(f'<path class="grid" d="M{self.left} {at:.1f}H{right}"/>')
-            self._text(self.left - 8, at + 3.5, number(value), "end")
+            position = self.y(np.array([value]))[0]
+            self._parts.append(f'<path class="grid" d="M{self.left} {position:.1f}H{right}"/>')
+            self._text(self.left - 8, position + 3.5, number(value), "end")
         for value in self.x.ticks(9) if x_ticks else ():
-            at = self.x(np.array([value]))[0]
-            self._parts.append(f'<path class="grid" d="M{at:.1f} {self._floor}v4"/>')
-            self._text(at, self._floor + 17, number(value), "middle")
+            position = self.x(np.array([value]))[0]
+            self._parts.append(f'<path class="grid" d="M{position:.1f} {self._floor}v4"/>')
+            self._text(position, self._floor + 17, number(value), "middle")
 
     def line(self, x: Array, y: Array, style: str) -> None:
         """A line through (N,) points, broken where y is not finite; a lone point becomes a dot. style: a CSS class."""
@@ -215,9 +215,9 @@ class Plot:
         """The area between low and high (N,), broken where either is not finite."""
         for part in stretches(np.isfinite(low) & np.isfinite(high)):
             rows = thinned((high - low)[part])
-            there = self._points(x[part][rows], high[part][rows])
-            back = self._points(x[part][rows], low[part][rows])[::-1]
-            self._parts.append(f'<path class="{style}" d="M{"L".join(there + back)}Z"/>')
+            upper = self._points(x[part][rows], high[part][rows])
+            lower = self._points(x[part][rows], low[part][rows])[::-1]
+            self._parts.append(f'<path class="{style}" d="M{"L".join(upper + lower)}Z"/>')
 
     def dots(self, x: Array, y: Array, style: str, radius: float = 1.6) -> None:
         """A dot at each finite of (N,) points."""
@@ -244,17 +244,17 @@ class Plot:
 
     def mark(self, x: float, text: str, style: str) -> None:
         """A vertical line at x with a word beside it."""
-        at = float(self.x(np.array([x]))[0])
-        self._parts.append(f'<path class="{style}" d="M{at:.1f} {self.top}V{self._floor}"/>')
-        self._text(at, self.top - 5, text, "middle")
+        position = float(self.x(np.array([x]))[0])
+        self._parts.append(f'<path class="{style}" d="M{position:.1f} {self.top}V{self._floor}"/>')
+        self._text(position, self.top - 5, text, "middle")
 
     def level(self, y: float, text: str, style: str) -> None:
         """A horizontal line at y with a word at its right end, if y is inside."""
         if self.y.low <= y <= self.y.high:
-            at = float(self.y(np.array([y]))[0])
+            position = float(self.y(np.array([y]))[0])
             right = self.width - self.right
-            self._parts.append(f'<path class="{style}" d="M{self.left} {at:.1f}H{right}"/>')
-            self._text(right, at - 4, text, "end")
+            self._parts.append(f'<path class="{style}" d="M{self.left} {position:.1f}H{right}"/>')
+            self._text(right, position - 4, text, "end")
 
     def svg(self) -> str:
         """The chart as one SVG element."""
@@ -264,8 +264,8 @@ class Plot:
         return f'<svg class="plot" {box} role="img" aria-label="{label or NAMELESS}">{"".join(self._parts)}{name}</svg>'
 
     def _text(self, x: float, y: float, text: str, anchor: str) -> None:
-        at = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
-        self._parts.append(f'<text class="tick" {at}>{escape(text)}</text>')
+        attributes = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
+        self._parts.append(f'<text class="tick" {attributes}>{escape(text)}</text>')
 
     def _points(self, x: Array, y: Array) -> list[str]:
         return [f"{a:.1f} {b:.1f}" for a, b in zip(self.x(x), self.y(y), strict=True)]
@@ -302,9 +302,9 @@ def camera_pictures(pictures: Iterable[tuple[str, bytes]]) -> str:
     return f'<div class="pictures">{figures}</div>'
 
 
-def two_views(ways: Sequence[tuple[Array, str]]) -> str:
+def two_views(curves: Sequence[tuple[Array, str]]) -> str:
     """Ways (N, 3), mm, each with its class, from the side that shows their farthest place, and from above."""
-    every = np.concatenate([way for way, _ in ways])
+    every = np.concatenate([curve for curve, _ in curves])
     forward = every[np.argmax(np.hypot(every[:, 0], every[:, 1])), :2]
     forward = forward / max(float(np.hypot(*forward)), 1e-9)
     plots = []
@@ -319,8 +319,8 @@ def two_views(ways: Sequence[tuple[Array, str]]) -> str:
         high = half * tall / wide
         spans = (middle_x - half, middle_x + half), (middle_y - high, middle_y + high)
         plot = Plot(VIEW_WIDTH_PX, VIEW_HEIGHT_PX, *spans, label=label)
-        for way, style in ways:
-            across, up = axes @ way.T
+        for curve, style in curves:
+            across, up = axes @ curve.T
             plot.way(across, up, style)
             plot.dots(across, up, style, 3.5)
         plots.append(plot.svg())

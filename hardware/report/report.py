@@ -17,8 +17,8 @@ from hardware.report.evaluation import (
     NEES_BOUND,
     Comparison,
     Evaluation,
-    calibration_words,
     clocks_learned,
+    consistency_text,
     figure,
     measured_share,
     percent,
@@ -60,8 +60,8 @@ def _tiles(result: Evaluation) -> str:
         )
         tiles.append(page.tile(figure(spread(aligned.translation).rmse), "mm", "RMSE, aligned"))
     if len(result.latency.total):
-        late = result.latency
-        tiles.append(page.tile(f"{late.p50[-1]:.1f}", "ms", f"per pose; 99 % under {late.p99[-1]:.1f} ms"))
+        timings = result.latency
+        tiles.append(page.tile(f"{timings.p50[-1]:.1f}", "ms", f"per pose; 99 % under {timings.p99[-1]:.1f} ms"))
     return page.row_of_tiles(tiles)
 
 
@@ -74,8 +74,8 @@ def time_range(stamps: Array) -> tuple[float, float]:
 def _followed(result: Evaluation) -> tuple[float, float]:
     """First and last instant (s) from the first map on; of the whole run where there never was one."""
     stamps = result.table.stamps
-    later = stamps[~result.table.is_state(TrackState.INITIALISING)]
-    return time_range(later if len(later) else stamps)
+    tracked = stamps[~result.table.is_state(TrackState.INITIALISING)]
+    return time_range(tracked if len(tracked) else stamps)
 
 
 def _states(result: Evaluation) -> str:
@@ -102,23 +102,23 @@ def _events(result: Evaluation) -> str:
         f"<td class=words>{escape(table.reasons[i])}</td></tr>"
         for i in changes[:MAX_EVENT_ROWS]
     )
-    more = len(changes) - MAX_EVENT_ROWS
-    rest = f"<p>and {more} more, all in poses.csv</p>" if more > 0 else ""
+    hidden_count = len(changes) - MAX_EVENT_ROWS
+    rest = f"<p>and {hidden_count} more, all in poses.csv</p>" if hidden_count > 0 else ""
     return f"<details><summary>{len(changes)} states, with reasons</summary><table>{rows}</table>{rest}</details>"
 
 
 def components(poses: Array, origin: Array) -> Array:
     """(N, 6): x y z in base, mm, and the rotation vector against `origin` (4, 4), degrees."""
-    turns = se3.log_rotation(origin[:3, :3].T @ poses[:, :3, :3])
-    return np.concatenate([poses[:, :3, 3], np.degrees(turns)], axis=-1)
+    rotations = se3.log_rotation(origin[:3, :3].T @ poses[:, :3, :3])
+    return np.concatenate([poses[:, :3, 3], np.degrees(rotations)], axis=-1)
 
 
 def deviations(poses: Array, covariance: Array) -> Array:
     """(N, 6): one standard deviation of what `components` shows; rotations to first order."""
     rotations = poses[:, :3, :3]
     position = rotations @ covariance[:, 3:, 3:] @ np.swapaxes(rotations, -1, -2)
-    both = np.stack([position, covariance[:, :3, :3]], axis=1)  # (N, 2, 3, 3)
-    deviations = np.sqrt(np.maximum(np.diagonal(both, axis1=2, axis2=3), 0)).reshape(-1, 6)
+    blocks = np.stack([position, covariance[:, :3, :3]], axis=1)  # (N, 2, 3, 3)
+    deviations = np.sqrt(np.maximum(np.diagonal(blocks, axis1=2, axis2=3), 0)).reshape(-1, 6)
     return np.asarray(deviations * np.repeat([1, 180 / np.pi], 3))
 
 
@@ -164,10 +164,10 @@ def _motion(result: Evaluation) -> str:
     if len(onsets):
         plot.dots(onsets, np.zeros(len(onsets)), "off", 3)
     share = float(np.mean(table.moving[table.measured])) if table.measured.any() else float("nan")
-    still = "was never at rest" if share == 1 else f"moved in {100 * share:.0f} % of the measured frame sets"
-    began = {0: "no start of a movement was detected", 1: "one start of a movement was detected"}
+    motion_text = "was never at rest" if share == 1 else f"moved in {100 * share:.0f} % of the measured frame sets"
+    start_texts = {0: "no start of a movement was detected", 1: "one start of a movement was detected"}
     text = (
-        f"The surface {still}; {began.get(len(onsets), f'{len(onsets)} starts of movements were detected')}. "
+        f"The surface {motion_text}; {start_texts.get(len(onsets), f'{len(onsets)} movement starts were detected')}. "
         "A movement is 0.3 mm or 0.1°; a dot marks the first pose of each."
     )
     keys = [page.line_key("estimate", "middle of the surface, relative to its last place of rest")]
@@ -224,7 +224,7 @@ def _consistency(comparison: Comparison) -> str:
         f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}; expected: 95 %. "
     )
     if comparison.exact and math.isfinite(aligned.mean_nees):
-        text += f"Aligned, {calibration_words(aligned.mean_nees / 6)}. "
+        text += f"Aligned, {consistency_text(aligned.mean_nees / 6)}. "
     if not comparison.exact:
         text += "It is of little use here: it includes the error of the reference."
     return f'<p class="note">{escape(text)}</p>'
@@ -250,8 +250,8 @@ def _clocks(result: Evaluation) -> str:
     table = result.table
     if not clocks_learned(table):
         return ""
-    shown = np.where(table.is_state(TrackState.INITIALISING), np.nan, 1.0)
-    offsets, sigmas = 1000 * table.offsets * shown[:, None], 1000 * table.offset_sigmas
+    known = np.where(table.is_state(TrackState.INITIALISING), np.nan, 1.0)
+    offsets, sigmas = 1000 * table.offsets * known[:, None], 1000 * table.offset_sigmas
     limits, keys = page.spanning([offsets], 0.15, 2.0), []
     plot = page.Plot(PAGE_CHART_WIDTH, 150, _followed(result), limits, label="clock offset, ms")
     for i, name in enumerate(table.cameras):
@@ -269,29 +269,29 @@ def _clocks(result: Evaluation) -> str:
 
 
 def _latency(result: Evaluation) -> str:
-    late = result.latency
+    timings = result.latency
     text = (
         "From the decoded frames to the pose, without the map refinement, which runs in parallel. The first "
-        f"{late.initial_sets} frame sets, until the first map, took {late.initialisation:.0f} ms and are not counted."
+        f"{timings.initial_sets} frame sets, until the first map, took {timings.initialisation:.0f} ms; not counted."
     )
-    if not len(late.total):
+    if not len(timings.total):
         return page.section("Latency", text, "")
     rows = [
         [name, *(f"{v:.2f}" for v in values)]
-        for name, *values in zip(late.stages, late.p50, late.p95, late.p99, late.max, strict=True)
+        for name, *values in zip(timings.stages, timings.p50, timings.p95, timings.p99, timings.max, strict=True)
     ]
     figures = page.figures_table(["stage, ms", "median", "95 %", "99 %", "max"], rows, last_total=True)
-    high = max(float(np.percentile(late.total, 99.5)) * 1.25, 1.0)
-    counts, edges = np.histogram(np.minimum(late.total, high * (1 - 1e-9)), bins=40, range=(0, high))
+    high = max(float(np.percentile(timings.total, 99.5)) * 1.25, 1.0)
+    counts, edges = np.histogram(np.minimum(timings.total, high * (1 - 1e-9)), bins=40, range=(0, high))
     plot = page.Plot(HALF_CHART_WIDTH, 210, (0, high), (0, max(float(counts.max()) * 1.1, 1.0)))
     plot.bars(edges, counts.astype(float), "bar")
-    plot.mark(float(late.p50[-1]), "median", "median")
-    plot.mark(float(late.p99[-1]), "99 %", "median")
+    plot.mark(float(timings.p50[-1]), "median", "median")
+    plot.mark(float(timings.p99[-1]), "99 %", "median")
     caption = '<div class="caption">frame sets by total time, ms</div>'
     return page.section("Latency", text, f'<div class="two"><div>{figures}</div><div>{caption}{plot.svg()}</div></div>')
 
 
-def error_timeline(error: Array, held: Mask, width: float, limit: float) -> str:
+def error_timeline(error: Array, holds: Mask, width: float, limit: float) -> str:
     """The predicted error (N,), mm, NaN where nothing was extruded, in bins of `width` s, beside its limit, mm.
 
     held: (N,) bins in which the nozzle was held.
@@ -300,7 +300,7 @@ def error_timeline(error: Array, held: Mask, width: float, limit: float) -> str:
         return "<p>Nothing was extruded.</p>"
     stamps, end = np.asarray((np.arange(len(error)) + 0.5) * width, float), len(error) * width
     plot = page.Plot(900, 220, (0.0, end), page.spanning([error, np.array([0.0, limit])]), label="predicted error, mm")
-    runs = np.array([(run.start, run.stop) for run in page.stretches(held)], float).reshape(-1, 2) * width
+    runs = np.array([(run.start, run.stop) for run in page.stretches(holds)], float).reshape(-1, 2) * width
     plot.shade(runs[:, 0], runs[:, 1], "holding")
     plot.level(limit, "limit", "limit")
     plot.line(stamps, error, "estimate")
@@ -323,25 +323,27 @@ def bead_map(points: Array, extrude: Mask, errors: Array, limit: float) -> str:
     places = np.column_stack([points[:, 0] - low[0], high[1] - points[:, 1]]) * scale + 10
     stretch = (np.arange(len(points)) / max(len(points) - 1, 1) * len(errors)).astype(int)
     begin, end = np.minimum(np.append(0, stretch[:-1]), len(errors) - 1), np.minimum(stretch, len(errors) - 1)
-    of = np.array([np.fmax.reduce(errors[a : b + 1]) for a, b in zip(begin, end, strict=True)])
-    kind = np.where(np.isnan(of), 0, np.where(of <= GOOD_BEAD * limit, 1, np.where(of <= limit, 2, 3)))
+    bead_error = np.array([np.fmax.reduce(errors[a : b + 1]) for a, b in zip(begin, end, strict=True)])
+    kind = np.where(
+        np.isnan(bead_error), 0, np.where(bead_error <= GOOD_BEAD * limit, 1, np.where(bead_error <= limit, 2, 3))
+    )
     parts = []
     for number, colour in enumerate(BEAD_COLOURS):  # the worst on top, as layers lie over each other
-        ways = "".join(
+        segments = "".join(
             f"M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}"
-            for a, b, at, out in zip(places[:-1], places[1:], kind[1:], extrude[1:], strict=True)
-            if out and at == number
+            for a, b, cell, out in zip(places[:-1], places[1:], kind[1:], extrude[1:], strict=True)
+            if out and cell == number
         )
-        parts.append(f'<path style="fill:none;stroke:{colour};stroke-width:2;stroke-linecap:round" d="{ways}"/>')
+        parts.append(f'<path style="fill:none;stroke:{colour};stroke-width:2;stroke-linecap:round" d="{segments}"/>')
     keys = f"good: to {GOOD_BEAD * limit:g} mm", f"to the limit of {limit:g} mm", "beyond", "not printed by this run"
     colours = (*BEAD_COLOURS[1:], BEAD_COLOURS[0])
-    shown = [
-        f'<span><svg viewBox="0 0 18 10"><path style="stroke:{colour};stroke-width:3" d="M0 5H18"/></svg>{words}</span>'
-        for words, colour in zip(keys, colours, strict=True)
+    key_items = [
+        f'<span><svg viewBox="0 0 18 10"><path style="stroke:{colour};stroke-width:3" d="M0 5H18"/></svg>{text}</span>'
+        for text, colour in zip(keys, colours, strict=True)
     ]
     box = f'viewBox="0 0 {size[0]:.0f} {size[1]:.0f}" style="max-height:440px"'
     return (
-        page.legend(shown)
+        page.legend(key_items)
         + f'<svg class="plot" {box} role="img" aria-label="the beads from above">{"".join(parts)}</svg>'
     )
 
@@ -351,16 +353,16 @@ TRACK_HEIGHT = 420  # px
 
 def track_map(track: Array, path: Array, extrude: Mask) -> str:
     """A way (N, 3) mm, rows of NaN between its pieces, over the beads of a path (M, 3), from above, equal scales."""
-    both = np.concatenate([path, track[np.isfinite(track[:, 0])]])
-    low, high = both[:, :2].min(axis=0), both[:, :2].max(axis=0)
+    points = np.concatenate([path, track[np.isfinite(track[:, 0])]])
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     wide = PAGE_CHART_WIDTH - page.Plot.left - page.Plot.right
     tall = TRACK_HEIGHT - page.Plot.top - page.Plot.bottom
     scale = 1.06 * max((high[0] - low[0]) / wide, (high[1] - low[1]) / tall, 1e-3)
     x, y = ((m - scale * n / 2, m + scale * n / 2) for m, n in zip((low + high) / 2, (wide, tall), strict=True))
     plot = page.Plot(PAGE_CHART_WIDTH, TRACK_HEIGHT, x, y, label="from above, mm")
-    for way, style in ((np.where(_beads(extrude)[:, None], path, np.nan), "aside"), (track, "estimate")):
-        for part in page.stretches(np.isfinite(way[:, 0])):
-            plot.way(way[part, 0], way[part, 1], style)
+    for curve, style in ((np.where(_beads(extrude)[:, None], path, np.nan), "aside"), (track, "estimate")):
+        for part in page.stretches(np.isfinite(curve[:, 0])):
+            plot.way(curve[part, 0], curve[part, 1], style)
     keys = [page.line_key("estimate", "the nozzle"), page.line_key("aside", "the path's beads")]
     return page.legend(keys) + plot.svg()
 

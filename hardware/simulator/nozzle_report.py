@@ -111,7 +111,7 @@ def _png(kind: NDArray[np.uint8], thickness: Array) -> bytes:
     return data.tobytes()
 
 
-def way_picture(result: NozzleResult, width: float) -> str:
+def nozzle_path_picture(result: NozzleResult, width: float) -> str:
     """The planned path, dashed, and the printing tip's path, coloured by the error."""
     view = whole_map_view(result.deposit, width)
     plan = view.pixels(result.line.points)
@@ -128,8 +128,8 @@ def way_picture(result: NozzleResult, width: float) -> str:
     return view.svg("".join(lines), "path of the nozzle, coloured by its error")
 
 
-def way_legend() -> list[tuple[str, str]]:
-    """Class and words of each colour in `way_picture`."""
+def error_legend() -> list[tuple[str, str]]:
+    """Class and words of each colour in `nozzle_path_picture`."""
     lows = ("", *(f"{step:g}" for step in ERROR_STEPS))
     between = (f"{a} to {b:g} mm" for a, b in zip(lows[1:], ERROR_STEPS[1:], strict=False))
     words = [f"under {ERROR_STEPS[0]:g} mm", *between, f"over {ERROR_STEPS[-1]:g} mm"]
@@ -306,8 +306,8 @@ def _pictures(result: NozzleResult) -> str:
         for i, number in enumerate(deposit.layers[:MAX_LAYERS])
     )
     kinds = page.legend([page.area_key(kind.replace(" ", "-"), kind) for kind in CELL_KINDS])
-    colours = page.legend([page.line_key(*entry) for entry in (("plan", "planned"), *way_legend())])
-    both = f"<div>{maps}{kinds}</div><div>{way_picture(result, width)}{colours}</div>"
+    colours = page.legend([page.line_key(*entry) for entry in (("plan", "planned"), *error_legend())])
+    both = f"<div>{maps}{kinds}</div><div>{nozzle_path_picture(result, width)}{colours}</div>"
     text = (
         f"The surface from above, x to the right. Beads are {result.run.bead:g} mm wide, {f.area:.0f} mm² are planned: "
         f"{share(f.coverage)} are covered, {share(f.gaps)} are gaps (half a bead or more is missing), "

@@ -14,7 +14,7 @@ from estimation.se3 import Array
 from estimation.synthetic.follow import follow_steps
 from estimation.synthetic.world import arc_rig, synthetic_world
 from hardware.bench.figures import Figure, milliseconds, with_progress
-from hardware.bench.recordings import FRAME_RATE, WARM_UP_STEPS, made_recording, time_steps
+from hardware.bench.recordings import FRAME_RATE, WARM_UP_STEPS, rendered_recording, time_steps
 from hardware.process.clock import CpuClock
 from tests.campaigns.planner import carries
 
@@ -61,7 +61,7 @@ def axes_for(seconds: float) -> tuple[CostAxis, ...]:
         scale = (megapixels * 1e6 / (PICTURE_SIZE[0] * PICTURE_SIZE[1])) ** 0.5
         width, height = (8 * round(scale * n / 8) for n in PICTURE_SIZE)
         rig = arc_rig(size=(width, height), focal=scale * PICTURE_FOCAL)
-        return _two(time_steps(made_recording(GROWTH_RECORDING, seconds, rig))[0][:, 0])
+        return _two(time_steps(rendered_recording(GROWTH_RECORDING, seconds, rig))[0][:, 0])
 
     def late(minutes: float) -> tuple[float, float]:
         end = round(60 * minutes * FRAME_RATE)
