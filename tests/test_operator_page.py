@@ -201,7 +201,7 @@ def test_the_page_has_words_for_all_that_a_view_can_say(run: Run) -> None:
 def test_a_failed_check_says_what_to_do(run: Run) -> None:
     page = run.open()
     run.show(stage=RunStage.CHECK, offers=(Wish.AGAIN,))
-    assert "✗ mend" in page.text("#checks tr.fail") and "Switch it on." in page.text("#checks tr.fail")
+    assert "✗ fail" in page.text("#checks tr.fail") and "Switch it on." in page.text("#checks tr.fail")
     assert len(page.js('[...document.querySelectorAll("#checks tr")].map((r) => r.className)')) == 2
 
 

@@ -42,7 +42,7 @@ class Wish(StrEnum):
     AGAIN = "again"  # do this stage anew: check, or look for the wound
     START = "start"  # let the arm move: approach, then print
     PAUSE = "pause"  # hold above the surface, ready to go on
-    LOOK = "look"  # in a pause: step aside, and look at what was laid
+    LOOK = "look"  # in a pause: move aside, and inspect the print
     LIFT = "lift"  # after a stop: arm, and go up from the surface, as in a pause
     RESUME = "resume"  # go on printing where it left off
     STOP = "stop"  # come to rest now
@@ -50,8 +50,8 @@ class Wish(StrEnum):
     END = "end"  # end the run, and write its report
 
 
-WISH_WORDS = {  # on buttons, in messages, in the terminal and in the documents: one word for one thing
-    Wish.CONFIRM: "Yes, it lies right",
+WISH_WORDS = {  # on buttons, in messages, in the terminal and in the documents
+    Wish.CONFIRM: "Yes, the path is right",
     Wish.MOVE: "Move",
     Wish.OUTLINE: "Use this outline",
     Wish.AGAIN: "Look again",
@@ -76,7 +76,7 @@ WISH_KEYS = {  # in the terminal and on the page; Enter stops in the terminal on
     Wish.AGAIN: "a",
     Wish.END: "q",
 }
-CALMING_WISHES = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead towards rest: right whatever the window showed
+CALMING_WISHES = frozenset({Wish.STOP, Wish.PAUSE, Wish.END})  # lead to rest: accepted also from an old window
 ACTIVE_STAGES = (RunStage.APPROACH, RunStage.PRINT, RunStage.HOMING, RunStage.PAUSED)  # the arm may move, or is armed
 OVER_STAGES = (RunStage.DONE, RunStage.ENDED, RunStage.FAILED)  # nothing more will happen
 STAGE_OFFERS = {
@@ -92,19 +92,19 @@ STAGE_OFFERS = {
 }
 STAGE_QUESTIONS = {
     RunStage.CHECK: "Checking cameras, arm, path and recording",
-    RunStage.FIND: "Looking for the wound and laying the path on it",
-    RunStage.CONFIRM: "Does the path lie where it should be printed?",
+    RunStage.FIND: "Searching for the wound and placing the path",
+    RunStage.CONFIRM: "Is the path at the right place?",
     RunStage.READY: "Is nobody within the arm's reach? Then it may start",
-    RunStage.APPROACH: "The nozzle goes to where printing begins",
+    RunStage.APPROACH: "The nozzle moves to the start of the path",
     RunStage.PRINT: "Printing",
     RunStage.PAUSED: "Paused: resume, look at the print, go home, or finish",
     RunStage.STOPPED: "Stopped: resume, lift the nozzle, go home, or finish",
-    RunStage.HOMING: "The arm goes home",
+    RunStage.HOMING: "The arm moves to its home",
     RunStage.DONE: "The path is printed",
-    RunStage.ENDED: "The run was finished early; what is left can be resumed",
-    RunStage.FAILED: "The run cannot go on; what is left can be resumed",
+    RunStage.ENDED: "The run was finished early; the rest can be resumed",
+    RunStage.FAILED: "The run cannot go on; the rest can be resumed",
 }
-DRAW_QUESTION = "Click round what is to be followed, in two pictures or more"
+DRAW_QUESTION = "Mark the corners of the region to track, in two or more pictures"
 
 
 def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> str:

@@ -5,7 +5,7 @@ const GO = ["confirm", "start", "resume"]; // share the place in the middle
 const BEFORE = ["check", "find", "confirm", "ready"]; // the arm has moved
 const SURE = {
   start: "Let the arm move and print?", home: "Let the arm move to its home?", end: "Finish this run?",
-  resume: "Let the arm move again and go on?", lift: "Let the arm lift the nozzle off the surface?", look: "Let the nozzle step aside, so that the print is seen?",
+  resume: "Let the arm move again and go on?", lift: "Let the arm lift the nozzle off the surface?", look: "Move the nozzle aside to inspect the print?",
 };
 const UNTOUCHED = 700; // ms for which a button that has just come to mean something else is not pressed
 const PATIENCE = 1500; // ms until a request without an answer is spoken of
@@ -75,7 +75,7 @@ export class Buttons {
     document.getElementById("sure-no").focus();
   }
   accept() {
-    if (document.getElementById("sure-yes").disabled) return this.say("Nothing is heard from the run just now: answer again.", true);
+    if (document.getElementById("sure-yes").disabled) return this.say("No connection to the run at the moment: answer again.", true);
     const { wish, turn } = this.asking;
     this.drop();
     this.send(wish, turn);

@@ -48,7 +48,7 @@ function tell(seen, news) {
   const about = STAGES[seen.stage], blunt = seen.cameras.filter((each) => !each.words && each.sharpness !== null && each.sharpness < BLUNT);
   [document.body.dataset.stage, document.body.dataset.tone] = [seen.stage, about.tone];
   by("chip").textContent = about.word;
-  by("question").textContent = seen.draws ? "Click round what is to be followed, in two pictures or more." : about.say;
+  by("question").textContent = seen.draws ? "Mark the corners of the region to track, in two or more pictures." : about.say;
   const hints = blunt.map((each) => `${each.name} was sharper before: look at its focus`);
   if (seen.dropped) hints.push(`${seen.dropped} entries found no room on their way to the disk`);
   by("reason").textContent = upper(seen.words || hints[0] || "");

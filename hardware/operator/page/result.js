@@ -33,7 +33,7 @@ export class ResultView {
       [result.duty === null ? "–" : (100 * result.duty).toFixed(0), result.duty === null ? "" : "%", "duty cycle"],
       [duration(result.seconds), "", "since the approach"],
       ...(result.ink === null ? [] : [[result.ink.toFixed(result.ink < 10 ? 2 : 0), "mm³", "of ink"]]),
-      ...(result.begun ? [[`${((100 * result.begun) / result.total).toFixed(0)} %`, "", "where this run went on"]] : []),
+      ...(result.begun ? [[`${((100 * result.begun) / result.total).toFixed(0)} %`, "", "start of this run"]] : []),
     ];
     this.root.querySelector(".sums").replaceChildren(...tiles.map(([value, unit, words]) => {
       const box = made("div"), figures = made("b", value);

@@ -1,17 +1,17 @@
-// What things are called, and how figures are written.
+// Words of the page, and formats of figures.
 
 export const STAGES = {
-  check: { word: "Checking", tone: "wait", say: "Everything is checked before the arm may move." },
-  find: { word: "Looking", tone: "wait", say: "The wound is being looked for." },
-  confirm: { word: "Confirm", tone: "wait", say: "Does the path lie where it should in every picture?" },
+  check: { word: "Checking", tone: "wait", say: "All checks run before the arm may move." },
+  find: { word: "Searching", tone: "wait", say: "Searching for the wound." },
+  confirm: { word: "Confirm", tone: "wait", say: "Is the path at the right place in every picture?" },
   ready: { word: "Ready", tone: "wait", say: "Ready to print. The arm waits." },
-  approach: { word: "Approach", tone: "good", say: "The nozzle goes to the wound." }, // unless the nozzle does something else: DOES
+  approach: { word: "Approach", tone: "good", say: "The nozzle moves to the wound." }, // unless the nozzle does something else: DOES
   print: { word: "Printing", tone: "good", say: "The path is being printed." },
   paused: { word: "Paused", tone: "hold", say: "Paused. The arm stands and can go on." },
   stopped: { word: "Stopped", tone: "bad", say: "Stopped. Nothing is sent to the arm." },
-  homing: { word: "Going home", tone: "good", say: "The arm goes home." },
+  homing: { word: "Going home", tone: "good", say: "The arm moves to its home." },
   done: { word: "Done", tone: "good", say: "The path is printed." },
-  ended: { word: "Finished", tone: "wait", say: "The run was ended. The arm is at rest." },
+  ended: { word: "Finished", tone: "wait", say: "The run has ended. The arm is at rest." },
   failed: { word: "Failed", tone: "bad", say: "The run cannot go on. The arm is at rest." },
 };
 export const OVER = ["done", "ended", "failed"]; // stages after which nothing happens
@@ -33,12 +33,12 @@ export const ACTIVITIES = {
   homing: { word: "Going home", tone: "good" },
 };
 export const WISHES = {
-  confirm: "Yes, it lies right", move: "Move", outline: "Use this outline", again: "Look again", start: "Start", pause: "Pause", lift: "Lift", look: "Look at the print",
+  confirm: "Yes, the path is right", move: "Move", outline: "Use this outline", again: "Look again", start: "Start", pause: "Pause", lift: "Lift", look: "Look at the print",
   resume: "Resume", stop: "Stop", home: "Home", end: "Finish",
 };
 export const KEYS = { p: "pause", r: "resume", l: "lift", o: "look", h: "home", y: "confirm", s: "start", a: "again", q: "end" }; // the terminal's
 export const AGAIN = { check: "Check again", confirm: "No, look again" };
-export const VERDICTS = { pass: "✓ good", warn: "! look", fail: "✗ mend", busy: "… busy" };
+export const VERDICTS = { pass: "✓ good", warn: "! check", fail: "✗ fail", busy: "… busy" };
 
 export function figure(value, digits) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
@@ -52,7 +52,7 @@ export function duration(seconds) {
   if (h) return `${h} h ${m} min`;
   return m ? `${m} min${s ? ` ${s} s` : ""}` : `${s} s`;
 }
-/** Seconds about which little is known, to few digits. */
+/** An uncertain duration, s, rounded to few digits. */
 export function about(seconds) {
   const step = seconds < 60 ? 5 : seconds < 600 ? 10 : 60;
   return duration(Math.max(step * Math.round(seconds / step), step));
@@ -61,7 +61,7 @@ export function upper(words) {
   return words ? words[0].toUpperCase() + words.slice(1) : "";
 }
 
-/** Shows words for six seconds; refused: in the colour of what was not followed. */
+/** Shows words for six seconds; refused: in the colour of a refused request. */
 export function toast(words, refused) {
   const box = document.getElementById("toast");
   [box.textContent, box.hidden] = [words, false];
