@@ -62,8 +62,8 @@ def run_calibration(options: argparse.Namespace) -> list[Figure]:
 def true_rig(lenses: Array = TRUE_LENSES) -> Rig:
     """Three cameras about the board, the first one the base; lenses: (3, 9)."""
     centre = np.array([0.0, 0.0, BOARD_DISTANCE])
-    turns = se3.exp_rotation(np.radians(CAMERA_TURNS))
-    places = se3.make(turns, centre - turns @ centre)
+    rotations = se3.exp_rotation(np.radians(CAMERA_TURNS))
+    places = se3.make(rotations, centre - rotations @ centre)
     cameras = zip("abc", lenses, places, CAMERA_DELAYS, strict=True)
     return Rig(tuple(Camera(n, PICTURE_SIZE, matrix_of(k), k[4:].copy(), place, s) for n, k, place, s in cameras))
 
@@ -76,9 +76,11 @@ def swaying_board(seed: int, speed: float = 1.0) -> Callable[[Array], Array]:
     rates, phases = rates * speed, rng.uniform(0, 2 * np.pi, (6, 3))
 
     def motion(stamps: Array) -> Array:
-        way = (sizes * np.sin(2 * np.pi * rates * stamps[:, None, None] + phases)).sum(-1)  # (N, 6) rad and mm
-        turned = se3.make(se3.exp_rotation(way[:, :3]), np.array([0.0, 0.0, BOARD_DISTANCE]) + way[:, 3:])
-        return np.asarray(turned @ se3.make(np.eye(3), -BOARD.corners.mean(0)))
+        displacement = (sizes * np.sin(2 * np.pi * rates * stamps[:, None, None] + phases)).sum(-1)  # (N, 6) rad and mm
+        poses = se3.make(
+            se3.exp_rotation(displacement[:, :3]), np.array([0.0, 0.0, BOARD_DISTANCE]) + displacement[:, 3:]
+        )
+        return np.asarray(poses @ se3.make(np.eye(3), -BOARD.corners.mean(0)))
 
     return motion
 
@@ -106,10 +108,10 @@ def _rendered(instants: int) -> Iterator[Figure]:
         values, missing = [float("nan")] * len(RENDERED_FIGURES), str(error)
     pictures = f"{instants} frame sets at {BOARD_RATE:g} Hz, {BOARD}, blur {BLUR_PX:g} px, noise {GREY_NOISE:g}"
     for number, (value, (what, unit, target, note)) in enumerate(zip(values, RENDERED_FIGURES, strict=True)):
-        told = note if number else f"{pictures}; {note}"
+        note_text = note if number else f"{pictures}; {note}"
         if missing:
-            told = "not measured" if number else f"not measured: {missing}"
-        yield Figure(what, value, unit, target, "" if number else NO_REFERENCE, told)
+            note_text = "not measured" if number else f"not measured: {missing}"
+        yield Figure(what, value, unit, target, "" if number else NO_REFERENCE, note_text)
 
 
 def _rendered_values(rig: Rig, instants: int) -> list[float]:
@@ -146,9 +148,9 @@ def _corner_table(rig: Rig, instants: int) -> CornerTable:
                 detected.append(corners)
     cameras, numbers, stamps = (np.array(column) for column in zip(*rows, strict=True))
     sigma, blur, marker = (np.array([getattr(c, name) for c in detected]) for name in ("sigma", "blur", "marker"))
-    looked, strangers = np.full(len(rig), instants), empty_table(BOARD, len(rig)).strangers
+    picture_counts, strangers = np.full(len(rig), instants), empty_table(BOARD, len(rig)).strangers
     pixels = np.stack([c.pixels for c in detected])
-    return CornerTable(cameras, numbers, stamps, pixels, sigma, blur, marker, looked, strangers, instants)
+    return CornerTable(cameras, numbers, stamps, pixels, sigma, blur, marker, picture_counts, strangers, instants)
 
 
 def _errors(calibration: Calibration, rig: Rig) -> Array:
@@ -228,8 +230,8 @@ def sightings_of(
     stamp = np.tile(stamps, len(rig)) + 0.003 * camera
     pixels = predict(state, set_point, kinematics, rig, stamp, camera).pixels
     pixels = pixels + noise * rng.normal(size=pixels.shape)
-    wrong = rng.random(len(stamp)) < outliers
-    pixels[wrong] += 40 * rng.normal(size=(int(wrong.sum()), 2))
+    outlier = rng.random(len(stamp)) < outliers
+    pixels[outlier] += 40 * rng.normal(size=(int(outlier.sum()), 2))
     sigma = np.full(len(stamp), max(noise, 1e-3))
     return Sightings(stamp, camera, pixels, sigma, set_point.places(stamp, REST_AFTER))
 
@@ -262,10 +264,10 @@ def _rendered_arm(seed: int) -> Iterator[Figure]:
     middle = solution.places.mean(0)
     change = fit.state.base_from_arm @ se3.inverse(true.base_from_arm)
     shift = float(np.linalg.norm(np.asarray(se3.transform_points(change, middle[None])[0] - middle)))
-    where = "base_from_camera in the arm's frame, in the middle of the places"
-    yield Figure(f"{where}, arm {seed}", shift, "mm", at_most(0.05), NO_REFERENCE, note)
-    turn = float(np.degrees(np.linalg.norm(error[:3])))
-    yield Figure(f"base_from_camera in the arm's frame, arm {seed}", turn, "degrees", at_most(0.02))
+    frame_text = "base_from_camera in the arm's frame, in the middle of the places"
+    yield Figure(f"{frame_text}, arm {seed}", shift, "mm", at_most(0.05), NO_REFERENCE, note)
+    rotation_error = float(np.degrees(np.linalg.norm(error[:3])))
+    yield Figure(f"base_from_camera in the arm's frame, arm {seed}", rotation_error, "degrees", at_most(0.02))
     at_rest = tips.sightings.stamp[tips.sightings.place >= 0]
     poses = kinematics_of(solution.profile.arm)(solution.set_point.lagged(at_rest, 0.0, 0.0))
     tip = _tip_error(fit.state, true, poses)

@@ -168,8 +168,10 @@ def table_text(figures: Sequence[Figure]) -> str:
     for f in figures:
         target = "" if f.target is None else str(f.target)
         rows.append((f.what, digits(f.value), f.unit, target, f.verdict, f.reference, f.note))
-    shown = [i for i in range(len(TABLE_HEADER)) if any(row[i] for row in rows[1:])]
-    text = aligned([[row[i] for i in shown] for row in rows], [shown.index(1)] if 1 in shown else [])
+    used_columns = [i for i in range(len(TABLE_HEADER)) if any(row[i] for row in rows[1:])]
+    text = aligned(
+        [[row[i] for i in used_columns] for row in rows], [used_columns.index(1)] if 1 in used_columns else []
+    )
     verdicts = [figure.verdict for figure in figures if figure.target is not None]
     return f"{text}\n\n{verdicts.count('met')} of {len(verdicts)} targets met"
 
@@ -241,12 +243,12 @@ def relative_nees(errors: Array, covariance: Array) -> float:
     return float(errors @ np.linalg.solve(covariance, errors)) / len(errors)
 
 
-def with_progress(what: str, unit: str, items: Iterable[Item], count: int) -> Iterator[Item]:
+def with_progress(task: str, unit: str, items: Iterable[Item], count: int) -> Iterator[Item]:
     """The items one by one; stderr shows how many of `count` are done."""
-    with Progress(what, unit, WallClock().now) as progress:
-        for done, item in enumerate(items, 1):
+    with Progress(task, unit, WallClock().now) as progress:
+        for finished, item in enumerate(items, 1):
             yield item
-            progress(done, count)
+            progress(finished, count)
 
 
 @contextmanager
@@ -281,11 +283,11 @@ def memory_growth(memory: Sequence[tuple[float, dict[str, float]]]) -> dict[str,
     settled = [each for each in memory if each[0] > memory[0][0] + MEMORY_WARM_UP]
     stamps = np.array([stamp for stamp, _ in settled])
     if len(settled) < 6 or stamps[-1] < stamps[0] + MEMORY_SPAN:
-        return {name: (np.nan, held) for name, held in memory[-1][1].items()} if memory else {}
+        return {name: (np.nan, megabytes) for name, megabytes in memory[-1][1].items()} if memory else {}
     growth = {}
     for name in settled[-1][1]:
-        held = np.array([each.get(name, np.nan) for _, each in settled])
-        there = np.isfinite(held)
-        slope = np.polyfit(stamps[there] - stamps[0], held[there], 1)[0] if there.sum() > 5 else np.nan
-        growth[name] = float(3600 * slope), float(held[-1])
+        megabytes = np.array([each.get(name, np.nan) for _, each in settled])
+        known = np.isfinite(megabytes)
+        slope = np.polyfit(stamps[known] - stamps[0], megabytes[known], 1)[0] if known.sum() > 5 else np.nan
+        growth[name] = float(3600 * slope), float(megabytes[-1])
     return growth

@@ -85,29 +85,32 @@ def run_link(options: argparse.Namespace) -> list[Figure]:
     calm, halted, rough = parts
     name = f"real time {seconds / 60:.3g} min"
     arms = [arm for part in parts for arm in part.arms]
-    obeying = calm.arms + halted.arms
+    healthy_arms = calm.arms + halted.arms
     load, report = np.mean([*calm.load, *halted.load, *rough.load] or [NOT_MEASURED]), calm.report
-    priority, late, skipped = "", NOT_LATE, 0
+    priority, lateness, skipped = "", NOT_LATE, 0
     if report is not None:
-        priority, late, skipped = report.priority, _lateness(report), report.skipped
+        priority, lateness, skipped = report.priority, _lateness(report), report.skipped
     machine = f"{priority}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
     stops, orders = calm.stops + halted.stops + rough.stops, calm.orders + rough.orders
     note = f"{halted.halts} halts up to 600 ms, {len(halted.arms) - 1} returns of the device"
-    decided, moving = f"{name}: stop on the wire after its decision, 99 %", sum(p.arms[-1].left > 0 for p in parts[:2])
+    stop_name, moving = (
+        f"{name}: stop on the wire after its decision, 99 %",
+        sum(p.arms[-1].left > 0 for p in parts[:2]),
+    )
     return [
         Figure(f"{name}: ticks a second", calm.rate, "Hz", at_least(49.5), "thesis 30", machine),
-        Figure(f"{name}: tick late, median", 1000 * late.median, "ms"),
-        Figure(f"{name}: tick late, 99 %", 1000 * late.p99, "ms", at_most(3), "8 in a process, 72 in a thread"),
-        Figure(f"{name}: tick late, largest", 1000 * late.largest, "ms", note=f"{skipped} ticks were skipped"),
-        Figure(decided, milliseconds(stops, 99), "ms", at_most(10), note=f"{len(stops)} stops"),
+        Figure(f"{name}: tick late, median", 1000 * lateness.median, "ms"),
+        Figure(f"{name}: tick late, 99 %", 1000 * lateness.p99, "ms", at_most(3), "8 in a process, 72 in a thread"),
+        Figure(f"{name}: tick late, largest", 1000 * lateness.largest, "ms", note=f"{skipped} ticks were skipped"),
+        Figure(stop_name, milliseconds(stops, 99), "ms", at_most(10), note=f"{len(stops)} stops"),
         Figure(f"{name}: stop on the wire after the order, 99 %", milliseconds(orders, 99), "ms",
                note="from another process"),
         Figure(f"{name}: most under way, by the model", 1000 * max(p.flight for p in parts), "ms", at_most(50)),
-        Figure(f"{name}: most queued in the arm", _queued(obeying), "ms", at_most(50), "", note),
+        Figure(f"{name}: most queued in the arm", _queued(healthy_arms), "ms", at_most(50), "", note),
         Figure(f"{name}: most queued, the arm stalls and loses frames", _queued(rough.arms), "ms"),
         Figure(f"{name}: commands that found the queue full", sum(a.ignored for a in arms), "", at_most(0)),
         Figure(f"{name}: bytes in no frame", sum(a.garbage for a in calm.arms), "", at_most(0), "", "calm part"),
-        Figure(f"{name}: frames that the arm refused", sum(a.refused for a in obeying), "", at_most(0)),
+        Figure(f"{name}: frames that the arm refused", sum(a.refused for a in healthy_arms), "", at_most(0)),
         Figure(f"{name}: arms not at rest once the motion has ended", moving, "", at_most(0), "", "of 2"),
         Figure(f"{name}: frames taken", sum(a.frames for a in arms)),
     ]  # fmt: skip
@@ -129,8 +132,8 @@ def run_part(seconds: float, seed: int, busy: int, part: str) -> LivePart:
             run.sender.put(prepared.rig)
             run.order(BeginPrint(prepared.task.path, prepared.task.profile, 0.0, {}, ""))
             _wait(lambda: run.motion.get() is not None)
-            begun = device = clock.now()
-            while (now := clock.now()) < begun + seconds:
+            start = device = clock.now()
+            while (now := clock.now()) < start + seconds:
                 operator.act(run.motion.get(), now)
                 if part == HALTED_PART and now > device + DEVICE_SPAN:
                     run.processes.end("arm", 0.0)

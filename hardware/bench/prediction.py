@@ -63,7 +63,7 @@ def plain_forecasts(values: Array, step: float, ahead: tuple[int, ...]) -> Array
     """Increments (H, T, C) expected of values (T, C), mm, `step` s apart, over each of H numbers of samples ahead."""
     longest = [max(2, round(lag / step)) for lag in LONGEST_LAGS]
     lags = [sorted({round(x) for x in np.geomspace(1, lag, min(lag, MAX_LAGS))}) for lag in longest]  # in samples
-    experts = [_autoregression(values, some, keep, ahead) for some in lags for keep in FORGETTING_FACTORS]
+    experts = [_autoregression(values, expert_lags, keep, ahead) for expert_lags in lags for keep in FORGETTING_FACTORS]
     velocity = np.concatenate([np.zeros_like(values[:1]), np.diff(values, axis=0)])
     steady = np.asarray(ahead)[:, None, None] * velocity
     return _weighted(values, np.stack([*experts, np.zeros_like(steady), steady]), ahead)
@@ -81,12 +81,12 @@ def _autoregression(values: Array, lags: list[int], keep: float, ahead: tuple[in
     increments = np.zeros((len(ahead), count, width))
     for t in range(first, count):
         if t - delay >= first:
-            then = t - delay
-            x, truth = inputs[then], np.stack([values[then + h] - values[then] for h in ahead], -1)  # (C, L), (C, H)
-            pull = (gain @ x[..., None])[..., 0]
-            share = pull / (keep + (x * pull).sum(1))[:, None]
+            past = t - delay
+            x, truth = inputs[past], np.stack([values[past + h] - values[past] for h in ahead], -1)  # (C, L), (C, H)
+            innovation_gain = (gain @ x[..., None])[..., 0]
+            share = innovation_gain / (keep + (x * innovation_gain).sum(1))[:, None]
             slopes += share[..., None] * (truth - (x[:, None] @ slopes)[:, 0])[:, None]
-            gain = (gain - share[..., None] * pull[:, None]) / keep
+            gain = (gain - share[..., None] * innovation_gain[:, None]) / keep
         increments[:, t] = (inputs[t][:, None] @ slopes)[:, 0].T
     return increments
 
@@ -95,12 +95,14 @@ def _weighted(values: Array, experts: Array, ahead: tuple[int, ...]) -> Array:
     """Experts' increments (E, H, T, C) combined (H, T, C) by exponential weights of their errors so far."""
     combined = np.zeros(experts.shape[1:])
     for k, h in enumerate(ahead):
-        square = np.zeros((len(experts), values.shape[1]))
+        squared_errors = np.zeros((len(experts), values.shape[1]))
         for t in range(values.shape[0]):
             if t >= h:
-                square += ((experts[:, k, t - h] - (values[t] - values[t - h])) ** 2 - square) / ERROR_MEMORY
-            best = square.min(0)
-            weights = np.exp(-WEIGHT_SHARPNESS * (square - best) / np.maximum(best, 1e-9))
+                squared_errors += (
+                    (experts[:, k, t - h] - (values[t] - values[t - h])) ** 2 - squared_errors
+                ) / ERROR_MEMORY
+            best = squared_errors.min(0)
+            weights = np.exp(-WEIGHT_SHARPNESS * (squared_errors - best) / np.maximum(best, 1e-9))
             combined[k, t] = (weights / weights.sum(0) * experts[:, k, t]).sum(0)
     return combined
 
@@ -220,15 +222,15 @@ def _predicted(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:
 
 def _marker_points(file: Path, trace: Trajectory) -> Array:
     """Where the markers beside a trace (NAME_markers.csv) sit on the surface (P, 3), mm; else points about it."""
-    beside = file.with_name(f"{file.stem}_markers.csv")
-    if not beside.is_file():
+    marker_file = file.with_name(f"{file.stem}_markers.csv")
+    if not marker_file.is_file():
         return POINTS_AROUND
-    with beside.open(newline="", encoding="utf-8") as stream:
+    with marker_file.open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     names = [c.removesuffix("_x_mm") for c in rows[0] if c.endswith("_x_mm")]
     markers = np.array([[[float(row[f"{n}_{a}_mm"]) for a in "xyz"] for n in names] for row in rows])
     if len(markers) != len(trace.stamps):
-        raise InputError(beside, "rows", len(markers), f"{len(trace.stamps)}, as many as poses")
+        raise InputError(marker_file, "rows", len(markers), f"{len(trace.stamps)}, as many as poses")
     inverse = se3.inverse(trace.base_from_surface)
     return np.asarray(se3.transform_points(inverse, markers - markers.mean((0, 1))).mean(0))
 
@@ -238,9 +240,9 @@ def prediction_figures(traces: list[TraceErrors], shares: Sequence[float | None]
     methods = [np.mean(errors, axis=0).tolist() for errors in columns(traces, "hold", "steady", "plain", "ours")]
     rows = []
     for ahead, share, hold, steady, plain, ours in zip(PREDICTION_HORIZONS, shares, *methods, strict=True):
-        others = f"constant velocity {steady / hold:.3f}, plain ensemble {plain / hold:.3f}"
+        references = f"constant velocity {steady / hold:.3f}, plain ensemble {plain / hold:.3f}"
         name, target = f"{1000 * ahead:.0f} ms", None if share is None else at_most(share)
-        rows.append(Figure(f"{name}: error by hold's", ours / hold, "", target, others, f"hold {hold:.3f} mm"))
+        rows.append(Figure(f"{name}: error by hold's", ours / hold, "", target, references, f"hold {hold:.3f} mm"))
         rows.append(Figure(f"{name}: error by the plain ensemble's", ours / plain, "", at_most(ENSEMBLE_TARGET)))
     for trace in traces:
         for k, ahead in enumerate(PREDICTION_HORIZONS):

@@ -139,8 +139,8 @@ def _compare_methods(recording: Recording, methods: tuple[str, ...]) -> list[Met
                 start, cost = now(), processor()
                 pose = step(frames)
                 costs[method].append(processor() - cost)
-                spent = now() - start
-                writers[method].write(pose, len(frames.frames), step.last, spent)
+                duration = now() - start
+                writers[method].write(pose, len(frames.frames), step.last, duration)
                 step.idle()
         return [_method_result(recording, Path(folder) / m / "poses.csv", m, costs[m]) for m in methods]
 
@@ -148,25 +148,27 @@ def _compare_methods(recording: Recording, methods: tuple[str, ...]) -> list[Met
 def _method_result(recording: Recording, file: Path, method: str, costs: list[float]) -> MethodResult:
     since = min((roi.stamp for roi in recording.roi), default=-np.inf)
     result = evaluate(read_poses(file), recording.truth, recording.name, since, method=method)
-    later, place, turn = costs[result.latency.initial_sets :], math.nan, math.nan
+    later, position_error, rotation_error = costs[result.latency.initial_sets :], math.nan, math.nan
     if result.comparison is not None:
         start = result.comparison.start
-        place, turn = spread(start.translation).rmse, float(np.degrees(spread(start.rotation).rmse))
-    return MethodResult(result, place, turn, 1000 * float(np.median(later)) if later else math.nan)
+        position_error, rotation_error = spread(start.translation).rmse, float(np.degrees(spread(start.rotation).rmse))
+    return MethodResult(result, position_error, rotation_error, 1000 * float(np.median(later)) if later else math.nan)
 
 
-def _figures(name: str, ours: MethodResult, theirs: MethodResult) -> list[Figure]:
+def _figures(name: str, ours: MethodResult, reference_result: MethodResult) -> list[Figure]:
     """Ours, the thesis's and how many times ours is smaller, with the least ratio where one is a target."""
-    label, figures = theirs.run.method, list[Figure]()
-    shares = f"measured: {label} {percent(measured_share(theirs.run))}, ours {percent(measured_share(ours.run))}"
+    label, figures = reference_result.run.method, list[Figure]()
+    shares = (
+        f"measured: {label} {percent(measured_share(reference_result.run))}, ours {percent(measured_share(ours.run))}"
+    )
     accuracy, speed = at_least(MIN_ACCURACY_RATIO), at_least(MIN_SPEED_RATIO)
-    late, their_late = ours.run.latency, theirs.run.latency
+    latency, reference_latency = ours.run.latency, reference_result.run.latency
     for what, unit, own, other, reference, target, note in (
-        ("error", "mm RMSE", ours.millimetres, theirs.millimetres, REFERENCE_MM, accuracy, ""),
-        ("turn", "deg RMSE", ours.degrees, theirs.degrees, "", accuracy, shares),
-        ("pose after", "ms, median", late.p50[-1], their_late.p50[-1], REFERENCE_MS, speed, ""),
-        ("pose after, 99 %", "ms", late.p99[-1], their_late.p99[-1], "", None, ""),
-        ("processor", "ms, median", ours.processor, theirs.processor, "", None, ""),
+        ("error", "mm RMSE", ours.millimetres, reference_result.millimetres, REFERENCE_MM, accuracy, ""),
+        ("turn", "deg RMSE", ours.degrees, reference_result.degrees, "", accuracy, shares),
+        ("pose after", "ms, median", latency.p50[-1], reference_latency.p50[-1], REFERENCE_MS, speed, ""),
+        ("pose after, 99 %", "ms", latency.p99[-1], reference_latency.p99[-1], "", None, ""),
+        ("processor", "ms, median", ours.processor, reference_result.processor, "", None, ""),
     ):
         ratio = float(other) / float(own) if own > 0 else math.nan
         figures += [
@@ -201,11 +203,11 @@ def time_steps(recording: Recording) -> tuple[Array, Array]:
             frames = unpacked_set(each)
             start, cost = now(), processor()
             pose = step(frames)
-            cost, spent = processor() - cost, now() - start
+            cost, duration = processor() - cost, now() - start
             step.idle()
             initialised += pose.state is not TrackState.INITIALISING
             if initialised > WARM_UP_STEPS:
-                rows.append([spent, *step.last.seconds])
+                rows.append([duration, *step.last.seconds])
                 costs.append(cost)
     return np.array(rows).reshape(-1, 1 + len(STAGES)), np.array(costs)
 
@@ -258,23 +260,32 @@ def beside_figures(
     tracked = np.cumsum([pose.state is not TrackState.INITIALISING for pose in without]) > WARM_UP_STEPS
     if not tracked.any():
         return [Figure(f"{name}: pose after", math.nan, "ms", note="no surface was followed for long enough")]
-    both, figures = list(zip(without, along, strict=True)), list[Figure]()
-    lost = sum(a.state.measured and not b.state.measured for a, b in both)
-    other = sum(pose_bytes(a) != pose_bytes(b) for a, b in both)
+    pairs, figures = list(zip(without, along, strict=True)), list[Figure]()
+    lost_count = sum(a.state.measured and not b.state.measured for a, b in pairs)
+    different_count = sum(pose_bytes(a) != pose_bytes(b) for a, b in pairs)
     for word, share in (("median", 50), ("99 %", 99)):
-        alone, beside, handed = (milliseconds(seconds[tracked], share) for seconds in spent)
+        plain_ms, loaded_ms, handover_ms = (milliseconds(seconds[tracked], share) for seconds in spent)
         figures += [
-            Figure(f"{name}: pose after, without the network, {word}", alone, "ms", None, "", f"{tracked.sum()} each"),
-            Figure(f"{name}: pose after, with it, {word}", beside, "ms"),
-            Figure(f"{name}: with / without, {word}", beside / alone, "times"),
-            Figure(f"{name}: pictures handed over, after the pose, {word}", handed, "ms"),
+            Figure(
+                f"{name}: pose after, without the network, {word}", plain_ms, "ms", None, "", f"{tracked.sum()} each"
+            ),
+            Figure(f"{name}: pose after, with it, {word}", loaded_ms, "ms"),
+            Figure(f"{name}: with / without, {word}", loaded_ms / plain_ms, "times"),
+            Figure(f"{name}: pictures handed over, after the pose, {word}", handover_ms, "ms"),
         ]
-    late = [int((seconds[tracked] > 1 / FRAME_RATE).sum()) for seconds in spent[:2]]
+    late_counts = [int((seconds[tracked] > 1 / FRAME_RATE).sum()) for seconds in spent[:2]]
     return [
         *figures,
-        Figure(f"{name}: poses later than the next pictures", late[1], "", None, "", f"without the network {late[0]}"),
-        Figure(f"{name}: poses lost with the network alone", lost, "", at_most(0), "", f"of {len(both)}"),
-        Figure(f"{name}: poses that differ in a bit", other, "", at_most(0), "", f"of {len(both)}"),
+        Figure(
+            f"{name}: poses later than the next pictures",
+            late_counts[1],
+            "",
+            None,
+            "",
+            f"without the network {late_counts[0]}",
+        ),
+        Figure(f"{name}: poses lost with the network alone", lost_count, "", at_most(0), "", f"of {len(pairs)}"),
+        Figure(f"{name}: poses that differ in a bit", different_count, "", at_most(0), "", f"of {len(pairs)}"),
     ]
 
 

@@ -39,8 +39,8 @@ def whole_page(
     command: str, parts: Parts, troubles: Mapping[str, str], pages: Mapping[str, str], machine: Machine
 ) -> str:
     """An HTML page with a card for each part. troubles: why a part has no figures. pages: of parts that drew one."""
-    judged, missed, plain = target_counts(parts)
-    counts = [(judged - missed, f"of {judged}", "targets met"), (missed, "", "missed")]
+    with_target, missed, plain = target_counts(parts)
+    counts = [(with_target - missed, f"of {with_target}", "targets met"), (missed, "", "missed")]
     counts += [(plain, "", "figures without a target"), (len(troubles), "", "parts that could not be measured")]
     tiles = [tile(str(count), unit, caption) for count, unit, caption in counts]
     versions = ", ".join(f"{name} {number}" for name, number in machine.versions.items() if number)
@@ -70,13 +70,13 @@ def _overview(parts: Parts, troubles: Mapping[str, str]) -> str:
     """A line for each part: how many targets it meets, and which it misses; its name leads to its card."""
     rows = []
     for name, figures in parts.items():
-        judged, missed, plain = target_counts({name: figures})
+        with_target, missed, plain = target_counts({name: figures})
         what = [escape(figure.what) for figure in figures if figure.verdict == "MISSED"]
-        more = [f"and {len(what) - MAX_MISSES_NAMED} more"] if len(what) > MAX_MISSES_NAMED else []
-        misses = "; ".join([*what[:MAX_MISSES_NAMED], *more])
+        hidden_count = [f"and {len(what) - MAX_MISSES_NAMED} more"] if len(what) > MAX_MISSES_NAMED else []
+        misses = "; ".join([*what[:MAX_MISSES_NAMED], *hidden_count])
         link = f'<td><a href="#{escape(_place(name))}">{escape(name)}</a></td>'
         alarm = f'<span class="missed">{missed}</span>' if missed else "0"
-        counts = f"<td>{judged - missed}</td><td>{alarm}</td><td>{plain}</td>"
+        counts = f"<td>{with_target - missed}</td><td>{alarm}</td><td>{plain}</td>"
         rows.append(f'<tr>{link}{counts}<td class="words">{escape(troubles.get(name, "")) or misses}</td></tr>')
     head = '<th>part</th><th>met</th><th>missed</th><th>without a target</th><th class="words">which miss it</th>'
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
@@ -110,12 +110,12 @@ def _row(figure: Figure) -> tuple[str, ...]:
 
 def whole_markdown(command: str, parts: Parts, machine: Machine) -> str:
     """The same as Markdown: the machine, and a table for each part."""
-    judged, missed, plain = target_counts(parts)
+    with_target, missed, plain = target_counts(parts)
     lines = [
         "# All that is measured",
         "",
         f"`{command}` on {measured_on(machine)}",
-        f"{judged - missed} of {judged} targets are met; {plain} figures have none.",
+        f"{with_target - missed} of {with_target} targets are met; {plain} figures have none.",
     ]
     for name, figures in parts.items():
         lines += ["", f"## {name}", "", _line(PART_HEADER), "|---|---|---|---|---|---|"]
