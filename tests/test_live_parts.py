@@ -677,7 +677,7 @@ def test_whatever_ends_the_thread_that_sends_to_the_recorder_is_told() -> None:
     assert pipe.asked.wait(5)
     sender.close()
     assert sender.failed == "RuntimeError: out of its mind" and sender.dropped == 1  # the other one was being sent
-    with pytest.raises(StillbedError, match="nothing is recorded any more: RuntimeError: out of its mind"):
+    with pytest.raises(StillbedError, match="the recording has failed: RuntimeError: out of its mind"):
         sender.check()
     sender.put(EventEntry(0.0, "x", 2, "y"))
     assert sender.dropped == 2

@@ -1,6 +1,6 @@
-"""The processes of a live run: a group that starts and ends them, what each runs, and the channels that join them.
+"""The processes of a live run: a group that starts and ends them, their bodies, and the channels between them.
 
-Each process is spawned and runs one of the functions `run_*` below, which import what only that process needs.
+Each process is spawned and runs one of the functions `run_*` below, which import the modules of that process only.
 """
 
 from __future__ import annotations
@@ -49,26 +49,26 @@ from hardware.recording.session_reader import open_session
 from perception.frames import Frame, FrameSet, frame_set
 from planning.material import FlowShares
 
-TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as a scenario has it
-REQUEST_POLL_PERIOD = 0.02  # s between looks whether the tracker asks for frames
-TURN_SEARCH_SHARE = 0.25  # share of a session at each end in which a turn is looked for
-DECODE_LEAD = 1.5  # of the time that decoding takes: so long before a set is due it is begun
-DECODE_DECAY = 0.9  # of that time, from set to set
-PICTURE_CACHE_BYTES = 2**30  # of encoded pictures, kept where a session is shown again and again
-DECODED_CACHE_BYTES = 2**29  # of decoded ones: a session of so many is decoded before it begins, as a camera has no CPU
+TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as in scenarios
+REQUEST_POLL_PERIOD = 0.02  # s between checks for the tracker's request
+TURN_SEARCH_SHARE = 0.25  # share of a session at each end that is searched for a turn
+DECODE_LEAD = 1.5  # of the decoding time: decoding starts so long before display
+DECODE_DECAY = 0.9  # of the decoding time, per set
+PICTURE_CACHE_BYTES = 2**30  # of encoded pictures, kept if a session is repeated
+DECODED_CACHE_BYTES = 2**29  # of decoded pictures: a session up to this size is decoded in advance
 
 
 @dataclass(frozen=True, slots=True)
 class SetShowing:
-    """One showing of one set."""
+    """One display of one set."""
 
     index: int  # of the set in the session
-    live: float  # s, the stamp that its first frame gets
+    live: float  # s, stamp of its first frame
     backwards: bool  # whether the session's time runs backwards
 
 
 def turning_sets(truth: Trajectory, stamps: np.ndarray) -> tuple[int, int]:
-    """First and last set (N stamps, s) between which a session is shown to and fro: where the surface is slowest."""
+    """First and last set (N stamps, s) of a session played to and fro: where the surface is slowest."""
     count = len(stamps)
     places = np.stack([np.interp(stamps, truth.stamps, truth.base_from_surface[:, i, 3]) for i in range(3)], 1)
     speed = np.linalg.norm(np.gradient(places, stamps, axis=0), axis=1)
@@ -77,7 +77,7 @@ def turning_sets(truth: Trajectory, stamps: np.ndarray) -> tuple[int, int]:
 
 
 def schedule(stamps: np.ndarray, begin: float, between: tuple[int, int] | None) -> Iterator[SetShowing]:
-    """When each set, of stamps (N,), is shown: once, or to and fro for ever between two of them."""
+    """The display of each set of stamps (N,): once, or to and fro for ever between two of them."""
     if between is None:
         yield from (SetShowing(i, begin + float(s - stamps[0]), False) for i, s in enumerate(stamps))
         return
@@ -94,9 +94,9 @@ def schedule(stamps: np.ndarray, begin: float, between: tuple[int, int] | None) 
 
 
 def play(prepared: Prepared, ring: FrameRing, notices: Connection, start: c_double) -> None:
-    """The body of the process: show the run's session until it is over or the other end is closed.
+    """The body of the process: play the run's session until its end or until the other end is closed.
 
-    The last notice is a text that says why it ended.
+    The last notice is a text with the reason of the end.
     """
     set_up_process("feed")
     with suppress(BrokenPipeError, ConnectionError):
@@ -115,36 +115,36 @@ def play_session(
     clock, pictures = WallClock(), PictureCache(session, again)
     pictures.decode_ahead()
     inject = FrameFaults(faults, session.rig, "command line")
-    parent = parent_process()  # a session that is shown once begins when the tracker is ready for it
+    parent = parent_process()  # start when the tracker is ready
     while not ring.requested.value and (parent is None or parent.is_alive()):
         clock.wait_until(clock.now() + REQUEST_POLL_PERIOD)
     stamps = np.array([np.mean([ref.stamp for ref in refs]) for refs in session.sets])
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     between = turning_sets(session.truth, stamps) if again and session.truth is not None else None
-    spent = period  # s that decoding a set took
+    decode_time = period  # s, decoding time of a set
     for showing in schedule(stamps, clock.now(), between):
-        due = showing.live + TRANSPORT_DELAY
-        if clock.now() > due + period:
-            continue  # as a camera whose host is late loses a frame
+        display_time = showing.live + TRANSPORT_DELAY
+        if clock.now() > display_time + period:
+            continue  # a late host loses frames
         refs, anchor = session.sets[showing.index], float(stamps[showing.index])
-        clock.wait_until(due - DECODE_LEAD * spent)  # not before: the tracker wants the cores for the set before
-        decoding = clock.now()
+        clock.wait_until(display_time - DECODE_LEAD * decode_time)  # not earlier: the tracker needs the cores
+        decode_start = clock.now()
         encoded, frames = pictures.decoded(refs)
-        spent = max(clock.now() - decoding, DECODE_DECAY * spent)
-        ahead = -1 if showing.backwards else 1  # backwards, what was earlier is later
-        restamped = [replace(f, stamp=showing.live + ahead * (f.stamp - anchor)) for f in frames]
+        decode_time = max(clock.now() - decode_start, DECODE_DECAY * decode_time)
+        direction = -1 if showing.backwards else 1  # of time
+        restamped = [replace(f, stamp=showing.live + direction * (f.stamp - anchor)) for f in frames]
         head = session.heads.at(anchor)
         intact = FrameSet(frame_set(restamped).stamp, tuple(restamped), head)
-        struck = inject(intact, showing.live - start.value)
-        same = {frame.camera for frame in struck.frames if frame in intact.frames}
-        clock.wait_until(due)
-        if struck.frames:
-            unchanged = {camera: stored for camera, stored in encoded.items() if camera in same}
-            notices.send(ring.put(struck, unchanged, clock.now, anchor))
+        faulty = inject(intact, showing.live - start.value)
+        unchanged_cameras = {frame.camera for frame in faulty.frames if frame in intact.frames}
+        clock.wait_until(display_time)
+        if faulty.frames:
+            unchanged = {camera: stored for camera, stored in encoded.items() if camera in unchanged_cameras}
+            notices.send(ring.put(faulty, unchanged, clock.now, anchor))
 
 
 class PictureCache:
-    """Reads and decodes pictures; of a session that is shown again and again, keeps them as they were encoded."""
+    """Reads and decodes pictures; keeps the encoded pictures of a repeated session."""
 
     def __init__(self, session: Session, keep: bool) -> None:
         self._session, self._keep, self._cache, self._size = session, keep, dict[FrameRef, Encoded](), 0
@@ -152,9 +152,9 @@ class PictureCache:
         self._decoded = dict[tuple[FrameRef, ...], tuple[dict[int, Encoded], list[Frame]]]()
 
     def decode_ahead(self) -> None:
-        """Decode the whole session now, where it is shown again and again and fits into memory.
+        """Decode the whole session now, if it is repeated and fits into memory.
 
-        Then its decoding takes nothing from the run that is measured: what is left is to copy a set into the ring.
+        Then decoding takes no processor time of the measured run: a set is only copied into the ring.
         """
         sizes = [camera.size for camera in self._session.rig.cameras]
         pixels = sum(sizes[ref.camera][0] * sizes[ref.camera][1] for refs in self._session.sets for ref in refs)
@@ -187,12 +187,12 @@ class PictureCache:
 
 
 EXIT_TIMEOUT = 10.0  # s that a process gets to close its files, on a busy machine
-EARLY_EXIT_TIME = 0.5, 0.2  # s that the tracker gets before a path is begun (it may adjust a map), and then once asked
-ARM_POLL_PERIOD = 0.02  # s between looks for the virtual arm's device
-ARM_START_TIMEOUT = 60.0  # s in which that device must be there, on a busy machine
-ARM_AFTERLIFE = 2.0  # s that a virtual arm goes on without the run: it has to come to rest by itself
-EXECUTED_STEP = 0.002  # s between rows of what a virtual arm executed
-TROUBLE_BYTES, SHARES_BYTES = 4096, 2**22  # of what is wrong with the arm; of a layer's flows: 170,000 pieces
+EARLY_EXIT_TIME = 0.5, 0.2  # s for the tracker before printing (it may adjust a map), and after the request to end
+ARM_POLL_PERIOD = 0.02  # s between checks for the virtual arm's device
+ARM_START_TIMEOUT = 60.0  # s for the device to appear, on a busy machine
+ARM_AFTERLIFE = 2.0  # s that a virtual arm continues without the run, to come to rest
+EXECUTED_STEP = 0.002  # s between rows of the executed motion
+TROUBLE_BYTES, SHARES_BYTES = 4096, 2**22  # of the text about the arm's failure; of a layer's flows: 170,000 pieces
 
 ProcessBody = Callable[..., None]
 
@@ -204,7 +204,7 @@ class ProcessGroup:
     members: dict[str, BaseProcess] = field(default_factory=dict)
 
     def start(self, name: str, body: ProcessBody, arguments: tuple[Any, ...], ends: Sequence[Connection] = ()) -> None:
-        """Start a process. ends: of pipes among its arguments, which are its own from now on."""
+        """Start a process. ends: pipe ends among its arguments, which only it owns from now on."""
         process = SPAWN.Process(target=body, args=arguments, name=name)
         with blocked_sigint():
             process.start()
@@ -222,18 +222,18 @@ class ProcessGroup:
         return [name for name, member in self.members.items() if not member.is_alive()]
 
     def ending(self, name: str) -> str:
-        """How a process ended, in words."""
+        """The end of a process as a text."""
         code = self.members[name].exitcode
         if code is None:
             return "runs"
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
 
     def sentinels(self) -> list[int]:
-        """What becomes ready once a process ends."""
+        """Handles that become ready when a process ends."""
         return [member.sentinel for member in self.members.values() if member.is_alive()]
 
     def end(self, name: str, patience: float = EXIT_TIMEOUT, grace: float = EXIT_TIMEOUT) -> None:
-        """Wait `patience` s for a process to end, ask it to, and `grace` s later end it, with all that it started."""
+        """Wait `patience` s for a process, request its end, and `grace` s later kill it with its children."""
         member = self.members.get(name)
         if member is None:
             return
@@ -244,7 +244,7 @@ class ProcessGroup:
         self.kill(name)
 
     def kill(self, name: str) -> None:
-        """End a process and its group at once, whatever it does."""
+        """Kill a process and its group at once."""
         member = self.members.get(name)
         if member is None or member.pid is None:
             return
@@ -275,7 +275,7 @@ def run_motion(prepared: Prepared, channels: MotionChannels) -> None:
 
 
 def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
-    """Be a virtual arm at `device` until SIGTERM or the end of the lifeline; then write the motion it executed."""
+    """Serve a virtual arm at `device` until SIGTERM or the end of the lifeline; then write the executed motion."""
     from hardware.simulator.arm.ports import run_virtual_arm
     from hardware.simulator.arm.settings import ArmSettings, ReplyMode, read_virtual_arm
 
@@ -284,7 +284,7 @@ def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
     if prepared.virtual is not None:
         settings, faults = read_virtual_arm(prepared.virtual)
     if prepared.settings.real_time:
-        ask_for_real_time()  # a real controller shares no core with us
+        ask_for_real_time()  # a real controller has its own processor
     clock, stop = WatchedClock(WallClock()), threading.Event()
     threading.Thread(target=_stop_after, args=(lifeline, stop), daemon=True).start()
     arm = run_virtual_arm(
@@ -295,13 +295,13 @@ def run_arm(prepared: Prepared, device: File, lifeline: Connection) -> None:
     axes = arm.axes_at(stamps) if len(stamps) else np.zeros((0, 6))  # (N, 6)
     counts = {"ignored": len(arm.ignored), "refused": len(arm.refused), "garbage": sum(len(d) for _, d in arm.garbage)}
     spans = {"deepest": arm.peak_work, "held_up": clock.longest, "left": arm.in_flight}
-    done: dict[str, Any] = {"stamps": stamps + clock.begun, "axes": axes, "frames": arm.frames, **counts, **spans}
+    executed: dict[str, Any] = {"stamps": stamps + clock.begun, "axes": axes, "frames": arm.frames, **counts, **spans}
     with prepared.files.executed.open("wb") as file:
-        np.savez(file, **done)
+        np.savez(file, **executed)
 
 
 def _stop_after(lifeline: Connection, stop: threading.Event) -> None:
-    """Set `stop` some time after the other end of the lifeline is gone."""
+    """Set `stop` some time after the other end of the lifeline is closed."""
     try:
         lifeline.poll(None)
         stop.wait(ARM_AFTERLIFE)
@@ -311,7 +311,7 @@ def _stop_after(lifeline: Connection, stop: threading.Event) -> None:
 
 @dataclass(slots=True)
 class RunChannels:
-    """What joins the supervising process to the others."""
+    """The channels between the supervising process and the others."""
 
     processes: ProcessGroup
     url: str  # of the arm's port
@@ -321,36 +321,37 @@ class RunChannels:
     recorder: SharedLatest[RecorderReport]
     orders: Connection  # to the motion process,
     bell: Bell  # which waits for them
-    lifeline: Connection  # nothing is sent: its end tells the tracking process that this one is gone
+    lifeline: Connection  # its closing tells the tracking process that this one has ended
     arm_lifeline: Connection  # the same for a virtual arm
     sender: RecorderSender
     link: OperatorLink
-    trouble: SharedLatest[str]  # why the arm cannot be used at all
+    trouble: SharedLatest[str]  # reason why the arm cannot be used
     start: c_double  # s, when printing began; NaN before
-    looks: c_uint64  # how often the surface is to be looked for anew
-    outline: SharedLatest[OutlineOrder]  # put before `looks` is set
-    placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of what is printed, put when it is begun
+    looks: c_uint64  # number of requested new searches for the surface
+    outline: SharedLatest[OutlineOrder]  # put before `looks` is increased
+    placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of the printed path, put at its start
 
     def order(self, order: object) -> None:
-        """Give the motion process an order; OSError where it is gone."""
+        """Send an order to the motion process; OSError if it has ended."""
         self.orders.send(order)
         self.bell.ring()
 
     def end(self) -> None:
-        """End the processes so that none misses another: motion first, then what feeds the recorder, the arm last.
+        """End the processes in the order of their data: motion first, then the recorder's sources, the arm last.
 
-        One that has reported nothing still loads its libraries; before a path is begun there is little to lose either.
+        A process without a report is still loading; before printing there is little to lose either.
         """
         until = (clock := WallClock()).now() + EARLY_EXIT_TIME[0]
-        self.lifeline.close()  # the motion process was told to end: it needs no poses any more
-        begun, tracks = self.place.value == self.place.value, self.tracking.get() is not None
+        self.lifeline.close()  # the motion process ends: it needs no more poses
+        printing, has_tracked = self.place.value == self.place.value, self.tracking.get() is not None
         self.processes.end("motion", 0.0 if self.motion.get() is None else EXIT_TIMEOUT)
-        patience, grace = (EXIT_TIMEOUT, EXIT_TIMEOUT) if begun else (max(until - clock.now(), 0.0), EARLY_EXIT_TIME[1])
-        self.processes.end("tracking", patience if tracks else 0.0, grace)
+        patience = EXIT_TIMEOUT if printing else max(until - clock.now(), 0.0)
+        grace = EXIT_TIMEOUT if printing else EARLY_EXIT_TIME[1]
+        self.processes.end("tracking", patience if has_tracked else 0.0, grace)
         self.processes.kill("feed")  # it keeps nothing
         self.sender.close()
-        self.processes.end("recorder", 30.0 if tracks or self.recorder.get() is not None else 0.0)
-        self.processes.end("arm", 0.1 if begun else 0.0)
+        self.processes.end("recorder", 30.0 if has_tracked or self.recorder.get() is not None else 0.0)
+        self.processes.end("arm", 0.1 if printing else 0.0)
 
 
 def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:
@@ -386,9 +387,9 @@ def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> R
 
 
 def start_arm(processes: ProcessGroup, prepared: Prepared, device: File) -> Connection:
-    """Start a virtual arm, and wait for its device; returns the lifeline, at whose end it ends."""
-    theirs, lifeline = SPAWN.Pipe(duplex=False)
-    processes.start("arm", run_arm, (prepared, device, theirs), (theirs,))
+    """Start a virtual arm, and wait for its device; returns the lifeline, whose closing ends it."""
+    arm_end, lifeline = SPAWN.Pipe(duplex=False)
+    processes.start("arm", run_arm, (prepared, device, arm_end), (arm_end,))
     clock = WallClock()
     until = clock.now() + ARM_START_TIMEOUT
     while not device.is_symlink():

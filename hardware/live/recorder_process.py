@@ -1,8 +1,8 @@
 """The recorder of a live run: each process's queue of entries to it, and the process that writes them to the file.
 
-A sender never waits: it queues a bounded number of bytes and counts the entries for which there was no room. Pixels are
-copied twice on their way, into the pipe and out of it. All processes of a run import this module, so the modules that
-write files are imported in the recorder's process alone.
+A sender never waits: it queues a bounded number of bytes and counts the entries without space. Pixels are
+copied twice, into the pipe and out of it. All processes of a run import this module; the modules that
+write files are imported only in the recorder's process.
 """
 
 from __future__ import annotations
@@ -53,41 +53,41 @@ from planning.laid_beads import Look
 if TYPE_CHECKING:
     from hardware.recording.recorder import Recorder
 
-ENTRY_HEAD = struct.Struct("=QQ")  # bytes that follow: a size for each array, the arrays, the entry; number of arrays
-ARRAY_SIZE = struct.Struct("=Q")  # bytes of an array that stands beside its entry
-PIPE_BYTES = 2**20  # bytes that a pipe holds: 0.1 s of three cameras' pictures, and as much as anyone may ask for
-CROWDED_SHARE = 0.9  # of that, from which whoever sends may be waiting
-QUEUE_BYTES = 48 * 2**20  # bytes that may wait in a sender: 3 s of pictures as three cameras encode them
-RESERVED_BYTES = 8 * 2**20  # of them kept free of pictures, so that these never push out what is small
-FLUSH_AFTER = 0.2  # s without anything new after which what is there goes to the disk
-GATHER_TIME = 0.08  # s in which entries gather: woken for each, this process took twice as long for all of them
-FREE_PAGES_BYTES = 2**25  # bytes of free pages that are kept: some chunks, as glibc allows at most
-RECORDER_NICENESS = 10  # below all that moves the arm, unless senders wait
+ENTRY_HEAD = struct.Struct("=QQ")  # number of following bytes (sizes of the arrays, arrays, entry); number of arrays
+ARRAY_SIZE = struct.Struct("=Q")  # bytes of an array outside its entry
+PIPE_BYTES = 2**20  # capacity of a pipe: 0.1 s of three cameras' pictures, the most that Linux allows
+CROWDED_SHARE = 0.9  # of the capacity: above it a sender may be waiting
+QUEUE_BYTES = 48 * 2**20  # capacity of a sender's queue: 3 s of three cameras' encoded pictures
+RESERVED_BYTES = 8 * 2**20  # of the queue, reserved for small entries
+FLUSH_AFTER = 0.2  # s without new entries before a flush to the disk
+GATHER_TIME = 0.08  # s to collect entries: one at a time took twice the processor time
+FREE_PAGES_BYTES = 2**25  # bytes of free pages to retain: some chunks, glibc's maximum
+RECORDER_NICENESS = 10  # below the processes that move the arm, unless senders wait
 
 
 class RecorderSender:
     """One process's queue to the recorder.
 
     dropped: entries without room, after the recorder has ended, or not sent when this was closed.
-    failed: what ended the thread that sends, other than the recorder's end; "" while all is well. Who owns the sender
-        looks at it, and ends the run.
+    failed: the error that ended the sending thread, except the recorder's end; "" without an error. The owner of the
+        sender checks it, and ends the run.
     """
 
     def __init__(self, connection: Connection) -> None:
         self.dropped, self.failed = 0, ""
         self._connection = connection
         self._waiting: deque[list[memoryview]] = deque()
-        self._size, self._closed, self._gone = 0, False, False
+        self._size, self._closed, self._ended = 0, False, False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._send, daemon=True)
         self._thread.start()
 
     def put(self, entry: Entry) -> None:
-        """Queue an entry. Pixels are not copied: nobody may change a picture from now on."""
+        """Queue an entry. Pixels are not copied: a picture must not be changed after this."""
         parts, pictures = packed(entry), isinstance(entry, SetEntry)
         size = sum(map(len, parts))
         with self._changed:
-            if self._gone or self._size + size > QUEUE_BYTES - RESERVED_BYTES * pictures:
+            if self._ended or self._size + size > QUEUE_BYTES - RESERVED_BYTES * pictures:
                 self.dropped += 1
                 return
             self._waiting.append(parts)
@@ -95,42 +95,42 @@ class RecorderSender:
             self._changed.notify()
 
     def close(self, patience: float = 5.0) -> None:
-        """Send what waits, for `patience` s at most, and close the pipe. What still waits then is lost, and counted."""
+        """Send the queue, for `patience` s at most, and close the pipe. The rest is lost, and counted."""
         with self._changed:
             self._closed = True
             self._changed.notify()
         self._thread.join(patience)
         with self._changed:
-            self._gone = True
+            self._ended = True
             self.dropped += len(self._waiting) + self._thread.is_alive()
             self._waiting.clear()
 
     def _send(self) -> None:
         try:
-            while (left := self._next()) is not None:
-                while left:
-                    sent = os.writev(self._connection.fileno(), left)
-                    while left and sent >= len(left[0]):
-                        sent -= len(left.pop(0))
-                    left[:1] = [part[sent:] for part in left[:1]]
-        except (OSError, ValueError):  # nobody is there any more
+            while (unsent := self._next()) is not None:
+                while unsent:
+                    sent = os.writev(self._connection.fileno(), unsent)
+                    while unsent and sent >= len(unsent[0]):
+                        sent -= len(unsent.pop(0))
+                    unsent[:1] = [part[sent:] for part in unsent[:1]]
+        except (OSError, ValueError):  # the recorder has ended
             pass
         except Exception as error:
             self.failed = f"{type(error).__name__}: {error}"
         finally:
             with self._changed:
-                self._gone = True
+                self._ended = True
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
             self._connection.close()
 
     def check(self) -> None:
-        """StillbedError where the thread that sends has failed."""
+        """StillbedError if the sending thread has failed."""
         if self.failed:
-            raise StillbedError(f"nothing is recorded any more: {self.failed}")
+            raise StillbedError(f"the recording has failed: {self.failed}")
 
     def _next(self) -> list[memoryview] | None:
-        """The next entry's parts, waited for; None once this is closed and empty."""
+        """Wait for the next entry's parts; None if this is closed and empty."""
         with self._changed:
             while not self._waiting:
                 if self._closed:
@@ -142,7 +142,7 @@ class RecorderSender:
 
 
 def packed(entry: Entry) -> list[memoryview]:
-    """The parts in which an entry goes through the pipe: its head, its pictures' pixels themselves, and the rest."""
+    """The parts of an entry in the pipe: its head, its pictures' pixels, and the rest."""
     arrays = list[pickle.PickleBuffer]()
     rest = pickle.dumps(entry, 5, buffer_callback=arrays.append if isinstance(entry, SetEntry) else None)
     pixels = [array.raw() for array in arrays]
@@ -152,7 +152,7 @@ def packed(entry: Entry) -> list[memoryview]:
 
 
 def unpacked(data: memoryview, arrays: int) -> Entry:
-    """The entry in what followed its head. Its pixels are those in `data`, not copied."""
+    """The entry in the data after its head. Its pixels are those in `data`, not copied."""
     begin, parts = ARRAY_SIZE.size * arrays, list[memoryview]()
     for (size,) in ARRAY_SIZE.iter_unpack(data[:begin]):
         parts.append(data[begin : begin + size])
@@ -164,8 +164,8 @@ def unpacked(data: memoryview, arrays: int) -> Entry:
 class RecorderReceiver:
     """The recorder's end of a sender's pipe.
 
-    ended: whether the sender has closed its end, and all that it sent was returned or was cut short.
-    crowded: whether the pipe was full, as far as can be seen, when it was last read.
+    ended: whether the sender has closed its end, and all its entries were returned or truncated.
+    crowded: whether the pipe was nearly full at the last read.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -177,13 +177,13 @@ class RecorderReceiver:
         self._room = fcntl.fcntl(connection.fileno(), fcntl.F_GETPIPE_SZ)
 
     def fileno(self) -> int:
-        """The pipe, for whoever waits for it."""
+        """The file descriptor of the pipe, for a selector."""
         return self._connection.fileno()
 
     def take(self) -> Iterator[Entry]:
-        """The complete entries that have come since the last call; waits where nothing has.
+        """The complete entries since the last call; waits for the first one.
 
-        An entry's pixels hold until the next one is taken.
+        An entry's pixels are valid until the next entry.
         """
         with memoryview(self._memory) as memory:
             count = os.readv(self._connection.fileno(), [memory[self._filled :]])
@@ -199,22 +199,22 @@ class RecorderReceiver:
                 yield unpacked(memory[begin + ENTRY_HEAD.size : begin + needed], arrays)
                 begin += needed
                 needed = ENTRY_HEAD.size
-            kept = memory[begin : self._filled]  # the part of the next entry
+            incomplete = memory[begin : self._filled]  # the part of the next entry
             if needed > len(memory):
-                self._memory = bytearray(kept) + bytes(needed)
+                self._memory = bytearray(incomplete) + bytes(needed)
             elif begin:
-                memory[: len(kept)] = kept
+                memory[: len(incomplete)] = incomplete
         self._filled -= begin
 
     def close(self) -> None:
-        """Close the pipe, which the sender notices."""
+        """Close the pipe; the sender detects it."""
         self._connection.close()
 
 
 def record(settings: LiveSettings, senders: Sequence[Connection], reports: SharedLatest[RecorderReport]) -> None:
     """The body of the process: record until all senders have closed their end.
 
-    A fault of the disk ends it, and is named in the last report.
+    A disk error ends it, and is in the last report.
     """
     set_up_process("recorder", settings.cores_recorder, RECORDER_NICENESS, outlives=True)
     state_inputs(used_files(settings), settings.operator)
@@ -236,15 +236,15 @@ def record(settings: LiveSettings, senders: Sequence[Connection], reports: Share
 
 
 class _EntryWriter:
-    """Writes entries to the file, which is opened once the rig is known; earlier entries wait for that."""
+    """Writes entries to the file, which is opened with the rig; earlier entries wait."""
 
     def __init__(self, settings: LiveSettings, reports: SharedLatest[RecorderReport]) -> None:
-        from hardware.recording.recorder import Recorder  # before pictures come, as loading it takes a while
+        from hardware.recording.recorder import Recorder  # a slow import, before pictures arrive
 
         assert settings.record is not None
         self._file, self._reports, quality = settings.record, reports, settings.jpeg_quality or None
         self._clock, self._processor = WallClock(), ProcessorClock()
-        began = round((utc_now() - self._clock.now()) * 1e9)
+        start_ns = round((utc_now() - self._clock.now()) * 1e9)
         self._server, listener = None, None
         if settings.foxglove_port:
             from hardware.operator.process import FoxgloveServer
@@ -252,14 +252,14 @@ class _EntryWriter:
             self._server = FoxgloveServer(settings.foxglove_port)
             listener = self._server.publish
         opened = partial(Recorder, self._file, jpeg_quality=quality, overwrite=True, compress=False)
-        self._opened = partial(opened, began=began, listener=listener)
+        self._opened = partial(opened, began=start_ns, listener=listener)
         self._lane = TraceLane(RECORDER_LANE, self._clock, self._write) if settings.trace else None
         self._begin = self._clock.now(), self._processor.now()
         self._recorder: Recorder | None = None
-        self._used, self._tracked = UsedPoses(()), -np.inf  # and the stamp, s, of the last pose by the tracking process
-        self._early, self._failed, self._reported = list[Entry](), "", 0.0
-        self._urgent = settings.real_time  # where senders wait
-        self.report()  # pictures may come
+        self._used, self._tracked = UsedPoses(()), -np.inf  # stamp, s, of the tracking process's last pose
+        self._pending, self._failed, self._reported = list[Entry](), "", 0.0
+        self._urgent = settings.real_time  # raise the priority when senders wait
+        self.report()  # ready for pictures
 
     def run(self, senders: Sequence[RecorderReceiver]) -> None:
         """Write entries until all senders have ended."""
@@ -272,17 +272,17 @@ class _EntryWriter:
                     self._recorder.flush()
                 elif not crowded:
                     self._clock.wait_until(self._clock.now() + GATHER_TIME)
-                begun = self._clock.now()
-                before, crowded = crowded, any([self._take(key.fileobj, selector) for key, _ in selector.select(0)])
-                if crowded != before and self._urgent:
+                start = self._clock.now()
+                previous, crowded = crowded, any([self._take(key.fileobj, selector) for key, _ in selector.select(0)])
+                if crowded != previous and self._urgent:
                     catch_up(crowded)
-                if self._lane is not None and (now := self._clock.now()) > begun + MIN_WRITE_S:
-                    self._lane.add(now, (("a batch is written", begun, now),))
+                if self._lane is not None and (now := self._clock.now()) > start + MIN_WRITE_S:
+                    self._lane.add(now, (("a batch is written", start, now),))
                 if self._clock.now() > self._reported + FLUSH_AFTER:
                     self.report()
 
     def _take(self, sender: object, selector: BaseSelector) -> bool:
-        """Write what has come from a sender; whether it may be waiting to send more."""
+        """Write the entries of a sender; whether it may be waiting to send more."""
         assert isinstance(sender, RecorderReceiver)
         for entry in sender.take():
             self._write(entry)
@@ -293,11 +293,11 @@ class _EntryWriter:
     def _write(self, entry: Entry) -> None:
         if isinstance(entry, Rig):
             self._recorder = self._opened(rig=entry)
-            early, self._early = self._early, []
-            for each in early:
+            pending, self._pending = self._pending, []
+            for each in pending:
                 _write_entry(self._recorder, each)
         elif self._recorder is None:
-            self._early.append(deepcopy(entry))  # its pixels are the pipe's
+            self._pending.append(deepcopy(entry))  # its pixels belong to the pipe
         elif isinstance(entry, UsedPoses):
             self._used = entry
         else:
@@ -305,10 +305,10 @@ class _EntryWriter:
             _write_entry(self._recorder, entry)
 
     def report(self, failed: str = "") -> None:
-        """Report the state. failed: what ended the recording."""
-        now, spent = self._clock.now(), self._processor.now()
+        """Report the state. failed: the error that ended the recording."""
+        now, cpu_time = self._clock.now(), self._processor.now()
         self._failed, self._reported = self._failed or failed, now
-        share = (spent - self._begin[1]) / max(now - self._begin[0], 1e-3)
+        share = (cpu_time - self._begin[1]) / max(now - self._begin[0], 1e-3)
         size = self._file.stat().st_size if self._recorder is not None and self._file.exists() else 0
         self._reports.put(RecorderReport(size, share, self._failed))
 
@@ -357,7 +357,7 @@ def _write_entry(recorder: Recorder, entry: Entry) -> None:
 
 
 def _write_used(recorder: Recorder, entry: UsedEntry) -> None:
-    """Keep the file; the path, which is now in the tracker's surface frame, and the arm's nozzle are shown as well."""
+    """Attach the file; also show the path, now in the tracker's surface frame, and the arm's nozzle."""
     from hardware.files.arm_file import arm_from_text
     from hardware.files.path_file import path_from_text
     from hardware.recording.session_reader import ARM_ATTACHMENT, PATH_ATTACHMENT
@@ -375,8 +375,8 @@ def _write_pose(recorder: Recorder, entry: PoseEntry) -> None:
     from hardware.files.session import row_from_head
 
     if entry.truth is not None:
-        known = Trajectory(np.array([entry.pose.stamp]), entry.truth[None], exact=True)
-        recorder.truth_row(rows_from_trajectory(known)[0], exact=True)
+        truth = Trajectory(np.array([entry.pose.stamp]), entry.truth[None], exact=True)
+        recorder.truth_row(rows_from_trajectory(truth)[0], exact=True)
     if entry.head is not None:
         recorder.head_row(row_from_head(entry.pose.stamp, entry.head), entry.head.extruding, shown=False)
     recorder.write(entry.observations)
