@@ -104,7 +104,7 @@ def test_the_command_marks_the_path_and_what_can_be_printed(tmp_path: Path, caps
     command = ["reach", str(tmp_path / "path.csv"), "--arm", str(ARMS / "s6h4d.toml")]
     assert main([*command, "-o", str(tmp_path / "good")]) == 0
     text = capsys.readouterr().out
-    assert "6 of 6 can be printed" in text and "NOMINAL" in text
+    assert "6 of 6 are feasible" in text and "NOMINAL" in text
     assert main([*command, "--surface", "580,0,50,0,0,0", "-o", str(tmp_path / "bad"), "--spin"]) == 1
     marked = read_path(tmp_path / "bad" / "path.csv").extra["feasible"]
     assert 0 < (marked == 0).sum() <= 6
@@ -161,4 +161,4 @@ def test_the_page_draws_the_arm_and_its_limits_and_lists_what_cannot_be_printed_
     ]  # fmt: skip
     assert "--spin" in rows[0][3] and "--surface" in rows[2][3]
     assert "from the side, mm" in text and "checkpoint 2: singular" in text and "limit 100" in text
-    assert "What cannot be printed" not in reach_page("p.csv", "an arm", "words", path, reach, model)
+    assert "Infeasible checkpoints" not in reach_page("p.csv", "an arm", "words", path, reach, model)

@@ -56,14 +56,14 @@ WRITTEN = "path.csv", "reach.csv", "reach.html"
 PRINTABLE_CLASS, BLOCKED_CLASS, PATH_CLASS, TRUTH_CLASS = "estimate", "off", "aside", "truth"  # of report.css
 
 REMEDIES = {  # by REACH_REASONS
-    "too far": "bring the surface nearer to the arm (--surface), or allow it more room (limits in the arm file)",
-    "joint range": "let the tool spin (--spin), take the better posture, or turn the surface",
-    "singular": "let the tool spin (--spin), or lay the surface elsewhere or a little tilted",
-    "joint speed": "print slower there (speed_mm_s of the path), or keep the surface calmer",
-    LEANS: "lay the surface more level, keep it calmer, or allow more (max_lean_deg in the arm file)",
-    TISSUE: "plan with --arm, which tilts the tool or leaves the bead out; or a longer needle",
+    "too far": "move the surface nearer to the arm (--surface), or extend the limits in the arm file",
+    "joint range": "allow the tool to spin (--spin), use the better posture, or rotate the surface",
+    "singular": "allow the tool to spin (--spin), or move or tilt the surface",
+    "joint speed": "print slower there (speed_mm_s of the path), or reduce the surface's motion",
+    LEANS: "level the surface, reduce its motion, or increase max_lean_deg in the arm file",
+    TISSUE: "plan with --arm, which tilts the tool or omits the bead; or use a longer needle",
 }
-MAX_STRETCHES = 60  # of red checkpoints that are listed; the table reach.csv has all
+MAX_STRETCHES = 60  # rows of infeasible checkpoints on the page; reach.csv has all
 
 
 def reach_page(path_name: str, arm: str, text: str, path: Path, reach: Reach, model: ArmModel | None = None) -> str:
@@ -72,20 +72,20 @@ def reach_page(path_name: str, arm: str, text: str, path: Path, reach: Reach, mo
     rows = [[name, str(int((reach.reason == i).sum()))] for i, name in enumerate(REACH_REASONS)]
     body = [section("From above", "The checkpoints in the surface frame, mm.", _above(path, reach))]
     if isinstance(model, JointModel) and np.isfinite(reach.joints).all(axis=1).any():
-        words = "Its links at the first checkpoint, and at the worst one; the arm's own frame, mm."
+        words = "Links at the first checkpoint and at the worst one, in the arm's frame, mm."
         body.append(section("The arm", words, _arm_picture(model, reach)))
-    words = "The worst over where the surface may be; by checkpoint. Dashed: what it must stay above, or below."
+    words = "Worst value over the surface's motion, by checkpoint. Dashed: the limit."
     body += [
         section("Along the path", words, _along(reach, model)),
-        section("Why", "Checkpoints by what the arm lacks there.", figures_table(("", "checkpoints"), rows)),
+        section("Reasons", "Number of checkpoints by reason.", figures_table(("", "checkpoints"), rows)),
     ]
     if good < count:
-        head = ("checkpoints", "layer", "what is wrong", "what to do")
+        head = ("checkpoints", "layer", "reason", "remedy")
         body.append(
-            section("What cannot be printed", "In the order of the path.", figures_table(head, _red(path, reach)))
+            section("Infeasible checkpoints", "In the order of the path.", figures_table(head, _red(path, reach)))
         )
-    body.append(section("In words", "As in the terminal.", f"<pre>{escape(text)}</pre>"))
-    return document("reach", path_name, f"{arm}: {good} of {count} checkpoints can be printed.", body, "stillbed reach")
+    body.append(section("Summary", "As in the terminal.", f"<pre>{escape(text)}</pre>"))
+    return document("reach", path_name, f"{arm}: {good} of {count} checkpoints are feasible.", body, "stillbed reach")
 
 
 def _red(path: Path, reach: Reach) -> list[list[str]]:
@@ -99,7 +99,7 @@ def _red(path: Path, reach: Reach) -> list[list[str]]:
             which = str(a) if a == b else f"{a} to {b}"
             rows.append([which, str(path.layer[a]), REACH_REASONS[reason], REMEDIES[REACH_REASONS[reason]]])
     rest = len(rows) - MAX_STRETCHES
-    return rows if rest <= 0 else [*rows[:MAX_STRETCHES], [f"and {rest} stretches more", "", "", "see reach.csv"]]
+    return rows if rest <= 0 else [*rows[:MAX_STRETCHES], [f"and {rest} more rows", "", "", "see reach.csv"]]
 
 
 def _arm_picture(model: JointModel, reach: Reach) -> str:
@@ -127,9 +127,9 @@ def _above(path: Path, reach: Reach) -> str:
     printable, blocked = places[reach.feasible & (not many)], places[~reach.feasible]
     plot.dots(printable[:, 0], printable[:, 1], PRINTABLE_CLASS, 1.6)
     plot.dots(blocked[:, 0], blocked[:, 1], BLOCKED_CLASS, 4.0)
-    keys = [(line_key if many else dot_key)(PRINTABLE_CLASS, "can be printed")]
+    keys = [(line_key if many else dot_key)(PRINTABLE_CLASS, "feasible")]
     keys += [] if many else [line_key(PATH_CLASS, "path")]
-    return legend([*keys, dot_key(BLOCKED_CLASS, "cannot")]) + plot.svg()
+    return legend([*keys, dot_key(BLOCKED_CLASS, "infeasible")]) + plot.svg()
 
 
 def _along(reach: Reach, model: ArmModel | None) -> str:
@@ -138,12 +138,12 @@ def _along(reach: Reach, model: ArmModel | None) -> str:
     if isinstance(model, SimpleArm) and reach.lean is not None:
         lean, most = np.rad2deg(reach.lean), float(np.rad2deg(model.max_lean or 0.0))
     curves = {
-        "to the end of a joint's range, degrees": (np.rad2deg(reach.bound), 0.0),
-        "to a singular wrist, degrees": (np.rad2deg(reach.wrist), angle),
-        "to a singular elbow, degrees": (np.rad2deg(reach.elbow), angle),
-        "wrist to the first axis, mm": (reach.shoulder, MIN_SHOULDER_DISTANCE),
-        "of an axis's speed, %": (100 * reach.speed, 100.0),
-        "tool leans by, degrees": (lean, most),
+        "distance to a joint limit, degrees": (np.rad2deg(reach.bound), 0.0),
+        "distance to the wrist singularity, degrees": (np.rad2deg(reach.wrist), angle),
+        "distance to the elbow singularity, degrees": (np.rad2deg(reach.elbow), angle),
+        "distance of the wrist from the first axis, mm": (reach.shoulder, MIN_SHOULDER_DISTANCE),
+        "joint speed, % of the maximum": (100 * reach.speed, 100.0),
+        "lean of the tool, degrees": (lean, most),
     }
     plots, span = [], (0.0, float(max(len(reach.speed) - 1, 1)))
     for label, (values, limit) in curves.items():
@@ -166,7 +166,7 @@ REACH_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class ReachQuestion:
-    """Where the surface is, how it moves, and whether the tool may spin."""
+    """Pose and motion of the surface, and whether the tool may spin."""
 
     surface: tuple[float, ...] | None = (
         None  # (6,) at rest, arm frame, mm and degrees; None: on the default arm's bench
@@ -180,7 +180,7 @@ class ReachQuestion:
 
 @dataclass(frozen=True, slots=True)
 class ReachAnswer:
-    """The reach of a path in words, and whether all checkpoints can be printed."""
+    """The reach of a path as a text, and whether all checkpoints are feasible."""
 
     text: str
     feasible: bool
@@ -197,18 +197,18 @@ def run_reach(
         for stale in WRITTEN:  # an earlier run's, which nobody is to take for this one's
             (out / stale).unlink(missing_ok=True)
     with Progress("reach", "steps", WallClock().now) as progress:
-        progress.note = "joints and speeds of each checkpoint, wherever the surface moves to"
+        progress.note = "joints and speeds of each checkpoint, with the surface's motion"
         progress(0, 4)
         model, motion, reach = _evaluated(checkpoints, arm, question)
         best, profile, scan = None, read_arm(arm), _scan_of(path, question)
-        progress.note = "the tool beside the tissue"
+        progress.note = "clearance between tool and tissue"
         progress(1, 4)
         reach, met = _with_tissue(reach, checkpoints, profile, scan, question)
         progress.note = "other postures"
         progress(2, 4)
         if isinstance(model, JointModel):
             best = best_posture(model, _arm_from_surface(question), checkpoints, motion)
-        progress.note = "how long it takes"
+        progress.note = "printing time"
         progress(3, 4)
         seconds = float(run_times(checkpoints, profile.arm, profile.limits, profile.tick)[-1])
     text = reach_text(model, reach, best, question, seconds, float(profile.tool[0, 1]))
@@ -231,7 +231,7 @@ def _with_tissue(
 ) -> tuple[Reach, str]:
     """The reach with checkpoints marked at which the tool has no room, and a line about that."""
     if scan is None:
-        return reach, "tool: not checked against the tissue, as there is no scan: --scan SCAN"
+        return reach, "tool: clearance not checked without --scan SCAN"
     spun = replace(path, surface_from_nozzle=spin_path(path, reach.spin))
     try:
         body = tool_body_of(profile, BASE_MARGIN + question.amplitude_mm)
@@ -244,15 +244,17 @@ def _with_tissue(
         return marked, f"tool: {body.margin:g} mm or more from the tissue at all checkpoints"
     return marked, (
         f"tool: too near to the tissue at {int(short.sum())} checkpoints, by up to {-room[worst]:.2f} mm: the "
-        f"{part[worst]} at checkpoint {worst}; {body.margin:g} mm are kept"
+        f"{part[worst]} at checkpoint {worst}; required: {body.margin:g} mm"
     )
 
 
 def with_feasible(path: Path, arm: File) -> tuple[Path, str]:
     """The path with the column `feasible` for the arm in a file over a surface at rest, and a sentence about it."""
     model, _, reach = _evaluated(path, arm, ReachQuestion())
-    count = f"{int(reach.feasible.sum())} of {len(path)} checkpoints can be printed, the surface at rest"
-    return with_feasible_column(path, reach), f"arm {_name(model)}: {count}; how, and on a moving one: stillbed reach"
+    count = f"{int(reach.feasible.sum())} of {len(path)} checkpoints are feasible, surface at rest"
+    return with_feasible_column(
+        path, reach
+    ), f"arm {_name(model)}: {count}; details, and moving surfaces: stillbed reach"
 
 
 def _evaluated(path: Path, arm: File, question: ReachQuestion) -> tuple[ArmModel, SurfaceMotion, Reach]:
@@ -318,13 +320,13 @@ def reach_text(
     swing = f"{question.amplitude_mm:g} mm and {question.turn_deg:g} degrees at {question.rate_hz:g} Hz"
     nominal = isinstance(model, JointModel) and model.nominal
     rows = [
-        ("arm", _name(model) + (" (NOMINAL: its numbers are made up)" if nominal else "")),
-        ("surface moves by", f"+-{swing}" if question.amplitude_mm or question.turn_deg else "nothing"),
-        ("checkpoints", f"{good} of {count} can be printed"),
+        ("arm", _name(model) + (" (NOMINAL: not measured)" if nominal else "")),
+        ("motion of the surface", f"+-{swing}" if question.amplitude_mm or question.turn_deg else "none"),
+        ("checkpoints", f"{good} of {count} are feasible"),
         *((f"  {name}", str(int((reach.reason == i).sum()))) for i, name in enumerate(REACH_REASONS) if i),
         *_stance(model, reach, edge),
-        ("most of an axis's speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
-        ("a run over a surface at rest", f"{duration_text(seconds)} once it is at the first checkpoint"),
+        ("largest joint speed", f"{100 * speed.max() if len(speed) else np.nan:.0f} %"),
+        ("printing time, surface at rest", f"{duration_text(seconds)} from the first checkpoint"),
     ]
     if best is not None and best[1] > good:
         names = zip(POSTURES[best[0]], (SHOULDERS, ELBOWS, WRISTS), strict=True)
@@ -335,33 +337,33 @@ def reach_text(
 
 
 def _name(model: ArmModel) -> str:
-    return "a machine that does not turn" if isinstance(model, SimpleArm) else model.name
+    return "a machine without rotations" if isinstance(model, SimpleArm) else model.name
 
 
 def _stance(model: ArmModel, reach: Reach, edge: float) -> list[tuple[str, str]]:
-    """How the arm stands, and how far it is from where it cannot; of one that does not turn, what that costs."""
+    """Posture of the arm and distances to its limits; without rotations, the lean of the tool."""
     if isinstance(model, SimpleArm):
         assert reach.lean is not None and model.max_lean is not None
         lean, nearer = float(reach.lean.max()), edge * float(np.sin(reach.lean.max()))
         allowed = f"{np.rad2deg(model.max_lean):g} allowed"
         cost = f"{np.rad2deg(lean):.1f} degrees ({allowed}): an edge of its tip is {nearer:.2f} mm nearer to the tissue"
-        return [("tool leans by up to", cost)]
-    ends = [("nearest to a joint's end", f"{_smallest(np.rad2deg(reach.bound))} degrees")]
+        return [("largest lean of the tool", cost)]
+    ends = [("distance to a joint limit", f"{_smallest(np.rad2deg(reach.bound))} degrees")]
     if isinstance(model, UrdfKinematics):
         near = f"near {', '.join(f'{angle:.0f}' for angle in np.rad2deg(model.ready))} degrees"
         return [("posture", near), *ends, ("least manipulability", f"{_smallest(reach.manipulability, 3)}")]
     return [
         ("posture", ", ".join(model.posture)),
         *ends,
-        ("nearest to a singular wrist", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
-        ("nearest to a singular elbow", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
-        ("wrist to the first axis", f"{_smallest(reach.shoulder)} mm"),
+        ("distance to the wrist singularity", f"{_smallest(np.rad2deg(reach.wrist))} degrees"),
+        ("distance to the elbow singularity", f"{_smallest(np.rad2deg(reach.elbow))} degrees"),
+        ("wrist from the first axis", f"{_smallest(reach.shoulder)} mm"),
         ("spin of the tool", f"{np.rad2deg(reach.spin.min()):.0f} to {np.rad2deg(reach.spin.max()):.0f} degrees"),
     ]
 
 
 def _arm_from_surface(question: ReachQuestion, profile: ArmProfile | None = None) -> Array:
-    """Where the surface is; by default on the bench, or as far below the home of `profile`."""
+    """Pose of the surface; default: on the bench, or below the home of `profile`."""
     if question.surface is None and profile is not None:
         return se3.make(np.eye(3), ARM_FROM_BENCH[:3, 3] + (profile.arm.home - ArmProfile().arm.home)[:3])
     if question.surface is None:
@@ -373,7 +375,7 @@ def _arm_from_surface(question: ReachQuestion, profile: ArmProfile | None = None
 
 
 def _within(profile: ArmProfile, place: Array, path: Path, motion: SurfaceMotion, reach: Reach) -> Reach:
-    """The same reach, with checkpoints outside the arm file's own limits of X Y Z marked as too far."""
+    """The same reach, with checkpoints outside the arm file's limits of X Y Z marked as too far."""
     tips = (place @ motion.places[:, None] @ path.surface_from_nozzle)[..., :3, 3]
     low, high = profile.limits.low[:3], profile.limits.high[:3]
     beyond = ((tips < low) | (tips > high)).any(axis=(0, 2))
