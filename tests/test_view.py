@@ -368,5 +368,5 @@ def test_errors_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(("nees", "honest"), [(0.79, False), (0.81, True), (1.24, True), (1.81, False)])
 def test_covariances_that_are_not_calibrated_are_said_not_to_be(nees: float, honest: bool) -> None:
     words = consistency_text(nees)
-    assert ("not calibrated" in words) is not honest
+    assert ("inconsistent" in words) is not honest
     assert honest or f"{nees**0.5:.2g} times" in words
