@@ -51,9 +51,7 @@ class SettingInfo:
     default: str = ""  # text of the value None or ()
 
 
-def _setting(
-    default: Any, label: str, unit: str = "", low: float = math.nan, high: float = math.nan, text: str = ""
-) -> Any:
+def _setting(default: Any, label: str, unit: str = "", low: float = math.nan, high: float = 0, text: str = "") -> Any:
     limits = None if math.isnan(low) else (low, high)
     return field(default=default, metadata={"setting": SettingInfo(label, unit, limits, text)})
 
@@ -289,11 +287,10 @@ def measured_amplitude(motion: str) -> float:
         raise InputError(motion, "poses", "none", "a trajectory of the surface")
     ends = np.percentile(places, [100 - AMPLITUDE_SHARE, AMPLITUDE_SHARE], axis=0)
     distance = np.linalg.norm(places - ends.mean(axis=0), axis=1)
-    amplitude, limits = float(np.percentile(distance, AMPLITUDE_SHARE)), SETTINGS["amplitude_mm"].limits
-    assert limits is not None
-    if not amplitude <= limits[1]:
-        allowed = f"{limits[1]:g} mm or less: of tissue, not of a camera"
-        raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", allowed)
+    _, most = SETTINGS["amplitude_mm"].limits or (0.0, math.inf)
+    amplitude = float(np.percentile(distance, AMPLITUDE_SHARE))
+    if not amplitude <= most:
+        raise InputError(motion, "amplitude", f"{amplitude:.1f} mm", f"{most:g} mm or less: of tissue, not of a camera")
     if amplitude < MIN_AMPLITUDE:
         allowed = f"{MIN_AMPLITUDE:g} mm or more; places are in mm, not m; of tissue at rest: --amplitude-mm 0"
         raise InputError(motion, "amplitude", f"{amplitude:.2g} mm", allowed)
