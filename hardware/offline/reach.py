@@ -168,9 +168,7 @@ REACH_COLUMNS = (
 class ReachQuestion:
     """Pose and motion of the surface, and whether the tool may spin."""
 
-    surface: tuple[float, ...] | None = (
-        None  # (6,) at rest, arm frame, mm and degrees; None: on the default arm's bench
-    )
+    surface: tuple[float, ...] | None = None  # (6,) at rest, arm frame, mm and degrees; None: on the default bench
     amplitude_mm: float = 0.0  # of the surface's motion, as the next two
     turn_deg: float = 0.0
     rate_hz: float = 0.25
