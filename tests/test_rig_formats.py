@@ -267,7 +267,7 @@ def test_a_device_closed_to_this_user_says_which_group_to_join(tmp_path: Path, m
 
 def test_nothing_plugged_in_is_a_warning_with_what_to_do() -> None:
     for check in (doctor.camera_check(()), doctor.arm_check([])):
-        assert check.verdict is WARN and "plug" in check.remedy
+        assert check.verdict is WARN and "connect" in check.remedy
 
 
 def test_a_network_that_is_damaged_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

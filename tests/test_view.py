@@ -354,7 +354,7 @@ def test_the_truth_in_a_recording_is_found_by_itself(tmp_path: Path, capsys: pyt
     [
         ("", "poses = 'none'"),
         ("1 2 3\n", "line 1"),
-        ("9 0 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n11 0 0 0 0 0 0 1\n", "one clock"),
+        ("9 0 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n11 0 0 0 0 0 0 1\n", "same clock"),
     ],
 )
 def test_errors_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str) -> None:
