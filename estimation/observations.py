@@ -13,38 +13,40 @@ RAYLEIGH_MEDIAN = 1.1774  # sqrt(2 ln 2): median length of a vector whose two en
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MissedLandmarks:
-    """Landmarks that were looked for, with nothing known to hide them, and not found: M parallel rows."""
+    """Landmarks that were searched and not found although nothing known hides them: M parallel rows."""
 
     camera: Index  # (M,) number in the rig
     track: Index  # (M,) id of the landmark
 
 
-NOTHING_MISSED = MissedLandmarks(np.zeros(0, np.int64), np.zeros(0, np.int64))
+NO_MISSED_LANDMARKS = MissedLandmarks(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DisplacedPlaces:
-    """Places of the surface whose colours do not stand where its tracks put them."""
+    """Places of the surface where colours and texture disagree about the position."""
 
     centres: Array  # (K, 3) mm, surface frame
-    sizes: Array  # (K,) mm, by how much
+    distances: Array  # (K,) mm, between colours and texture
     reach: float  # mm, one sigma about each centre
-    whole: bool  # whether so many of the places that could tell are among them that the pose may be wrong
+    ambiguous: bool  # whether they are so many of the checked places that the pose itself may be wrong
 
     @property
     def message(self) -> str:
         """For the operator, or ''."""
-        if not len(self.sizes):
+        if not len(self.distances):
             return ""
-        return f"colours stand {self.sizes.max():.1f} mm off the texture: something moves over the tissue, or under it"
+        return (
+            f"colours stand {self.distances.max():.1f} mm off the texture: something moves over the tissue, or under it"
+        )
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of a pose that may be off by the largest of them, one sigma, along every direction."""
-        return np.diag([0.0] * 3 + [float(self.sizes.max(initial=0.0)) ** 2] * 3)
+        """Pose covariance (6, 6) for an error of the largest distance, one sigma, along every direction."""
+        return np.diag([0.0] * 3 + [float(self.distances.max(initial=0.0)) ** 2] * 3)
 
 
-NOTHING_DISPLACED = DisplacedPlaces(np.zeros((0, 3)), np.zeros(0), 1.0, False)
+NO_DISPLACED_PLACES = DisplacedPlaces(np.zeros((0, 3)), np.zeros(0), 1.0, False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +58,7 @@ class Observations:
     track: Index  # (N,) id of the landmark
     pixels: Array  # (N, 2) undistorted px of the camera's own matrix
     sigma: Array  # (N,) px, one standard deviation per axis
-    missed: MissedLandmarks = NOTHING_MISSED  # of the same frame set; not recorded
+    missed: MissedLandmarks = NO_MISSED_LANDMARKS  # of the same frame set; not recorded
 
     def __repr__(self) -> str:
         return f"Observations({len(self)} tracks in {len(np.unique(self.camera))} cameras at {self.stamp:.3f} s)"
@@ -64,12 +66,12 @@ class Observations:
     def __len__(self) -> int:
         return len(self.camera)
 
-    def only(self, rows: Mask) -> Observations:
-        """The same of some rows (N,), without what was missed."""
+    def select(self, rows: Mask) -> Observations:
+        """The observations of some rows, a mask (N,), without the missed landmarks."""
         return Observations(self.stamp, self.camera[rows], self.track[rows], self.pixels[rows], self.sigma[rows])
 
 
 def no_observations(stamp: float) -> Observations:
     """A frame set without a track."""
-    none = np.zeros(0, np.int64)
-    return Observations(stamp, none, none, np.zeros((0, 2)), np.zeros(0))
+    empty = np.zeros(0, np.int64)
+    return Observations(stamp, empty, empty, np.zeros((0, 2)), np.zeros(0))

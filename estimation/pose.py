@@ -1,7 +1,4 @@
-"""The estimated pose of the surface with velocity, covariance, state, and a forecast once enough is learned.
-
-A `Trajectory` holds poses over time.
-"""
+"""The estimated pose of the surface with velocity, covariance, state and forecast; and trajectories."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from estimation.surface_map import LocalError, Warp
 
 _normal_quantile = lru_cache(maxsize=32)(NormalDist().inv_cdf)
 
-MIN_FORECAST_S = 0.01  # a shorter rest of a forecast says no more than the velocity there
+MIN_FORECAST_S = 0.01  # a shorter remainder of a forecast says no more than the velocity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,25 +48,25 @@ class Forecast:
         before = start if k == 1 else self.covariances[k - 2]
         return np.asarray((1 - u) * before + u * self.covariances[k - 1])
 
-    def after(self, ahead: float) -> Forecast | None:
-        """What is left of the forecast at `ahead` s, seen from the pose expected there; None from the end on."""
-        left = self.end - ahead
-        if left < MIN_FORECAST_S:
+    def remainder(self, ahead: float) -> Forecast | None:
+        """The forecast from `ahead` s on, relative to the predicted pose there; None at its end and beyond."""
+        length = self.end - ahead
+        if length < MIN_FORECAST_S:
             return None
-        steps = left * np.arange(1, len(self.horizons) + 1) / len(self.horizons)
-        here, there = self.at(np.array([ahead]))[0][0], self.at(ahead + steps)[0]
+        steps = length * np.arange(1, len(self.horizons) + 1) / len(self.horizons)
+        increment, increments = self.at(np.array([ahead]))[0][0], self.at(ahead + steps)[0]
         covariances = np.stack([self.covariance(self.covariances[0], ahead + s) for s in steps.tolist()])
-        return Forecast(steps, se3.log(se3.inverse(se3.exp(here)) @ se3.exp(there)), covariances)
+        return Forecast(steps, se3.log(se3.inverse(se3.exp(increment)) @ se3.exp(increments)), covariances)
 
 
 @lru_cache(maxsize=8)
 def _basis(horizons: tuple[float, ...]) -> CubicCurve:
-    """The curve by each horizon's increment."""
+    """Cubic curves, one for each horizon: 1 there, 0 at the other horizons and at the pose."""
     count = len(horizons)
     return CubicCurve(np.array([0.0, *horizons]), np.concatenate([np.zeros((1, count)), np.eye(count)]))
 
 
-def body_rate(increment: Array, rate: Array) -> Array:
+def body_twist(increment: Array, rate: Array) -> Array:
     """Body velocity (..., 6) where exp(increment) is passed with d increment / dt = rate, both (..., 6).
 
     The right Jacobian's series (Barfoot 2017, 7.1.5) up to the square of the increment: turns within half a second are
@@ -89,7 +86,7 @@ def _bracket(a: Array, b: Array) -> Array:
 def radius(covariance: Array, share: float | Array = 0.9, offset: Array | None = None) -> Array:
     """Radius (...) of the ball that holds `share` of a normal error with covariance (..., 3, 3).
 
-    share: of one covariance (1, 3, 3) also several (M,), for as many radii.
+    share: 0 to 1; for one covariance (1, 3, 3) also (M,), which gives M radii.
     offset: (..., 3) of its mean from the ball's centre; None: about its mean.
 
     The sum of three weighted squares is taken as one scaled chi-square (Satterthwaite 1946), whose quantile is Wilson
@@ -100,12 +97,12 @@ def radius(covariance: Array, share: float | Array = 0.9, offset: Array | None =
     if offset is not None:  # the mean of the squared length, and its variance over 2
         squares = squares + 2 * np.einsum("...i,...ij,...j", offset, covariance, offset)
         trace = trace + (offset**2).sum(-1)
-    safe = np.where(trace > 0, trace, 1.0)
-    part = 2 * np.where(trace > 0, squares, 1.0) / (9 * safe**2)
+    safe_trace = np.where(trace > 0, trace, 1.0)
+    variance = 2 * np.where(trace > 0, squares, 1.0) / (9 * safe_trace**2)
     quantile = (
         np.array(list(map(_normal_quantile, share))) if isinstance(share, np.ndarray) else _normal_quantile(share)
     )
-    return np.asarray(np.sqrt(trace) * np.maximum(1 - part + quantile * np.sqrt(part), 0.0) ** 1.5)
+    return np.asarray(np.sqrt(trace) * np.maximum(1 - variance + quantile * np.sqrt(variance), 0.0) ** 1.5)
 
 
 class TrackState(Enum):
@@ -127,10 +124,10 @@ class TrackState(Enum):
 class MotionState:
     """Whether the surface moves: 300 um or 0.1 degree away from where it was at rest (thesis 1.3)."""
 
-    moving: bool = True  # also before it has been seen at rest
+    moving: bool = True  # also before the surface was at rest for the first time
     onset: float = float("nan")  # s, stamp of the first pose of the last movement; nan: before the first pose
-    moved: float = 0.0  # mm, of the map's middle since it was last at rest, or since the first pose
-    turned: float = 0.0  # rad, likewise
+    distance: float = 0.0  # mm, of the map's middle from its last place of rest, or from the first pose
+    angle: float = 0.0  # rad, likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,11 +141,11 @@ class SurfacePose:
     state: TrackState
     twist_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     acceleration_psd: Array = field(default_factory=lambda: np.zeros(6))  # (6,) between poses, rad^2/s^3 and mm^2/s^3
-    reason: str = ""  # why the state is what it is, for the operator
+    reason: str = ""  # of the state, for the operator
     motion: MotionState = MotionState()
-    warp: Warp | None = None  # how the surface departs from a rigid body; None while it does not
-    forecast: Forecast | None = None  # where it is known better than by the twist
-    local: LocalError | None = None  # what single places may be off by beyond all that; None: nothing
+    warp: Warp | None = None  # deformation of the surface; None where it is rigid
+    forecast: Forecast | None = None  # learned prediction; None: constant twist
+    local: LocalError | None = None  # additional error of single places; None: none
 
     def __repr__(self) -> str:
         place = " ".join(f"{value:.2f}" for value in self.base_from_surface[:3, 3])
@@ -156,12 +153,12 @@ class SurfacePose:
 
     @property
     def deformation(self) -> float:
-        """Root mean square displacement of the landmarks, mm, that no rigid motion explains."""
+        """Root mean square displacement of the landmarks by the warp, mm."""
         return 0.0 if self.warp is None else self.warp.deformation
 
     @property
     def finite(self) -> bool:
-        """Whether all that a motion follows of it is finite."""
+        """Whether stamp, pose, covariances, warp, forecast and local errors are finite."""
         arrays = [self.base_from_surface, self.covariance, self.twist, self.twist_covariance, self.acceleration_psd]
         if self.warp is not None:
             arrays += [self.warp.control, self.warp.coefficients, self.warp.covariance, self.warp.growth]
@@ -171,34 +168,36 @@ class SurfacePose:
             arrays += [local.centres, local.variance, local.growth, local.reach, local.support]
         return bool(np.isfinite(self.stamp) and all(np.isfinite(a).all() for a in arrays))
 
-    def predict(self, stamp: float, onwards: bool = True) -> SurfacePose:
+    def predict(self, stamp: float, keep_forecast: bool = True) -> SurfacePose:
         """The pose at `stamp` (s): along the forecast as far as it reaches, then under constant body velocity.
 
         The covariance is the forecast's, whose 90 % radii are calibrated, or that of white noise on acceleration
         (Barfoot 2017, 11.1): P + dt^2 P_twist + q dt^3 / 3, carried along the geodesic. A stamp before the pose's own
-        runs the constant velocity backwards. onwards: whether to keep what is left of the forecast, which is slow.
+        runs the constant velocity backwards. keep_forecast: whether to keep the remaining forecast, which is slow.
         """
         dt = stamp - self.stamp
         if self.forecast is None or dt <= 0:
-            return self._drift(stamp)
+            return self._predict_by_twist(stamp)
         if dt > self.forecast.end:
-            return self._foreseen(self.stamp + self.forecast.end, self.forecast, onwards=False)._drift(stamp)
-        return self._foreseen(stamp, self.forecast, onwards)
+            return self._predict_by_forecast(self.stamp + self.forecast.end, self.forecast, False)._predict_by_twist(
+                stamp
+            )
+        return self._predict_by_forecast(stamp, self.forecast, keep_forecast)
 
-    def base_at(self, stamps: Array) -> Array:
+    def predicted_poses(self, stamps: Array) -> Array:
         """base_from_surface (T, 4, 4) at stamps (T,), s: the poses of `predict`, for many stamps at once."""
         ahead = stamps - self.stamp
         if self.forecast is None:
             return np.asarray(self.base_from_surface @ se3.exp(self.twist * ahead[:, None]))
         within = np.clip(ahead, 0.0, self.forecast.end)
-        foreseen = np.asarray(self.base_from_surface @ se3.exp(self.forecast.at(within)[0]))
+        poses = np.asarray(self.base_from_surface @ se3.exp(self.forecast.at(within)[0]))
         if np.array_equal(within, ahead):
-            return foreseen
-        beyond = body_rate(*self.forecast.at(np.array([self.forecast.end])))
-        speed = np.where((ahead < 0)[:, None], self.twist, beyond)
-        return np.asarray(foreseen @ se3.exp(speed * (ahead - within)[:, None]))
+            return poses
+        end_twist = body_twist(*self.forecast.at(np.array([self.forecast.end])))
+        twist = np.where((ahead < 0)[:, None], self.twist, end_twist)
+        return np.asarray(poses @ se3.exp(twist * (ahead - within)[:, None]))
 
-    def _foreseen(self, stamp: float, forecast: Forecast, onwards: bool) -> SurfacePose:
+    def _predict_by_forecast(self, stamp: float, forecast: Forecast, keep_forecast: bool) -> SurfacePose:
         """The pose at `stamp`, s, within its forecast."""
         ahead = min(stamp - self.stamp, forecast.end)
         increments, rates = forecast.at(np.array([ahead]))
@@ -207,19 +206,19 @@ class SurfacePose:
             stamp=stamp,
             base_from_surface=self.base_from_surface @ se3.exp(increments[0]),
             covariance=forecast.covariance(self.covariance, ahead),
-            twist=body_rate(increments[0], rates[0]),
+            twist=body_twist(increments[0], rates[0]),
             twist_covariance=self.twist_covariance + np.diag(self.acceleration_psd) * ahead,
-            warp=None if self.warp is None else self.warp.later(ahead),
-            local=None if self.local is None else self.local.later(ahead),
-            forecast=forecast.after(ahead) if onwards else None,
+            warp=None if self.warp is None else self.warp.propagate(ahead),
+            local=None if self.local is None else self.local.propagate(ahead),
+            forecast=forecast.remainder(ahead) if keep_forecast else None,
         )
 
-    def _drift(self, stamp: float) -> SurfacePose:
+    def _predict_by_twist(self, stamp: float) -> SurfacePose:
         """The pose at `stamp`, s, under constant body velocity."""
         dt = stamp - self.stamp
         step = se3.exp(self.twist * dt)
-        carry = se3.adjoint(se3.inverse(step))
-        grown = carry @ self.covariance @ carry.T + dt**2 * self.twist_covariance
+        transport = se3.adjoint(se3.inverse(step))
+        grown = transport @ self.covariance @ transport.T + dt**2 * self.twist_covariance
         grown = grown + np.diag(self.acceleration_psd) * abs(dt) ** 3 / 3
         twist_grown = self.twist_covariance + np.diag(self.acceleration_psd) * abs(dt)
         return replace(
@@ -228,45 +227,47 @@ class SurfacePose:
             base_from_surface=self.base_from_surface @ step,
             covariance=(grown + grown.T) / 2,
             twist_covariance=twist_grown,
-            warp=None if self.warp is None else self.warp.later(dt),
-            local=None if self.local is None else self.local.later(dt),
+            warp=None if self.warp is None else self.warp.propagate(dt),
+            local=None if self.local is None else self.local.propagate(dt),
             forecast=None if dt else self.forecast,
         )
 
     def error_at(self, points_surface: Array) -> Array:
         """Standard deviation (N,), mm, of the position of points (N, 3), surface frame, along its worst direction."""
-        return np.asarray(np.sqrt(np.linalg.eigvalsh(self._spread(points_surface))[:, -1]))
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self._position_covariances(points_surface))[:, -1]))
 
-    def error_ahead(self, stamp: float, points_surface: Array) -> Array:
-        """`predict(stamp).error_at(points)`, faster: without all else that a prediction holds."""
+    def predicted_error(self, stamp: float, points_surface: Array) -> Array:
+        """`predict(stamp).error_at(points)`, but faster: only the covariances are predicted."""
         dt = stamp - self.stamp
         if self.forecast is None or not 0 < dt <= self.forecast.end:
             return self.predict(stamp).error_at(points_surface)
         covariance = self.forecast.covariance(self.covariance, dt)
-        warp = None if self.warp is None else self.warp.later(dt)
-        local = None if self.local is None else self.local.later(dt)
+        warp = None if self.warp is None else self.warp.propagate(dt)
+        local = None if self.local is None else self.local.propagate(dt)
         return replace(self, covariance=covariance, warp=warp, local=local).error_at(points_surface)
 
     def radius_at(self, points_surface: Array, share: float | Array = 0.9, offsets: Array | None = None) -> Array:
-        """Radius (N,), mm, about points (N, 3), surface frame, that holds their true places in `share` of cases.
+        """Radius (N,), mm, of balls at points (N, 3), surface frame, that hold the true places in `share` of cases.
 
-        share: as `radius` takes it.
-        offsets: (N, 3) mm, of the points from the centres of those balls, None: none.
+        share: as in `radius`.
+        offsets: (N, 3) mm, of the points from the balls' centres; None: zero.
         """
-        return radius(self._spread(points_surface), share, offsets)
+        return radius(self._position_covariances(points_surface), share, offsets)
 
-    def _spread(self, points_surface: Array) -> Array:
+    def _position_covariances(self, points_surface: Array) -> Array:
         """Covariances (N, 3, 3), mm^2, of the positions of points (N, 3)."""
         jacobian = se3.point_jacobians(points_surface)
-        spread = np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2))
-        spread = spread if self.warp is None else spread + self.warp.spread(points_surface)
+        covariances = np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2))
+        covariances = (
+            covariances if self.warp is None else covariances + self.warp.displacement_covariance(points_surface)
+        )
         if self.local is not None:
-            spread = spread + self.local.variance_at(points_surface)[:, None, None] * np.eye(3)
-        return np.asarray(spread)
+            covariances = covariances + self.local.variance_at(points_surface)[:, None, None] * np.eye(3)
+        return np.asarray(covariances)
 
 
 def identity_pose(stamp: float, reason: str) -> SurfacePose:
-    """The pose before the first map: INITIALISING, at the base's origin, with a covariance that says nothing."""
+    """The pose before the first map: INITIALISING, at the base's origin, with a covariance of half a turn and 1 m."""
     covariance = np.diag([np.pi**2] * 3 + [1e6] * 3)
     return SurfacePose(stamp, np.eye(4), covariance, np.zeros(6), TrackState.INITIALISING, reason=reason)
 
@@ -279,15 +280,15 @@ def position_sigma(covariance: Array) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """A recorded motion of the surface: a session's truth or reference, or what a run wrote.
+    """A recorded motion of the surface: a session's truth or reference, or the poses of a run.
 
-    The error of a measured reference (`reference.tum`) must not be held against the tracker; a truth (`truth.tum`) is
-    a simulator's or an instrument's.
+    A truth (`truth.tum`) is a simulator's or an instrument's. A reference (`reference.tum`) is measured and has errors
+    of its own, which are not the tracker's.
     """
 
     stamps: Array  # (N,) s, strictly increasing
     base_from_surface: Array  # (N, 4, 4) mm
-    exact: bool  # a truth, not a measured reference
+    exact: bool  # truth; False: measured reference
 
     def __repr__(self) -> str:
         seconds = float(self.stamps[-1] - self.stamps[0]) if len(self) else 0.0
@@ -297,7 +298,7 @@ class Trajectory:
         return len(self.stamps)
 
     def at(self, times: Array) -> Array:
-        """base_from_surface (N, 4, 4) mm at times (N,), s, interpolated; the first and the last one beyond its ends."""
+        """base_from_surface (N, 4, 4) mm interpolated at times (N,), s; beyond the ends the first or the last one."""
         after = np.clip(np.searchsorted(self.stamps, times), 1, len(self.stamps) - 1)
         share = (times - self.stamps[after - 1]) / (self.stamps[after] - self.stamps[after - 1])
         poses = self.base_from_surface

@@ -3,8 +3,8 @@
 The unknown is the right perturbation of base_from_surface. Weights are Geman-McClure's, which redescend: with 30 % of
 the tracks stuck to a static drape, the error was 0.107 mm with Huber's loss and 0.023 mm with a redescending one.
 
-Some errors are shared by all tracks of a camera and do not average out: a late exposure, or a lens that shifts its
-image. `SharedErrors` holds their expected size. They are solved for beside the pose (linear mixed-effects model;
+All tracks of a camera share some errors, which do not average out: the delay of its exposure and the shift of its
+image. `SharedErrors` holds their expected size. They are estimated beside the pose (linear mixed-effects model;
 Henderson 1975), so that they are not mistaken for outliers and can be learned. They do not change the weights between
 cameras: that moved poses farther from the reference of the webcams' recordings.
 """
@@ -24,16 +24,16 @@ from estimation.se3 import Array, Index, Mask
 TRACK_COLUMNS = 10  # of a track's row: six of the pose, its camera's delay and two shifts, its residual
 CHI2_MEDIAN = 1.386  # of the squared length of two normal entries, in their variance
 GATE = 3.0  # residual in sigmas at which a track's weight has fallen to a quarter
-# What the weights, at that gate, take from the information of Gaussian noise beyond what the estimate itself loses
-# (Huber 1981, 4.6, integrated over two dimensions): the weights' mean is 0.72, the estimate is worth 0.89
+# Factor on the weighted information for Gaussian noise at that gate: the weights' mean is 0.72, the estimate's
+# efficiency 0.89 (Huber 1981, 4.6, integrated over two dimensions)
 EFFICIENCY = 1.235
-INLIER_WEIGHT = 0.2  # from there on a track agrees with the fit
-CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: a last step as small as that leaves a hundredth of a sigma to go
+INLIER_WEIGHT = 0.2  # least weight of an inlier
+CONVERGED_CHI2 = 1e-3  # squared sigmas of the pose: after a last step that small a hundredth of a sigma remains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTracks:
-    """Points of the surface and where cameras see them: N parallel rows."""
+    """Points of the surface and their pixels: N parallel rows."""
 
     camera: Index  # (N,) number in the rig
     points: Array  # (N, 3) mm, surface frame
@@ -41,37 +41,37 @@ class PointTracks:
     sigma: Array  # (N,) px, one standard deviation per axis
 
     @staticmethod
-    def of(observations: Observations, points: Array) -> PointTracks:
-        """Observations of points (N, 3), one for each row."""
+    def from_observations(observations: Observations, points: Array) -> PointTracks:
+        """Tracks of observations with their points (N, 3) mm, surface frame."""
         return PointTracks(observations.camera, points, observations.pixels, observations.sigma)
 
-    def only(self, rows: Mask) -> PointTracks:
-        """Those of the rows (N,)."""
+    def select(self, rows: Mask) -> PointTracks:
+        """The tracks of some rows, a mask (N,)."""
         return PointTracks(self.camera[rows], self.points[rows], self.pixels[rows], self.sigma[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedErrors:
-    """The expected size of the errors that all tracks of one camera share in one frame set."""
+    """Prior covariance of the errors that all tracks of one camera share in one frame set."""
 
-    twist: Array  # (6,) rad/s and mm/s of the surface: a delay shows along it
+    twist: Array  # (6,) rad/s and mm/s of the surface, along which a delay moves the image
     delay: Array  # (C, C) s^2, covariance of the cameras' delays; may be singular
     shift: Array  # (C,) px^2, variance of an image's shift, per axis
 
     def covariance(self) -> Array:
         """Of (delays (C,), shifts (C,) right, shifts (C,) down): (3C, 3C)."""
-        n = len(self.shift)
-        whole = np.zeros((3 * n, 3 * n))
-        whole[:n, :n] = self.delay
-        whole[np.arange(n, 3 * n), np.arange(n, 3 * n)] = np.tile(self.shift, 2)
-        return whole
+        count = len(self.shift)
+        covariance = np.zeros((3 * count, 3 * count))
+        covariance[:count, :count] = self.delay
+        covariance[np.arange(count, 3 * count), np.arange(count, 3 * count)] = np.tile(self.shift, 2)
+        return covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedFit:
-    """Normal equations of the shared errors, the pose marginalised: information @ effect = pull."""
+    """Normal equations of the shared errors, the pose marginalised: information @ errors = pull."""
 
-    information: Array  # (3C, 3C) of the effect: delays (C,) s, shifts right (C,) px, shifts down (C,) px
+    information: Array  # (3C, 3C) of the errors: delays (C,) s, shifts right (C,) px, shifts down (C,) px
     pull: Array  # (3C,)
 
 
@@ -82,7 +82,7 @@ class PoseFit:
     base_from_surface: Array  # (4, 4)
     information: Array  # (6, 6) of its right perturbation
     residuals: Array  # (N, 2) px, predicted minus observed, without the shared errors
-    weights: Array  # (N,) in [0, 1], one for a track that fits
+    weights: Array  # (N,) in [0, 1], 1 without residual
     jacobians: Array  # (N, 2, 6) px per rad and mm
     scale: float  # robust size of the residuals, in sigmas
     shared: SharedFit | None = None  # only of a fit with shared errors
@@ -110,7 +110,7 @@ def solve_pose(
 ) -> PoseFit:
     """Fit base_from_surface to tracks, from `start` (4, 4), by iteratively reweighted Gauss-Newton steps.
 
-    The unit of residuals grows to the tracks' own median, so that tracks worse than they claim are averaged.
+    Residuals are scaled by their median, at least 1 sigma, so that tracks with too small sigmas are averaged too.
 
     scales: factors of GATE, from coarse to fine.
     prior: (6, 6) information about `start`.
@@ -120,23 +120,25 @@ def solve_pose(
     """
     count, none = len(rig), np.zeros((6, 6))
     twist, effects = (none[0], np.zeros((3 * count,) * 2)) if shared is None else (shared.twist, shared.covariance())
-    seen = contiguous(tracks.camera, np.int64), contiguous(tracks.points), contiguous(tracks.pixels)
-    fixed = rig.camera_from_base, rig.matrices, *seen, contiguous(1 / tracks.sigma**2), contiguous(start)
-    how = np.array(scales, float), iterations, tolerance, none if prior is None else contiguous(prior)
-    fitted = _gauss_newton(*fixed, *how, shared is not None, contiguous(twist), effects)
-    pose, information, residuals, weights, jacobians, unit, grams = fitted
+    observed = contiguous(tracks.camera, np.int64), contiguous(tracks.points), contiguous(tracks.pixels)
+    data = rig.camera_from_base, rig.matrices, *observed, contiguous(1 / tracks.sigma**2), contiguous(start)
+    settings = np.array(scales, float), iterations, tolerance, none if prior is None else contiguous(prior)
+    fitted = _gauss_newton(*data, *settings, shared is not None, contiguous(twist), effects)
+    pose, information, residuals, weights, jacobians, scale, grams = fitted
     if shared is None:
-        return PoseFit(pose, EFFICIENCY / unit**2 * information, residuals, weights, jacobians, unit)
-    own, pull = _shared_equations(grams)
-    return PoseFit(pose, information, residuals, weights, jacobians, unit, SharedFit(own, pull.ravel()))
+        return PoseFit(pose, EFFICIENCY / scale**2 * information, residuals, weights, jacobians, scale)
+    shared_information, right_side = _shared_equations(grams)
+    return PoseFit(
+        pose, information, residuals, weights, jacobians, scale, SharedFit(shared_information, right_side.ravel())
+    )
 
 
 exp_entries = compiled("UniTuple(f8, 12)(f8, f8, f8, f8, f8, f8)")(se3.exp_entries)
 
 
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
-def solved(matrix: Array, right: Array) -> Array:
-    """matrix^-1 @ right, (N, N) and (N, K) of few rows, by elimination with pivots; not finite where it is singular."""
+def solve_small(matrix: Array, right: Array) -> Array:
+    """matrix^-1 @ right, (N, N) and (N, K) with few rows: Gauss elimination with pivots; not finite if singular."""
     left, out, count = matrix.copy(), right.copy(), len(matrix)
     for k in range(count):
         pivot = k
@@ -164,7 +166,7 @@ def solved(matrix: Array, right: Array) -> Array:
 
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
 def product(a: Array, b: Array) -> Array:
-    """a @ b of few rows and columns, without the library's call."""
+    """a @ b with few rows and columns, without a call of BLAS."""
     out = np.zeros((a.shape[0], b.shape[1]))
     for i in range(a.shape[0]):
         for k in range(a.shape[1]):
@@ -174,22 +176,22 @@ def product(a: Array, b: Array) -> Array:
 
 
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1])")
-def _stepped(pose: Array, step: Array) -> Array:
+def _retract(pose: Array, step: Array) -> Array:
     """pose (4, 4) @ exp(-step), of (6, 1)."""
-    moved = np.zeros((4, 4))
+    exponential = np.zeros((4, 4))
     entries = exp_entries(-step[0, 0], -step[1, 0], -step[2, 0], -step[3, 0], -step[4, 0], -step[5, 0])
     for i in range(12):
-        moved[i // 4, i % 4] = entries[i]
-    moved[3, 3] = 1.0
-    return product(pose, moved)
+        exponential[i // 4, i % 4] = entries[i]
+    exponential[3, 3] = 1.0
+    return product(pose, exponential)
 
 
 @compiled("Tuple((f8[:,::1], f8[:,::1]))(f8[:,:,::1])")
 def _shared_equations(grams: Array) -> tuple[Array, Array]:
-    """As in `SharedFit`, (3C, 3C) and (3C, 1), of products as `gram_by_camera` has them (Schur complement)."""
+    """`SharedFit`'s equations, (3C, 3C) and (3C, 1), from `camera_grams`: the pose's Schur complement."""
     n = len(grams)
-    pose, right, cross = np.zeros((6, 6)), np.zeros((3 * n, 1)), np.zeros((6, 3 * n + 1))
-    own = np.zeros((3 * n, 3 * n))
+    pose, right_side, cross = np.zeros((6, 6)), np.zeros((3 * n, 1)), np.zeros((6, 3 * n + 1))
+    information = np.zeros((3 * n, 3 * n))
     for c in range(n):
         for a in range(6):
             cross[a, 3 * n] += grams[c, a, 9]
@@ -198,21 +200,21 @@ def _shared_equations(grams: Array) -> tuple[Array, Array]:
             for k in range(3):
                 cross[a, k * n + c] = grams[c, a, 6 + k]
         for k in range(3):
-            right[k * n + c, 0] = grams[c, 6 + k, 9]
+            right_side[k * n + c, 0] = grams[c, 6 + k, 9]
             for m in range(3):
-                own[k * n + c, m * n + c] = grams[c, 6 + k, 6 + m]
+                information[k * n + c, m * n + c] = grams[c, 6 + k, 6 + m]
     damping = 1e-12
     for a in range(6):
         damping += 1e-9 * pose[a, a]
     for a in range(6):
         pose[a, a] += damping
-    taken = product(cross.T.copy(), solved(pose, cross))
-    out = np.empty((3 * n, 3 * n))
+    eliminated = product(cross.T.copy(), solve_small(pose, cross))
+    schur = np.empty((3 * n, 3 * n))
     for i in range(3 * n):
-        right[i, 0] = taken[i, 3 * n] - right[i, 0]
+        right_side[i, 0] = eliminated[i, 3 * n] - right_side[i, 0]
         for j in range(3 * n):
-            out[i, j] = (own[i, j] - taken[i, j] + own[j, i] - taken[j, i]) / 2
-    return out, right
+            schur[i, j] = (information[i, j] - eliminated[i, j] + information[j, i] - eliminated[j, i]) / 2
+    return schur, right_side
 
 
 @compiled("Tuple((f8[:,::1], f8[::1], f8[:,:,::1]))(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1])")
@@ -249,7 +251,7 @@ def project_tracks(
 
 
 @compiled("f8[:,:,::1](i8, i8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[::1])")
-def gram_by_camera(cameras: int, camera: Index, jacobian: Array, residual: Array, weight: Array, twist: Array) -> Array:
+def camera_grams(cameras: int, camera: Index, jacobian: Array, residual: Array, weight: Array, twist: Array) -> Array:
     """Weighted products (C, 10, 10) of the columns of each camera's tracks: pose, own delay, own two shifts, residual.
 
     camera: (N,). jacobian: (N, 2, 6). residual: (N, 2) px. weight: (N,) px^-2. twist: (6,), along which a delay shows.
@@ -276,8 +278,8 @@ def gram_by_camera(cameras: int, camera: Index, jacobian: Array, residual: Array
 
 
 @compiled("f8[:,::1](i8[::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[:,::1])")
-def shared_residuals(camera: Index, jacobian: Array, twist: Array, effect: Array, whole: Array) -> Array:
-    """Residuals (N, 2) px, of the whole ones, with what the cameras' delays and shifts, effect (3, C), make added."""
+def shared_residuals(camera: Index, jacobian: Array, twist: Array, effect: Array, pose_residual: Array) -> Array:
+    """Residuals (N, 2) px with the cameras' delays and shifts, effect (3, C), added to those of the pose."""
     residual = np.empty((len(camera), 2))
     for i in range(len(camera)):
         c = camera[i]
@@ -285,57 +287,57 @@ def shared_residuals(camera: Index, jacobian: Array, twist: Array, effect: Array
             along = 0.0
             for a in range(6):
                 along += jacobian[i, k, a] * twist[a]
-            residual[i, k] = whole[i, k] + (effect[0, c] * along + effect[1 + k, c])
+            residual[i, k] = pose_residual[i, k] + (effect[0, c] * along + effect[1 + k, c])
     return residual
 
 
 @compiled("Tuple((f8[::1], f8))(f8[:,::1], f8[::1], f8[::1], f8, f8)")
-def weights_of(residual: Array, precision: Array, depth: Array, gate: float, unit: float) -> tuple[Array, float]:
-    """Geman-McClure's weights (N,), zero behind the camera, and the unit of residuals, in sigmas, that they hold for.
+def robust_weights(residual: Array, precision: Array, depth: Array, gate: float, scale: float) -> tuple[Array, float]:
+    """Geman-McClure's weights (N,), zero behind the camera, and the scale of the residuals, in sigmas.
 
-    residual: (N, 2) px. precision: (N,) px^-2. depth: (N,) mm. gate: units at which a weight is a quarter. unit: 0
-    where it is to be found: by the median residual of what is in front, one at least.
+    residual: (N, 2) px. precision: (N,) px^-2. depth: (N,) mm. gate: scales at which a weight is a quarter. scale: 0
+    to estimate it, by the median residual in front of the cameras, at least 1.
     """
     squared = np.empty(len(depth))
-    front = 0
+    in_front = 0
     for i in range(len(depth)):
         squared[i] = (residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1]) * precision[i]
-        front += depth[i] > 0
-    if unit == 0.0:
-        unit = 1.0
-        if front > 0:
-            middle = np.sort(squared[depth > 0])[front // 2] / CHI2_MEDIAN
-            unit = np.sqrt(max(middle, 1.0))
+        in_front += depth[i] > 0
+    if scale == 0.0:
+        scale = 1.0
+        if in_front > 0:
+            median = np.sort(squared[depth > 0])[in_front // 2] / CHI2_MEDIAN
+            scale = np.sqrt(max(median, 1.0))
     weight = np.zeros(len(depth))
     for i in range(len(depth)):
         if depth[i] > 0:
-            beside = 1.0 + squared[i] / (gate * unit) ** 2
-            weight[i] = 1.0 / (beside * beside)
-    return weight, unit
+            decay = 1.0 + squared[i] / (gate * scale) ** 2
+            weight[i] = 1.0 / (decay * decay)
+    return weight, scale
 
 
 @compiled(
     "Tuple((f8[::1], f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1], f8[:,::1], f8[:,::1])"
 )
-def _reprojected(
+def _reproject(
     camera_from_base: Array, matrices: Array, camera: Index, points: Array, pixels: Array, pose: Array
 ) -> tuple[Array, Array, Array]:
-    """Depths (N,), Jacobians (N, 2, 6) and residuals (N, 2), px, predicted minus seen, as `project_tracks` has them."""
+    """Depths (N,) mm, Jacobians (N, 2, 6) and residuals (N, 2) px, predicted minus observed, at a pose (4, 4)."""
     from_surface = product(camera_from_base.reshape(-1, 4), pose).reshape(-1, 4, 4)
-    left, depth, jacobian = project_tracks(from_surface, matrices, camera, points)
-    for i in range(len(left)):
-        left[i, 0] -= pixels[i, 0]
-        left[i, 1] -= pixels[i, 1]
-    return depth, jacobian, left
+    residual, depth, jacobian = project_tracks(from_surface, matrices, camera, points)
+    for i in range(len(residual)):
+        residual[i, 0] -= pixels[i, 0]
+        residual[i, 1] -= pixels[i, 1]
+    return depth, jacobian, residual
 
 
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1], f8[:,::1])")
-def _expected_effects(own: Array, pull: Array, effects: Array) -> Array:
-    """Effects (3, C) expected by their equations (3C, 3C), (3C, 1) and their covariance (3C, 3C)."""
-    weighed = product(own, effects)
-    for a in range(len(own)):
-        weighed[a, a] += 1.0
-    return product(effects, solved(weighed, pull)).reshape(3, len(own) // 3)
+def _expected_effects(information: Array, right_side: Array, effects: Array) -> Array:
+    """Posterior mean (3, C) of the shared errors by their equations (3C, 3C), (3C, 1) and prior covariance (3C, 3C)."""
+    system = product(information, effects)
+    for a in range(len(information)):
+        system[a, a] += 1.0
+    return product(effects, solve_small(system, right_side)).reshape(3, len(information) // 3)
 
 
 @compiled(
@@ -359,22 +361,27 @@ def _gauss_newton(
     twist: Array,
     effects: Array,
 ) -> tuple[Array, Array, Array, Array, Array, float, Array]:
-    """The parts of the `PoseFit` that `solve_pose` finds. effects: (3C, 3C), `SharedErrors.covariance`, if `shared`."""
-    count, pose, unit, moved = len(matrices), start, 1.0, np.zeros((6, 1))
-    weight, trusted, information = np.zeros(len(points)), np.zeros(len(points)), np.zeros((6, 6))
+    """The loop of `solve_pose`: its pose, information, residuals, weights, Jacobians, residual scale and grams.
+
+    effects: (3C, 3C) prior covariance of the shared errors, used if `shared`.
+    """
+    count, pose, residual_scale, total_step = len(matrices), start, 1.0, np.zeros((6, 1))
+    weight, track_information, information = np.zeros(len(points)), np.zeros(len(points)), np.zeros((6, 6))
     grams, effect = np.zeros((count, TRACK_COLUMNS, TRACK_COLUMNS)), np.zeros((3, count))
-    depth, jacobian, whole = _reprojected(camera_from_base, matrices, camera, points, pixels, pose)
-    residual = whole
-    for widening in scales:
-        for iteration in range(iterations if widening == scales[-1] else 3):
-            # robust weights; the unit of residuals is estimated anew in the first three iterations
-            weight, unit = weights_of(residual, precision, depth, GATE * widening, 0.0 if iteration < 3 else unit)
+    depth, jacobian, pose_residual = _reproject(camera_from_base, matrices, camera, points, pixels, pose)
+    residual = pose_residual
+    for gate_factor in scales:
+        for iteration in range(iterations if gate_factor == scales[-1] else 3):
+            # robust weights; the residual scale is estimated anew in the first three iterations
+            weight, residual_scale = robust_weights(
+                residual, precision, depth, GATE * gate_factor, 0.0 if iteration < 3 else residual_scale
+            )
             # normal equations (information, gradient), damped
-            clear = EFFICIENCY / unit**2 if shared else 1.0
+            efficiency = EFFICIENCY / residual_scale**2 if shared else 1.0
             for i in range(len(weight)):
-                trusted[i] = weight[i] * precision[i] * clear
-            grams = gram_by_camera(count, camera, jacobian, whole, trusted, twist)
-            information, damped, gradient = np.zeros((6, 6)), prior.copy(), product(prior, moved)
+                track_information[i] = weight[i] * precision[i] * efficiency
+            grams = camera_grams(count, camera, jacobian, pose_residual, track_information, twist)
+            information, damped, gradient = np.zeros((6, 6)), prior.copy(), product(prior, total_step)
             for a in range(6):
                 for c in range(count):
                     gradient[a, 0] += grams[c, a, 9]
@@ -383,17 +390,17 @@ def _gauss_newton(
                         damped[a, b] += grams[c, a, b]
                 damped[a, a] += 1e-9 + 1e-9 * information[a, a]
             # Gauss-Newton step, right perturbation
-            step, largest, gain = solved(damped, gradient), 0.0, 0.0
+            step, largest, gain = solve_small(damped, gradient), 0.0, 0.0
             for a in range(6):
-                moved[a, 0] -= step[a, 0]
+                total_step[a, 0] -= step[a, 0]
                 largest, gain = max(largest, abs(step[a, 0])), gain + step[a, 0] * gradient[a, 0]
-            pose = _stepped(pose, step)
-            depth, jacobian, whole = _reprojected(camera_from_base, matrices, camera, points, pixels, pose)
-            residual = whole
+            pose = _retract(pose, step)
+            depth, jacobian, pose_residual = _reproject(camera_from_base, matrices, camera, points, pixels, pose)
+            residual = pose_residual
             if shared:
-                if iteration < 2:  # the shared part by the last equations, the pose free; effects may be singular
+                if iteration < 2:  # shared errors by the last equations, the pose marginalised
                     effect = _expected_effects(*_shared_equations(grams), effects)
-                residual = shared_residuals(camera, jacobian, twist, effect, whole)
+                residual = shared_residuals(camera, jacobian, twist, effect, pose_residual)
             if largest < tolerance or gain < CONVERGED_CHI2:
                 break
-    return pose, information, residual, weight, jacobian, unit, grams
+    return pose, information, residual, weight, jacobian, residual_scale, grams

@@ -1,4 +1,4 @@
-"""Speed and memory: compiled loops (numba), fast median, cubic spline, the C library's heap, and what is not loaded.
+"""Speed and memory: compiled loops (numba), fast median, cubic spline, heap settings, and modules that are not loaded.
 
 Dozens of short numpy calls a frame cost more than what they compute, so loops over tracks are compiled. Their types are
 stated: a loop is compiled once, when its module is first imported, and cached. Other threads run meanwhile.
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from estimation.se3 import Array
 
 REORDERED_SUMS = {"reassoc", "contract", "nsz"}  # sums may be taken in parts, the same ones every time; nan stays nan
-OPEN3D_PAGES = "dash", "plotly", "plotly.graph_objects"  # half of the time that open3d takes to load
+UNUSED_OPEN3D_MODULES = "dash", "plotly", "plotly.graph_objects"  # half of the time that open3d takes to load
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # glibc's numbers of the options of mallopt
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -28,9 +28,9 @@ Function = TypeVar("Function", bound=Callable[..., object])
 def compiled(signature: str, reordered: bool = False, inlined: bool = False) -> Callable[[Function], Function]:
     """Compile a function for the given types; arrays must be contiguous and writable, as new ones are.
 
-    reordered: long sums may be taken several terms at a time, which is many times faster. Runs on one machine give the
-    same bits; another kind of processor may round otherwise.
-    inlined: its code stands wherever it is called, which is several times faster for a few operations in a loop.
+    reordered: whether long sums may be taken several terms at a time, which is many times faster. Runs on one machine
+    give the same bits; another kind of processor may round otherwise.
+    inlined: whether the code is inlined at each call, which is several times faster for a few operations in a loop.
     """
 
     from numba import njit  # half a second, which processes without such loops need not spend
@@ -46,7 +46,7 @@ def compiled(signature: str, reordered: bool = False, inlined: bool = False) -> 
 
 
 def contiguous(values: NDArray[Any], kind: type = float) -> NDArray[Any]:
-    """An array in the layout that compiled functions take, itself where it is: twenty times as fast as np.require."""
+    """The array in the layout that compiled functions take, itself if it has it; 20 times as fast as np.require."""
     values = np.asarray(values)
     if values.dtype == kind and values.flags.c_contiguous and values.flags.writeable:
         return values
@@ -117,7 +117,7 @@ def _knot_rates(step: Array, slope: Array, at_rest: bool) -> Array:
     return right
 
 
-class _LeftOut(ModuleType):
+class _StubModule(ModuleType):
     """A module in which every name is None."""
 
     def __getattr__(self, name: str) -> None:
@@ -126,33 +126,30 @@ class _LeftOut(ModuleType):
 
 
 @contextmanager
-def left_out(*names: str) -> Iterator[None]:
-    """Within it these modules are not loaded, whoever imports them, but stand empty: for what a library loads in vain.
+def stub_modules(*names: str) -> Iterator[None]:
+    """Replace modules by empty stubs while a library is imported that does not need them.
 
-    names: full ones, of each package on the way as well. What was loaded before stays.
+    names: full names, parent packages included. Modules loaded before stay as they are.
     """
-    absent = {name: _LeftOut(name) for name in names if name not in sys.modules}
-    sys.modules.update(absent)
-    held = [(sys.modules.get(name.rpartition(".")[0]), name.rpartition(".")[2]) for name in absent]
-    for (package, last), empty in zip(held, absent.values(), strict=True):
+    stubs = {name: _StubModule(name) for name in names if name not in sys.modules}
+    sys.modules.update(stubs)
+    parents = [(sys.modules.get(name.rpartition(".")[0]), name.rpartition(".")[2]) for name in stubs]
+    for (package, attribute), stub in zip(parents, stubs.values(), strict=True):
         if package is not None:
-            setattr(package, last, empty)  # as an import does: numpy looks there for its own parts
+            setattr(package, attribute, stub)  # as an import does: numpy looks there for its own parts
     try:
         yield
     finally:
-        for name in absent:
+        for name in stubs:
             del sys.modules[name]
-        for package, last in held:
+        for package, attribute in parents:
             if package is not None:
-                delattr(package, last)
+                delattr(package, attribute)
 
 
 def load_scipy() -> None:
-    """Load what all of scipy stands on, first of all: a tenth of a second less than by its first import elsewhere.
-
-    It takes over all names of numpy, also of the parts that build and test numpy's own code, which nobody else needs.
-    """
-    with left_out("numpy.f2py", "numpy.testing"):
+    """Load scipy's core with stubs for numpy's build and test tools: a tenth of a second faster than a plain import."""
+    with stub_modules("numpy.f2py", "numpy.testing"):
         import scipy.linalg  # noqa: F401
 
 
@@ -170,7 +167,7 @@ def trim_heap() -> None:
 def retain_freed_pages(room: int) -> None:
     """Keep up to `room` bytes of freed pages for later allocations, where the C library can (glibc's mallopt).
 
-    A process that fills and frees the same few buffers again and again is else given fresh pages each time, which the
+    Otherwise a process that fills and frees the same few buffers again and again gets new pages each time, which the
     system has to clear: half of the cost of writing pictures.
     """
     _mallopt(MMAP_THRESHOLD, room)
@@ -178,9 +175,9 @@ def retain_freed_pages(room: int) -> None:
 
 
 def use_one_arena() -> None:
-    """Let threads that are started from now on share one heap, where the C library can.
+    """Make threads started from now on share one heap, where the C library can (glibc's mallopt).
 
-    Else each has its own (glibc) and keeps the most it ever needed: 26 MB for tracking three cameras, partly touched
+    Otherwise each thread has a heap of its own, which never shrinks: 26 MB for tracking three cameras, partly used
     again only after hours, which looks like a leak.
     """
     _mallopt(ARENA_MAX, 1)

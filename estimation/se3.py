@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # the axes after each and before each
 _SMALL = 1e-4  # rad: below, the fourth-order series is exact to 1e-16 relative
-_TINY = 1e-100  # rad: so small a turn, and none, are the same to every digit, its square's among them
+_TINY = 1e-100  # rad: no different from no turn in any digit, even squared
 
 
 def hat(v: ArrayLike) -> Array:
@@ -35,7 +35,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def _coefficients(angle: Array) -> tuple[Array, Array]:
-    """sin(a)/a and (1 - cos a)/a^2, which lose nothing near zero as they stand."""
+    """sin(a)/a and (1 - cos a)/a^2, by formulas that keep their precision near zero."""
     a = np.maximum(angle, _TINY)
     return np.sin(a) / a, 2 * (np.sin(a / 2) / a) ** 2
 
@@ -211,7 +211,7 @@ def right_jacobian(xi: Array) -> Array:
 
 
 def inverse_right_jacobian(xi: Array) -> Array:
-    """(..., 6, 6), the inverse of it, by its Bernoulli series: exact to 1e-7 up to half a radian."""
+    """Inverse (..., 6, 6) of `right_jacobian` by its Bernoulli series: exact to 1e-7 up to half a radian."""
     ad = small_adjoint(xi)
     square = ad @ ad
     return np.asarray(np.eye(6) + ad / 2 + square / 12 - square @ square / 720 + square @ square @ square / 30240)

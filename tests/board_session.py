@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimation.calibration.lens_model import matrix_of
+from estimation.calibration.lens_model import lens_matrix
 from estimation.rig import Camera, Rig
 from hardware.files.folder_tables import SessionFolderWriter
 from hardware.files.images import encode
@@ -28,7 +28,7 @@ LENSES = np.array(
 def small_rig() -> Rig:
     """Three cameras of 640 x 480 px, the first one the base."""
     cameras = zip("abc", LENSES, places(), strict=True)
-    return Rig(tuple(Camera(name, (640, 480), matrix_of(lens), lens[4:], place) for name, lens, place in cameras))
+    return Rig(tuple(Camera(name, (640, 480), lens_matrix(lens), lens[4:], place) for name, lens, place in cameras))
 
 
 def rendered(folder: Path, instants: int = 14, board: Board = BOARD) -> Path:

@@ -85,4 +85,4 @@ def waved(
         pixels,
         np.full(len(stamp), noise),
     )
-    return views.only(views.seen.sum(1) >= 6), Truth(lenses, base_from_camera, np.array(offsets))
+    return views.select(views.seen.sum(1) >= 6), Truth(lenses, base_from_camera, np.array(offsets))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation import se3
-from estimation.mapping.bundle_adjustment import AdjustedMap, KeyFrame, adjust, frame_change, without_frame
+from estimation.mapping.bundle_adjustment import AdjustedMap, KeyFrame, adjust, frame_change, remove_rigid_motion
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
 from estimation.pose_solver import PointTracks, solve_pose
@@ -50,7 +50,9 @@ def look(
 
 
 def fitted(seen: Observations, points: Array, start: Array) -> Array:
-    return solve_pose(RIG, PointTracks.of(seen, points[seen.track]), start, scales=(4.0, 1.0)).base_from_surface
+    return solve_pose(
+        RIG, PointTracks.from_observations(seen, points[seen.track]), start, scales=(4.0, 1.0)
+    ).base_from_surface
 
 
 def key_frames(seen: list[Observations], points: Array) -> list[KeyFrame]:
@@ -170,11 +172,11 @@ def test_a_covariance_without_its_frame_has_no_rigid_motion_left() -> None:
     points = landmarks(6, 12)
     motion = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (12, 3, 3))], -1).reshape(-1, 6)
     a = np.random.default_rng(9).normal(size=(36, 40))
-    left = without_frame(a @ a.T, points)
+    left = remove_rigid_motion(a @ a.T, points)
     values = np.linalg.eigvalsh(left)
     assert np.allclose(left, left.T) and np.abs(values[:6]).max() < 1e-9 < values[6]
     whole = motion @ np.diag([0.1, 0.2, 0.1, 3.0, 1.0, 2.0]) @ motion.T
-    assert np.abs(without_frame(whole, points)).max() < 1e-9 * np.abs(whole).max()
+    assert np.abs(remove_rigid_motion(whole, points)).max() < 1e-9 * np.abs(whole).max()
 
 
 def test_a_point_that_is_hardly_known_lends_nothing_to_the_others() -> None:
@@ -182,7 +184,7 @@ def test_a_point_that_is_hardly_known_lends_nothing_to_the_others() -> None:
     known = 0.01 * np.eye(36)
     vague = known.copy()
     vague[2, 2] = 40.0**2
-    before, after = np.diag(without_frame(known, points))[3:], np.diag(without_frame(vague, points))[3:]
+    before, after = np.diag(remove_rigid_motion(known, points))[3:], np.diag(remove_rigid_motion(vague, points))[3:]
     assert (after < before + 0.01 * 12 / 11 / 6).all()  # no more than one holder of the frame less accounts for
 
 
@@ -197,7 +199,7 @@ def test_a_landmark_seen_too_seldom_stays_where_it_was() -> None:
     for i, t in enumerate(STAMPS):
         o = look(true, float(t), 4)
         keep = (o.track != 0) | ((o.camera < 2) & (i == 0))
-        seen.append(o.only(keep))
+        seen.append(o.select(keep))
     wrong = true.copy()
     wrong[0] += [0.0, 0.0, 5.0]
     adjusted = adjust(RIG, as_map(wrong), key_frames(seen, wrong), unsure(0.0))

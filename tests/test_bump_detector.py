@@ -82,7 +82,7 @@ def test_a_camera_that_nobody_saw_at_first_is_not_taken_for_bumped_once_it_is_se
     rig, estimator, draw = knocked(2, se3.exp([0, 0, 0, 0.6, 0, 0])), begun(breathing), np.random.default_rng(5)
     for stamp in np.arange(1, round((CALM + 2) * RATE)) / RATE:
         seen = observations(rig, LANDMARKS, breathing(stamp), stamp, draw, 0.3)
-        seen = seen.only(seen.camera != 2) if stamp < CALM else seen
+        seen = seen.select(seen.camera != 2) if stamp < CALM else seen
         estimator.accept(estimator.fit(seen, estimator.predict(stamp)), seen)
         assert not estimator.health.bumps.bumped
 

@@ -14,7 +14,7 @@ import pytest
 
 from estimation import se3
 from estimation.calibration.camera_rig import calibrate
-from estimation.calibration.lens_model import BoardViews, KnownLenses, lens_of
+from estimation.calibration.lens_model import BoardViews, KnownLenses, lens_parameters
 from estimation.rig import Rig
 from hardware.calibration.corners import collect_corners
 from hardware.calibration.inputs import camera_shifts, check_against, check_distance
@@ -217,7 +217,7 @@ def test_corners_are_good_to_half_a_pixel_and_half_a_millimetre(recording: tuple
 @pytest.mark.slow
 def test_with_given_lenses_the_cameras_stand_where_they_are_given(recording: tuple[str, BoardViews, Rig]) -> None:
     name, views, rig = recording
-    found = calibrate(views, known=KnownLenses(np.stack([lens_of(c) for c in rig.cameras]), np.zeros((3, 9))))
+    found = calibrate(views, known=KnownLenses(np.stack([lens_parameters(c) for c in rig.cameras]), np.zeros((3, 9))))
     assert median_residual(found) < 0.25
     millimetres, degrees = np.max(camera_shifts(found.rig, rig), axis=0)
     # webcams_b's own rig images its own recording 1.4 times worse than this one does, and its two halves agree on that

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.calibration.camera_rig import Calibration, calibrate, fit_lenses, rebased
+from estimation.calibration.camera_rig import Calibration, calibrate, fit_lenses, rebase
 from estimation.calibration.lens_fit import fit_lens, homography
 from estimation.calibration.lens_model import (
     BoardViews,
@@ -20,7 +20,7 @@ from estimation.calibration.lens_model import (
     Undetermined,
     check_lens,
     check_neighbours,
-    lens_of,
+    lens_parameters,
     project_lens,
 )
 from estimation.calibration.rig_fit import RigState, fit_rig, free_numbers, interpolate_board, stencils
@@ -63,7 +63,7 @@ def test_pixels_are_those_of_the_rig_and_their_derivatives_are_differences(xi: A
     found, by_lens, by_point = project_lens(LENSES[0], point)
     camera = Rig((camera_of(LENSES[0]),)).cameras[0]
     assert np.allclose(found, pixels_from_points(camera, point[None])[0][0])
-    assert np.allclose(lens_of(camera), LENSES[0])
+    assert np.allclose(lens_parameters(camera), LENSES[0])
     for k, step in enumerate([1e-3] * 4 + [1e-6] * 5):
         change = (project_lens(LENSES[0] + np.eye(9)[k] * step, point)[0] - found) / step
         assert np.allclose(change, by_lens[:, k], rtol=1e-4, atol=1e-4 * abs(by_lens).max())
@@ -73,10 +73,10 @@ def test_pixels_are_those_of_the_rig_and_their_derivatives_are_differences(xi: A
 
 
 def camera_of(lens: Array):
-    from estimation.calibration.lens_model import matrix_of
+    from estimation.calibration.lens_model import lens_matrix
     from estimation.rig import Camera
 
-    return Camera("a", SIZE, matrix_of(lens), np.array(lens[4:]), np.eye(4))
+    return Camera("a", SIZE, lens_matrix(lens), np.array(lens[4:]), np.eye(4))
 
 
 @given(st.lists(st.floats(-1, 1), min_size=8, max_size=8))
@@ -130,7 +130,7 @@ def test_an_instant_without_neighbours_is_taken_to_rest() -> None:
 
 def test_exact_corners_give_the_exact_rig() -> None:
     views, truth = waved(np.random.default_rng(1), noise=1e-6, offsets=(0.0, 0.0, 0.0))
-    fits = [fit_lens(views.only(views.camera == c), MODELS[c]) for c in range(3)]
+    fits = [fit_lens(views.select(views.camera == c), MODELS[c]) for c in range(3)]
     assert np.abs(np.stack([f.lens for f in fits]) - truth.lens).max() < 1e-3
 
 
@@ -158,7 +158,7 @@ def test_what_is_stated_to_be_uncertain_is_so(runs: int, low: float, high: float
 
 def _boards(views: BoardViews, truth: Truth) -> Array:
     first = [np.flatnonzero(views.instant == i)[0] for i in range(views.instant.max() + 1)]
-    fits = [fit_lens(views.only(views.camera == c), MODELS[c]) for c in range(3)]
+    fits = [fit_lens(views.select(views.camera == c), MODELS[c]) for c in range(3)]
     poses = np.zeros((len(views), 4, 4))
     for c, fit in enumerate(fits):
         poses[views.camera == c] = fit.camera_from_board
@@ -180,7 +180,7 @@ def test_lenses_that_bend_in_ways_too_slight_to_be_told_are_doubted() -> None:
     views, truth = waved(np.random.default_rng(3), lenses=bent)
     found = calibrate(views)
     choices = fit_lenses(views)[1]
-    assert all(0 <= choice.chance <= 1 for choice in choices)
+    assert all(0 <= choice.probability <= 1 for choice in choices)
     assert [c.rival for c in choices] == ["" if m == "k1 k2 p1 p2 k3" else "k1 k2 p1 p2 k3" for m in found.models]
     plain = fit_rig(found.views, found.fit.state, free_numbers(found.models), 0.0)
     gained = found.fit.covariance - plain.covariance
@@ -229,10 +229,10 @@ def test_blunders_are_dropped() -> None:
 
 def test_the_model_is_no_richer_than_the_lens() -> None:
     views, _ = waved(np.random.default_rng(3), noise=0.05)
-    choices = [choose_model(views.only(views.camera == c)) for c in range(3)]
+    choices = [choose_model(views.select(views.camera == c)) for c in range(3)]
     assert choices[0].fit.model == "k1 k2" and all("p1" not in choice.fit.model for choice in choices)
     none = next(score for score in choices[0].scores if score.model == "none")
-    assert none.ahead < -2 * none.doubt  # a lens that bends is not taken for one that does not
+    assert none.gain < -2 * none.gain_sigma  # a lens that bends is not taken for one that does not
 
 
 @pytest.mark.parametrize("lens", [TOP, SIDE, BOTTOM])
@@ -275,7 +275,7 @@ def test_lenses_of_webcams_that_were_measured_are_not_refused() -> None:
 def test_a_camera_that_sees_too_little_of_the_board_is_named(kept: Callable[[BoardViews], Array], words: str) -> None:
     views, _ = waved(np.random.default_rng(3))
     with pytest.raises(Undetermined, match=words):
-        calibrate(views.only(kept(views)))
+        calibrate(views.select(kept(views)))
 
 
 def test_a_board_that_is_not_the_one_described_is_told_by_how_its_corners_scatter() -> None:
@@ -322,7 +322,7 @@ def _nearest(sides: list, start: Array) -> Array:
         rows, rest = [], []
         for camera, seen in sides:
             camera_from_base = se3.inverse(camera.base_from_camera)
-            pixels, _, by = project_lens(lens_of(camera), se3.transform_points(camera_from_base, point[None]))
+            pixels, _, by = project_lens(lens_parameters(camera), se3.transform_points(camera_from_base, point[None]))
             rows.append(by[0] @ camera_from_base[:3, :3])
             rest.append(pixels[0] - seen)
         point = point - np.linalg.lstsq(np.concatenate(rows), np.concatenate(rest), rcond=None)[0]
@@ -347,7 +347,7 @@ def test_a_late_clock_costs_more_the_faster_the_surface_moves(known: tuple[Calib
 def test_another_base_leaves_the_cameras_where_they_are_to_each_other(known: tuple[Calibration, Truth]) -> None:
     found, _ = known
     base = se3.exp(np.array([0.3, -0.2, 1.0, 100.0, -50.0, 30.0]))
-    moved = rebased(found.rig, base)
+    moved = rebase(found.rig, base)
     assert np.allclose(moved.cameras[0].base_from_camera, base)
     for a, b in zip(found.rig.cameras, moved.cameras, strict=True):
         assert np.allclose(base @ a.base_from_camera, b.base_from_camera)

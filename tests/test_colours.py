@@ -62,12 +62,12 @@ class Looked:
 def test_a_pose_that_is_off_along_the_surface_is_told_by_how_much(shift: tuple[float, ...]) -> None:
     look = Looked(made("plain"))
     for number in range(10):
-        assert not len(look(number).sizes)
+        assert not len(look(number).distances)
     told = look(12, shift)
     size = float(np.linalg.norm(shift))
-    assert told.whole and 0.5 * size < told.sizes.max() < 1.3 * size
-    assert f"{told.sizes.max():.1f} mm off the texture" in told.message
-    assert not len(look(13).sizes) and not look(13).message
+    assert told.ambiguous and 0.5 * size < told.distances.max() < 1.3 * size
+    assert f"{told.distances.max():.1f} mm off the texture" in told.message
+    assert not len(look(13).distances) and not look(13).message
 
 
 @pytest.mark.parametrize(("shares", "told"), [((1.0, 0.0, 0.0), 0), ((0.6, 0.4, 0.0), 4), ((1.0,), 4)])
@@ -80,7 +80,7 @@ def test_a_displacement_is_what_a_second_camera_sees_as_well(shares: tuple[float
     pulls = np.stack([share * 1e3 * shift for share in shares])
     explained = 1e3 * (shift**2).sum(1)
     found = colours._judge(normal, pulls, 1.1 * explained + 50, np.full(4, 50.0))
-    assert len(found.sizes) == told
+    assert len(found.distances) == told
 
 
 def test_a_place_beside_the_print_head_of_the_first_picture_is_not_known() -> None:
@@ -110,7 +110,7 @@ def test_a_displacement_is_what_several_places_see(displaced: int, told: int) ->
         1.1 * (shift * pull).sum(1) + 50,
         np.full(8, 50.0),
     )
-    assert len(found.sizes) == told
+    assert len(found.distances) == told
 
 
 def test_a_shadow_over_dark_tissue_is_no_displacement() -> None:
@@ -129,16 +129,16 @@ def test_a_shadow_over_dark_tissue_is_no_displacement() -> None:
             edge = look.colours._pixels(c, poses[c], np.array([[4.0, 0.0, 0.0]]))[0, 0]
             light = np.where((np.arange(image.shape[1]) > edge) & (number > 6), 0.4, 1.0)
             shaded[c] = darkened(image, light[None, :, None])
-        assert not len(look.colours(shaded, poses).sizes)
+        assert not len(look.colours(shaded, poses).distances)
 
 
 def test_what_is_told_is_remembered_until_the_colours_are_back() -> None:
     look = Looked(made("plain"))
     for number in range(8):
         look(number)
-    sizes = [look(8 + k, (k * 0.5, 0.0, 0.0)).sizes.max(initial=0.0) for k in range(40)]
+    sizes = [look(8 + k, (k * 0.5, 0.0, 0.0)).distances.max(initial=0.0) for k in range(40)]
     assert (np.diff(sizes) >= 0).all() and sizes[0] == 0 and sizes[-1] > 2.0
-    assert not len(look(50).sizes)
+    assert not len(look(50).distances)
 
 
 def test_grey_cameras_tell_nothing() -> None:
@@ -146,14 +146,14 @@ def test_grey_cameras_tell_nothing() -> None:
     images, poses = look.seen(0)
     look.colours.begin({c: image[..., 1].copy() for c, image in images.items()}, poses, grid_map(look.session, 25.0))
     moved = {c: pose @ se3.make(np.eye(3), [3.0, 0, 0]) for c, pose in poses.items()}
-    assert not len(look.colours({c: image[..., 1].copy() for c, image in images.items()}, moved).sizes)
+    assert not len(look.colours({c: image[..., 1].copy() for c, image in images.items()}, moved).distances)
 
 
 @pytest.mark.parametrize("away", [-900.0, 900.0, 1e5])
 def test_a_surface_out_of_view_or_behind_a_camera_tells_nothing(away: float) -> None:
     look = Looked(made("plain"))
     for axis in np.eye(3):
-        assert not len(look(3, away * axis).sizes)
+        assert not len(look(3, away * axis).distances)
     camera, rig = 0, look.session.world.rig
     behind = se3.inverse(rig.camera_from_base[camera]) @ se3.make(np.eye(3), [0.0, 0.0, -abs(away)])
     assert (look.colours._pixels(camera, behind, look.colours._points) < 0).all()  # the lens model says: the middle
@@ -163,7 +163,7 @@ def test_ink_has_its_own_colours() -> None:
     look = Looked(made("plain"))
     everywhere = look.colours._points
     look.colours.cover(everywhere)
-    assert not len(look(8, (2.0, 0.0, 0.0)).sizes)
+    assert not len(look(8, (2.0, 0.0, 0.0)).distances)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_ink_has_its_own_colours() -> None:
 def test_light_hands_and_blur_are_no_displacement(kind: str) -> None:
     look = Looked(made(kind))
     numbers = range(0, len(look.session.stamps) - 1, 2)
-    assert not [n for n in numbers if look(n).sizes.max(initial=0.0) > 0]
+    assert not [n for n in numbers if look(n).distances.max(initial=0.0) > 0]
 
 
 @pytest.mark.slow  # a fast one is among the deceits

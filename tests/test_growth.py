@@ -18,7 +18,7 @@ from estimation.observations import no_observations
 from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, joined_map
+from estimation.surface_map import SurfaceMap, merge_maps
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.simulator.scene.scene import rois
 from hardware.simulator.scene.shape import Wound
@@ -207,7 +207,7 @@ def small_map(count: int, seed: int) -> SurfaceMap:
 
 def test_maps_are_joined_one_after_the_other_with_errors_of_their_own() -> None:
     a, b = small_map(4, 1), small_map(3, 2)
-    both = joined_map(a, b)
+    both = merge_maps(a, b)
     assert len(both) == 7 and np.array_equal(both.points[4:], b.points) and np.array_equal(both.points[:4], a.points)
     assert np.array_equal(both.covariance[:12, :12], a.covariance)
     assert np.array_equal(both.covariance[12:, 12:], b.covariance) and not both.covariance[:12, 12:].any()
@@ -216,9 +216,9 @@ def test_maps_are_joined_one_after_the_other_with_errors_of_their_own() -> None:
 def test_a_map_that_grew_while_it_was_refined_keeps_its_new_rows() -> None:
     a, b = small_map(4, 1), small_map(3, 2)
     refiner = Refiner(RIG)
-    refiner.extend(joined_map(a, b))
+    refiner.extend(merge_maps(a, b))
     better = SurfaceMap(a.points + 0.1, a.normals, 2 * a.covariance)
-    whole = refiner.with_new_rows(AdjustedMap(better, np.array([True, False, True, True])))
+    whole = refiner.append_new_rows(AdjustedMap(better, np.array([True, False, True, True])))
     assert np.array_equal(whole.map.points, np.concatenate([better.points, b.points]))
     assert whole.agrees.tolist() == [True, False, True, True, True, True, True]
     assert np.array_equal(whole.map.covariance[:12, :12], better.covariance)

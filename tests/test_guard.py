@@ -193,7 +193,7 @@ def test_the_error_that_counts_is_the_one_the_pose_itself_foretells(seed: int, f
     now = 1.0 + 0.2 * draw.random()
     answer = guard(move(begin, now, extrude=True), unsure, now)
     assert isinstance(answer, Refusal) and answer.code is RefusalCode.POSE_ERROR
-    assert answer.got == pytest.approx(unsure.error_ahead(now + TICK + lag, begin[None, :3])[0], rel=1e-9)
+    assert answer.got == pytest.approx(unsure.predicted_error(now + TICK + lag, begin[None, :3])[0], rel=1e-9)
 
 
 def test_after_moves_were_called_back_a_step_counts_from_where_the_arm_stands() -> None:

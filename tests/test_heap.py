@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from estimation.runtime import CubicCurve, left_out, median, trim_heap
+from estimation.runtime import CubicCurve, median, stub_modules, trim_heap
 from tests.campaigns.estimator import resident
 
 
@@ -98,8 +98,8 @@ def test_the_cubic_curve_is_scipys_spline(steps: list[float], at_rest: bool, see
 def test_a_part_that_is_left_out_is_empty_in_its_package_too() -> None:
     code = """
 import sys, numpy
-from estimation.runtime import left_out
-with left_out("numpy.f2py"):
+from estimation.runtime import stub_modules
+with stub_modules("numpy.f2py"):
     assert numpy.f2py.whatever is None
 assert "numpy.f2py" not in sys.modules and "f2py" not in vars(numpy)
 print(callable(numpy.f2py.get_include) + 0)
@@ -109,7 +109,7 @@ print(callable(numpy.f2py.get_include) + 0)
 
 def test_what_is_left_out_stands_empty_for_a_while_and_what_was_there_stays() -> None:
     before = sys.modules["numpy"]
-    with left_out("no_such_package", "no_such_package.part", "numpy"):
+    with stub_modules("no_such_package", "no_such_package.part", "numpy"):
         part = import_module("no_such_package.part")
         assert part.whatever is None and sys.modules["numpy"] is before
     assert "no_such_package" not in sys.modules and sys.modules["numpy"] is before

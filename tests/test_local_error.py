@@ -196,7 +196,7 @@ def test_a_place_is_known_as_pose_guard_and_a_recording_tell_alike(seed: int, ah
     best = max(best, 9.0 * np.clip(np.linalg.norm(support - place, axis=1).min() / 10.0 - 1.0, 0.0, 1.0))
     variance = then.error_at(place[None])[0] ** 2
     assert variance == pytest.approx(alone.error_at(place[None])[0] ** 2 + best)
-    assert pose.error_ahead(1.0 + ahead, place[None])[0] ** 2 == pytest.approx(variance)
+    assert pose.predicted_error(1.0 + ahead, place[None])[0] ** 2 == pytest.approx(variance)
     assert guard._error(pose, place, ahead) ** 2 == pytest.approx(variance)
     assert (then.radius_at(place[None]) >= alone.radius_at(place[None])).all()
     told = pose_from_message(json.loads(json.dumps(message_from_pose(pose))))

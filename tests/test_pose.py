@@ -144,4 +144,4 @@ def test_the_error_ahead_is_that_of_the_prediction(seed: int, dt: float) -> None
         grown = [(1 + k) * start.covariance for k in steps]
         start = replace(start, forecast=Forecast(steps, steps[:, None] * start.twist, np.stack(grown)))
     then = start.stamp + dt
-    assert np.allclose(start.error_ahead(then, places), start.predict(then).error_at(places))
+    assert np.allclose(start.predicted_error(then, places), start.predict(then).error_at(places))

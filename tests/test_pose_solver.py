@@ -19,7 +19,7 @@ from estimation.pose_solver import (
     SharedErrors,
     project,
     solve_pose,
-    solved,
+    solve_small,
 )
 from estimation.rig import ideal_pixels
 from estimation.se3 import Array
@@ -38,7 +38,7 @@ def seen(pose: Array, seed: int, noise: float = 0.3, outliers: float = 0.0) -> O
 
 
 def fit(o: Observations, start: Array, scales: tuple[float, ...] = (4.0, 1.0), prior: Array | None = None) -> PoseFit:
-    return solve_pose(RIG, PointTracks.of(o, LANDMARKS[o.track]), start, scales=scales, prior=prior)
+    return solve_pose(RIG, PointTracks.from_observations(o, LANDMARKS[o.track]), start, scales=scales, prior=prior)
 
 
 def away(fitted: PoseFit, truth: Array) -> Array:
@@ -153,7 +153,7 @@ def apart(mm: float, seed: int) -> tuple[Observations, Observations]:
     along = np.random.default_rng(seed).normal(size=3)
     shift = np.r_[np.zeros(3), mm * along / np.linalg.norm(along)]
     parts = [seen(BASE_FROM_REST @ se3.exp(k * shift), seed, noise=0.0) for k in (-1, 0, 1)]
-    return joined(0.0, [part.only(part.camera == c) for c, part in enumerate(parts)]), parts[1]
+    return joined(0.0, [part.select(part.camera == c) for c, part in enumerate(parts)]), parts[1]
 
 
 @pytest.mark.parametrize("mm", [0.3, 1.0, 3.0])
@@ -179,7 +179,7 @@ def test_points_behind_the_camera_have_no_say() -> None:
     points[back] = beyond[o.camera[back]]
     depth = project(RIG, o.camera, BASE_FROM_REST, points)[1]
     assert (depth[back] < 0).any()
-    fitted = solve_pose(RIG, PointTracks.of(o, points), BASE_FROM_REST, scales=(4.0, 1.0))
+    fitted = solve_pose(RIG, PointTracks.from_observations(o, points), BASE_FROM_REST, scales=(4.0, 1.0))
     assert (fitted.weights[depth < 0] == 0).all() and np.linalg.norm(away(fitted, BASE_FROM_REST)[3:]) < 0.1
 
 
@@ -199,9 +199,9 @@ TWIST = np.array([0.05, -0.03, 0.08, 30.0, -12.0, 15.0])  # rad/s and mm/s
 def late(seed: int, delays: Array, noise: float = 0.1) -> tuple[PoseFit, SharedErrors, Observations]:
     """The fit to cameras that expose `delays` (C,) s late, what was expected of their errors, and their tracks."""
     parts = [seen(BASE_FROM_REST @ se3.exp(s * TWIST), seed + 1000 * c, noise) for c, s in enumerate(delays)]
-    o = joined(0.0, [part.only(part.camera == c) for c, part in enumerate(parts)])
+    o = joined(0.0, [part.select(part.camera == c) for c, part in enumerate(parts)])
     expected = SharedErrors(TWIST, 0.01**2 * (np.eye(3) - 1 / 3), np.full(3, 0.005**2))
-    tracks = PointTracks.of(o, LANDMARKS[o.track])
+    tracks = PointTracks.from_observations(o, LANDMARKS[o.track])
     return solve_pose(RIG, tracks, BASE_FROM_REST, scales=(4.0, 1.0), shared=expected), expected, o
 
 
@@ -274,5 +274,7 @@ def test_small_equations_are_solved_whatever_stands_on_their_diagonal(seed: int,
     kept = matrix.copy()
     size = np.linalg.cond(matrix)
     if size < 1e8:
-        assert np.allclose(solved(matrix, right), np.linalg.solve(matrix, right), rtol=1e-15 * size, atol=1e-13 * size)
+        assert np.allclose(
+            solve_small(matrix, right), np.linalg.solve(matrix, right), rtol=1e-15 * size, atol=1e-13 * size
+        )
     assert (matrix == kept).all()

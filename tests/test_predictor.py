@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.forecast.predictor import ACCEPT_AFTER_S, HORIZONS, InnovationGate, PoseHistory, Predictor
-from estimation.pose import Forecast, SurfacePose, TrackState, body_rate, radius
+from estimation.forecast.predictor import HORIZONS, MAX_OUTLIER_DURATION_S, InnovationGate, PoseHistory, Predictor
+from estimation.pose import Forecast, SurfacePose, TrackState, body_twist, radius
 from estimation.se3 import Array
 from tests.slow_cases import slowly
 
@@ -82,7 +82,9 @@ def test_breathing_is_predicted_far_better_than_by_its_velocity(period: float) -
     for pose, forecast in zip(poses, forecasts(poses), strict=True):
         later = min(int(np.searchsorted(stamps, pose.stamp + 0.3 - 1e-9)), len(stamps) - 1)
         if forecast is not None and stamps[later] - pose.stamp < 0.5:
-            guesses = [p.base_at(stamps[later : later + 1])[0, :3, 3] for p in (pose, replace(pose, forecast=forecast))]
+            guesses = [
+                p.predicted_poses(stamps[later : later + 1])[0, :3, 3] for p in (pose, replace(pose, forecast=forecast))
+            ]
             errors.append([np.linalg.norm(guess - truth[later, :3, 3]) for guess in guesses])
     steady, ours = np.sqrt((np.array(errors)[100:] ** 2).mean(0))
     assert ours < 0.5 * steady
@@ -208,7 +210,9 @@ def test_a_forecast_begins_at_the_pose_and_passes_its_horizons() -> None:
 @pytest.mark.parametrize("ahead", [-0.2, 0.0, 0.05, 0.33, 0.5, 0.7])
 def test_many_instants_at_once_are_where_each_alone_is(ahead: float) -> None:
     pose = pose_with(some_forecast())
-    assert np.allclose(pose.base_at(np.array([2.0 + ahead]))[0], pose.predict(2.0 + ahead).base_from_surface, atol=1e-6)
+    assert np.allclose(
+        pose.predicted_poses(np.array([2.0 + ahead]))[0], pose.predict(2.0 + ahead).base_from_surface, atol=1e-6
+    )
 
 
 def test_two_steps_of_a_forecast_end_where_one_does() -> None:
@@ -220,9 +224,9 @@ def test_two_steps_of_a_forecast_end_where_one_does() -> None:
 
 def test_the_predicted_twist_is_the_rate_of_the_predicted_pose() -> None:
     pose = pose_with(some_forecast())
-    before, after = pose.base_at(np.array([2.249, 2.251]))
+    before, after = pose.predicted_poses(np.array([2.249, 2.251]))
     assert np.allclose(se3.log(se3.inverse(before) @ after) / 0.002, pose.predict(2.25).twist, atol=1e-3)
-    assert np.allclose(body_rate(np.zeros(6), np.arange(6.0)), np.arange(6.0))
+    assert np.allclose(body_twist(np.zeros(6), np.arange(6.0)), np.arange(6.0))
 
 
 def test_a_forecast_crosses_to_another_process() -> None:
@@ -245,7 +249,7 @@ def test_increments_of_the_past_are_those_of_the_group() -> None:
         history.add(stamp, pose)
     expected = se3.log(se3.inverse(poses[-1]) @ poses[15:])
     assert np.allclose(history.increments(np.tile(poses[-1], (15, 1, 1)), stamps[15:]), expected, atol=1e-9)
-    assert history.reach == pytest.approx(2.0, abs=0.11)
+    assert history.duration == pytest.approx(2.0, abs=0.11)
 
 
 RATE = 30.0
@@ -339,16 +343,16 @@ def test_what_goes_on_surprising_becomes_usual() -> None:
     for _ in range(300):
         surprise(0.01 * draw.normal(size=6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
     asides = [surprise(0.3 * draw.normal(size=6), 1 / RATE, 0.1, 1e-4 * np.eye(6)) for _ in range(200)]
-    first = int(ACCEPT_AFTER_S * RATE)
+    first = int(MAX_OUTLIER_DURATION_S * RATE)
     assert all(asides[: first - 1]) and not any(asides[first + 2 :])
-    assert not surprise.active and not surprise.drift.any()
+    assert not surprise.active and not surprise.velocity.any()
 
 
 def test_an_unknown_velocity_fades() -> None:
     surprise = InnovationGate()
     for off in (0.01, 0.01, 1.0):
         surprise(off * np.ones(6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
-    widest = np.trace(surprise.unknown)
+    widest = np.trace(surprise.velocity_covariance)
     for _ in range(30):
         surprise(0.01 * np.ones(6), 1 / RATE, 0.1, 1e-4 * np.eye(6))
-    assert 0 < np.trace(surprise.unknown) < 1e-3 * widest
+    assert 0 < np.trace(surprise.velocity_covariance) < 1e-3 * widest

@@ -14,7 +14,7 @@ from estimation.rig import ideal_pixels
 from estimation.scans.registration import Registration
 from estimation.scans.scan import Hits, Scan, cast_rays, face_normals, open_edges, scan_from_triangles
 from estimation.se3 import Array
-from estimation.surface_map import moved_map
+from estimation.surface_map import transform_map
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.simulator.scene.scene import Scene, rois
 from hardware.simulator.scene.shape import Shape, Wound, body, cylinder, flat, with_wound
@@ -333,6 +333,6 @@ def test_what_the_scan_tells_of_landmarks_is_sharp_across_it_and_shared_in_its_p
         own = laid.normals[k] @ blocks[k, :, k] @ laid.normals[k]
         assert anchors.sigma[k] ** 2 < own < anchors.sigma[k] ** 2 + 0.05**2
     assert np.abs(blocks[i, :, j]).max() > 0
-    turned = moved_map(laid, SCAN_FROM_SURFACE)
-    back = moved_map(turned, se3.inverse(SCAN_FROM_SURFACE))
+    turned = transform_map(laid, SCAN_FROM_SURFACE)
+    back = transform_map(turned, se3.inverse(SCAN_FROM_SURFACE))
     assert np.allclose(back.points, laid.points) and np.allclose(back.covariance, laid.covariance)

@@ -8,7 +8,7 @@ import pytest
 from estimation.mapping.refiner import MIN_DELAY_SETS, Refiner, sets_until_ready
 from estimation.online.estimator import Estimator
 from estimation.se3 import Array
-from estimation.surface_map import joined_map
+from estimation.surface_map import merge_maps
 from tests.test_adjustment import RIG, as_map, landmarks, look, shape_error, swaying, unsure
 
 STAMPS = (0.0, 0.15, 0.3, 0.45)
@@ -54,7 +54,7 @@ def test_a_surface_that_deforms_has_the_map_again_as_it_was_confirmed_and_it_sta
             refiner.offer(estimator.fit(seen, swaying(seen.stamp)), seen, np.zeros(6), delays)
             refined.append(refiner.poll())
     assert any(r is not None for r in refined)
-    grown = joined_map(confirmed.map, as_map(true[:3], 0.1))
+    grown = merge_maps(confirmed.map, as_map(true[:3], 0.1))
     refiner.extend(grown)
     back = refiner.freeze()
     assert back is not None and len(back.map) == len(grown)

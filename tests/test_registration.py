@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
-from estimation.scans.registration import MIN_REGISTRATION_POINTS, Registration, better_of, register
+from estimation.scans.registration import MIN_REGISTRATION_POINTS, Registration, register, resolve_ambiguity
 from estimation.scans.scan import Scan, ScanIndex, scan_from_triangles
 from estimation.se3 import Array
 from tests import scans
@@ -136,15 +136,17 @@ def test_an_ambiguous_place_is_settled_by_better_points_only_where_these_tell_it
     ambiguous = replace(refined(0.0, 0.07), sure=False, verdict="ambiguous", rival=refined(3.0, 0.07).base_from_surface)
     points = np.random.default_rng(0).uniform(-20, 20, (50, 3))
     here, there = refined(0.0, 0.025), refined(3.0, 0.027)
-    asked = better_of(ambiguous, here, there, points)
+    asked = resolve_ambiguity(ambiguous, here, there, points)
     assert not asked.sure and "ambiguous" in asked.verdict and asked.rival is ambiguous.rival
-    assert better_of(ambiguous, here, refined(3.0, 0.05), points) is here
+    assert resolve_ambiguity(ambiguous, here, refined(3.0, 0.05), points) is here
     poor = refined(0.0, 0.05)
-    assert better_of(ambiguous, poor, there, points) is there
-    assert better_of(ambiguous, here, refined(0.05, 0.027), points) is here  # the rival has come to the same place
+    assert resolve_ambiguity(ambiguous, poor, there, points) is there
+    assert (
+        resolve_ambiguity(ambiguous, here, refined(0.05, 0.027), points) is here
+    )  # the rival has come to the same place
     turned = replace(there, base_from_surface=se3.exp(np.array([0, 0, 0.05, 0, 0, 0.0])))  # far at the rim
-    assert not better_of(ambiguous, here, turned, points).sure
-    assert not better_of(ambiguous, here, there, np.zeros((0, 3))).sure
+    assert not resolve_ambiguity(ambiguous, here, turned, points).sure
+    assert not resolve_ambiguity(ambiguous, here, there, np.zeros((0, 3))).sure
 
 
 def test_points_of_another_surface_are_called_a_poor_fit() -> None:

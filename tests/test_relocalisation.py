@@ -172,7 +172,7 @@ def case() -> Case:
 
 def had(seen: Observations, k: int) -> Observations:
     """What was tracked of a frame set."""
-    return no_observations(seen.stamp) if k in LOST else seen.only((seen.track % 2 == 0) | (k >= JOINED))
+    return no_observations(seen.stamp) if k in LOST else seen.select((seen.track % 2 == 0) | (k >= JOINED))
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimation.pose import SurfacePose
-from estimation.runtime import left_out
+from estimation.runtime import stub_modules
 from hardware.arm.profile import ArmProfile
 from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axes_from_nozzle
@@ -39,7 +39,7 @@ from tests.campaigns.planner import (
 )
 from tests.moving_surfaces import Motion, path_through, pose_at, raster, still
 
-with left_out("matplotlib", "matplotlib.pyplot"):
+with stub_modules("matplotlib", "matplotlib.pyplot"):
     from toppra.algorithm import TOPPRA
 
 TRIED_TOPPRA = {
@@ -119,7 +119,7 @@ def test_no_stretch_and_no_corner_is_passed_faster_than_it_may_be(seed: int) -> 
 def most_of_the_limits(curve: PathCurve, timing: Timing, pose: SurfacePose, end: float) -> tuple[float, float]:
     """The largest shares of speed and acceleration limits up to `end`, s, by differences of the axes asked for."""
     t = np.arange(timing.times[0], min(timing.end, end), STEP)
-    axes = axes_from_nozzle(ARM, pose.base_at(t) @ curve.poses(timing.at(t)))
+    axes = axes_from_nozzle(ARM, pose.predicted_poses(t) @ curve.poses(timing.at(t)))
     speed, acceleration = (np.abs(np.diff(axes, n, axis=0)) / STEP**n / BOUNDS[n - 1] for n in (1, 2))
     return float(speed.max(initial=0.0)), float(acceleration.max(initial=0.0))
 
@@ -212,7 +212,9 @@ def test_the_demand_of_a_surface_is_its_axes_own_speed_and_acceleration() -> Non
     grid = gridpoints_on(curve, 0.0, 4.0)
     asked = axis_derivatives(ARM, pose, curve, grid, 10.0)
     fixed = curve.poses(grid.places[:1])
-    before, after = (axes_from_nozzle(ARM, pose.base_at(np.array([10.0 + h])) @ fixed)[0] for h in (-1e-3, 1e-3))
+    before, after = (
+        axes_from_nozzle(ARM, pose.predicted_poses(np.array([10.0 + h])) @ fixed)[0] for h in (-1e-3, 1e-3)
+    )
     own = np.abs(after - before) / 2e-3
     assert (asked.speed[0] >= 0.999 * own).all()
     assert asked.speed[0, 2] == pytest.approx(10.0 * 2 * np.pi * 0.25, rel=0.06)  # and the tilt lowers it

@@ -161,7 +161,7 @@ def test_all_cameras_that_lose_most_of_the_surface_at_a_jump_are_no_rivals_of_no
         step(estimator, look(breathing, number / 30, 1))
     for number in range(60, 75):
         few = look(lambda t: breathing(t) @ se3.make(np.eye(3), [20.0, 0, 0]), number / 30, 1)
-        pose = step(estimator, few.only(few.track % 5 == 0))
+        pose = step(estimator, few.select(few.track % 5 == 0))
         assert not (pose.state is TrackState.TRACKING and error(pose, breathing) < 1.0)
 
 

@@ -69,9 +69,9 @@ def test_a_chain_with_a_border_is_inverted_as_a_whole(seed: int, count: int, siz
     chain, gradient = BlockTridiagonal(count), right.reshape(count, STATE_DOF)
     cut = count // 2
     entry = np.zeros((0, 0))
-    roots = [chain.take(own[:cut], ties[:cut], border[:cut], gradient[:cut])] if cut else []
-    entry = chain.border if cut else entry
-    roots.append(chain.take(own[cut:], ties[cut:], border[cut:], gradient[cut:]))
+    roots = [chain.eliminate_states(own[:cut], ties[:cut], border[:cut], gradient[:cut])] if cut else []
+    entry = chain.carried_border if cut else entry
+    roots.append(chain.eliminate_states(own[cut:], ties[cut:], border[cut:], gradient[cut:]))
     inverse = np.linalg.inv(whole[:n, :n])
     covariance, after = chain.covariances()
     expected = inverse.reshape(count, STATE_DOF, count, STATE_DOF)
@@ -83,7 +83,7 @@ def test_a_chain_with_a_border_is_inverted_as_a_whole(seed: int, count: int, siz
     border_left = np.concatenate(roots)
     schur = border.reshape(n, size).T @ inverse @ border.reshape(n, size)
     assert np.allclose(border_left.T @ border_left, schur, rtol=1e-6, atol=1e-9)
-    again = chain.again((cut, count), border[cut:], entry)
+    again = chain.roots_again((cut, count), border[cut:], entry)
     assert np.allclose(again, roots[-1])
     response = dict(chain.responses((cut, count), again, np.zeros((STATE_DOF, size))))
     for k, found in response.items():
@@ -101,7 +101,9 @@ def test_the_prior_is_differentiated_exactly(seed: int) -> None:
     for k in range(STATE_DOF):
         step = np.zeros((3, STATE_DOF))
         step[1, k] = 1e-6
-        change = (prior_factors(states.moved(step), stamps).off - prior_factors(states.moved(-step), stamps).off) / 2e-6
+        change = (
+            prior_factors(states.retract(step), stamps).residual - prior_factors(states.retract(-step), stamps).residual
+        ) / 2e-6
         assert np.allclose(change[0], at.after[0, :, k], atol=2e-5)
         assert np.allclose(change[1], at.before[1, :, k], atol=2e-5)
 
@@ -110,7 +112,7 @@ def test_a_constant_twist_costs_nothing_and_time_may_be_cut_anywhere() -> None:
     twist = np.array([0.3, -0.2, 0.5, 20.0, -10.0, 5.0])
     stamps = np.array([0.0, 0.05, 0.2])
     states = States(se3.exp(twist * stamps[:, None]), np.tile(twist, (3, 1)), np.zeros((3, 6)))
-    assert np.abs(prior_factors(states, stamps).off).max() < 1e-9
+    assert np.abs(prior_factors(states, stamps).residual).max() < 1e-9
     step = transition(np.array(0.3))
     both = step @ jerk_covariance(np.array(0.2)) @ step.T + jerk_covariance(np.array(0.3))
     assert np.allclose(both, jerk_covariance(np.array(0.5)))
@@ -154,7 +156,7 @@ def test_clocks_are_found_with_their_doubt() -> None:
 def test_a_camera_without_tracks_is_told_no_clock_and_takes_no_part_in_the_mean() -> None:
     given = np.array([0.016, -0.006, 0.0])
     world = synthetic_world("lively", seconds=1.0, count=FEW, offsets=tuple(given), seed=2)
-    result = smooth(world.rig, [seen.only(seen.camera != 2) for seen in world])
+    result = smooth(world.rig, [seen.select(seen.camera != 2) for seen in world])
     off = result.offsets[:2] - (given[:2] - given[:2].mean())
     assert np.abs(off).max() < 1e-3 and result.offsets[2] == pytest.approx(0, abs=1e-6)
     assert result.offset_sigma[2] == pytest.approx(CalibrationPrior().clock, rel=1e-3)
@@ -253,7 +255,7 @@ def test_gtsam_finds_no_better_landmarks_for_these_poses() -> None:
             values.insert(key, gtsam.Pose3(se3.inverse(pose)))
             graph.add(gtsam.NonlinearEqualityPose3(key, values.atPose3(key)))
         for c, track, pixel, sigma in zip(seen.camera, seen.track, seen.pixels, seen.sigma, strict=True):
-            noise = gtsam.noiseModel.Isotropic.Sigma(2, float(sigma * result.fitted.unit[c]))
+            noise = gtsam.noiseModel.Isotropic.Sigma(2, float(sigma * result.statistics.residual_scale[c]))
             graph.add(
                 gtsam.GenericProjectionFactorCal3_S2(
                     pixel,
@@ -289,7 +291,7 @@ def test_gtsam_solves_the_same_condensed_factors_alike(monkeypatch: pytest.Monke
     sigma = np.sqrt(np.diag(done.shared_covariance()))
     assert found.at(key) == pytest.approx(done.shared_step(), abs=1e-6 * float(sigma.min()))
     assert np.abs(steps.marginalCovariance(key) / np.outer(sigma, sigma) - shared / np.outer(sigma, sigma)).max() < 1e-6
-    again = equations.eliminate(lambda done, total: None, done.shared_step()).chain.steps()
+    again = equations.eliminate(lambda done, total: None, done.shared_step()).factor.steps()
     for k in range(count):
         scale = np.sqrt(np.diag(result.covariance[k]))
         assert (np.abs(found.at(k) - again[k]) < 1e-6 * scale).all()
@@ -300,22 +302,22 @@ def test_gtsam_solves_the_same_condensed_factors_alike(monkeypatch: pytest.Monke
 def gtsam_solution(equations: NormalEquations) -> tuple[gtsam.GaussianBayesTree, Array]:
     """The states 0 to K - 1 and, as K, the shared unknowns; their covariance (S, S) by the banded solver."""
     problem, estimate, known = equations.problem, equations.estimate, equations.known
-    part, links = condense(problem, 0, len(problem.data), estimate, equations.noise), equations._links
+    part, links = condense(problem, 0, len(problem.data), estimate, equations.noise), equations._motion_prior
     count, q, size = len(problem.data), len(problem.free), problem.size
     equations._begin(0, count, part.information, part.gradient)
     graph, none = gtsam.GaussianFactorGraph(), np.zeros((size, size))
     for k in range(count):
         own = part.information[k], part.cross[k], -part.gradient[k]
         graph.add(gtsam.HessianFactor(k, count, *own, none, np.zeros(size), 0.0))
-    information, pull = part.shared - part.own.T @ part.own, part.pull.copy()
+    information, pull = part.shared - part.error_roots.T @ part.error_roots, part.shared_gradient.copy()
     information[:q, :q] += known.calibration[np.ix_(problem.free, problem.free)]
     information[q:, q:] += known.map
-    pull[:q] += (known.calibration @ estimate.cameras.since(known.calibrated))[problem.free]
+    pull[:q] += (known.calibration @ estimate.cameras.difference(known.cameras))[problem.free]
     pull[q:] += known.map @ (estimate.points - known.points).ravel()
     graph.add(gtsam.HessianFactor(count, information, -pull, 0.0))
     unit = gtsam.noiseModel.Unit.Create(STATE_DOF)
     for k, root in enumerate(np.linalg.cholesky(equations._information)):
-        before, after, off = root.T @ links.before[k], root.T @ links.after[k], -root.T @ links.off[k]
+        before, after, off = root.T @ links.before[k], root.T @ links.after[k], -root.T @ links.residual[k]
         graph.add(gtsam.JacobianFactor(k, before, k + 1, after, off, unit))
     ordering = gtsam.Ordering()
     for k in range(count + 1):
@@ -344,6 +346,6 @@ def test_what_cannot_be_smoothed_is_said() -> None:
 @settings(max_examples=300)
 def test_times_at_a_rate_lie_within_the_recording_at_any_uptime(uptime: float, sets: int, rate: float) -> None:
     recorded = replace(smoothed("breathing")[0], stamps=np.array([uptime, uptime + sets / 30.0]))
-    times, (first, last) = recorded.times(rate), recorded.stamps
+    times, (first, last) = recorded.sample_times(rate), recorded.stamps
     assert first == times[0] and times[-1] < last <= times[-1] + 1 / rate + 1e-8
     assert np.abs(np.diff(times) - 1 / rate).max(initial=0.0) < 1e-8

@@ -204,7 +204,7 @@ def test_a_step_of_300_um_or_0_1_degrees_is_flagged_within_two_frames(seed: int,
     said = watched(stepped(se3.exp(change)), SIGMA, claimed, seed)
     assert not any(motion.moving for motion in said[40:START]) and said[START + 1].moving
     assert said[START + 1].onset * RATE in (START - 1, START)  # by noise, the pose before it may stand out as well
-    assert (said[START + 1].turned if turn else said[START + 1].moved) == pytest.approx(size, rel=0.3)
+    assert (said[START + 1].angle if turn else said[START + 1].distance) == pytest.approx(size, rel=0.3)
 
 
 @pytest.mark.parametrize("turn", [False, True])
@@ -259,7 +259,7 @@ def test_a_breathing_surface_moves_and_one_that_stops_is_at_rest_again() -> None
     assert begun < first < begun + 10 and begun <= said[first].onset * RATE <= first
     assert all(motion.moving for motion in said[first : ended + 20])
     assert {motion.onset for motion in said[first:]} == {said[first].onset}
-    assert not any(motion.moving for motion in said[ended + 40 :]) and said[-1].moved < 0.02
+    assert not any(motion.moving for motion in said[ended + 40 :]) and said[-1].distance < 0.02
 
 
 def test_a_surface_that_was_moved_while_nobody_looked_is_flagged_when_it_is_seen_again() -> None:

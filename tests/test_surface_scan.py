@@ -13,7 +13,7 @@ from estimation import se3
 from estimation.errors import InputError, StillbedError
 from estimation.pose import TrackState, identity_pose
 from estimation.scans.registration import register
-from estimation.scans.scan import ScanIndex, face_normals, lattice_triangles, scan_from_triangles
+from estimation.scans.scan import ScanIndex, face_normals, scan_from_triangles, triangulate_lattice
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.cli.plan import scanned_settings
@@ -132,7 +132,7 @@ def test_its_page_shows_it(scanned: SurfaceScan) -> None:
 def test_a_lattices_triangles_face_the_eye_and_leave_holes_open() -> None:
     sure = np.ones((5, 6), bool)
     sure[2, 3] = False
-    used, triangles = lattice_triangles(sure)
+    used, triangles = triangulate_lattice(sure)
     points = np.column_stack([used % 6, used // 6, np.zeros(len(used))]).astype(float)
     assert len(triangles) == 2 * 20 - 6
     assert 2 * 6 + 3 not in used

@@ -150,7 +150,7 @@ def test_least_squares_reaches_the_bound_and_does_not_pass_it() -> None:
     errors = []
     for seen in world:
         points = world.landmarks.points[seen.track]
-        plain = solve_pose(world.rig, PointTracks.of(seen, points), true, scales=(1e6 / GATE,))
+        plain = solve_pose(world.rig, PointTracks.from_observations(seen, points), true, scales=(1e6 / GATE,))
         errors.append(se3.log(se3.inverse(plain.base_from_surface) @ true))
     bound = pose_bound(information(world, seen))
     nees = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(bound), errors)

@@ -22,12 +22,12 @@ from perception.thesis.camera import (
     GaussianState,
     KeyPoints,
     Pairs,
-    corners_of,
+    bounds_of,
     displacement,
     initial_velocity,
     predict,
     turn,
-    united,
+    union_box,
     update,
     update_velocity,
 )
@@ -141,8 +141,8 @@ def test_a_picture_without_texture_gives_no_pairs(kind: type[KeyPoints] | type[C
 def test_the_united_box_holds_both_regions_and_stays_in_the_image(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = (320, 240)
-    regions = [corners_of(rng.uniform(-50, 400, (5, 2)), size) for _ in range(2)]
-    x0, y0, x1, y1 = united(regions[0], regions[1], size)
+    regions = [bounds_of(rng.uniform(-50, 400, (5, 2)), size) for _ in range(2)]
+    x0, y0, x1, y1 = union_box(regions[0], regions[1], size)
     assert 0 <= x0 < x1 <= size[0] and 0 <= y0 < y1 <= size[1]
     both = np.concatenate(regions)
     assert (both >= [x0, y0]).all() and (both <= [x1, y1]).all()

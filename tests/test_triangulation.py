@@ -13,11 +13,11 @@ from estimation.mapping.triangulation import (
     MIN_SURFACE_POINTS,
     RaySurfaceHits,
     epipolar_distance,
-    meet_rays,
+    intersect_rays_with_surface,
     rays,
     smooth_normals,
     triangulate,
-    updated_by_looks,
+    update_from_observations,
 )
 from estimation.pose_solver import project
 from estimation.rig import ideal_pixels
@@ -165,7 +165,7 @@ def looked(
         said = pose @ se3.exp(rng.normal(0, np.sqrt(np.diag(POSE))))
         predicted, _, jacobians = project(RIG, camera, said, known.points)
         sigma = np.full(len(true), PIXEL_SIGMA)
-        known, agrees = updated_by_looks(known, rows, predicted - pixels, jacobians, sigma, POSE)
+        known, agrees = update_from_observations(known, rows, predicted - pixels, jacobians, sigma, POSE)
     return known, agrees
 
 
@@ -199,7 +199,7 @@ def test_a_look_at_another_spot_is_left_out() -> None:
 def test_no_look_changes_nothing() -> None:
     _, known = guessed(1)
     none = np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2, 6)), np.zeros(0)
-    after, agrees = updated_by_looks(known, *none, POSE)
+    after, agrees = update_from_observations(known, *none, POSE)
     assert after is known and len(agrees) == 0
 
 
@@ -209,7 +209,7 @@ def test_a_landmark_of_unknown_depth_counts_little_in_another_camera_and_fully_i
     wide = {}
     for camera in (CAMERA, 2):
         jacobians = project(RIG, np.full(len(known), camera), BASE_FROM_REST, known.points)[2]
-        wide[camera] = MapError(known).widened(sigma, rows, jacobians)
+        wide[camera] = MapError(known).inflate_sigmas(sigma, rows, jacobians)
     assert wide[CAMERA].max() < 1.3 * PIXEL_SIGMA and wide[2].min() > 5 * PIXEL_SIGMA
 
 
@@ -218,7 +218,7 @@ def test_landmarks_that_are_well_known_keep_their_sigmas() -> None:
     sure = SurfaceMap(known.points, known.normals, 0.9 * UNCERTAIN_MM**2 * np.eye(3 * len(known)))
     rows, sigma = np.arange(len(sure)), np.full(len(sure), PIXEL_SIGMA)
     jacobians = project(RIG, np.full(len(sure), 0), BASE_FROM_REST, sure.points)[2]
-    assert MapError(sure).widened(sigma, rows, jacobians) is sigma
+    assert MapError(sure).inflate_sigmas(sigma, rows, jacobians) is sigma
 
 
 NOISE = 0.04  # mm
@@ -245,7 +245,9 @@ def met(seed: int, radius: float, beside: bool, rough: float = 0.0) -> tuple[Ray
     true[:, 2] += rng.normal(0, rough, 40)
     points += rng.normal(0, NOISE, points.shape) + rng.normal(0, 1, (120, 1)) * rough * [0, 0, 1]
     directions = (true - EYE) / np.linalg.norm(true - EYE, axis=1, keepdims=True)
-    found = meet_rays(points, NOISE**2 * np.eye(360), np.tile(EYE, (40, 1)), directions, np.full(40, EXACT))
+    found = intersect_rays_with_surface(
+        points, NOISE**2 * np.eye(360), np.tile(EYE, (40, 1)), directions, np.full(40, EXACT)
+    )
     return found, np.einsum("mi,mi->m", found.points - true, found.normals)
 
 
@@ -290,7 +292,9 @@ def test_the_doubt_of_a_landmark_lies_along_its_ray() -> None:
 
 def test_without_a_surface_nothing_is_met() -> None:
     points = np.random.default_rng(0).normal(size=(MIN_SURFACE_POINTS - 1, 3))
-    assert not meet_rays(points, np.zeros((33, 33)), EYE[None], -EYE[None] / 400, np.array([EXACT])).good.any()
+    assert not intersect_rays_with_surface(
+        points, np.zeros((33, 33)), EYE[None], -EYE[None] / 400, np.array([EXACT])
+    ).good.any()
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.05])
@@ -298,7 +302,7 @@ def test_a_ray_that_grazes_meets_nothing(tilt: float) -> None:
     flat = np.random.default_rng(0).uniform(-20, 20, (60, 2))
     points = np.column_stack([flat, 0 * flat[:, 0]])
     ray = np.array([[1.0, 0.0, -tilt]]) / np.hypot(1.0, tilt)
-    assert not meet_rays(points, np.zeros((180, 180)), -400 * ray, ray, np.array([EXACT])).good.any()
+    assert not intersect_rays_with_surface(points, np.zeros((180, 180)), -400 * ray, ray, np.array([EXACT])).good.any()
 
 
 @settings(max_examples=10)

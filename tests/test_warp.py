@@ -53,9 +53,9 @@ def test_a_warp_is_undone_and_poses_are_carried_there_and_back(seed: int, size: 
     warp = warp_of(seed, size or 1e-9)
     assert warp.undo(warp.apply(CHECKPOINTS)) == pytest.approx(CHECKPOINTS, abs=2e-3 * max(size, 1e-3))
     poses = se3.make(se3.exp_rotation(0.3 * np.random.default_rng(seed).normal(size=(30, 3))), CHECKPOINTS)
-    carried = warp.carry(poses)
+    carried = warp.apply_to_poses(poses)
     assert carried[:, :3, 3] == pytest.approx(warp.apply(CHECKPOINTS), abs=1e-12)
-    assert warp.uncarry(carried) == pytest.approx(poses, abs=3e-3 * max(size, 1e-3))
+    assert warp.undo_on_poses(carried) == pytest.approx(poses, abs=3e-3 * max(size, 1e-3))
     assert all(se3.is_transform(pose) for pose in carried)
 
 
@@ -64,7 +64,7 @@ def test_a_pose_turns_with_the_tissue_by_the_polar_decomposition_of_the_gradient
     poses = se3.make(np.eye(3), CHECKPOINTS)
     slopes = [warp.displacement(CHECKPOINTS + step * a) - warp.displacement(CHECKPOINTS - step * a) for a in np.eye(3)]
     u, _, vt = np.linalg.svd(np.eye(3) + np.stack(slopes, -1) / (2 * step))
-    assert se3.angle_of(np.swapaxes(u @ vt, -1, -2) @ warp.carry(poses)[:, :3, :3]).max() < np.deg2rad(0.1)
+    assert se3.angle_of(np.swapaxes(u @ vt, -1, -2) @ warp.apply_to_poses(poses)[:, :3, :3]).max() < np.deg2rad(0.1)
 
 
 def test_many_points_are_moved_like_each_alone_and_far_away_nothing_is() -> None:
@@ -176,7 +176,7 @@ def _filtered(amounts: Array, seed: int = 0) -> WarpFilter:
         bent = LANDMARKS + BULGE.displacement(LANDMARKS, float(amount))
         seen = observations(RIG, bent, BASE_FROM_REST, k / 30, rng, 0.1)
         points = warps.points(MAP)[seen.track]
-        fit = solve_pose(RIG, PointTracks.of(seen, points), BASE_FROM_REST)
+        fit = solve_pose(RIG, PointTracks.from_observations(seen, points), BASE_FROM_REST)
         warps.learn(seen, fit, seen.sigma, np.zeros(6), 0.0)
     return warps
 

@@ -1,10 +1,10 @@
-"""The tracks' part of the normal equations, a stretch of frame sets at a time: each frame set condensed to its state.
+"""The tracks' part of the normal equations, a segment of frame sets at a time: each frame set condensed to its state.
 
-A compiled loop sums what a frame set's tracks say of its pose, the landmarks and the cameras, in the columns of each
-camera's own pose of the surface. All else is linear in those: a late camera sees the pose carried on along twist and
-acceleration; a camera's place moves the surface the other way. Errors that all tracks of one camera share in one frame
-set alone (jitter of its exposure, shift of its image) are eliminated at once (Henderson 1975, as in
-`estimation/pose_solver.py`).
+1. A compiled loop sums the products of each camera's tracks, with its own pose of the surface as unknown.
+2. The chain rule turns that pose into state, camera pose and exposure delay: a delayed camera sees the pose moved along
+   twist and acceleration.
+3. Errors that all tracks of a camera share in one frame set (delay of its exposure, shift of its image) are eliminated
+   (Henderson 1975, as in `estimation/pose_solver.py`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from estimation.se3 import Array, Index, Mask
 TrackRows = tuple[Index, Index, Index, Array, Array]
 TRACK_ROWS_TYPE = "Tuple((i8[::1], i8[::1], i8[::1], f8[:,::1], f8[::1]))"
 
-OBSERVATION_COLUMNS = 11  # of an observation: six of its camera's own pose of the surface, fx fy cx cy, its residual
-COMMON_DELAY_SIGMA_S = 1e-4  # s: as the sum of a frame set's delays is held at nothing
+OBSERVATION_COLUMNS = 11  # of an observation: surface pose in its camera 6, fx fy cx cy, residual
+COMMON_DELAY_SIGMA_S = 1e-4  # s: prior that the delays of a frame set sum to zero
 
 
 @compiled(
@@ -33,7 +33,7 @@ COMMON_DELAY_SIGMA_S = 1e-4  # s: as the sum of a frame set's delays is held at 
     f"({TRACK_ROWS_TYPE}, f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], b1)",
     reordered=True,
 )
-def frame_sums(
+def accumulate_tracks(
     tracks: TrackRows,
     camera_from_surface: Array,
     matrices: Array,
@@ -44,13 +44,15 @@ def frame_sums(
 ) -> tuple[Array, Array, Array, Array, float]:
     """Sums of the normal equations of F frame sets, robustly weighted (Geman-McClure).
 
-    tracks: with the precision of the estimate. camera_from_surface: (F, C, 4, 4) at each exposure. matrices: (C, 3, 3).
-    points: (L, 3) mm. gate: (C,) squared length of a whitened residual at which a weight is a quarter. moved: (L, 3)
-    mm, a step of the landmarks that the residuals are to hold. coupled: whether to give the products of landmarks with
-    the rest.
+    tracks: rows, with scaled precisions.
+    camera_from_surface: (F, C, 4, 4) at each exposure.
+    matrices: (C, 3, 3) px. points: (L, 3) mm.
+    gate: (C,) squared whitened residual at which a weight is a quarter.
+    moved: (L, 3) mm, a step of the landmarks that is added to the residuals.
+    coupled: whether to return the products of landmarks with the other columns.
 
-    Returns products (F, C, 11, 11) of the columns; of landmarks with columns (F, L, 3, C, 10), empty where not
-    coupled; information (L, 3, 3) and gradient (L, 3) of the landmarks; and the robust cost, half of squared sigmas.
+    Returns the products (F, C, 11, 11) of the columns; the products (F, L, 3, C, 10) of landmarks and columns, empty
+    if not coupled; information (L, 3, 3) and gradient (L, 3) of the landmarks; the robust cost, half of squared sigmas.
     """
     starts, camera, landmark, pixels, precision = tracks
     frames, cameras, count = len(starts) - 1, matrices.shape[0], points.shape[0]
@@ -111,7 +113,7 @@ def frame_sums(
 
 @compiled(f"f8[::1]({TRACK_ROWS_TYPE}, f8[:,:,:,::1], f8[:,:,::1], f8[:,::1])", reordered=True)
 def squared_residuals(tracks: TrackRows, camera_from_surface: Array, matrices: Array, points: Array) -> Array:
-    """Squared whitened residuals (N,); inf behind a camera. Arguments as `frame_sums` takes them."""
+    """Squared whitened residuals (N,); inf behind a camera. Arguments as `accumulate_tracks` takes them."""
     starts, camera, landmark, pixels, precision = tracks
     out = np.empty(len(camera))
     for f in range(len(starts) - 1):
@@ -130,34 +132,34 @@ def squared_residuals(tracks: TrackRows, camera_from_surface: Array, matrices: A
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseModel:
-    """How the tracks err."""
+    """Noise of the tracks, and settings of the robust loss."""
 
-    unit: Array  # (C,) size of the residuals in parts of what is claimed of them
-    jitter: float  # s, standard deviation of a camera's delay in one frame set, as in CameraErrors
-    unrest: float  # px, standard deviation of an image's shift in one frame set
-    gate: float = 1.0  # times the usual gate
-    slope: float = 1.0  # of the weighted residuals over their weights, for a step: a redescending loss is flatter
+    residual_scale: Array  # (C,) size of the residuals in their stated sigmas
+    delay_sigma: float  # s, standard deviation of a camera's delay in one frame set, as in CameraErrors
+    shift_sigma: float  # px, standard deviation of an image's shift in one frame set
+    gate: float = 1.0  # factor of GATE
+    slope: float = 1.0  # factor on the information: a redescending loss is flatter than its weights
 
-    def own_information(self) -> Array:
-        """(3C,) of each frame set's own delays and shifts."""
-        n = len(self.unit)
-        return np.repeat([self.jitter**-2.0, self.unrest**-2.0], [n, 2 * n])
+    def shared_error_information(self) -> Array:
+        """Prior information (3C,) of a frame set's delays and shifts."""
+        n = len(self.residual_scale)
+        return np.repeat([self.delay_sigma**-2.0, self.shift_sigma**-2.0], [n, 2 * n])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """All unknowns."""
+    """The unknowns."""
 
     states: States  # K
     cameras: CorrectedCameras  # C
     points: Array  # (L, 3) mm, landmarks in the surface frame
 
-    def moved(self, steps: Array, shared: Array, free: Index) -> Estimate:
-        """The same after steps of the states (K, 18) and of the shared unknowns (S,), the `free` cameras' first."""
+    def retract(self, steps: Array, shared: Array, free: Index) -> Estimate:
+        """The estimate after steps of states (K, 18) and shared unknowns (S,): `free` corrections, then landmarks."""
         corrections = np.zeros(11 * len(self.cameras))
         corrections[free] = shared[: len(free)]
         points = self.points + shared[len(free) :].reshape(-1, 3)
-        return Estimate(self.states.moved(steps), self.cameras.moved(corrections), points)
+        return Estimate(self.states.retract(steps), self.cameras.retract(corrections), points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,18 +169,18 @@ class CondensedFrames:
     information: Array  # (F, 18, 18) of the states
     gradient: Array  # (F, 18)
     cross: Array  # (F, 18, S) of states and shared
-    own: Array  # (3C F, S) square roots of what elimination takes from the shared ones' information
+    error_roots: Array  # (3C F, S) square roots of the information that elimination of the shared errors removes
     shared: Array  # (S, S) information of the shared unknowns
-    pull: Array  # (S,) their gradient
-    effects: Array  # (F, 3C) what each camera's tracks share: delays, shifts right, shifts down
-    doubts: Array  # (F, 3C) variance of that, were the state known
-    follows: Array  # (F, 3C, 18) how it goes with the state
+    shared_gradient: Array  # (S,)
+    errors: Array  # (F, 3C) each camera's delays, s, and shifts right and down, px
+    error_variances: Array  # (F, 3C) of these, given the state
+    error_by_state: Array  # (F, 3C, 18) derivatives of these by the state
     cost: float  # robust, half of squared sigmas
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchProblem:
-    """What is measured, and what is free."""
+    """The measurements, and which corrections are free."""
 
     data: TrackArrays
     free: Index  # numbers of the cameras' corrections (11 C,) that are free
@@ -195,15 +197,15 @@ class BatchProblem:
 
 
 def exposed_poses(states: States, cameras: CorrectedCameras) -> tuple[Array, Array]:
-    """How far (F, C, 6) the surface moves until each camera exposes; camera_from_surface (F, C, 4, 4) then."""
-    late = cameras.offsets[:, None]
-    ahead = late * states.twists[:, None] + late**2 / 2 * states.accelerations[:, None]
-    there = states.poses[:, None] @ se3.exp(ahead)
-    return ahead, np.ascontiguousarray(se3.inverse(cameras.base_from_camera) @ there)
+    """Motion (F, C, 6) of the surface until each camera's exposure; camera_from_surface (F, C, 4, 4) then."""
+    delay = cameras.offsets[:, None]
+    ahead = delay * states.twists[:, None] + delay**2 / 2 * states.accelerations[:, None]
+    poses = states.poses[:, None] @ se3.exp(ahead)
+    return ahead, np.ascontiguousarray(se3.inverse(cameras.base_from_camera) @ poses)
 
 
 def whitened_squares(data: TrackArrays, estimate: Estimate) -> Array:
-    """Squared residuals (N,) of all frame sets in parts of their variance."""
+    """Squared whitened residuals (N,) of all frame sets."""
     poses = exposed_poses(estimate.states, estimate.cameras)[1]
     tracks = data.starts, data.camera, data.landmark, data.pixels, data.precision
     return squared_residuals(tracks, poses, estimate.cameras.matrices, estimate.points)
@@ -212,10 +214,10 @@ def whitened_squares(data: TrackArrays, estimate: Estimate) -> Array:
 def condense(
     problem: BatchProblem, first: int, last: int, estimate: Estimate, noise: NoiseModel, step: Array | None = None
 ) -> CondensedFrames:
-    """Frame sets first <= k < last.
+    """The condensed frame sets first <= k < last.
 
-    step: (S,) of the shared unknowns, where that is known; then the gradient holds it, and `cross`, `own` and `shared`
-    are without meaning.
+    step: (S,) of the shared unknowns, if it is given; then the gradient includes it, and `cross`, `error_roots` and
+    `shared` are invalid.
     """
     summed = _sum_frames(problem, first, last, estimate, noise, step)
     return _eliminate_shared(summed, noise, len(estimate.cameras), step is None)
@@ -223,14 +225,14 @@ def condense(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FrameSums:
-    """F frame sets' normal equations before any elimination, in M columns: state, cameras' own, free corrections."""
+    """F frame sets' normal equations before elimination, in M columns: state, shared errors, free corrections."""
 
-    whole: Array  # (F, M, M)
-    right: Array  # (F, M)
-    by_landmark: Array  # (F, 3L, M), without rows where the step is known
-    known: Array  # (L, 3, 3) information of the landmarks
-    pull: Array  # (L, 3) their gradient
-    seeing: Mask  # (F, C) whether a camera has tracks
+    information: Array  # (F, M, M)
+    gradient: Array  # (F, M)
+    by_landmark: Array  # (F, 3L, M) products with the landmarks; empty if the step is given
+    landmark_information: Array  # (L, 3, 3) information of the landmarks
+    landmark_gradient: Array  # (L, 3) gradient of the landmarks
+    has_tracks: Mask  # (F, C) whether a camera has tracks
     cost: float  # robust
 
 
@@ -238,105 +240,107 @@ def _sum_frames(
     problem: BatchProblem, first: int, last: int, estimate: Estimate, noise: NoiseModel, step: Array | None
 ) -> _FrameSums:
     data, cameras, free = problem.data, estimate.cameras, problem.free
-    n, part = len(cameras), data.rows(first, last)
-    mine = estimate.states[first:last]
+    n, rows = len(cameras), data.rows(first, last)
+    states = estimate.states[first:last]
     # sums over the tracks, in the columns of each camera's own pose
-    ahead, camera_from_surface = exposed_poses(mine, cameras)
-    camera = data.camera[part]
-    worth = EFFICIENCY / noise.unit**2
-    moved = np.zeros_like(estimate.points) if step is None else step[len(free) :].reshape(-1, 3)
-    starts, precision = data.starts[first : last + 1] - data.starts[first], data.precision[part] * worth[camera]
-    grams, products, known, pull, cost = frame_sums(
-        (starts, camera, data.landmark[part], data.pixels[part], precision),
+    ahead, camera_from_surface = exposed_poses(states, cameras)
+    camera = data.camera[rows]
+    efficiency = EFFICIENCY / noise.residual_scale**2
+    landmark_steps = np.zeros_like(estimate.points) if step is None else step[len(free) :].reshape(-1, 3)
+    starts, precision = data.starts[first : last + 1] - data.starts[first], data.precision[rows] * efficiency[camera]
+    grams, products, landmark_information, landmark_gradient, cost = accumulate_tracks(
+        (starts, camera, data.landmark[rows], data.pixels[rows], precision),
         camera_from_surface,
         cameras.matrices,
         estimate.points,
         np.full(n, (GATE * noise.gate) ** 2 * EFFICIENCY),
-        np.ascontiguousarray(noise.slope * moved),
+        np.ascontiguousarray(noise.slope * landmark_steps),
         step is None,
     )
-    for sums in (grams[..., :10, :10], products, known):
+    for sums in (grams[..., :10, :10], products, landmark_information):
         sums *= noise.slope
     # chain rule: those columns by state, each camera's own errors and free corrections
-    columns = _columns(mine, cameras, ahead, camera_from_surface, free)  # (F, C, 10, 18 + 3C + Q)
+    columns = _columns(states, cameras, ahead, camera_from_surface, free)  # (F, C, 10, 18 + 3C + Q)
     if step is not None:
-        off = columns[..., STATE_DOF + 3 * n :] @ step[: len(free)]
-        grams[..., :10, 10] += (grams[..., :10, :10] @ off[..., None])[..., 0]
-    frames, width = len(mine), columns.shape[-1]
-    tall = columns.reshape(frames, 10 * n, width)
+        columns_step = columns[..., STATE_DOF + 3 * n :] @ step[: len(free)]
+        grams[..., :10, 10] += (grams[..., :10, :10] @ columns_step[..., None])[..., 0]
+    frames, width = len(states), columns.shape[-1]
+    stacked = columns.reshape(frames, 10 * n, width)
     weighted = (grams[..., :10, :10] @ columns).reshape(frames, 10 * n, width)
-    whole = np.swapaxes(tall, 1, 2) @ weighted  # (F, M, M)
-    right = (np.swapaxes(tall, 1, 2) @ np.ascontiguousarray(grams[..., :10, 10]).reshape(frames, -1, 1))[..., 0]
+    whole = np.swapaxes(stacked, 1, 2) @ weighted  # (F, M, M)
+    right = (np.swapaxes(stacked, 1, 2) @ np.ascontiguousarray(grams[..., :10, 10]).reshape(frames, -1, 1))[..., 0]
     empty = np.zeros((frames, 0, width))
-    by_landmark = products.reshape(frames, -1, 10 * n) @ tall if step is None else empty
-    return _FrameSums(whole, right, by_landmark, known, pull, grams[..., 8, 8] > 0, cost)
+    by_landmark = products.reshape(frames, -1, 10 * n) @ stacked if step is None else empty
+    return _FrameSums(whole, right, by_landmark, landmark_information, landmark_gradient, grams[..., 8, 8] > 0, cost)
 
 
 def _eliminate_shared(summed: _FrameSums, noise: NoiseModel, n: int, coupled: bool) -> CondensedFrames:
-    """Eliminate each of the n cameras' own errors (Schur complement). coupled: whether `shared` is wanted."""
-    whole, right, by_landmark = summed.whole, summed.right, summed.by_landmark
-    frames, width = right.shape
+    """Eliminate the shared errors of n cameras (Schur complement). coupled: whether to compute `shared`."""
+    information, gradients, by_landmark = summed.information, summed.gradient, summed.by_landmark
+    frames, width = gradients.shape
     state, own, rest = slice(0, STATE_DOF), slice(STATE_DOF, STATE_DOF + 3 * n), slice(STATE_DOF + 3 * n, width)
-    cross = np.concatenate([whole[:, state, rest], np.swapaxes(by_landmark[..., state], 1, 2)], axis=2)
-    own_cross = np.concatenate([whole[:, own, rest], np.swapaxes(by_landmark[..., own], 1, 2)], axis=2)
-    root = np.linalg.inv(np.linalg.cholesky(whole[:, own, own] + _own_prior(noise, summed.seeing)))
-    by_state, by_shared, by_right = root @ whole[:, own, state], root @ own_cross, root @ right[:, own, None]
-    turned, held = np.swapaxes(by_state, 1, 2), np.swapaxes(root, 1, 2)
+    cross = np.concatenate([information[:, state, rest], np.swapaxes(by_landmark[..., state], 1, 2)], axis=2)
+    own_cross = np.concatenate([information[:, own, rest], np.swapaxes(by_landmark[..., own], 1, 2)], axis=2)
+    root = np.linalg.inv(np.linalg.cholesky(information[:, own, own] + _shared_error_prior(noise, summed.has_tracks)))
+    by_state, by_shared, by_right = root @ information[:, own, state], root @ own_cross, root @ gradients[:, own, None]
+    by_state_transposed, root_transposed = np.swapaxes(by_state, 1, 2), np.swapaxes(root, 1, 2)
     shared = np.zeros((by_shared.shape[2],) * 2)
-    gradient = np.concatenate([right[:, rest].sum(0), summed.pull.ravel()[: by_landmark.shape[1]]])
+    gradient = np.concatenate([gradients[:, rest].sum(0), summed.landmark_gradient.ravel()[: by_landmark.shape[1]]])
     if coupled:
-        shared = _shared(whole[:, rest, rest].sum(0), by_landmark[..., rest].sum(0), summed.known)
+        shared = _shared_information(
+            information[:, rest, rest].sum(0), by_landmark[..., rest].sum(0), summed.landmark_information
+        )
     return CondensedFrames(
-        information=whole[:, state, state] - turned @ by_state,
-        gradient=(right[:, state, None] - turned @ by_right)[..., 0],
-        cross=cross - turned @ by_shared,
-        own=by_shared.reshape(3 * n * frames, len(shared)),
+        information=information[:, state, state] - by_state_transposed @ by_state,
+        gradient=(gradients[:, state, None] - by_state_transposed @ by_right)[..., 0],
+        cross=cross - by_state_transposed @ by_shared,
+        error_roots=by_shared.reshape(3 * n * frames, len(shared)),
         shared=shared,
-        pull=gradient - (np.swapaxes(by_shared, 1, 2) @ by_right)[..., 0].sum(0),
-        effects=-(held @ by_right)[..., 0],
-        doubts=(root**2).sum(1),
-        follows=-(held @ by_state),
+        shared_gradient=gradient - (np.swapaxes(by_shared, 1, 2) @ by_right)[..., 0].sum(0),
+        errors=-(root_transposed @ by_right)[..., 0],
+        error_variances=(root**2).sum(1),
+        error_by_state=-(root_transposed @ by_state),
         cost=summed.cost,
     )
 
 
 def _columns(states: States, cameras: CorrectedCameras, ahead: Array, camera_from_surface: Array, free: Index) -> Array:
-    """How the ten columns of each camera's sums (F, C, 10, M) move with state, own delay and shifts, corrections."""
+    """Derivatives (F, C, 10, M) of each camera's ten columns by state, shared errors and free corrections."""
     frames, n = len(states), len(cameras)
     late = cameras.offsets[:, None, None]
-    carried = se3.right_jacobian(ahead)
+    right_jacobian = se3.right_jacobian(ahead)
     speed = states.twists[:, None] + cameras.offsets[:, None] * states.accelerations[:, None]
-    along = (carried @ speed[..., None])[..., 0]  # (F, C, 6)
+    along = (right_jacobian @ speed[..., None])[..., 0]  # (F, C, 6)
     each, lens = np.arange(n), np.arange(4)
     out = np.zeros((frames, n, 10, STATE_DOF + 3 * n + 11 * n))
     out[:, :, :6, :6] = se3.adjoint(se3.exp(-ahead))
-    out[:, :, :6, 6:12], out[:, :, :6, 12:18] = late * carried, late**2 / 2 * carried
+    out[:, :, :6, 6:12], out[:, :, :6, 12:18] = late * right_jacobian, late**2 / 2 * right_jacobian
     out[:, each, :6, STATE_DOF + each] = along.swapaxes(0, 1)
     out[:, each, 8, STATE_DOF + n + each] = out[:, each, 9, STATE_DOF + 2 * n + each] = 1.0
-    begin = STATE_DOF + 3 * n
-    out[:, each, :6, begin + each] = along.swapaxes(0, 1)
-    place = -se3.adjoint(se3.inverse(camera_from_surface))
+    first_correction = STATE_DOF + 3 * n
+    out[:, each, :6, first_correction + each] = along.swapaxes(0, 1)
+    by_camera_pose = -se3.adjoint(se3.inverse(camera_from_surface))
     for c in range(n):
-        out[:, c, :6, begin + n + 6 * c : begin + n + 6 * c + 6] = place[:, c]
-        out[:, c, 6 + lens, begin + 7 * n + 4 * c + lens] = 1.0
-    return np.ascontiguousarray(out[..., np.concatenate([np.arange(begin), begin + free])])
+        out[:, c, :6, first_correction + n + 6 * c : first_correction + n + 6 * c + 6] = by_camera_pose[:, c]
+        out[:, c, 6 + lens, first_correction + 7 * n + 4 * c + lens] = 1.0
+    return np.ascontiguousarray(out[..., np.concatenate([np.arange(first_correction), first_correction + free])])
 
 
-def _own_prior(noise: NoiseModel, seeing: Mask) -> Array:
-    """Information (F, 3C, 3C) of what each camera's tracks share. seeing: (F, C).
+def _shared_error_prior(noise: NoiseModel, has_tracks: Mask) -> Array:
+    """Prior information (F, 3C, 3C) of the shared errors. has_tracks: (F, C).
 
-    The instant of a frame set is the mean of its cameras': what their delays have in common nobody could tell from the
-    motion, and a prior that smoothed it away took poses of a waved board farther off.
+    The instant of a frame set is the mean of its cameras': a common delay cannot be separated from the motion, and a
+    prior without this constraint made poses of a waved board worse.
     """
-    frames, n = seeing.shape
-    out = np.tile(np.diag(noise.own_information()), (frames, 1, 1))
-    both = seeing[:, :, None] & seeing[:, None]
-    out[:, :n, :n] += np.where(both, COMMON_DELAY_SIGMA_S**-2.0, 0.0)
+    frames, cameras = has_tracks.shape
+    out = np.tile(np.diag(noise.shared_error_information()), (frames, 1, 1))
+    pairs = has_tracks[:, :, None] & has_tracks[:, None]
+    out[:, :cameras, :cameras] += np.where(pairs, COMMON_DELAY_SIGMA_S**-2.0, 0.0)
     return out
 
 
-def _shared(corrections: Array, by_landmark: Array, known: Array) -> Array:
-    """(S, S) information of the shared unknowns by their own tracks."""
+def _shared_information(corrections: Array, by_landmark: Array, known: Array) -> Array:
+    """Information (S, S) of the shared unknowns before elimination. known: (L, 3, 3) of the landmarks."""
     q, count = len(corrections), len(known)
     out = np.zeros((q + 3 * count, q + 3 * count))
     out[:q, :q], out[q:, :q], out[:q, q:] = corrections, by_landmark, by_landmark.T

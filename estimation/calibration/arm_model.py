@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation import se3
-from estimation.calibration.lens_model import lens_of, project_lens
+from estimation.calibration.lens_model import lens_parameters, project_lens
 from estimation.errors import InputError
 from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, distort
@@ -147,7 +147,7 @@ def predict(
     bases = np.stack([c.base_from_camera for c in rig.cameras])[camera]
     end = _end(points - bases[:, :3, 3], turned[:, :, 2])
     inside = np.einsum("nji,nj->ni", bases[:, :3, :3], points + state.blunt * end - bases[:, :3, 3])
-    pixels, by_lens, by_inside = project_lens(np.stack([lens_of(c) for c in rig.cameras])[camera], inside)
+    pixels, by_lens, by_inside = project_lens(np.stack([lens_parameters(c) for c in rig.cameras])[camera], inside)
     by_point = by_inside @ np.swapaxes(bases[:, :3, :3], 1, 2)
     by_dead, by_lag = _by_time(state, set_point, kinematics, stamp)
     by_time = by_point @ np.stack([by_dead, by_lag], -1)

@@ -19,21 +19,21 @@ from estimation.rig import Camera, Rig
 from estimation.se3 import Array, Index, Mask
 
 MIN_COMMON_INSTANTS = 3  # that two cameras must share
-MAX_COMPARED = 60  # pose estimates of one pair: the medoid compares them all with each other
+MAX_COMPARED = 60  # pose estimates of a pair of cameras, of which the medoid is taken
 GRID_SIDE = 5  # points of the working volume's grid along each axis
-VOLUME_SHARE = 0.9  # of the board's places, along each axis, that the working volume holds
+VOLUME_SHARE = 0.9  # of the board's places, along each axis, within the working volume
 MIN_VIEWS = 10  # of a camera: eight leave the distortion model to chance, and a minute gives hundreds
 OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 0.5  # both exceeded by an outlier: a corner nearer than half a pixel is a good one
 MAX_WRONG_SHARE = 0.5  # of a view's corners, beyond which the whole view is dropped
-INITIAL_SIGMA = 0.3  # px, of a corner, until the residuals show it
-MIN_CORNER_SIGMA = 0.01  # px: no corner is located better, whatever a few residuals say
+INITIAL_SIGMA = 0.3  # px, of a corner, before it is estimated from residuals
+MIN_CORNER_SIGMA = 0.01  # px
 MAX_FIT_ERROR = 2.0  # px, of a camera's own views: beyond, the board differs from its description
 JITTER_ROUNDS = 6  # of expectation maximisation
 MIN_JITTER = 3e-4  # s: less counts as none
 MAX_JOINT_SCALE = 1.15  # ratio of the joint residuals to the cameras' own, beyond which jitter is estimated
 
 
-def first_rig(views: BoardViews, camera_from_board: Array) -> tuple[Array, Array]:
+def initial_rig(views: BoardViews, camera_from_board: Array) -> tuple[Array, Array]:
     """First base_from_camera (C, 4, 4), the first camera being the base, and base_from_board (S, 4, 4).
 
     camera_from_board: (V, 4, 4). A spanning tree over the pairs with most shared instants. Undetermined names the
@@ -50,7 +50,7 @@ def first_rig(views: BoardViews, camera_from_board: Array) -> tuple[Array, Array
         links = [pair for pair in shared if pair[0] in base_from_camera and pair[1] not in base_from_camera]
         a, b = max(links, key=lambda pair: len(shared[pair]))
         if len(shared[a, b]) < MIN_COMMON_INSTANTS:
-            _refuse(views, base_from_camera, shared)
+            _raise_unconnected(views, base_from_camera, shared)
         rows = shared[a, b][:: -(-len(shared[a, b]) // MAX_COMPARED)]
         a_from_b = _medoid(camera_from_board[rows[:, 0]] @ se3.inverse(camera_from_board[rows[:, 1]]))
         base_from_camera[b] = base_from_camera[a] @ a_from_b
@@ -60,7 +60,7 @@ def first_rig(views: BoardViews, camera_from_board: Array) -> tuple[Array, Array
     return placed, np.asarray(placed[views.camera[best]] @ camera_from_board[best])
 
 
-def _refuse(views: BoardViews, placed: dict[int, Array], shared: dict[tuple[int, int], Index]) -> None:
+def _raise_unconnected(views: BoardViews, placed: dict[int, Array], shared: dict[tuple[int, int], Index]) -> None:
     alone = [c for c in range(len(views.names)) if c not in placed]
     most = max(len(shared[a, b]) for a in placed for b in alone)
     cameras, others = (", ".join(views.names[c] for c in group) for group in (alone, placed))
@@ -80,14 +80,14 @@ def _medoid(poses: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A calibrated rig and all that is known about it."""
+    """A calibrated rig with its fit and validation."""
 
     rig: Rig  # its base is the first camera
     fit: RigFit  # the joint adjustment, with its covariance in real units
     views: BoardViews  # the views used, with the sigma that their residuals show
     models: tuple[str, ...]  # distortion model of each camera
     scores: tuple[tuple[ModelScore, ...], ...]  # of all models, for each camera
-    jitter: float  # s, one sigma of single pictures' delays; 0 if none is significant
+    jitter: float  # s, one sigma of single pictures' delays; 0 if not significant
     dropped: int  # corners left out as outliers
     held_out: Array  # (V, P, 2) px, residuals under rigs calibrated without the view's stretch of the recording
 
@@ -111,7 +111,7 @@ class Calibration:
 def calibrate(views: BoardViews, known: KnownLenses | None = None) -> Calibration:
     """Calibrate a rig from views of a board.
 
-    known: lenses that are fixed, or may move within their stated sigma. Undetermined where the views do not determine
+    known: given lenses, fixed or with their stated sigma as prior. Undetermined where the views do not determine
     the rig, Implausible where the result is no camera; both name camera and figure.
     """
     views, choices, dropped = fit_lenses(views, known)
@@ -119,7 +119,7 @@ def calibrate(views: BoardViews, known: KnownLenses | None = None) -> Calibratio
     camera_from_board = np.full((len(views), 4, 4), np.nan)
     for c, choice in enumerate(choices):
         camera_from_board[views.camera == c] = choice.fit.camera_from_board
-    base_from_camera, base_from_board = first_rig(views, camera_from_board)
+    base_from_camera, base_from_board = initial_rig(views, camera_from_board)
     nothing = np.zeros(len(names)), np.zeros(len(views))
     state = RigState(np.stack([c.fit.lens for c in choices]), base_from_camera, *nothing, base_from_board)
     views, fit, jitter, more = adjust(views, state, choices, known)
@@ -127,7 +127,7 @@ def calibrate(views: BoardViews, known: KnownLenses | None = None) -> Calibratio
         lens_model.check_lens(name, views.sizes[c], fit.state.lens[c])
         if known is None:
             rows = slice(CAMERA_PARAMETERS * c, CAMERA_PARAMETERS * c + 9)
-            lens_model.check_doubt(name, fit.state.lens[c], fit.covariance[rows, rows])
+            lens_model.check_focal_uncertainty(name, fit.state.lens[c], fit.covariance[rows, rows])
     lens_model.check_neighbours(names, views.sizes, fit.state.lens)
     scores = tuple(choice.scores for choice in choices)
     unseen = validation.held_out_residuals(views, fit.state, free_numbers(models, known), jitter, known)
@@ -143,14 +143,14 @@ def fit_lenses(views: BoardViews, known: KnownLenses | None = None) -> tuple[Boa
     for c, name in enumerate(views.names):
         rows = np.flatnonzero((views.camera == c) & (views.seen.sum(1) >= MIN_VIEW_CORNERS))
         _check_number(name, len(rows))
-        own = views.only(rows)
+        own = views.select(rows)
         exact = known is not None and not known.sigma[c].any()
         own, choice, out = _select_model(own) if known is None else _with_known_lens(own, known.lens[c], exact)
         good = own.without(out).seen.sum(1) >= np.maximum(MIN_VIEW_CORNERS, MAX_WRONG_SHARE * own.seen.sum(1))
         _check_number(name, int(good.sum()))
         dropped += int(out.sum())
         pixels[rows] = own.without(out).pixels
-        own = own.without(out).only(good)
+        own = own.without(out).select(good)
         begin = choice.fit.lens, choice.fit.camera_from_board[good]
         fit = fit_lens(own, choice.fit.model, begin) if known is None else fit_given_lens(own, known.lens[c])
         _check_fit(name, own, fit)
@@ -159,7 +159,7 @@ def fit_lenses(views: BoardViews, known: KnownLenses | None = None) -> tuple[Boa
         usable[rows[good]] = True
         sigma[rows[good]] = np.maximum(own.sigma * fit.scale, MIN_CORNER_SIGMA)
     views = replace(views, pixels=pixels, sigma=sigma)
-    return views.only(usable), choices, dropped
+    return views.select(usable), choices, dropped
 
 
 def _select_model(own: BoardViews) -> tuple[BoardViews, LensChoice, Mask]:
@@ -179,7 +179,7 @@ def _with_known_lens(own: BoardViews, lens: Array, exact: bool) -> tuple[BoardVi
     if not exact:
         return own, LensChoice(fit, ()), out
     left = own.without(out)
-    return own, validation.doubt_given_lens(left, fit_given_lens(left, lens)), out
+    return own, validation.validate_given_lens(left, fit_given_lens(left, lens)), out
 
 
 def _with_sigma(views: BoardViews, sigma: float) -> BoardViews:
@@ -197,7 +197,7 @@ def _single_outliers(own: BoardViews, fit: LensFit) -> Mask:
 
 
 def outliers(views: BoardViews, residuals: Array, scale: float) -> Mask:
-    """(V, P) which corners are outliers by the median residual, which they do not pull."""
+    """Which corners (V, P) are outliers, by the median residual, which is robust to them."""
     away = np.linalg.norm(residuals, axis=-1)
     usual = min(scale * float(np.median(views.sigma)), float(np.nanmedian(away)) / RAYLEIGH_MEDIAN)
     return np.asarray(np.nan_to_num(away) > max(OUTLIER_SIGMAS * usual, OUTLIER_PX))
@@ -222,7 +222,7 @@ def adjust(
         jitter = jitter if jitter > MIN_JITTER else 0.0
     out = outliers(views, fit.residuals, fit.scale)
     usable = views.without(out).seen.sum(1) >= 4
-    left = views.without(out).only(usable)
+    left = views.without(out).select(usable)
     boards = np.isin(np.arange(len(fit.state.base_from_board)), views.instant[usable])
     delays, poses = fit.state.jitter[usable] * (jitter > 0), fit.state.base_from_board[boards]
     state = replace(fit.state, jitter=delays, base_from_board=poses)
@@ -236,16 +236,16 @@ def _rivals_of(choices: Sequence[LensChoice]) -> list[RivalModel]:
         if choice.rival:
             free = np.zeros(CAMERA_PARAMETERS * len(choices), bool)
             free[CAMERA_PARAMETERS * c + MODELS[choice.rival]] = True
-            out.append(RivalModel(free, choice.chance))
+            out.append(RivalModel(free, choice.probability))
     return out
 
 
 def _delays(views: BoardViews, fit: RigFit) -> tuple[Array, Array]:
     """Delay (V,) of each view, s, by its own corners alone, and the variance of that."""
     seen = views.seen[..., None]
-    pace, residuals = np.where(seen, fit.pace, 0.0), np.where(seen, fit.residuals, 0.0)
-    information = (pace**2).sum((1, 2)) / views.sigma**2
-    late = -(pace * residuals).sum((1, 2)) / views.sigma**2 / np.maximum(information, 1e-9)
+    image_velocity, residuals = np.where(seen, fit.image_velocity, 0.0), np.where(seen, fit.residuals, 0.0)
+    information = (image_velocity**2).sum((1, 2)) / views.sigma**2
+    late = -(image_velocity * residuals).sum((1, 2)) / views.sigma**2 / np.maximum(information, 1e-9)
     return late, 1 / np.maximum(information, 1e-9)
 
 
@@ -266,12 +266,12 @@ def _jitter(views: BoardViews, fit: RigFit, jitter: float) -> float:
 
 
 def _rig_of(views: BoardViews, state: RigState) -> Rig:
-    matrices, offsets = [lens_model.matrix_of(lens) for lens in state.lens], state.offset.tolist()
+    matrices, offsets = [lens_model.lens_matrix(lens) for lens in state.lens], state.offset.tolist()
     parts = views.names, views.sizes, matrices, state.lens[:, 4:].copy(), state.base_from_camera, offsets
     return Rig(tuple(Camera(*each) for each in zip(*parts, strict=True)))
 
 
-def rebased(rig: Rig, base_from_first: Array) -> Rig:
+def rebase(rig: Rig, base_from_first: Array) -> Rig:
     """The rig in the base frame in which its first camera is at `base_from_first` (4, 4)."""
     change = base_from_first @ se3.inverse(rig.cameras[0].base_from_camera)
     return Rig(tuple(replace(c, base_from_camera=change @ c.base_from_camera) for c in rig.cameras))

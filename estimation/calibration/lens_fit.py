@@ -194,7 +194,7 @@ class _LensEquations:
     pose_slope: Array  # (V, 6)
 
 
-def first_lens(views: BoardViews) -> tuple[Array, Array]:
+def initial_lens(views: BoardViews) -> tuple[Array, Array]:
     """A lens (9,) without distortion and poses (V, 4, 4) of one camera's views, from homographies alone."""
     planes = homographies(views)
     size = np.array(views.sizes[int(views.camera[0])], float)
@@ -210,7 +210,7 @@ def fit_lens(
 ) -> LensFit:
     """The lens that fits one camera's views best. begin: a lens (9,) and poses (V, 4, 4) to start from."""
     free = MODELS[model]
-    lens, camera_from_board = first_lens(views) if begin is None else begin
+    lens, camera_from_board = initial_lens(views) if begin is None else begin
     lens = np.where(np.isin(np.arange(9), free), lens, 0.0)
     state, at = _minimise(views, _LensState(lens, camera_from_board), free, min_gain)
     return LensFit(model, state.lens, state.poses, at.residuals, _scale(views, at.residuals, len(free)))

@@ -37,13 +37,13 @@ MIN_RADIAL_SLOPE = 0.05  # of the radial polynomial inside the image: below, it 
 MAX_FOCAL_SIGMA = 0.01  # one sigma, of the focal length itself
 
 
-def lens_of(camera: Camera) -> Array:
+def lens_parameters(camera: Camera) -> Array:
     """The lens (9,) of a camera."""
     m = camera.matrix
     return np.concatenate([[m[0, 0], m[1, 1], m[0, 2], m[1, 2]], camera.distortion])
 
 
-def matrix_of(lens: ArrayLike) -> Array:
+def lens_matrix(lens: ArrayLike) -> Array:
     """The camera matrix (3, 3), px, of a lens (9,)."""
     fx, fy, cx, cy = np.asarray(lens, float)[:4]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -148,7 +148,7 @@ class BoardViews:
         """(V, P) which corners were seen."""
         return np.isfinite(self.pixels[..., 0])
 
-    def only(self, kept: Mask | Index) -> BoardViews:
+    def select(self, kept: Mask | Index) -> BoardViews:
         """The rows `kept`, a mask (V,) or numbers, with instants renumbered from 0."""
         instant = np.unique(self.instant[kept], return_inverse=True)[1].astype(np.int64)
         rows = self.camera[kept], instant, self.stamp[kept], self.pixels[kept], self.sigma[kept]
@@ -201,7 +201,7 @@ def check_neighbours(names: Sequence[str], sizes: Sequence[tuple[int, int]], len
             raise _implausible(name, what, got, f"at most {MAX_FOCAL_RATIO:g} times")
 
 
-def check_doubt(name: str, lens: Array, covariance: Array) -> None:
+def check_focal_uncertainty(name: str, lens: Array, covariance: Array) -> None:
     """Implausible where the views do not determine the focal length; lens (9,) with its covariance (9, 9)."""
     sigma = float(np.sqrt(covariance[0, 0])) / float(lens[0])
     if not sigma <= MAX_FOCAL_SIGMA:

@@ -26,7 +26,7 @@ from estimation.se3 import Array, Index, Mask
 MAX_INSTANT_GAP = 0.5  # s between instants, beyond which the motion is not interpolated: the board is taken to rest
 STENCIL_SIDE = 2  # neighbours on either side
 STENCIL_WIDTH = 2 * STENCIL_SIDE  # K below
-OFFSET_SIGMA = 0.5  # s: prior of a clock offset; frames with a larger one would have been paired otherwise
+OFFSET_SIGMA = 0.5  # s: prior of a clock offset; with larger ones frames are paired differently
 MEAN_OFFSET_SIGMA = 1e-6  # s: the mean of the offsets is held at zero, as only their differences are observable
 
 
@@ -34,8 +34,8 @@ MEAN_OFFSET_SIGMA = 1e-6  # s: the mean of the offsets is held at zero, as only 
 class Stencils:
     """The neighbours through which each instant's motion is interpolated."""
 
-    neighbours: Index  # (S, K) instants, the own number where there is none
-    times: Array  # (S, K) s after the own instant, or nan
+    neighbours: Index  # (S, K) instants; the instant itself where there is none
+    times: Array  # (S, K) s after the instant, or nan
 
 
 def stencils(stamps: Array) -> Stencils:
@@ -59,9 +59,9 @@ class BoardPoses:
     by_pose: Array  # (V, 6, 6 + 6 K) by the own pose, then by the neighbours
 
 
-def interpolate_board(poses: Array, who: Stencils, instant: Index, delay: Array) -> BoardPoses:
+def interpolate_board(poses: Array, around: Stencils, instant: Index, delay: Array) -> BoardPoses:
     """The board's poses in views exposed `delay` (V,), s, after their instants (V,); poses: (S, 4, 4)."""
-    own, others, times = poses[instant], poses[who.neighbours[instant]], who.times[instant]
+    own, others, times = poses[instant], poses[around.neighbours[instant]], around.times[instant]
     way = se3.log(se3.inverse(own)[:, None] @ others)  # (V, K, 6)
     weight, slope = _lagrange(times, delay)
     xi, rate = np.einsum("vk,vki->vi", weight, way), np.einsum("vk,vki->vi", slope, way)
@@ -109,24 +109,24 @@ class RigFit:
     state: RigState
     covariance: Array  # (16 C, 16 C) at the views' stated sigma; zero for parameters that are not free
     residuals: Array  # (V, P, 2) px, projection less measurement
-    pace: Array  # (V, P, 2) px/s, image velocity of the corners
+    image_velocity: Array  # (V, P, 2) px/s, of the corners
     scale: float  # of the residuals, in stated sigmas
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RivalModel:
-    """A richer model that may be the true one."""
+    """A richer lens model that may be the true one."""
 
     free: Mask  # (16 C,) its additional parameters
-    chance: float  # 0 to 1
+    probability: float  # that it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigProblem:
-    """What is constant over the iterations."""
+    """The constants of the iteration."""
 
     views: BoardViews
-    who: Stencils
+    stencils: Stencils
     late: Array  # (V,) s, each view's stamp after its instant's
     free: Mask  # (16 C,) which of the cameras' parameters are estimated
     jitter: float  # s, one sigma of single pictures' delays, 0 for none
@@ -139,7 +139,7 @@ class _RigEquations:
     matrix: Array
     slope: Array
     residuals: Array
-    pace: Array
+    image_velocity: Array
     jitter_slope: Array  # (V,)
     jitter_own: Array  # (V,)
     jitter_cross: Array  # (V, K)
@@ -166,7 +166,7 @@ def fit_rig(views: BoardViews, state: RigState, free: Mask, jitter: float, known
     cost = huber((np.nan_to_num(at.residuals) ** 2).sum(-1) / views.sigma[:, None] ** 2)[0][seen].sum()
     count = 2 * int(seen.sum()) - 6 * instants - int(free.sum()) - (len(views) - instants if jitter else 0)
     scale = float(np.sqrt(cost / max(count, 1)))
-    return RigFit(state, _covariance(problem, at), at.residuals, at.pace, scale)
+    return RigFit(state, _covariance(problem, at), at.residuals, at.image_velocity, scale)
 
 
 def with_rivals(views: BoardViews, fit: RigFit, free: Mask, jitter: float, rivals: Sequence[RivalModel]) -> RigFit:
@@ -185,7 +185,7 @@ def with_rivals(views: BoardViews, fit: RigFit, free: Mask, jitter: float, rival
             away = change[: len(free)]
             excess, known = np.zeros_like(fit.covariance), np.isfinite(fit.covariance)  # infinite entries stay
             excess[known] = size**2 * (_covariance(wider, at)[known] - fit.covariance[known])
-            covariance = covariance + rival.chance * (excess + np.outer(away, away))
+            covariance = covariance + rival.probability * (excess + np.outer(away, away))
     return replace(fit, covariance=covariance)
 
 
@@ -199,7 +199,7 @@ def _equations(problem: RigProblem, state: RigState) -> _RigEquations:
     views = problem.views
     camera, seen = views.camera, views.seen
     delay = problem.late + state.offset[camera] + state.jitter
-    board = interpolate_board(state.base_from_board, problem.who, views.instant, delay)
+    board = interpolate_board(state.base_from_board, problem.stencils, views.instant, delay)
     camera_from_base = se3.inverse(state.base_from_camera)[camera]
     points = se3.transform_points(camera_from_base @ board.pose, views.points)
     if not (state.lens[:, :2] > 1).all():  # an impossible state gets an infinite cost
@@ -224,20 +224,21 @@ def _equations(problem: RigProblem, state: RigState) -> _RigEquations:
     chain[:, :15, :15] = np.eye(15)
     chain[:, 15:, 15], chain[:, 15:, 16:] = board.by_delay, board.by_pose
     blocks, slopes = np.swapaxes(chain, 1, 2) @ square @ chain, np.einsum("vij,vi->vj", chain, slope)
-    pace = np.einsum("vpij,vj->vpi", by_board, board.by_delay)
+    image_velocity = np.einsum("vpij,vj->vpi", by_board, board.by_delay)
     total = float(cost[seen].sum()) if not infinite else np.inf
-    return _assemble(problem, state, total, blocks, slopes, np.where(seen[..., None], residuals, np.nan), pace)
+    residuals = np.where(seen[..., None], residuals, np.nan)
+    return _assemble(problem, state, total, blocks, slopes, residuals, image_velocity)
 
 
 def _assemble(
-    problem: RigProblem, state: RigState, cost: float, blocks: Array, slopes: Array, residuals: Array, pace: Array
+    problem: RigProblem, state: RigState, cost: float, blocks: Array, slopes: Array, residuals: Array, velocity: Array
 ) -> _RigEquations:
     """The normal equations from the views' blocks (V, K, K) and slopes (V, K), with jitter eliminated, and priors."""
     views, cameras, instants = problem.views, len(problem.views.names), len(state.base_from_board)
     size = CAMERA_PARAMETERS * cameras + 6 * instants
-    who = np.concatenate([views.instant[:, None], problem.who.neighbours[views.instant]], 1)
+    nodes = np.concatenate([views.instant[:, None], problem.stencils.neighbours[views.instant]], 1)
     camera_rows = CAMERA_PARAMETERS * views.camera[:, None] + np.arange(CAMERA_PARAMETERS)
-    board_rows = (CAMERA_PARAMETERS * cameras + 6 * who[..., None] + np.arange(6)).reshape(len(views), -1)
+    board_rows = (CAMERA_PARAMETERS * cameras + 6 * nodes[..., None] + np.arange(6)).reshape(len(views), -1)
     places = np.concatenate([camera_rows, board_rows], 1)
     own, cross, jitter_slope = np.ones(len(views)), np.zeros((len(views), blocks.shape[1])), np.zeros(len(views))
     if problem.jitter:  # one delay per view: its Schur complement
@@ -264,7 +265,7 @@ def _assemble(
             slope[lens] += prior.slope
             cost += prior.cost
     cost += float(mean * state.offset.sum() + (state.offset**2).sum() / OFFSET_SIGMA**2)
-    return _RigEquations(cost, matrix, slope, residuals, pace, jitter_slope, own, cross, places)
+    return _RigEquations(cost, matrix, slope, residuals, velocity, jitter_slope, own, cross, places)
 
 
 def _free_rows(problem: RigProblem, size: int) -> Index:

@@ -1,7 +1,7 @@
-"""How far a calibration can be trusted: cross-validation of models and rig, and predicted error in the working volume.
+"""Validation of a calibration: cross-validation of lens models and rig, and predicted error in the working volume.
 
-Stretches of the recording are held out in turn. Of a held-out stretch only the board's poses are estimated, which all
-cameras share: a rig whose cameras fit their own views but not each other's shows here.
+Segments of the recording are held out in turn. Of a held-out segment only the board's poses are estimated, which all
+cameras share, so that cameras that fit their own views but not each other's show.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from scipy.special import ndtr
 
 from estimation import se3
 from estimation.calibration import lens_model
-from estimation.calibration.lens_fit import LensFit, first_lens, fit_lens, fit_poses
+from estimation.calibration.lens_fit import LensFit, fit_lens, fit_poses, initial_lens
 from estimation.calibration.lens_model import CAMERA_PARAMETERS, MODELS, BoardViews, Implausible, KnownLenses
 from estimation.calibration.rig_fit import RigState, fit_rig
 from estimation.rig import Rig
 from estimation.se3 import Array, Index, Mask
 
 CROSS_FOLDS = 4
-FOLD_BLOCKS = 12  # stretches of neighbouring views that are held out as one: neighbours look alike
-USUAL_MODEL = "k1 k2"  # of any webcam: a number left out is claimed to be zero, a free one has its uncertainty stated
-MIN_RICHER_CHANCE = 0.15  # of a richer lens, whatever the test says: the views' free poses hide part of the error
+FOLD_BLOCKS = 12  # segments of neighbouring views, which are similar, that are held out together
+USUAL_MODEL = "k1 k2"  # of webcams: a fixed parameter is taken for exactly zero, a free one has an uncertainty
+MIN_RICHER_PROBABILITY = 0.15  # of a richer lens: the views' free poses hide a part of the error from the test
 RICHEST_MODEL = list(MODELS)[-1]
-FOLD_MIN_GAIN = 1e-5  # relative cost at which a held-out fit ends: models differ by a hundred times that
-MIN_LEAD = 2.0  # standard errors by which another model must beat the usual one: one is exceeded by chance in six
+FOLD_MIN_GAIN = 1e-5  # relative cost reduction below which a held-out fit ends: models differ by a hundred times that
+MIN_ADVANTAGE = 2.0  # standard errors of another model over the usual one: one is exceeded by chance in six
 MIN_TRAINING_VIEWS = 6  # of each camera outside a fold: fewer do not determine its pose
 
 
@@ -35,13 +35,13 @@ class ModelScore:
 
     model: str
     held_out: float  # px, RMS
-    ahead: float  # px^2, mean square error of the usual model less this one's
-    doubt: float  # px^2, standard error of `ahead`
+    gain: float  # px^2, mean square error of the usual model less this one's
+    gain_sigma: float  # px^2, standard error of `gain`
 
     @property
-    def chance(self) -> float:
-        """Probability that `ahead` is positive, its mean over the views being normal."""
-        return float(ndtr(self.ahead / self.doubt)) if self.doubt > 0 else 0.0
+    def probability(self) -> float:
+        """Probability that `gain` is positive, its mean over the views being normal."""
+        return float(ndtr(self.gain / self.gain_sigma)) if self.gain_sigma > 0 else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,32 +51,32 @@ class LensChoice:
     fit: LensFit
     scores: tuple[ModelScore, ...]  # of all models
     rival: str = ""  # the richest model, '' if it was chosen
-    chance: float = 0.0  # probability that a richer model predicts better
+    probability: float = 0.0  # probability that a richer model predicts better
 
 
 def choose_model(views: BoardViews) -> LensChoice:
-    """One camera's usual model, or one clearly better on held-out views; of plausible ones, if there are any."""
+    """One camera's lens model: the usual one, or one clearly better on held-out views; plausible if any is."""
     folds = folds_of(len(views))
-    fits = _fits(views)
+    fits = _fit_models(views)
     errors = {model: _fold_errors(views, fits[model], folds) for model in MODELS}
     possible = [model for model in MODELS if _is_possible(views, fits[model].lens)] or list(MODELS)
     usual = USUAL_MODEL if USUAL_MODEL in possible else possible[0]
     scores = tuple(_score(model, errors[model], errors[usual]) for model in MODELS)
-    better = [s for s in scores if s.model in possible and s.ahead > MIN_LEAD * s.doubt]
-    chosen = max(better, key=lambda s: s.ahead).model if better else usual
+    better = [s for s in scores if s.model in possible and s.gain > MIN_ADVANTAGE * s.gain_sigma]
+    chosen = max(better, key=lambda s: s.gain).model if better else usual
     richer = [_score(m, errors[m], errors[chosen]) for m in possible if len(MODELS[m]) > len(MODELS[chosen])]
     if not richer:
         return LensChoice(fits[chosen], scores)
-    chance = max(MIN_RICHER_CHANCE, *(score.chance for score in richer))
-    return LensChoice(fits[chosen], scores, richer[-1].model, chance)
+    probability = max(MIN_RICHER_PROBABILITY, *(score.probability for score in richer))
+    return LensChoice(fits[chosen], scores, richer[-1].model, probability)
 
 
-def doubt_given_lens(views: BoardViews, given: LensFit) -> LensChoice:
+def validate_given_lens(views: BoardViews, given: LensFit) -> LensChoice:
     """A given lens, with the probability that a lens fitted to these views would predict held-out ones better."""
-    fits, folds = _fits(views), folds_of(len(views))
+    fits, folds = _fit_models(views), folds_of(len(views))
     errors = _squares(views, given.residuals)
     rivals = [_score(model, _fold_errors(views, fits[model], folds), errors) for model in (USUAL_MODEL, RICHEST_MODEL)]
-    return LensChoice(given, (), RICHEST_MODEL, max(score.chance for score in rivals))
+    return LensChoice(given, (), RICHEST_MODEL, max(score.probability for score in rivals))
 
 
 def _is_possible(views: BoardViews, lens: Array) -> bool:
@@ -87,9 +87,9 @@ def _is_possible(views: BoardViews, lens: Array) -> bool:
     return True
 
 
-def _fits(views: BoardViews) -> dict[str, LensFit]:
+def _fit_models(views: BoardViews) -> dict[str, LensFit]:
     """Every model's fit to all views, started from the next simpler one's."""
-    begin, out = first_lens(views), {}
+    begin, out = initial_lens(views), {}
     for model in MODELS:
         out[model] = fit_lens(views, model, begin)
         begin = out[model].lens, out[model].camera_from_board
@@ -106,9 +106,9 @@ def _fold_errors(views: BoardViews, whole: LensFit, folds: Index) -> Array:
     """(V,) mean squared error, px^2, of each view under the lens fitted outside its fold; whole: the fit to all."""
     out = np.zeros(len(views))
     for fold in range(folds.max() + 1):
-        held, rest = folds == fold, views.only(folds == fold)
+        held, rest = folds == fold, views.select(folds == fold)
         begin = whole.lens, whole.camera_from_board[~held]
-        lens = fit_lens(views.only(~held), whole.model, begin, FOLD_MIN_GAIN).lens
+        lens = fit_lens(views.select(~held), whole.model, begin, FOLD_MIN_GAIN).lens
         out[held] = _squares(rest, fit_poses(rest, lens, whole.camera_from_board[held], FOLD_MIN_GAIN)[1])
     return out
 
@@ -120,9 +120,9 @@ def _squares(views: BoardViews, residuals: Array) -> Array:
 
 
 def _score(model: str, errors: Array, usual: Array) -> ModelScore:
-    ahead = usual - errors
-    rms, doubt = float(np.sqrt(errors.mean() / 2)), float(ahead.std() / np.sqrt(len(ahead)))
-    return ModelScore(model, rms, float(ahead.mean()), doubt)
+    gain = usual - errors
+    rms, gain_sigma = float(np.sqrt(errors.mean() / 2)), float(gain.std() / np.sqrt(len(gain)))
+    return ModelScore(model, rms, float(gain.mean()), gain_sigma)
 
 
 def held_out_residuals(
@@ -135,10 +135,10 @@ def held_out_residuals(
         held, cameras = folds == fold, range(len(views.names))
         if min(int((~held & (views.camera == c)).sum()) for c in cameras) < MIN_TRAINING_VIEWS:
             continue
-        rig = fit_rig(views.only(~held), _state_of(views, state, ~held), free, jitter, known).state
+        rig = fit_rig(views.select(~held), _state_of(views, state, ~held), free, jitter, known).state
         own = _state_of(views, state, held)
         begin = replace(own, lens=rig.lens, base_from_camera=rig.base_from_camera, offset=rig.offset)
-        out[held] = fit_rig(views.only(held), begin, np.zeros_like(free), jitter, known).residuals
+        out[held] = fit_rig(views.select(held), begin, np.zeros_like(free), jitter, known).residuals
     return out
 
 
@@ -183,7 +183,7 @@ def volume_error(rig: Rig, covariance: Array, points: Array, speed: float = 0.0)
         inside = se3.transform_points(camera_from_base, points)
         front = inside[:, 2] > 1.0
         inside[:, 2] = np.where(front, inside[:, 2], 1.0)
-        pixels, by_lens, by_place = lens_model.project_lens(lens_model.lens_of(camera), inside)
+        pixels, by_lens, by_place = lens_model.project_lens(lens_model.lens_parameters(camera), inside)
         visible = front & (pixels >= 0).all(1) & (pixels <= np.array(camera.size) - 1).all(1)
         rows, columns = slice(2 * c, 2 * c + 2), CAMERA_PARAMETERS * c
         by_point[:, rows] = np.where(visible[:, None, None], by_place @ camera_from_base[:3, :3], 0.0)
@@ -197,14 +197,14 @@ def volume_error(rig: Rig, covariance: Array, points: Array, speed: float = 0.0)
     moves = -spread @ np.swapaxes(by_point, 1, 2) @ by_rig  # (N, 3, 16 C): triangulation, linearised
     error, pixel = np.full(count, np.nan), np.sqrt(np.trace(spread, axis1=1, axis2=2))
     if known.any():
-        moved = _without_rigid(points[known], moves[known])
-        late = _by_clock(covariance, spread[known], by_point[known], cameras, speed)
+        moved = _remove_rigid_motion(points[known], moves[known])
+        late = _clock_variance(covariance, spread[known], by_point[known], cameras, speed)
         variance = np.einsum("nia,ab,nib->n", moved, covariance, moved) + late
         error[known] = np.sqrt(np.maximum(variance, 0.0))
     return VolumeError(points, error, np.where(known, pixel, np.nan), number.astype(float))
 
 
-def _without_rigid(points: Array, moves: Array) -> Array:
+def _remove_rigid_motion(points: Array, moves: Array) -> Array:
     """Moves (N, 3, K) of points less their best common rigid motion; nothing is left of a single point's."""
     middle = points - points.mean(0)
     size = max(float(np.abs(middle).max()), 1.0)
@@ -215,7 +215,7 @@ def _without_rigid(points: Array, moves: Array) -> Array:
     return np.asarray((flat - basis @ (basis.T @ flat)).reshape(moves.shape))
 
 
-def _by_clock(covariance: Array, spread: Array, by_point: Array, cameras: int, speed: float) -> Array:
+def _clock_variance(covariance: Array, spread: Array, by_point: Array, cameras: int, speed: float) -> Array:
     """Variance (N,), mm^2, from the clock offsets at `speed` mm/s, as the mean over all directions."""
     out = np.zeros(len(spread))
     if not speed:

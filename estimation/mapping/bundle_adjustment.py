@@ -1,9 +1,9 @@
-"""Refining the map from key frames: one GTSAM bundle adjustment, made away from the frame's path (it takes 20-300 ms).
+"""Bundle adjustment of the map over key frames (GTSAM; 20-300 ms, outside the latency of a pose).
 
-The unknowns are the landmarks, the surface's pose at each key frame, and each camera's own pose of the surface at its
-own instant, since cameras are seldom exposed together. The latter is tied to the key frame's pose by how far it
-may have moved meanwhile. The surface frame is kept: on average the refined poses of the key frames agree with the
-published ones, so the path does not jump under the nozzle when a better map comes into force.
+The unknowns are the landmarks, the surface's pose at each key frame, and its pose at each camera's own exposure, since
+cameras are seldom triggered together. A factor ties the latter to the key frame's pose by the motion in between. The
+surface frame is kept: on average the refined poses of the key frames agree with the published ones, so the path does
+not jump under the nozzle when a better map comes into force.
 """
 
 from __future__ import annotations
@@ -24,54 +24,54 @@ from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap
 
 MIN_SIGHTINGS = 3
-MIN_KEYFRAMES_TO_REJECT = 6  # fewer cannot tell a stray landmark from a bent map; a rejected one never comes back
+MIN_KEYFRAMES_TO_REJECT = 6  # fewer do not distinguish a stray landmark from a bent map; rejection is final
 MAX_REPROJECTION_PX = 3.0  # rolling shutters and late cameras bend images that much
-FREE_SIGMA_MM = 50.0  # how far a landmark may lie from where it was: only keeps a hardly seen one finite
+FREE_SIGMA_MM = 50.0  # prior of a landmark: keeps one with few sightings finite
 CAUCHY_SIGMAS = 3.0
-SINGLE_CAMERA_SIGMA_MM = 1.0  # of the depth that one camera gives
-# rad, mm: how far one camera's instant may be from another's
+SINGLE_CAMERA_SIGMA_MM = 1.0  # of the depth by one camera
+# rad, mm: motion between the exposures of two cameras
 SINGLE_CAMERA_PRIOR = np.diag([1 / 0.05**2] * 3 + [1 / 10.0**2] * 3)
-MIN_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: keeps the tie well conditioned
+MIN_DRIFT = np.array([1e-5] * 3 + [1e-3] * 3)  # rad, mm: keeps the factor well conditioned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyFrame:
-    """One frame set worth keeping."""
+    """A frame set that the adjustment uses."""
 
     base_from_surface: Array  # (4, 4)
     observations: Observations  # tracks count rows of the map
-    twist: Array  # (6,) rad/s and mm/s: how far the surface may have moved between the cameras' instants
+    twist: Array  # (6,) rad/s and mm/s, for the motion between the cameras' exposures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchors:
-    """What a scan, or the surface around it, says of each landmark: it lies near a plane."""
+    """Priors of landmarks by a scan or the surface around them: each lies near a plane."""
 
-    points: Array  # (N, 3) surface frame, on the plane
-    normals: Array  # (N, 3)
-    sigma: Array  # (N,) mm across it; FREE_SIGMA_MM where nothing is known
-    frame: Array  # (6, 6) covariance of the scan's own place, right perturbation, rad and mm; zero without a scan
+    points: Array  # (N, 3) mm, surface frame, on the plane
+    normals: Array  # (N, 3) unit
+    sigma: Array  # (N,) mm across the plane; FREE_SIGMA_MM where unknown
+    frame: Array  # (6, 6) covariance of the scan's pose, right perturbation, rad and mm; zero without a scan
 
     def extended(self, new: Anchors) -> Anchors:
-        """The same with those of further rows."""
+        """The anchors with those of further rows."""
         points, normals = np.concatenate([self.points, new.points]), np.concatenate([self.normals, new.normals])
         return Anchors(points, normals, np.concatenate([self.sigma, new.sigma]), self.frame)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedMap:
-    """The refined map, same rows, same surface frame."""
+    """The adjusted map: same rows, same surface frame."""
 
     map: SurfaceMap
-    agrees: Mask  # (N,) which landmarks move with the rest
+    agrees: Mask  # (N,) landmarks that move with the rest
 
 
 def adjust(
     rig: Rig, surface_map: SurfaceMap, keyframes: list[KeyFrame], delays: Delays, anchors: Anchors | None = None
 ) -> AdjustedMap | None:
-    """The map that fits all key frames best, or None if they do not determine one.
+    """The map that fits all key frames best; None if they do not determine one.
 
-    delays: as known now. anchors: of the map's first rows, where there is a scan or one camera alone sees them.
+    delays: current estimate. anchors: of the map's first rows, where there is a scan or only one camera sees them.
 
     Base and surface swap roles (X = surface_from_base), so that GTSAM's stock projection factor with body_P_sensor =
     base_from_camera is the measurement.
@@ -101,11 +101,11 @@ def _adjusted(
     if not np.isfinite(points).all() or not np.isfinite(covariance).all():
         return None
     whole = surface_map.covariance.copy()
-    covariance = without_frame(covariance, points[rows])
+    covariance = remove_rigid_motion(covariance, points[rows])
     place = (3 * rows[:, None] + np.arange(3)).ravel()
     whole[place] = whole[:, place] = 0.0
     if anchors is not None:
-        covariance = covariance + of_frame(points[rows], anchors.frame)
+        covariance = covariance + rigid_motion_covariance(points[rows], anchors.frame)
     whole[np.ix_(place, place)] = covariance
     agrees = _agreement(rig, points, keyframes, solved)
     if agrees.sum() < 12:
@@ -117,32 +117,32 @@ def _adjusted(
     return AdjustedMap(SurfaceMap(points, normals, whole), agrees)
 
 
-def without_frame(covariance: Array, points: Array) -> Array:
-    """Covariance (3N, 3N) of points (N, 3) without the part that moves all of them as one, since they define the frame.
+def remove_rigid_motion(covariance: Array, points: Array) -> Array:
+    """Covariance (3N, 3N) of points (N, 3) without their common rigid motion, since they define the frame.
 
-    Each point counts by its own precision. Counted alike, a point of a single camera, unknown by centimetres along its
-    ray, was measured to add a tenth of a millimetre to each of two hundred others.
+    Points are weighted by their own precision. With equal weights one point of a single camera, unknown by centimetres
+    along its ray, was measured to add a tenth of a millimetre to each of two hundred others.
     """
     motion = se3.point_jacobians(points).reshape(-1, 6) * [0.01, 0.01, 0.01, 1, 1, 1]  # of about one size
     worth = 1 / np.maximum(np.repeat(np.diag(covariance).reshape(-1, 3).sum(1), 3), MIN_DRIFT[3] ** 2)
-    held = motion.T * worth
-    of_frame = motion @ np.linalg.solve(held @ motion, held)
-    left = covariance - of_frame @ covariance
-    return np.asarray(left - left @ of_frame.T)
+    weighted = motion.T * worth
+    projection = motion @ np.linalg.solve(weighted @ motion, weighted)
+    remaining = covariance - projection @ covariance
+    return np.asarray(remaining - remaining @ projection.T)
 
 
-def of_frame(points: Array, covariance: Array) -> Array:
-    """Covariance (3N, 3N) of points (N, 3) by that of their frame's place alone, (6, 6)."""
+def rigid_motion_covariance(points: Array, covariance: Array) -> Array:
+    """Covariance (3N, 3N) of points (N, 3) that follows from the covariance (6, 6) of their frame's pose."""
     motion = se3.point_jacobians(points).reshape(-1, 6)
     return np.asarray(motion @ covariance @ motion.T)
 
 
 def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Array:
-    """old_surface_from_new (4, 4): makes refined poses (K, 4, 4) agree with the published ones in the mean.
+    """old_surface_from_new (4, 4): makes refined poses (K, 4, 4) agree with the published ones on average.
 
-    Both are plain fits to the same pixels, with the old map and the new, so the cameras' instants cancel. A key frame
-    counts less the farther the surface may have moved between its cameras' instants, and hardly where one camera alone
-    saw it: its depth is many times the map's doubt.
+    Both are fits to the same pixels, with the old and the new map, so the exposure delays cancel. The weight of a key
+    frame falls with the motion between its cameras' exposures; with one camera it is small, as the depth's error is
+    many times the map's. skew: s, one sigma of the delays.
     """
     published = np.stack([f.base_from_surface for f in keyframes])
     drift = skew * np.array([np.linalg.norm(f.twist[3:]) for f in keyframes])
@@ -155,20 +155,21 @@ def frame_change(keyframes: list[KeyFrame], refined: Array, skew: float) -> Arra
     return change
 
 
-MIN_OWN_TRACKS, MAX_OFFSET_PX = 20, 0.5  # of a camera whose own pose counts; px it may stand off the joint one
+MIN_OWN_TRACKS, MAX_OFFSET_PX = 20, 0.5  # of a camera with a pose of its own; px from the joint one that are allowed
 
 
-def single_fit(rig: Rig, points: Array, observations: Observations, camera: int, near: Array) -> PoseFit:
-    """The fit to one camera's tracks alone, at its own instant, held to `near` (4, 4) where it sees little."""
-    mine = observations.only(observations.camera == camera)
-    tracks = PointTracks.of(mine, points[mine.track])
+def fit_single_camera(rig: Rig, points: Array, observations: Observations, camera: int, near: Array) -> PoseFit:
+    """The fit to one camera's tracks, at its own exposure, with the pose `near` (4, 4) as a weak prior."""
+    mine = observations.select(observations.camera == camera)
+    tracks = PointTracks.from_observations(mine, points[mine.track])
     return solve_pose(rig, tracks, near, scales=(4.0, 1.0), prior=SINGLE_CAMERA_PRIOR)
 
 
 def exposed_poses(rig: Rig, surface_map: SurfaceMap | None, tracks: Observations, joint: Array) -> dict[int, Array]:
-    """base_from_surface (4, 4) by camera: the `joint` one, or the camera's own where its tracks contradict that.
+    """base_from_surface (4, 4) by camera: the `joint` one, or the camera's own where its tracks contradict that one.
 
-    Cameras that are not exposed together see a moving surface at different places; a pose of one alone is known worse.
+    Cameras that are not triggered together see a moving surface at different places. A pose by one camera is less
+    accurate.
     """
     found = dict.fromkeys(range(len(rig)), joint)
     if surface_map is None:
@@ -177,7 +178,7 @@ def exposed_poses(rig: Rig, surface_map: SurfaceMap | None, tracks: Observations
         mine = tracks.track[tracks.camera == c]
         if len(mine) < MIN_OWN_TRACKS:
             continue
-        own = single_fit(rig, surface_map.points, tracks, c, joint).base_from_surface
+        own = fit_single_camera(rig, surface_map.points, tracks, c, joint).base_from_surface
         poses = np.stack([joint, own])
         here, there = ideal_pixels(camera, se3.transform_points(poses, surface_map.points[mine]))[0]
         if np.median(np.linalg.norm(here - there, axis=1)) > MAX_OFFSET_PX:
@@ -186,7 +187,7 @@ def exposed_poses(rig: Rig, surface_map: SurfaceMap | None, tracks: Observations
 
 
 def _fit(rig: Rig, points: Array, frame: KeyFrame) -> Array:
-    tracks = PointTracks.of(frame.observations, points[frame.observations.track])
+    tracks = PointTracks.from_observations(frame.observations, points[frame.observations.track])
     return solve_pose(rig, tracks, frame.base_from_surface, scales=(4.0, 1.0)).base_from_surface
 
 
@@ -210,14 +211,14 @@ def _graph(
         body = gtsam.symbol("x", i)
         start = gtsam.Pose3(se3.inverse(frame.base_from_surface))
         values.insert(body, start)
-        # T exp(d) has the inverse X exp(-Ad(T) d): the same drift, seen from the base
+        # T exp(d) has the inverse X exp(-Ad(T) d): the drift in the base frame
         carry = se3.adjoint(frame.base_from_surface)
         drift = frame.twist * delays.sigma
         along = np.outer(drift, drift) + np.diag((0.3 * np.abs(drift) + MIN_DRIFT) ** 2)
         loose = gtsam.noiseModel.Gaussian.Covariance(carry @ along @ carry.T)
         seen = frame.observations
         for c in np.unique(seen.camera):
-            own = single_fit(rig, surface_map.points, seen, int(c), frame.base_from_surface).base_from_surface
+            own = fit_single_camera(rig, surface_map.points, seen, int(c), frame.base_from_surface).base_from_surface
             values.insert(_camera_key(int(c), i), gtsam.Pose3(se3.inverse(own)))
             late = se3.exp(-carry @ frame.twist * delays.mean[c])
             graph.add(gtsam.BetweenFactorPose3(body, _camera_key(int(c), i), gtsam.Pose3(late), loose))
@@ -242,7 +243,7 @@ def _graph(
 
 
 def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: Index) -> Array:
-    """Joint covariance (3M, 3M) of the landmarks `rows`, from the dense information with all poses eliminated."""
+    """Joint covariance (3M, 3M) of the landmarks `rows`: inverse Schur complement, all poses eliminated."""
     ordering = gtsam.Ordering()
     landmarks = [gtsam.symbol("l", int(r)) for r in rows]
     known = set(landmarks)
@@ -257,7 +258,7 @@ def _joint_covariance(linear: gtsam.GaussianFactorGraph, rows: Index) -> Array:
 
 
 def _agreement(rig: Rig, points: Array, keyframes: list[KeyFrame], solved: gtsam.Values) -> Mask:
-    """Which landmarks (N,) fit most of their sightings; those that stand still while the surface moves do not."""
+    """Which landmarks (N,) fit at least half of their sightings, unlike points that stand still in a moving scene."""
     fits, total = np.zeros(len(points)), np.zeros(len(points))
     if len(keyframes) < MIN_KEYFRAMES_TO_REJECT:
         return np.ones(len(points), bool)

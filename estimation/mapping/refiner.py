@@ -1,7 +1,7 @@
-"""Key frames, and the refined maps made of them, which come into force at a fixed frame set.
+"""Selection of key frames, and delayed bundle adjustment of the map over them.
 
-The adjustment may run in another process. Its map is taken over a fixed number of frame sets later, so poses do not
-depend on how fast that process was; only where no pose may wait for it, as in a live run, a late one is taken later.
+The adjustment may run in another process. Its map comes into force a fixed number of frame sets later, so poses do not
+depend on that process's speed. In a live run, where no pose may wait, a late map comes into force when it is ready.
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from estimation import se3
-from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, AdjustedMap, Anchors, KeyFrame, adjust, single_fit
+from estimation.mapping.bundle_adjustment import (
+    FREE_SIGMA_MM,
+    AdjustedMap,
+    Anchors,
+    KeyFrame,
+    adjust,
+    fit_single_camera,
+)
 from estimation.observations import Observations
 from estimation.online.camera_errors import Delays
 from estimation.online.fit import FrameFit
@@ -28,30 +35,30 @@ from estimation.surface_map import SurfaceMap
 T = TypeVar("T")
 
 MIN_DELAY_SETS = 3  # frame sets from the submission of a job to its result, at least
-READY_AFTER_S = 0.3  # that an adjustment may take (0.2 s of a core); what is not ready by then is waited for
+READY_AFTER_S = 0.3  # time limit of an adjustment (0.2 s of a core); a later result is waited for
 
 MAX_KEYFRAMES = 20  # 40 improved the pose by nothing and cost four times as much
-VIEW_TURN, VIEW_SHIFT = 0.07, 0.04  # rad, and parts of the distance to the cameras, by which a new view differs
-SAME_VIEW_INTERVAL_S = 0.4  # between key frames of the same view, of which a few average the tracks' noise
-MAX_SAME_VIEW = 6
-READJUST_SIGMA_RATIO = 0.5  # of the doubt about the cameras' instants: then the same key frames tell more
+VIEW_ANGLE, VIEW_SHIFT = 0.07, 0.04  # rad, and ratio to the cameras' distance: a larger change is a new view
+SAME_VIEW_INTERVAL_S = 0.4  # between key frames of one view: a few of them average the tracks' noise
+MAX_SAME_VIEW_KEYFRAMES = 6
+READJUST_DELAY_RATIO = 0.5  # fall of the delays' sigma after which the same key frames are adjusted again
 MIN_TRACK_SIGMA_PX = 0.1
-MIN_AGREEING_TRACKS = 12  # of a camera: fewer may agree by chance, and so may less than half of those found
+MIN_AGREEING_TRACKS = 12  # of a camera: fewer may agree by chance, or less than half of its tracks
 
 
 def sets_until_ready(interval: float) -> int:
-    """The frame sets, `interval` s apart, in which a job is done on a machine that has other things to do too."""
+    """Number of frame sets, `interval` s apart, after which an adjustment's result comes into force."""
     return max(math.ceil(READY_AFTER_S / interval - 1e-6), MIN_DELAY_SETS) if interval > 0 else MIN_DELAY_SETS
 
 
 class DelayedJob(Generic[T]):
-    """One job at a time, in an executor or, without one, here when it is due: the results are the same."""
+    """One job at a time, in an executor or, without one, in `poll`; the results are the same."""
 
     def __init__(self, executor: Executor | None = None, delay: int = MIN_DELAY_SETS, waits: bool = True) -> None:
-        """executor: it may die. delay: frame sets from the next submission until its result counts.
+        """delay: frame sets from a submission until its result comes into force. executor: may break down.
 
-        waits: whether a result that is not ready when it is due is waited for; else it counts once it is there, and
-            `late` counts it.
+        waits: whether `poll` waits for a result that is due but not ready. If not, the result comes later, and `late`
+            counts it.
         """
         self._executor, self.delay, self._waits, self.late = executor, delay, waits, 0
         self._job: tuple[Callable[..., T | None], tuple[Any, ...]] | None = None
@@ -64,7 +71,7 @@ class DelayedJob(Generic[T]):
         return self._job is not None
 
     def cancel(self) -> None:
-        """The job under way is no longer wanted."""
+        """Discard the job under way."""
         self._job = self._future = None
 
     def submit(self, function: Callable[..., T | None], *arguments: Any) -> None:
@@ -74,7 +81,7 @@ class DelayedJob(Generic[T]):
         self._future = None if self._executor is None else self._executor.submit(function, *arguments)
 
     def poll(self) -> T | None:
-        """The result that is due now, if any; to be called once a frame set."""
+        """The result that is due now, or None. Call it once a frame set."""
         self._count += 1
         if self._job is None or self._count < self._due:
             return None
@@ -91,7 +98,7 @@ class DelayedJob(Generic[T]):
 
 
 class Refiner:
-    """Keeps the key frames of one surface and asks for a new map when a new one is worth it."""
+    """Keeps the key frames of one surface, and starts an adjustment after each new one."""
 
     def __init__(self, rig: Rig, executor: Executor | None = None, waits: bool = True) -> None:
         """executor, waits: of the adjustment, as `DelayedJob` takes them."""
@@ -111,23 +118,23 @@ class Refiner:
 
     @property
     def late(self) -> int:
-        """How many refined maps were not ready when they were due."""
+        """Number of refined maps that were not ready when due."""
         return self._work.late
 
     def begin(self, surface_map: SurfaceMap, stamp: float, pose: Array, observations: Observations) -> None:
-        """The first map and the frame set that it was made from, whose pose defines the surface frame."""
+        """Start with the first map and its frame set, whose pose defines the surface frame."""
         self._map, self._frames, self._stamps, self._anchors = surface_map, [], [], None
         self._work.cancel()
         self._due, self._confirmed = False, None
         self._keep(stamp, pose, observations, np.zeros(6))
 
     def speed(self, fit: FrameFit) -> Array:
-        """The twist (6,) from the first key frame's pose to a fit."""
+        """Mean twist (6,), rad/s and mm/s, from the first key frame's pose to a fit."""
         moved = se3.log(se3.inverse(self._frames[0].base_from_surface) @ fit.solution.base_from_surface)
         return np.asarray(moved / (fit.stamp - self._stamps[0]))
 
     def confirm(self, fit: FrameFit, observations: Observations, delays: Delays) -> AdjustedMap | None:
-        """Correct the first map at once by the second frame set: motion between exposures had looked like depth."""
+        """Correct the first map at once by the second frame set: motion between exposures looks like depth in one."""
         assert self._map is not None
         first, pose, twist = self._frames[0], fit.solution.base_from_surface, self.speed(fit)
         second = KeyFrame(pose, _inliers(self._rig, self._map, pose, observations), twist)
@@ -136,7 +143,7 @@ class Refiner:
         return self._at_once(delays)
 
     def rebuild(self, fit: FrameFit, observations: Observations, delays: Delays) -> AdjustedMap | None:
-        """One more frame set before a pose is given out: what moves fast is mapped from all of them, on the spot."""
+        """Add a frame set and adjust at once, before its pose is reported: for a fast surface."""
         self._keep(fit.stamp, fit.solution.base_from_surface, observations, fit.twist)
         return self._at_once(delays)
 
@@ -150,7 +157,7 @@ class Refiner:
         return refined
 
     def reframe(self, surface_map: SurfaceMap, new_from_old: Array, anchors: Anchors) -> None:
-        """The surface frame is another from now on: new_from_old (4, 4). surface_map: in the new one, same rows."""
+        """Change the surface frame by new_from_old (4, 4). surface_map: in the new frame, same rows."""
         turned = se3.adjoint(new_from_old)
         old_from_new = se3.inverse(new_from_old)
         self._map, self._anchors = surface_map, anchors
@@ -160,18 +167,18 @@ class Refiner:
         ]
 
     def offer(self, fit: FrameFit, observations: Observations, twist: Array, delays: Delays) -> None:
-        """A measured frame set; `poll` keeps it if it shows the surface anew."""
+        """Offer a measured frame set; `poll` keeps it if its view is new."""
         self.interval, self._before = max(float(np.nan_to_num(fit.stamp - self._before)), 0.0), fit.stamp
         self._offered, self._delays = (fit, observations, twist), delays
 
     def withdraw(self) -> None:
-        """The last frame set offered is no key frame after all."""
+        """Withdraw the frame set offered last."""
         self._offered = None
 
     def freeze(self) -> AdjustedMap | None:
-        """Instead of `poll` where the surface deforms: go back, once, to the map as it was confirmed.
+        """Call it instead of `poll` while the surface deforms: returns, once, to the confirmed map.
 
-        Key frames of different shapes would be averaged to one that never was. They are still chosen, for their other
+        An adjustment would average key frames of different shapes. Key frames are still selected, for their other
         uses.
         """
         self._choose()
@@ -179,12 +186,12 @@ class Refiner:
         if self._confirmed is None or self._map is None:
             return None
         self._work.cancel()
-        back, self._confirmed = self.with_new_rows(self._confirmed), None
+        back, self._confirmed = self.append_new_rows(self._confirmed), None
         self._map = back.map
         return back
 
     def _choose(self) -> None:
-        """Whether the last frame set offered becomes a key frame."""
+        """Decide whether the frame set offered last becomes a key frame."""
         self.took_keyframe = False
         if self._offered is None or self._map is None:
             return
@@ -192,20 +199,20 @@ class Refiner:
         self._offered = None
         pose = fit.solution.base_from_surface
         alike = int(self._alike(pose).sum())
-        again = alike < MAX_SAME_VIEW and fit.stamp - self._stamps[-1] > SAME_VIEW_INTERVAL_S
+        again = alike < MAX_SAME_VIEW_KEYFRAMES and fit.stamp - self._stamps[-1] > SAME_VIEW_INTERVAL_S
         self.took_keyframe = not alike or again
         if self.took_keyframe:
             self._keep(fit.stamp, pose, observations, twist)
             self._due = True
 
     def _alike(self, pose: Array) -> Mask:
-        """Which key frames (K,) show about what is seen at `pose`."""
+        """Which key frames (K,) have about the same view as `pose` (4, 4)."""
         poses = np.stack([f.base_from_surface for f in self._frames])
         turn = se3.angle_of(se3.inverse(poses) @ pose)
         shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
         centre = np.mean([c.base_from_camera[:3, 3] for c in self._rig.cameras], axis=0)
         far = VIEW_SHIFT * np.linalg.norm(pose[:3, 3] - centre)
-        return np.asarray((turn < VIEW_TURN) & (shift < far))
+        return np.asarray((turn < VIEW_ANGLE) & (shift < far))
 
     def _keep(self, stamp: float, pose: Array, observations: Observations, twist: Array) -> None:
         assert self._map is not None
@@ -219,14 +226,14 @@ class Refiner:
         """The most redundant key frame, never the first."""
         poses = np.stack([f.base_from_surface for f in self._frames])
         between = se3.log(se3.inverse(poses)[:, None] @ poses[None])
-        size = np.linalg.norm(between[..., :3], axis=2) / VIEW_TURN + np.linalg.norm(between[..., 3:], axis=2) / 40.0
+        size = np.linalg.norm(between[..., :3], axis=2) / VIEW_ANGLE + np.linalg.norm(between[..., 3:], axis=2) / 40.0
         size[np.diag_indices(len(poses))] = np.inf
         return 1 + int(np.argmin(np.sort(size[1:], axis=1)[:, :2].sum(1)))
 
     def extend(self, surface_map: SurfaceMap, level: Array | None = None) -> None:
-        """The map has got more rows at its end; the others are as they were.
+        """Take over a map with more rows at its end.
 
-        level: (M,) mm, of the new rows: sigma across the surface by the landmarks around, inf where they do not tell.
+        level: (M,) mm, of the new rows: sigma across the surface by the landmarks around, inf where unknown.
         """
         first, count = 0 if self._anchors is None else len(self._anchors.sigma), len(surface_map)
         self._map = surface_map
@@ -237,8 +244,8 @@ class Refiner:
         new = Anchors(surface_map.points[first:], surface_map.normals[first:], sigma, np.zeros((6, 6)))
         self._anchors = new if self._anchors is None else self._anchors.extended(new)
 
-    def with_new_rows(self, adjusted: AdjustedMap) -> AdjustedMap:
-        """What was adjusted, and the rows that the map has got since."""
+    def append_new_rows(self, adjusted: AdjustedMap) -> AdjustedMap:
+        """The adjusted map with the rows that were added to the map since."""
         assert self._map is not None
         current, count = self._map, len(adjusted.map)
         if count == len(current):
@@ -251,14 +258,14 @@ class Refiner:
         return AdjustedMap(SurfaceMap(points, normals, covariance), agrees)
 
     def poll(self) -> AdjustedMap | None:
-        """A refined map that is due now, or None. Call it once a frame set, when its pose is handed over."""
+        """The refined map that is due now, or None. Call it once a frame set, after its pose."""
         self._choose()
-        self._due |= self._delays.sigma < READJUST_SIGMA_RATIO * self._doubt
+        self._due |= self._delays.sigma < READJUST_DELAY_RATIO * self._doubt
         result = self._work.poll()
         if result is not None:
-            result = self.with_new_rows(result)
+            result = self.append_new_rows(result)
             self._map = result.map
-            trim_heap()  # 30 MB that went to and fro as messages, in 1 to 5 ms that no pose waits for
+            trim_heap()  # of 30 MB of messages; takes 1 to 5 ms, for which no pose waits
         if self._due and not self._work.busy and self._map is not None and len(self._frames) >= 3:
             self._due = False
             self._doubt = self._delays.sigma
@@ -268,13 +275,13 @@ class Refiner:
 
 
 def _inliers(rig: Rig, surface_map: SurfaceMap, near: Array, observations: Observations) -> Observations:
-    """Tracks that agree with the rest of their camera: in the joint fit, room for late cameras hides wrong matches."""
+    """Tracks that agree with the rest of their camera: the joint fit allows for delays, which hides wrong matches."""
     sigma = np.maximum(observations.sigma, MIN_TRACK_SIGMA_PX)
     seen = replace(observations, sigma=sigma)
     keep = np.zeros(len(seen), bool)
     for c in np.unique(seen.camera):
         mine = seen.camera == c
-        agrees = single_fit(rig, surface_map.points, seen, int(c), near).weights > INLIER_WEIGHT
+        agrees = fit_single_camera(rig, surface_map.points, seen, int(c), near).weights > INLIER_WEIGHT
         if agrees.sum() >= max(MIN_AGREEING_TRACKS, 0.5 * mine.sum()):
             keep[mine] = agrees
-    return seen.only(keep)
+    return seen.select(keep)

@@ -1,11 +1,9 @@
-"""Landmarks from pixels: of several cameras at once, look by look as the surface turns, or of one camera alone.
+"""Triangulation of landmarks from several cameras, their update by later observations, and landmarks of one camera.
 
-Where rays meet a surface that is known at points only: a smooth local fit, and its uncertainty.
-
-A landmark that one camera sees has no depth of its own; its neighbours tell where the surface goes on. Around each ray
-the height of the nearest points over their mean plane is a polynomial of fourth order (moving least squares; Levin
-1998), whose coefficients have the sizes they have on bodies (Bayesian linear regression; Bishop 2006, 3.3). Between the
-points their scatter decides how sure a height is; beyond them, what a body's curvature may still do.
+A landmark of one camera has no depth of its own: it is the intersection of its ray with a local fit to the landmarks
+around. Their heights over their mean plane are a polynomial of fourth order (moving least squares; Levin 1998) with a
+prior on its coefficients from the curvature of bodies (Bayesian linear regression; Bishop 2006, 3.3). Between the
+points their scatter gives the height's uncertainty, beyond them the prior.
 """
 
 from __future__ import annotations
@@ -20,13 +18,13 @@ from estimation.errors import InputError
 from estimation.observations import Observations
 from estimation.pose_solver import project
 from estimation.rig import Rig
-from estimation.scans.scan import foot_jacobians
+from estimation.scans.scan import intersection_jacobians
 from estimation.se3 import Array, Index, Mask
 from estimation.surface_map import SurfaceMap, local_normals, surface_frame
 
 MIN_MAP_LANDMARKS = 3  # landmarks: a plane's points, and no fewer span a frame
-MAX_RESIDUAL_SIGMAS = 4.0  # RMS over the sightings of a landmark: beyond, one of them is wrong
-MAX_LOOK_CHI2 = 16.0  # two degrees of freedom: beyond, it is another spot; one in three thousand by chance
+MAX_RESIDUAL_SIGMAS = 4.0  # RMS over the sightings of a landmark: beyond, one of them is an outlier
+MAX_INNOVATION_CHI2 = 16.0  # two degrees of freedom: beyond, an outlier; one in three thousand by chance
 
 
 def rays(rig: Rig, camera: Index, pixels: Array) -> tuple[Array, Array]:
@@ -44,8 +42,10 @@ def triangulate(
 ) -> tuple[Array, Array, Array]:
     """Points (count, 3) in the base frame, covariances (count, 3, 3) at 1 px, residuals (M, 2) px.
 
-    point, camera: (M,) and pixels: (M, 2) say which point stands where in which camera; each point needs two cameras.
-    Start: nearest point to the rays in the least-squares sense; then Gauss-Newton on pixels.
+    point: (M,) number of the point of each sighting; each point needs two cameras or more.
+    camera: (M,) number in the rig. pixels: (M, 2) undistorted px.
+
+    Start: the nearest point to the rays in least squares; then Gauss-Newton on pixels.
     """
     origins, directions = rays(rig, camera, pixels)
     across = np.eye(3) - directions[:, :, None] * directions[:, None]
@@ -91,9 +91,9 @@ class TriangulatedMap:
 
 
 def triangulated_map(rig: Rig, observations: Observations) -> TriangulatedMap:
-    """The map of landmarks that two cameras or more see alike, in a frame in their middle, z out of the surface.
+    """The map of landmarks on which two cameras or more agree; its frame is in their middle, z out of the surface.
 
-    InputError where they are fewer than MIN_MAP_LANDMARKS, which span no frame.
+    InputError with fewer than MIN_MAP_LANDMARKS, which define no frame.
     """
     _, point, count = np.unique(observations.track, return_inverse=True, return_counts=True)
     several = count[point] > 1
@@ -122,14 +122,18 @@ def triangulated_map(rig: Rig, observations: Observations) -> TriangulatedMap:
     return TriangulatedMap(whole, base_from_surface, ids[good])
 
 
-def updated_by_looks(
+def update_from_observations(
     surface_map: SurfaceMap, track: Index, residuals: Array, jacobians: Array, sigma: Array, pose_covariance: Array
 ) -> tuple[SurfaceMap, Mask]:
-    """The map after a look at some of its landmarks from known poses, and which looks (M,) agree with it.
+    """The map after M observations of its landmarks at known poses, and which observations (M,) are inliers.
 
-    One joint Kalman update: the landmarks' errors are correlated, and all looks share the pose's. track: (M,) rows,
-    residuals: (M, 2) px, predicted minus seen, jacobians: (M, 2, 6) by the pose, sigma: (M,) px. pose_covariance:
-    (6, 6).
+    One joint Kalman update: the landmarks' errors are correlated, and all observations share the pose's error.
+
+    track: (M,) rows of the map.
+    residuals: (M, 2) px, predicted minus observed.
+    jacobians: (M, 2, 6) px by the pose's right perturbation.
+    sigma: (M,) px.
+    pose_covariance: (6, 6), rad and mm.
     """
     count, looks = len(surface_map), len(track)
     if not looks:
@@ -142,7 +146,7 @@ def updated_by_looks(
     across = surface_map.covariance @ design.T
     spread = design @ across + noise
     own = np.einsum("minj->mnij", spread.reshape(looks, 2, looks, 2))[np.arange(looks), np.arange(looks)]
-    agrees = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(own), residuals) < MAX_LOOK_CHI2
+    agrees = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(own), residuals) < MAX_INNOVATION_CHI2
     rows = np.repeat(agrees, 2)
     gain = np.linalg.solve(spread[np.ix_(rows, rows)], across[:, rows].T).T
     covariance = surface_map.covariance - gain @ across[:, rows].T
@@ -150,46 +154,48 @@ def updated_by_looks(
     return SurfaceMap(points, surface_map.normals, (covariance + covariance.T) / 2), agrees
 
 
-FIT_NEIGHBOURS = 24  # twice what the polynomial asks for where they lie on one side
-MIN_SURFACE_POINTS = 12  # fewer are no surface
+FIT_NEIGHBOURS = 24  # of a local fit with 15 coefficients
+MIN_SURFACE_POINTS = 12  # of a surface
 POLYNOMIAL_ORDER = 4
-MIN_BODY_RADIUS_MM = 30.0  # of a wrist, the most strongly curved body that is printed on
-MIN_SCATTER_MM = 0.02  # no skin is smoother, no landmark better known
-OUTLIER_SCATTERS = 3.0  # times the scatter, from which a point counts by its distance only (Huber)
-MIN_RAY_COSINE = 0.15  # between ray and normal: beyond, nothing is visible
+MIN_BODY_RADIUS_MM = 30.0  # of curvature: a wrist's, the smallest of the bodies that are printed on
+MIN_SCATTER_MM = 0.02  # roughness of skin and error of landmarks, at least
+OUTLIER_SCATTERS = 3.0  # Huber's threshold, in scatters
+MIN_RAY_COSINE = 0.15  # between ray and normal: below, the surface is not visible
 MONOMIAL_POWERS = [(n - j, j) for n in range(POLYNOMIAL_ORDER + 1) for j in range(n + 1)]
-# mm^(1 - order), one standard deviation: h = y^2 / 2R + y^4 / 8R^3 on a cylinder, and as much askew in between
+# mm^(1 - order), one standard deviation: h = y^2 / 2R + y^4 / 8R^3 on a cylinder; mixed terms alike
 COEFFICIENT_SIGMAS = (1e2, 1e1, 0.5 / MIN_BODY_RADIUS_MM, 0.25 / MIN_BODY_RADIUS_MM**2, 0.125 / MIN_BODY_RADIUS_MM**3)
 COEFFICIENT_PRIOR = np.array([COEFFICIENT_SIGMAS[a + b] ** -2 for a, b in MONOMIAL_POWERS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaySurfaceHits:
-    """Where M rays meet the surface."""
+    """Intersections of M rays with the surface."""
 
     points: Array  # (M, 3) mm
     normals: Array  # (M, 3) unit, against the rays
     sigma: Array  # (M,) mm across the surface
     covariance: Array  # (3M, 3M) mm^2, joint: neighbours share a part of their heights' errors
-    good: Mask  # (M,) whether there is a surface to meet
+    good: Mask  # (M,) whether the ray meets the surface
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fits:
     """One polynomial fit for each of M rays, with P coefficients, to K neighbours."""
 
-    near: Index  # (M, K) rows of the points
+    near: Index  # (M, K) rows of the neighbours
     frames: Array  # (M, 3, 3) rows u, v and up
-    centres: Array  # (M, 3)
+    centres: Array  # (M, 3) mm
     maps: Array  # (M, P, K) from the neighbours' heights to the coefficients
     coefficients: Array  # (M, P)
-    doubt: Array  # (M, P, P) covariance of those beyond the neighbours' scatter
+    posterior: Array  # (M, P, P) covariance of the coefficients
     scatter: Array  # (M,) mm, one sigma
-    reach: Array  # (M,) mm, of the neighbours
+    reach: Array  # (M,) mm, RMS distance of the neighbours from the centre
 
 
-def meet_rays(points: Array, covariance: Array, origins: Array, directions: Array, angle: Array) -> RaySurfaceHits:
-    """Where rays meet the surface through points (N, 3) with joint covariance (3N, 3N), mm^2.
+def intersect_rays_with_surface(
+    points: Array, covariance: Array, origins: Array, directions: Array, angle: Array
+) -> RaySurfaceHits:
+    """Intersections of rays with the surface through points (N, 3) with joint covariance (3N, 3N), mm^2.
 
     origins, directions: (M, 3), unit, the points' frame. angle: (M,) rad, one sigma of each ray.
     """
@@ -211,7 +217,7 @@ def meet_rays(points: Array, covariance: Array, origins: Array, directions: Arra
     normals = np.einsum("mk,mki->mi", up, fits.frames)
     good &= (np.einsum("mi,mi->m", normals, directions) < -MIN_RAY_COSINE) & np.isfinite(hits).all(1)
     heights = _heights(fits, at, hits, covariance) * up[:, 2:] * up[:, 2]  # across the surface, not along the fit's up
-    shift, depth = foot_jacobians(hits - origins, normals)
+    shift, depth = intersection_jacobians(hits - origins, normals)
     side = (np.linalg.norm(hits - origins, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
     joint = np.einsum("mi,mn,nj->minj", depth, heights, depth)
     joint[np.arange(count), :, np.arange(count)] += side
@@ -221,7 +227,7 @@ def meet_rays(points: Array, covariance: Array, origins: Array, directions: Arra
 def smooth_normals(points: Array, outward: Array) -> Array:
     """Unit normals (N, 3) of the smooth surface through points (N, 3), on the side of `outward`, (3,) or (N, 3).
 
-    A plane through a point's neighbours leans inwards at the rim of a bent surface, where they lie on one side of it.
+    At the rim of a bent surface, where neighbours lie on one side, a plane through them would lean inwards.
     """
     outward = np.broadcast_to(outward, points.shape)
     near = np.asarray(cKDTree(points).query(points, k=min(FIT_NEIGHBOURS, len(points)))[1], np.int64)
@@ -233,7 +239,10 @@ def smooth_normals(points: Array, outward: Array) -> Array:
 
 
 def _fits(points: Array, own_covariance: Array, near: Index, outward: Array) -> _Fits:
-    """M fits to rows near (M, K) of points (N, 3) with covariances (N, 3, 3) mm^2; up is on the outward (M, 3) side."""
+    """M fits to rows near (M, K) of points (N, 3) with covariances (N, 3, 3) mm^2.
+
+    outward: (M, 3), the side of the frames' up.
+    """
     own = points[near]  # (M, K, 3)
     centres = own.mean(1)
     spread = own - centres[:, None]
@@ -248,8 +257,8 @@ def _fits(points: Array, own_covariance: Array, near: Index, outward: Array) -> 
     for _ in range(4):
         trusted = weight / (scatter[:, None] ** 2 + known)
         normal = np.einsum("mkp,mk,mkq->mpq", design, trusted, design) + np.diag(COEFFICIENT_PRIOR)
-        doubt = np.linalg.inv(normal)
-        maps = doubt @ np.swapaxes(design * trusted[..., None], 1, 2)
+        posterior = np.linalg.inv(normal)
+        maps = posterior @ np.swapaxes(design * trusted[..., None], 1, 2)
         coefficients = np.einsum("mpk,mk->mp", maps, local[..., 2])
         off = local[..., 2] - np.einsum("mkp,mp->mk", design, coefficients)
         free = np.maximum(weight.sum(1) - np.einsum("mkp,mpk->m", design, maps), 1.0)
@@ -259,11 +268,11 @@ def _fits(points: Array, own_covariance: Array, near: Index, outward: Array) -> 
         weight = np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-9))
     freedom = np.maximum(free, 3.0)
     scatter = scatter * np.sqrt(freedom / (freedom - 2))  # known from few neighbours: Student's t
-    return _Fits(near, frames, centres, maps, coefficients, doubt, scatter, reach)
+    return _Fits(near, frames, centres, maps, coefficients, posterior, scatter, reach)
 
 
 def _nearest(points: Array, origins: Array, directions: Array) -> Index:
-    """Rows (M, K) of the points about where each ray comes nearest to any of them."""
+    """Rows (M, K) of the points nearest to each ray."""
     away = points - origins[:, None]  # (M, N, 3)
     along = np.einsum("mni,mi->mn", away, directions)
     aside = np.linalg.norm(away - along[..., None] * directions[:, None], axis=2)
@@ -284,7 +293,10 @@ def _slopes(coefficients: Array, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, Mask]:
-    """Where (u, v), each (M,), rays with origin and direction places (M, 2, 3) meet the fits, by Newton's method."""
+    """Intersections u and v (M,), mm, of rays with the fits, by Newton's method, and whether it converged (M,).
+
+    places: (M, 2, 3) origin and direction of the rays in the fits' frames.
+    """
     origin, direction = places[:, 0], places[:, 1]
     level = np.where(np.abs(direction[:, 2]) < MIN_RAY_COSINE, -MIN_RAY_COSINE, direction[:, 2])
     reach = -origin[:, 2] / level
@@ -300,10 +312,11 @@ def _crossing(coefficients: Array, places: Array) -> tuple[Array, Array, Mask]:
 
 
 def _heights(fits: _Fits, at: Array, hits: Array, covariance: Array) -> Array:
-    """Covariance (M, M) mm^2 of the heights at `hits`, the sum of three parts.
+    """Covariance (M, M) mm^2 of the heights at `hits`, the sum of three parts:
 
-    The surface's own scatter, anew at each place; the neighbours' scatter and errors, by their weights in the fits; and
-    the remaining doubt about the coefficients, shared by places that lie close together.
+    - the surface's own scatter, independent at each place;
+    - the neighbours' scatter and errors, by their weights in the fits;
+    - the remaining uncertainty of the coefficients, correlated over the distance between places.
     """
     rays, count = np.arange(len(at)), len(covariance) // 3
     weights = np.einsum("mp,mpk->mk", at, fits.maps)  # of the neighbours' heights
@@ -312,6 +325,6 @@ def _heights(fits: _Fits, at: Array, hits: Array, covariance: Array) -> Array:
     rough[rays[:, None], fits.near] = weights * fits.scatter[:, None]
     by_point = (lever[..., None] * fits.frames[:, 2][:, None]).reshape(len(at), -1)  # (M, 3N)
     shared = rough @ rough.T + by_point @ covariance @ by_point.T
-    unseen = np.sqrt(np.maximum(np.einsum("mp,mpq,mq->m", at, fits.doubt, at) - np.diag(shared), 0.0))
+    unseen = np.sqrt(np.maximum(np.einsum("mp,mpq,mq->m", at, fits.posterior, at) - np.diag(shared), 0.0))
     apart = np.linalg.norm(hits[:, None] - hits, axis=2) / np.median(fits.reach)
     return np.asarray(shared + np.outer(unseen, unseen) * np.exp(-0.5 * apart**2) + np.diag(fits.scatter**2))

@@ -20,7 +20,7 @@ from estimation.online.camera_errors import RivalWatch
 from estimation.online.deformation import camera_medians, own_residuals, squared_speeds
 from estimation.online.fit import RivalPose, camera_numbers, motion_sigmas, picture_noise
 from estimation.pose import SurfacePose, TrackState
-from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, project, solve_pose, solved
+from estimation.pose_solver import INLIER_WEIGHT, PointTracks, PoseFit, SharedErrors, project, solve_pose, solve_small
 from estimation.rig import Rig
 from estimation.runtime import contiguous, median
 from estimation.se3 import Array, Index, Mask
@@ -252,11 +252,13 @@ class FrameTracks:
 
     def fit(self, start: Array, scales: tuple[float, ...], left_out: Collection[int]) -> PoseFit:
         """The pose of all cameras but `left_out`, whose tracks get residuals, but no weight; start: (4, 4)."""
-        tracks = PointTracks.of(self.observations, self.points)
+        tracks = PointTracks.from_observations(self.observations, self.points)
         if not left_out:
             return solve_pose(self.rig, tracks, start, scales=scales, shared=self.shared)
         kept = ~np.isin(tracks.camera, list(left_out))
-        return self._with_rest(solve_pose(self.rig, tracks.only(kept), start, scales=scales, shared=self.shared), kept)
+        return self._with_rest(
+            solve_pose(self.rig, tracks.select(kept), start, scales=scales, shared=self.shared), kept
+        )
 
     def _with_rest(self, fit: PoseFit, fitted: Mask) -> PoseFit:
         """A fit to the tracks `fitted` (N,) with the residuals of the others, which have no weight."""
@@ -319,7 +321,7 @@ class FrameTracks:
         if fit.shared is None:
             return frozenset()
         prior, eye = self.shared.covariance(), np.eye(len(fit.shared.pull))
-        effect = prior @ solved(eye + fit.shared.information @ prior, fit.shared.pull[:, None])[:, 0]
+        effect = prior @ solve_small(eye + fit.shared.information @ prior, fit.shared.pull[:, None])[:, 0]
         delay, sigma = np.abs(effect[: len(self.rig)]), np.sqrt(np.mean(np.diag(self.shared.delay)))
         return frozenset([int(np.argmax(delay))] if delay.max() > MAX_DELAY_SIGMAS * sigma else [])
 
@@ -368,8 +370,11 @@ class FrameTracks:
     def _only(self, cameras: frozenset[int], start: Array) -> tuple[PoseFit, float]:
         """The fit of these cameras' tracks alone, and its noise, px, in their pictures."""
         mine = np.isin(self.observations.camera, list(cameras))
-        tracks, prior = PointTracks.of(self.observations, self.points), SINGLE_POSE_PRIOR if len(cameras) == 1 else None
-        alone = solve_pose(self.rig, tracks.only(mine), start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
+        tracks, prior = (
+            PointTracks.from_observations(self.observations, self.points),
+            SINGLE_POSE_PRIOR if len(cameras) == 1 else None,
+        )
+        alone = solve_pose(self.rig, tracks.select(mine), start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
         fit = self._with_rest(alone, mine)
         return fit, picture_noise(fit, mine)
 

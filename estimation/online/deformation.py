@@ -247,7 +247,7 @@ def rows_of_modes(
     """Rows (2N, M + 6 + C + 1) of the regression on modes, pose and delays, each times its track's `root` (N,), px^-1.
 
     modes: (L, 3, M) mm of each landmark, rows `track` (N,). error: (M,), modes that the residuals (N, 2) px hold and
-    the points do not. The last column is what is left. The rest as in `gram_by_camera`.
+    the points do not. The last column is what is left. The rest as in `camera_grams`.
     """
     cameras = camera.max() + 1
     count = modes.shape[2]
@@ -301,7 +301,7 @@ def pose_pulls(
 ) -> tuple[Array, Array]:
     """How each landmark (6, L, 3), px^-2 per mm, and each camera's delay and shifts (6, 3, C) pull at the pose.
 
-    The pose gives way by its covariance times that. landmark: (N,) below L. The rest as in `gram_by_camera`.
+    The pose gives way by its covariance times that. landmark: (N,) below L. The rest as in `camera_grams`.
     """
     by_landmark, by_camera = np.zeros((6, landmarks, 3)), np.zeros((6, 3, cameras))
     for i in range(len(camera)):

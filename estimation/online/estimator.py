@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import se3
-from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces, Observations
+from estimation.observations import NO_DISPLACED_PLACES, DisplacedPlaces, Observations
 from estimation.online.camera_errors import CameraErrorHistory, CameraErrors
 from estimation.online.camera_health import CameraHealth, FrameTracks
 from estimation.online.deformation import WarpFilter, squared_speeds
@@ -108,7 +108,7 @@ class Estimator:
         """The pose expected at `stamp`, with the covariance of its search."""
         pose = self._surface.pose
         if self._prediction is None or self._prediction[0] is not pose or self._prediction[1].stamp != stamp:
-            self._prediction = pose, pose.predict(stamp, onwards=False)
+            self._prediction = pose, pose.predict(stamp, keep_forecast=False)
         return self._prediction[1]
 
     def predict(self, stamp: float) -> Array:
@@ -179,7 +179,7 @@ class Estimator:
         """The observations as by cameras without offsets, with realistic sigmas; and the smear, px, of the images."""
         sigma, camera = np.maximum(observations.sigma, self.settings.min_track_sigma), observations.camera
         simultaneous, _, jacobians = project(self.rig, camera, start, points)
-        sigma = self._surface.map_error.widened(sigma, observations.track, jacobians)
+        sigma = self._surface.map_error.inflate_sigmas(sigma, observations.track, jacobians)
         pixels = observations.pixels
         if self.cameras.offset.any():
             pixels = pixels + simultaneous - project(self.rig, camera, self.as_exposed(start, twist), points)[0]
@@ -280,7 +280,7 @@ class Estimator:
         observations: Observations,
         elsewhere: Observations | None = None,
         aliases: Array = NO_ALIASES,
-        displaced: DisplacedPlaces = NOTHING_DISPLACED,
+        displaced: DisplacedPlaces = NO_DISPLACED_PLACES,
     ) -> SurfacePose:
         """Take a measured fit into the window and give the pose.
 
@@ -288,7 +288,7 @@ class Estimator:
         """
         assert fit.measured
         surface, sigma = self._surface, np.maximum(observations.sigma, self.settings.min_track_sigma)
-        clear = self.may_learn(fit) and not len(aliases) and not displaced.whole
+        clear = self.may_learn(fit) and not len(aliases) and not displaced.ambiguous
         surface.displaced = displaced
         surface.pending_fit = fit, observations, fit.stamp - surface.pose.stamp, clear
         if clear and self._smear(fit) < MAX_LEARNING_SMEAR_MM:
@@ -322,7 +322,7 @@ class Estimator:
         pose = self._enter(window, fit.parts.smear, lasting, *self._states.measured(fit.stamp, measurement))
         reported = surface.reported_covariance.measured(pose, fit, self.cameras, surface.first_covariance, window)
         reported = widened(reported, alias_covariance(aliases)) if len(aliases) else reported
-        reported = widened(reported, displaced.covariance) if displaced.whole else reported
+        reported = widened(reported, displaced.covariance) if displaced.ambiguous else reported
         if self.health.rivals.untrusted or clock_caveat:
             delay_error = bool(clock_caveat) * DELAY_SIGMAS * sigma_s * fit.twist
             reported = widened(reported, self.health.rivals.covariance + np.outer(delay_error, delay_error))

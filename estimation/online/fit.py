@@ -10,7 +10,7 @@ from estimation import se3
 from estimation.observations import Observations
 from estimation.online.deformation import WarpFilter, pose_pulls
 from estimation.pose import SurfacePose
-from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, product, project, solved
+from estimation.pose_solver import EFFICIENCY, GATE, PoseFit, SharedErrors, product, project, solve_small
 from estimation.rig import Rig
 from estimation.runtime import compiled, contiguous, median
 from estimation.se3 import Array, Index, Mask
@@ -182,7 +182,7 @@ def _gain(prior: Array, information: Array) -> Array:
     system = product(prior, information)  # transposed
     for i in range(len(prior)):
         system[i, i] += 1.0
-    return solved(system, prior)
+    return solve_small(system, prior)
 
 
 @compiled("Tuple((f8[:,::1], f8))(f8[:,::1], f8[:,::1], f8[:,::1])")
@@ -257,7 +257,7 @@ def fit_covariance(
     rows, landmark = np.flatnonzero(mapped), (np.cumsum(mapped) - 1)[observations.track]
     cameras, camera = len(shared.shift), contiguous(observations.camera, np.int64)
     by_landmark, by_camera = pose_pulls(cameras, len(rows), camera, landmark, solution.jacobians, weight, shared.twist)
-    lasting = map_error.reaching_pose(rows, by_landmark)
+    lasting = map_error.pose_covariance(rows, by_landmark)
     lasting = noise @ (lasting + warp.pull(observations.track, weight, solution.jacobians)) @ noise
     # the pose by each delay, shift right and shift down; what a correction by the seen delays leaves of that, and adds
     effects, shared_fit = noise @ by_camera.reshape(6, -1), solution.shared
@@ -368,7 +368,7 @@ def motion_sigmas(fit: PoseFit, expected: SurfacePose) -> float:
     """By how many sigmas a pose differs from the one expected by the motion, at least one."""
     difference = se3.log(se3.inverse(expected.base_from_surface) @ fit.base_from_surface)
     spread = expected.covariance + _inverse(contiguous(fit.information), 1e-9, 1e-12)  # without information: one
-    return max(1.0, float(np.sqrt(difference @ solved(spread, difference[:, None])[:, 0] / 6)))
+    return max(1.0, float(np.sqrt(difference @ solve_small(spread, difference[:, None])[:, 0] / 6)))
 
 
 def picture_noise(fit: PoseFit, rows: Mask) -> float:
@@ -388,7 +388,7 @@ def _inverse(information: Array, share: float, floor: float) -> Array:
     for i in range(len(damped)):
         damped[i, i] += damping
         eye[i, i] = 1.0
-    out = solved(damped, eye)
+    out = solve_small(damped, eye)
     for i in range(len(damped)):
         for j in range(i):
             out[i, j] = out[j, i] = (out[i, j] + out[j, i]) / 2

@@ -161,7 +161,7 @@ class LocalMotion:
         self.error = LocalError(centres, variance, growth, reach, support, self._span, limit)
         if len(top):
             peak = (SMALL_RATIO * self._small[top]) ** 2
-            self.error = self.error.with_bells(self._points[top], peak, SMALL_REACH_MM)
+            self.error = self.error.add_bells(self._points[top], peak, SMALL_REACH_MM)
 
     def _take(self, surface_map: SurfaceMap) -> None:
         """Follow a map that was refined or has grown: rows keep their meaning, and landmarks their places."""

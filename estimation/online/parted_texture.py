@@ -97,7 +97,7 @@ class PartedTexture:
         places = places[near.sum(1) > 1]
         if error is None or not len(places):
             return error
-        return error.with_bells(places, max(self._size, MIN_APART_MM) ** 2, PLACE_MM)
+        return error.add_bells(places, max(self._size, MIN_APART_MM) ** 2, PLACE_MM)
 
     def search(self, observations: Observations, fit: FrameFit, points: Array) -> Elsewhere | None:
         """Landmarks to be searched elsewhere in this frame set, too; None: none. points: (N, 3) of the map, mm."""
@@ -131,7 +131,7 @@ class PartedTexture:
         if len(self._lost_rows) < MIN_GROUP_LANDMARKS and not self.message:
             return
         off = self._off(fit) & np.isin(observations.track, self._lost_rows)
-        parts = [observations.only(off)] + ([] if elsewhere is None else [elsewhere])
+        parts = [observations.select(off)] + ([] if elsewhere is None else [elsewhere])
         names = ("camera", "track", "pixels", "sigma")
         camera, track, pixels, sigma = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
         group = None

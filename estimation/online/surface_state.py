@@ -20,7 +20,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.forecast.predictor import Predictor
-from estimation.observations import NOTHING_DISPLACED, Observations
+from estimation.observations import NO_DISPLACED_PLACES, Observations
 from estimation.online.deformation import WarpFilter
 from estimation.online.fit import FrameFit
 from estimation.online.local_motion import LocalMotion
@@ -344,11 +344,11 @@ class MappedSurface:
         self.pending_fit: tuple[FrameFit, Observations, float, bool] | None = None
         # poses measured since the first map; whether that is held against a deformation: then no clocks are learned
         self.fit_count, self.clocks_frozen = 0, False
-        self.displaced = NOTHING_DISPLACED  # by their colours, in the last frame set that was measured
+        self.displaced = NO_DISPLACED_PLACES  # by their colours, in the last frame set that was measured
 
     @property
     def local_error(self) -> LocalError | None:
         """By how much single places may be off, by displaced landmarks, groups of them, and colours."""
         error = self.parted.local_error(self.local_motion.error, self.map.points)
         places = self.displaced
-        return error and error.with_bells(places.centres, places.sizes**2, places.reach)
+        return error and error.add_bells(places.centres, places.distances**2, places.reach)

@@ -1,4 +1,4 @@
-"""A scan of the surface, a triangle mesh in the surface frame: where rays meet it, and its nearest points."""
+"""A scan of the surface, a triangle mesh in the surface frame: ray intersection and nearest points."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimation.runtime import OPEN3D_PAGES, left_out
+from estimation.runtime import UNUSED_OPEN3D_MODULES, stub_modules
 from estimation.se3 import Array, Index, Mask
 
-MIN_INCIDENCE = 0.1  # cosine of ray and normal: no landmark is seen more from the side
-SAMPLE_COUNT = 15_000  # about so many spread over the scan; a 100 x 100 mm scan gets one every 0.8 mm
-RIM_WEIGHT = 1e-6  # barycentric, below which a nearest point lies on the opposite side: a digit over those of float32
+MIN_INCIDENCE = 0.1  # cosine of ray and normal, bounds the derivatives
+SAMPLE_COUNT = 15_000  # on the scan, about; 0.8 mm apart on 100 x 100 mm
+RIM_WEIGHT = 1e-6  # barycentric: below, a nearest point is on the opposite side; ten roundings of float32
 _MAX_DIVISIONS = 24  # of a triangle's side
 
 
@@ -23,7 +23,7 @@ class Scan:
 
     vertices: Array  # (V, 3) mm, surface frame
     triangles: Index  # (T, 3) numbers of vertices, anticlockwise as seen from outside
-    normals: Array  # (V, 3) unit, out of the surface, the mean of the triangles around, weighted by area
+    normals: Array  # (V, 3) unit, out of the surface, means of the adjacent triangles' by area
 
     @property
     def corners(self) -> Array:
@@ -74,7 +74,7 @@ def _crosses(points: Array, faces: Index) -> Array:
 
 
 def vertex_normals(points: Array, faces: Index) -> Array:
-    """Unit normals (V, 3); where the triangles around a vertex cancel out, that of one of them."""
+    """Unit normals (V, 3); where adjacent triangles' normals cancel out, that of one triangle."""
     crosses = _crosses(points, faces)
     sums = np.zeros_like(points)
     some = np.zeros_like(points)
@@ -87,52 +87,56 @@ def vertex_normals(points: Array, faces: Index) -> Array:
     return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
 
 
-def lattice_triangles(sure: Mask) -> tuple[Index, Index]:
-    """Nodes (V,) of a lattice (H, W), row by row, that are corners of triangles of sure ones, and those (T, 3) by rows
-    of V; anticlockwise where rows run along y, columns along x and the eye stands at +z."""
-    number = np.arange(sure.size).reshape(sure.shape)
+def triangulate_lattice(valid: Mask) -> tuple[Index, Index]:
+    """Triangles (T, 3) between valid nodes of a lattice (H, W), and the nodes (V,), row by row, that they number.
+
+    Anticlockwise seen from +z, where rows run along y and columns along x.
+    """
+    number = np.arange(valid.size).reshape(valid.shape)
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]))
     triangles = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
-    used, corner = np.unique(triangles[sure.ravel()[triangles].all(1)], return_inverse=True)
+    used, corner = np.unique(triangles[valid.ravel()[triangles].all(1)], return_inverse=True)
     return used, corner.reshape(-1, 3)
 
 
 class _Scene:
-    """open3d's ray casting scene of a scan. It is in float32 and tells the triangle; places follow in float64.
+    """open3d's ray casting scene of a scan, in float32: it finds triangles; points on them are computed in float64.
 
-    Which triangle does not depend on other queries: the same input gives the same result, whatever the threads.
+    The result of a query does not depend on other queries or threads.
     """
 
     def __init__(self, scan: Scan) -> None:
-        with left_out(*OPEN3D_PAGES):
+        with stub_modules(*UNUSED_OPEN3D_MODULES):
             import open3d as o3d  # a second and 100 MB, which processes without a scan need not spend
 
         self.scan, self._tensor = scan, o3d.core.Tensor
-        self._middle = scan.vertices.mean(axis=0)  # float32 has 7 digits: they are spent on the scan, not on its place
+        self._middle = scan.vertices.mean(axis=0)  # float32 has 7 digits, which a distant origin would use up
         self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._single(scan.vertices - self._middle), self._single(scan.triangles, np.uint32))
+        self._scene.add_triangles(
+            self._to_tensor(scan.vertices - self._middle), self._to_tensor(scan.triangles, np.uint32)
+        )
         self._miss = self._scene.INVALID_ID
 
-    def _single(self, values: Array | Index, kind: type = np.float32) -> Any:
+    def _to_tensor(self, values: Array | Index, kind: type = np.float32) -> Any:
         return self._tensor(np.ascontiguousarray(values, kind))
 
     def first_hits(self, origins: Array, directions: Array) -> tuple[Index, Index]:
-        """Rays (M,) that meet the scan, and the triangle (M,) that each meets first."""
+        """Rays (M,) that hit the scan, and the first triangle (M,) of each."""
         rays = np.concatenate([origins - self._middle, directions], axis=1)
-        triangle = self._scene.cast_rays(self._single(rays))["primitive_ids"].numpy()
+        triangle = self._scene.cast_rays(self._to_tensor(rays))["primitive_ids"].numpy()
         ray = np.flatnonzero(triangle != self._miss)
         return ray, triangle[ray].astype(np.int64)
 
     def closest(self, points: Array) -> tuple[Index, Array]:
         """The triangle (N,) nearest to each point (N, 3), and the barycentric weights (N, 3) of its nearest point."""
-        near = self._scene.compute_closest_points(self._single(points - self._middle))
+        near = self._scene.compute_closest_points(self._to_tensor(points - self._middle))
         uv = near["primitive_uvs"].numpy().astype(np.float64)
         return near["primitive_ids"].numpy().astype(np.int64), np.column_stack([1 - uv.sum(axis=1), uv])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Where N rays first meet the scan."""
+    """First intersections of N rays with the scan."""
 
     points: Array  # (N, 3) mm, surface frame; NaN without a hit
     normals: Array  # (N, 3) unit, likewise
@@ -140,27 +144,27 @@ class Hits:
 
 
 def cast_rays(scan: Scan, origins: ArrayLike, directions: Array) -> Hits:
-    """Where rays from `origins` (N, 3) or (3,) along `directions` (N, 3), surface frame, first meet it, on either side.
+    """First intersections, with either side, of rays from `origins` (N, 3) or (3,) along `directions` (N, 3).
 
-    open3d finds the triangle; where the ray meets its plane is worked out in float64.
+    Surface frame. open3d finds the triangle; the intersection with its plane is computed in float64.
     """
     points, normals = np.full((2, len(directions), 3), np.nan)
     if not len(directions) or not len(scan.triangles):
         return Hits(points, normals, np.zeros(len(directions), bool))
     origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
     ray, triangle = _Scene(scan).first_hits(origins, directions)
-    weights, depth = _meet(scan.corners[triangle] - origins[ray, None], directions[ray])
+    weights, depth = _intersect_triangles(scan.corners[triangle] - origins[ray, None], directions[ray])
     points[ray] = origins[ray] + depth[:, None] * directions[ray]
     normals[ray] = normals_at(scan, triangle, weights)
     return Hits(points, normals, np.isfinite(points[:, 0]))
 
 
-LIGHT_BESIDE_EYE = np.array([-0.4, 0.3, 0.87])  # of a picture: from above left
-DARKEST_SHADE = 0.45  # of what faces away from the light
+LIGHT_DIRECTION = np.array([-0.4, 0.3, 0.87])  # in the view's frame: from above left
+AMBIENT_LIGHT = 0.45  # brightness of faces turned away from the light
 
 
-def picture_of_scan(scan: Scan, colours: NDArray[np.uint8], way: Array, pixels: int) -> NDArray[np.uint8]:
-    """A picture (pixels, pixels, 3) of a scan with colours (V, 3), as seen from far away in direction `way` (3,)."""
+def render_scan(scan: Scan, colours: NDArray[np.uint8], way: Array, pixels: int) -> NDArray[np.uint8]:
+    """An orthographic picture (pixels, pixels, 3) of a scan with colours (V, 3), seen from direction `way` (3,)."""
     from scipy.spatial import cKDTree  # half a second, which processes without a scan need not spend
 
     z = way / np.linalg.norm(way)
@@ -174,14 +178,14 @@ def picture_of_scan(scan: Scan, colours: NDArray[np.uint8], way: Array, pixels: 
     flat = np.column_stack([u.ravel(), v.ravel(), np.full(u.size, high[2] + 1)])
     hits = cast_rays(scan, flat @ axes, np.broadcast_to(-z, (u.size, 3)))
     near = cKDTree(scan.vertices).query(hits.points[hits.hit])[1]
-    lit = np.clip(hits.normals[hits.hit] @ (LIGHT_BESIDE_EYE @ axes), 0, 1)
+    lit = np.clip(hits.normals[hits.hit] @ (LIGHT_DIRECTION @ axes), 0, 1)
     image = np.full((u.size, 3), 255, np.uint8)
-    image[hits.hit] = np.clip(colours[near] * (DARKEST_SHADE + 0.6 * lit)[:, None], 0, 255)
+    image[hits.hit] = np.clip(colours[near] * (AMBIENT_LIGHT + 0.6 * lit)[:, None], 0, 255)
     return image.reshape(pixels, pixels, 3)
 
 
-def foot_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:
-    """How the foot of each ray (N, 3), from the camera, moves along the plane with unit normal (N, 3) that it meets.
+def intersection_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:
+    """Derivatives of the intersections of rays (N, 3), from the camera, with planes of unit normals (N, 3).
 
     (N, 3, 3) by a shift of the ray, and (N, 3) by a shift of the plane along its normal.
     """
@@ -191,9 +195,11 @@ def foot_jacobians(rays: Array, normals: Array) -> tuple[Array, Array]:
     return np.eye(3) - along[:, :, None] * normals[:, None] / slope[:, None, None], along / slope[:, None]
 
 
-def _meet(corners: Array, directions: Array) -> tuple[Array, Array]:
-    """Barycentric weights (M, 3) of where rays (M, 3) from the origin meet the planes of triangles (M, 3, 3), and how
-    far away that is, in lengths of `directions` (Moeller and Trumbore 1997)."""
+def _intersect_triangles(corners: Array, directions: Array) -> tuple[Array, Array]:
+    """Intersections of rays (M, 3) from the origin with the planes of triangles (M, 3, 3) (Moeller and Trumbore 1997).
+
+    Their barycentric weights (M, 3), and distances in lengths of `directions` (M,).
+    """
     a = corners[:, 0]
     ab, ac = corners[:, 1] - a, corners[:, 2] - a
     p, q = np.cross(directions, ac), np.cross(-a, ab)
@@ -212,7 +218,7 @@ class ClosestPoints:
 
 
 class ScanIndex:
-    """A scan made ready for many queries, by samples spread over its triangles, at least one on each."""
+    """An index of a scan for many queries: samples on its triangles, at least one on each."""
 
     def __init__(self, scan: Scan) -> None:
         from scipy.spatial import cKDTree  # as above
@@ -220,7 +226,7 @@ class ScanIndex:
         self.scan, self._scene, self._corners, areas = scan, _Scene(scan), scan.corners, face_areas(scan)
         spacing = float(np.sqrt(areas.sum() / SAMPLE_COUNT))
         self.spacing = max(spacing, float(np.sqrt(np.quantile(areas, 0.9))))  # mm, about the largest between samples
-        self.triangle, weights = _spread(scan, spacing)  # (S,) that each sample lies on
+        self.triangle, weights = _sample_triangles(scan, spacing)  # (S,) that each sample lies on
         self.samples = np.einsum("sk,ski->si", weights, self._corners[self.triangle])  # (S, 3) mm, surface frame
         self.normals = normals_at(scan, self.triangle, weights)  # (S, 3)
         self.tree = cKDTree(self.samples)
@@ -239,7 +245,7 @@ class ScanIndex:
         return ClosestPoints(nearest, normals_at(self.scan, triangle, weights), rim)
 
 
-def _spread(scan: Scan, spacing: float) -> tuple[Index, Array]:
+def _sample_triangles(scan: Scan, spacing: float) -> tuple[Index, Array]:
     """Triangles (S,) and barycentric weights (S, 3) of samples about `spacing` apart: centres of sub-triangles."""
     corners = scan.corners
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)

@@ -22,14 +22,14 @@ from estimation.rig import Rig
 from estimation.se3 import Array, Mask
 from estimation.synthetic.world import SYNTHETIC_WORLD, World
 
-MIN_FRAME_SETS = StateSettings().averaged_poses + 3  # the map's, those averaged into the first pose, two to be judged
+MIN_FRAME_SETS = StateSettings().averaged_poses + 3  # the map's, those averaged into the first pose, two to evaluate
 Mapping = Literal["told", "seen"]  # the world's own map, or one triangulated from the first frame set and refined
 
 
 def pose_information(rig: Rig, base_from_surface: Array, points: Array, observations: Observations) -> Array:
     """Fisher information (6, 6) of one frame set about the right perturbation of the true pose (4, 4), rad and mm.
 
-    rig: the true cameras. points: (N, 3) mm, the true landmarks; seen.track are their rows. seen.sigma: px, white.
+    rig: the true cameras. points: (N, 3) mm, the true landmarks, whose rows the tracks count. Noise is taken as white.
     """
     _, _, jacobian = project(rig, observations.camera, base_from_surface, points[observations.track])
     return np.asarray(np.einsum("nki,n,nkj->ij", jacobian, observations.sigma**-2.0, jacobian))
@@ -76,7 +76,7 @@ class Follower:
             self.refiner.begin(start.map, first.stamp, start.base_from_surface, self.of_map(first))
 
     def __call__(self, observations: Observations) -> SurfacePose:
-        """The pose at `seen.stamp` from this frame set and the ones before."""
+        """The pose at the observations' stamp from this frame set and the ones before."""
         estimator, observations = self.estimator, self.of_map(observations)
         fit = estimator.fit(observations, estimator.predict(observations.stamp))
         refiner, refined = self.refiner, None
@@ -125,9 +125,9 @@ class Follower:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowResult:
-    """A run over a world beside its truth, after the first measured pose.
+    """A run over a world and its truth, after the first measured pose.
 
-    That pose places the estimated surface frame. The truth is moved into this frame once and never fitted.
+    That pose defines the estimated surface frame. The truth is moved into this frame once and never fitted.
     """
 
     poses: tuple[SurfacePose, ...]  # K of them

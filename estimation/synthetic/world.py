@@ -30,7 +30,7 @@ SIZE_FIELDS = (
     *("noise", "dropout_seconds", "jitter", "calibration", "map_error", "correlated", "correlated_seconds", "churn"),
 )
 MAX_OUTLIER = 40.0  # px: largest shift of an outlier along an axis
-MIN_TRACK_SIGMA = 0.02  # px: no track is sharper, and none may claim to be exact
+MIN_TRACK_SIGMA = 0.02  # px: of a track
 MIN_FACING_COSINE = 0.17  # at 80 degrees to the normal a patch of skin is a line
 MIN_CAMERA_DEPTH = 1.0  # mm
 MOTION_STREAM, LANDMARK_STREAM, CALIBRATION_STREAM, MAP_STREAM, TRACK_STREAM = range(5)  # each has its own generator
@@ -85,15 +85,15 @@ SURFACES: dict[str, Surface] = {draw.__name__: draw for draw in (patch, cube)}
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What degrades the cameras' tracks; all but the noise is off by default. InputError for a value out of range."""
+    """Degradations of the cameras' tracks; only noise is on by default. InputError for a value out of range."""
 
     noise: float = 0.25  # px: standard deviation per axis of white noise, and the sigma that observations state
     outliers: float = 0.0  # share of the observations that are shifted by up to 40 px, drawn anew in each frame
     coherent: float = 0.0  # share of the tracks that stay where they were in the image, as on a drape or a highlight
-    dropouts: float = 0.0  # share of the time for which a track is not found
+    dropouts: float = 0.0  # share of the time in which a track is missing
     dropout_seconds: float = 0.3  # s: mean length of a dropout
-    outages: tuple[Outage, ...] = ()  # periods in which one camera, or all of them, find nothing
-    views: int | None = None  # number of cameras that ever find a landmark, at random; None: all that see it
+    outages: tuple[Outage, ...] = ()  # periods without tracks in one camera, or in all of them
+    views: int | None = None  # number of cameras with tracks of a landmark, at random; None: all that see it
     offsets: tuple[float, ...] = ()  # s: delay of each camera's true instant after its stamp; not in the rig
     jitter: float = 0.0  # s: standard deviation of each camera's instant from frame to frame
     calibration: float = 0.0  # px: RMS distance of the landmarks' images by the given rig from the true ones, at rest
@@ -101,7 +101,7 @@ class Conditions:
     correlated: float = 0.0  # px: standard deviation of an error that lasts for `correlated_seconds`; not stated
     correlated_seconds: float = 2.0  # s: time constant of that error
     churn: float = 0.0  # s: mean life of a landmark before another one replaces it; 0: for ever
-    reveal: tuple[float, float] | None = None  # s: from and to when the half with x > 0 is uncovered; None: always is
+    reveal: tuple[float, float] | None = None  # s: begin and end of uncovering the half with x > 0; None: uncovered
 
     def __post_init__(self) -> None:
         for name in SHARE_FIELDS:
@@ -230,7 +230,7 @@ class _TrackErrors:
 
 
 class _TrackVisibility:
-    """Which tracks (C, N) in view a matcher finds, frame by frame."""
+    """Which landmarks in view (C, N) have tracks, frame by frame."""
 
     def __init__(self, conditions: Conditions, shape: tuple[int, int], rng: np.random.Generator) -> None:
         self._conditions, self._shape, self._rng = conditions, shape, rng
@@ -308,14 +308,14 @@ class World:
     def observations(self) -> Iterator[Observations]:
         """The observations at each stamp; every iteration gives the same bits."""
         c, shape = self.conditions, (len(self.rig), len(self.landmarks))
-        finding, erring, timing, sticking = np.random.default_rng([self.seed, TRACK_STREAM]).spawn(4)
-        errors, visibility = _TrackErrors(c, shape, erring), _TrackVisibility(c, shape, finding)
-        stuck = sticking.random(shape) < c.coherent
+        visibility_rng, error_rng, timing_rng, coherent_rng = np.random.default_rng([self.seed, TRACK_STREAM]).spawn(4)
+        errors, visibility = _TrackErrors(c, shape, error_rng), _TrackVisibility(c, shape, visibility_rng)
+        stuck = coherent_rng.random(shape) < c.coherent
         first, _ = self.pixels_at(np.zeros(shape[0]))
         offsets = np.array(c.offsets or np.zeros(shape[0]))
         step = float(self.stamps[1] - self.stamps[0]) if len(self) > 1 else 0.0
         for stamp in map(float, self.stamps):
-            pixels, seen = self.pixels_at(stamp + offsets + c.jitter * timing.standard_normal(shape[0]))
+            pixels, seen = self.pixels_at(stamp + offsets + c.jitter * timing_rng.standard_normal(shape[0]))
             pixels = np.where(stuck[..., None], first, pixels) + errors(step)
             seen = seen & visibility(stamp, step) & self._uncovered(stamp)
             yield _observations(stamp, pixels, seen, max(c.noise, MIN_TRACK_SIGMA))

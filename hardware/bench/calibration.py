@@ -17,7 +17,14 @@ from estimation import se3
 from estimation.calibration.arm_fit import ArmFit, ArmUnknowns, fit_arm
 from estimation.calibration.arm_model import ArmParameters, Kinematics, SetPoint, Sightings, first_pose, predict
 from estimation.calibration.camera_rig import Calibration, calibrate
-from estimation.calibration.lens_model import BoardViews, Implausible, Undetermined, lens_of, matrix_of, project_lens
+from estimation.calibration.lens_model import (
+    BoardViews,
+    Implausible,
+    Undetermined,
+    lens_matrix,
+    lens_parameters,
+    project_lens,
+)
 from estimation.rig import Camera, Rig, pixels_from_points
 from estimation.se3 import Array
 from hardware.bench.figures import CONSISTENT_NEES, Figure, at_most, relative_nees, rms
@@ -65,7 +72,7 @@ def true_rig(lenses: Array = TRUE_LENSES) -> Rig:
     rotations = se3.exp_rotation(np.radians(CAMERA_TURNS))
     places = se3.make(rotations, centre - rotations @ centre)
     cameras = zip("abc", lenses, places, CAMERA_DELAYS, strict=True)
-    return Rig(tuple(Camera(n, PICTURE_SIZE, matrix_of(k), k[4:].copy(), place, s) for n, k, place, s in cameras))
+    return Rig(tuple(Camera(n, PICTURE_SIZE, lens_matrix(k), k[4:].copy(), place, s) for n, k, place, s in cameras))
 
 
 def swaying_board(seed: int, speed: float = 1.0) -> Callable[[Array], Array]:
@@ -159,7 +166,7 @@ def _errors(calibration: Calibration, rig: Rig) -> Array:
     for camera, true in zip(calibration.rig.cameras, rig.cameras, strict=True):
         place = se3.log(se3.inverse(camera.base_from_camera) @ true.base_from_camera)
         offset = true.clock_offset - camera.clock_offset
-        errors.append(np.concatenate([lens_of(true) - lens_of(camera), place, [offset]]))
+        errors.append(np.concatenate([lens_parameters(true) - lens_parameters(camera), place, [offset]]))
     return np.array(errors)
 
 
@@ -178,7 +185,9 @@ def _triangulation_errors(rig: Rig, true: Rig, points: Array) -> Array:
         normal, gradient = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
         for camera, measured in zip(rig.cameras, pixels, strict=True):
             camera_from_base = se3.inverse(camera.base_from_camera)
-            projected, _, by_point = project_lens(lens_of(camera), se3.transform_points(camera_from_base, estimated))
+            projected, _, by_point = project_lens(
+                lens_parameters(camera), se3.transform_points(camera_from_base, estimated)
+            )
             by_point = by_point @ camera_from_base[:3, :3]
             normal += np.swapaxes(by_point, 1, 2) @ by_point
             gradient += np.einsum("npi,np->ni", by_point, projected - measured)
@@ -202,7 +211,7 @@ def _nees(seed: int) -> float:
     pixels[((pixels < 2) | (pixels > np.array(PICTURE_SIZE) - 3)).any(-1)] = np.nan
     stamps, sigma = instant / BOARD_RATE, np.full(len(camera), CORNER_SIGMA)
     views = BoardViews(tuple("abc"), (PICTURE_SIZE,) * 3, corners, camera, instant, stamps, pixels, sigma)
-    calibration = calibrate(views.only(views.seen.sum(1) >= 6))
+    calibration = calibrate(views.select(views.seen.sum(1) >= 6))
     return _camera_nees(calibration, _errors(calibration, rig))
 
 

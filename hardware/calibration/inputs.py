@@ -17,7 +17,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.calibration.camera_rig import MIN_VIEWS
-from estimation.calibration.lens_model import KnownLenses, lens_of
+from estimation.calibration.lens_model import KnownLenses, lens_parameters
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -137,7 +137,7 @@ class CalibrationInput:
     def lenses(self) -> KnownLenses:
         """The given lenses; those without a sigma are exact."""
         sigma = [np.zeros(9) if own is None else own for own in self.lens_sigma]
-        return KnownLenses(np.stack([lens_of(camera) for camera in self.rig.cameras]), np.stack(sigma))
+        return KnownLenses(np.stack([lens_parameters(camera) for camera in self.rig.cameras]), np.stack(sigma))
 
 
 def check_against(rig: Rig, before: Rig, board_file: Path, square: float) -> None:

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from estimation import se3
-from estimation.calibration.lens_model import matrix_of
+from estimation.calibration.lens_model import lens_matrix
 from estimation.calibration.rig_fit import MAX_INSTANT_GAP
 from estimation.errors import InputError
 from estimation.rig import Camera, Rig
@@ -193,7 +193,7 @@ def _placeholder_rig(names: tuple[str, ...], sizes: tuple[tuple[int, int], ...])
     for number, (name, size) in enumerate(zip(names, sizes, strict=True)):
         lens = [max(size), max(size), (size[0] - 1) / 2, (size[1] - 1) / 2]
         place = se3.make(np.eye(3), np.array([MIN_RIG_SPAN * number, 0.0, 0.0]))
-        cameras.append(Camera(name, size, matrix_of([*lens, 0, 0, 0, 0, 0]), np.zeros(5), place))
+        cameras.append(Camera(name, size, lens_matrix([*lens, 0, 0, 0, 0, 0]), np.zeros(5), place))
     return Rig(tuple(cameras))
 
 

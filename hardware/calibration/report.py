@@ -14,7 +14,7 @@ import numpy as np
 
 from estimation import se3
 from estimation.calibration.camera_rig import GRID_SIDE, Calibration
-from estimation.calibration.lens_model import PARAMETERS, lens_of, project_lens
+from estimation.calibration.lens_model import PARAMETERS, lens_parameters, project_lens
 from estimation.calibration.validation import VolumeError
 from estimation.se3 import Array
 from hardware.calibration.corners import coverage
@@ -170,7 +170,7 @@ def millimetres_per_pixel(result: Calibration, camera: int) -> float:
 def _cameras(result: Calibration) -> str:
     cameras = range(len(result.views.names))
     lone = [next((s.held_out for s in result.scores[c] if s.model == result.models[c]), np.nan) for c in cameras]
-    lenses = [lens_of(camera) for camera in result.rig.cameras]
+    lenses = [lens_parameters(camera) for camera in result.rig.cameras]
     sigmas = [np.sqrt(np.diag(result.covariance_of(c))) for c in cameras]
     rows = [
         ["views", *(str(int((result.views.camera == c).sum())) for c in cameras)],

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.calibration.camera_rig import Calibration, calibrate, rebased
+from estimation.calibration.camera_rig import Calibration, calibrate, rebase
 from estimation.errors import InputError
 from estimation.rig import Rig
 from estimation.se3 import Array
@@ -303,7 +303,7 @@ def finish(
         check_against(result.rig, material.rig, board_file, board.square)
     error = result.predicted_error(result.working_volume(), SURFACE_SPEED)
     verdict = judge_rig(result, error, options.limit, coverage_hints(result))
-    placed = rebased(result.rig, material.rig.cameras[0].base_from_camera if material.calibrated else np.eye(4))
+    placed = rebase(result.rig, material.rig.cameras[0].base_from_camera if material.calibrated else np.eye(4))
     sigmas = [np.sqrt(np.diag(result.covariance_of(c))[:9]) for c in range(len(placed))]
     write_rig(out, placed, material.images, sigmas)
     out.with_suffix(".json").write_text(rig_json(result, error, verdict), encoding="utf-8")

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.errors import InputError, StillbedError
-from estimation.runtime import OPEN3D_PAGES, left_out
+from estimation.runtime import UNUSED_OPEN3D_MODULES, stub_modules
 from estimation.se3 import Array
 from hardware.process.system import signal_at_parents_end
 
@@ -123,7 +123,7 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
     """Answer each request, a line of JSON with a file and whether it is a cloud, until there are no more."""
     failure = ""
     try:
-        with left_out(*OPEN3D_PAGES):
+        with stub_modules(*UNUSED_OPEN3D_MODULES):
             import open3d  # noqa: F401  # once for all forks
     except (ImportError, OSError) as error:
         failure = f"open3d does not load ({error}); on Debian: sudo apt-get install -y {SHARED_LIBRARIES}"

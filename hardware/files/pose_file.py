@@ -104,7 +104,7 @@ class PoseWriter(ExitStack):
         quaternion = se3.quaternion_from_rotation(pose.base_from_surface[:3, :3])
         transform = [*(f"{v:.6f}" for v in pose.base_from_surface[:3, 3]), *(f"{v:.12f}" for v in quaternion)]
         covariance_and_twist = [f"{v:.9g}" for v in (*pose.covariance[UPPER_TRIANGLE], *pose.twist)]
-        moved = [pose.motion.onset, pose.motion.moved, np.rad2deg(pose.motion.turned)]
+        moved = [pose.motion.onset, pose.motion.distance, np.rad2deg(pose.motion.angle)]
         deformation = [0.0, 0.0] if pose.warp is None else [pose.warp.deformation, pose.warp.deformation_sigma]
         motion = [int(pose.motion.moving), *(f"{v:.6f}" for v in (*moved, *deformation))]
         tracks = [int(n) for n in report.used]

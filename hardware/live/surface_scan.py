@@ -23,7 +23,7 @@ from estimation.errors import InputError, StillbedError
 from estimation.mapping.bundle_adjustment import exposed_poses
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
-from estimation.scans.scan import Scan, face_areas, lattice_triangles, picture_of_scan
+from estimation.scans.scan import Scan, face_areas, render_scan, triangulate_lattice
 from estimation.se3 import Array
 from hardware.files.mesh_file import write_scan
 from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
@@ -319,7 +319,7 @@ def fuse(
     surface = DenseFit(lenses, views, progress)(
         low, high, step, lambda flat: heights(flat[:, ::-1]), regions if isinstance(regions, dict) else {}
     )
-    used, triangles = lattice_triangles(surface.sure)
+    used, triangles = triangulate_lattice(surface.sure)
     if not len(triangles):
         raise StillbedError("no part of the surface was seen alike by two cameras")
     scan = Scan(surface.points.reshape(-1, 3)[used], triangles, surface.normals.reshape(-1, 3)[used])
@@ -345,7 +345,7 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     """The report as one HTML page."""
     sigma, surface = scanned.sigma, scanned.surface
     pictures = "".join(
-        _figure(title, picture_of_scan(scanned.scan, scanned.colours, np.array(direction), VIEW_PIXELS)[..., ::-1])
+        _figure(title, render_scan(scanned.scan, scanned.colours, np.array(direction), VIEW_PIXELS)[..., ::-1])
         for title, direction in VIEWS
     )
     limits = np.percentile(sigma, [50, 95])

@@ -133,7 +133,7 @@ def predicted_error(
     `fraction` of `path`, in checkpoints: the move's jerk is limited, and its prediction was older. The arm's own
     error beside its lag is not in it.
     """
-    pose_then = pose.predict(max(arrival, pose.stamp), onwards=False)
+    pose_then = pose.predict(max(arrival, pose.stamp), keep_forecast=False)
     tip = (se3.inverse(pose_then.base_from_surface) @ nozzle_from_axes(profile.arm, move.axes))[:3, 3]
     previous = min(int(fraction), len(path) - 2)
     start_point, end_point = path.surface_from_nozzle[previous : previous + 2, :3, 3]

@@ -118,7 +118,7 @@ def _solve(session: Session, tracks: SessionTracks, options: SmoothOptions, stre
 
 def _write(out: Path, session: Session, result: Smoothed, options: SmoothOptions) -> None:
     write_tum(out / "smoothed.tum", result.trajectory)
-    instants = result.instants if options.rate is None else result.at(result.times(options.rate))
+    instants = result.states_at_stamps if options.rate is None else result.at(result.sample_times(options.rate))
     write_instants(out / "smoothed.csv", instants)
     write_rig(out / "rig.toml", result.rig, [None] * len(result.rig))
     write_map(out / "map.ply", result, session)
@@ -129,7 +129,7 @@ def _write(out: Path, session: Session, result: Smoothed, options: SmoothOptions
 
 
 def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -> dict[str, Any]:
-    fitted, names = result.fitted, [camera.name for camera in result.rig.cameras]
+    fitted, names = result.statistics, [camera.name for camera in result.rig.cameras]
     ours, live = evaluation.rmse
     return {
         "session": str(session.path.name),
@@ -140,7 +140,7 @@ def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -
         "residual_px": {name: _median(rms[np.isfinite(rms)]) for name, rms in zip(names, fitted.rms.T, strict=True)},
         "offset_ms": dict(zip(names, (1000 * result.offsets).tolist(), strict=True)),
         "offset_sigma_ms": dict(zip(names, (1000 * result.offset_sigma).tolist(), strict=True)),
-        "jitter_ms": 1000 * fitted.jitter,
+        "jitter_ms": 1000 * fitted.delay_sigma,
         "breathing_per_minute": 60 * evaluation.spectrum.breathing.rate,
         "breathing_claim": 60 * evaluation.spectrum.breathing.claim,
         "pulse_per_minute": 60 * evaluation.spectrum.pulse.rate,

@@ -43,7 +43,7 @@ class MotionSpectrum:
 
 def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
     """The spectrum (Hann window) of the origin's position, resampled at `rate` Hz."""
-    times = smoothed.times(rate)
+    times = smoothed.sample_times(rate)
     positions = smoothed.at(times).base_from_surface[:, :3, 3]
     centred = positions - positions.mean(0)
     direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
@@ -140,7 +140,7 @@ def delay_errors(smoothed: Smoothed) -> Array:
     middle = np.median(smoothed.map.points, axis=0)
     last = smoothed.stamps[-1]
     out = np.full((len(LOOP_DELAYS_S), 4), np.nan)
-    times = smoothed.times(LOOP_RATE_HZ)
+    times = smoothed.sample_times(LOOP_RATE_HZ)
     now = smoothed.at(times)
     for i, delay in enumerate(LOOP_DELAYS_S):
         inside = times + delay <= last
@@ -256,12 +256,12 @@ def _errors(evaluation: SmoothEvaluation) -> str:
 
 
 def _residuals(result: Smoothed) -> str:
-    rms = result.fitted.rms
+    rms = result.statistics.rms
     top = float(np.nanpercentile(rms, 99.5)) * 1.15 if np.isfinite(rms).any() else 1.0
     plot = Plot(PAGE_CHART_WIDTH, 170, _span(result), (0.0, max(top, 0.05)), label="residual, px RMS")
     keys, rows = [], []
     parts = np.array_split(np.arange(len(result)), RESIDUAL_PARTS)
-    used, seen = result.fitted.used.sum(0), result.fitted.seen.sum(0)
+    used, seen = result.statistics.used.sum(0), result.statistics.observed.sum(0)
     for i, camera in enumerate(result.rig.cameras):
         plot.line(result.stamps, rms[:, i], f"series c{i % 5}")
         keys.append(line_key(f"series c{i % 5}", camera.name))
@@ -309,16 +309,17 @@ def _errors_by_delay(evaluation: SmoothEvaluation) -> str:
 def _cameras(result: Smoothed) -> str:
     rows = []
     for i, camera in enumerate(result.rig.cameras):
-        calibrated = result.calibrated.cameras[i]
+        calibrated = result.calibrated_rig.cameras[i]
         shift = se3.log(se3.inverse(calibrated.base_from_camera) @ camera.base_from_camera)
         lens = camera.matrix - calibrated.matrix
         values = [1000 * float(np.linalg.norm(shift[:3])), float(np.linalg.norm(shift[3:])), lens[0, 0], lens[0, 2]]
         clock = f"{1000 * result.offsets[i]:.2f} ± {1000 * result.offset_sigma[i]:.2f}"
         rows.append([camera.name, clock, *(f"{v:.3f}" for v in (*values, lens[1, 2]))])
     head = ["camera", "clock offset, ms", "rotation, mrad", "shift, mm", "fx, px", "cx, px", "cy, px"]
+    fit = result.statistics
     text = (
         "Cameras as estimated from this recording, minus their calibration: clock offsets relative to the mean, with "
         f"one sigma; poses and lenses only with --refine-cameras. Jitter of the exposures: "
-        f"{1000 * result.fitted.jitter:.2f} ms; of the images: {result.fitted.unrest:.3f} px between frame sets."
+        f"{1000 * fit.delay_sigma:.2f} ms; of the images: {fit.shift_sigma:.3f} px between frame sets."
     )
     return section("Calibration drift", text, figures_table(head, rows))

@@ -19,7 +19,7 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from estimation.batch.smoothed import Instants, Smoothed
+from estimation.batch.smoothed import SampledStates, Smoothed
 from estimation.errors import InputError, StillbedError
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.rig import Rig, distort, ideal_pixels
@@ -45,7 +45,7 @@ UNKNOWN_COLOUR = np.array([150, 150, 150])  # red green blue of a landmark that 
 MAX_COLOUR_AGE_S = 0.05  # s between a frame set and the smoothed pose by which its pictures give colours
 
 
-def write_instants(path: Path, instants: Instants) -> None:
+def write_instants(path: Path, instants: SampledStates) -> None:
     """smoothed.csv: pose, twist, and the upper triangles of both covariances, a line for each instant."""
     head = [*POSE_COLUMNS, *TWIST_COLUMNS, *COVARIANCE_COLUMNS, *(f"twist_{name}" for name in COVARIANCE_COLUMNS)]
     poses = instants.base_from_surface
@@ -295,8 +295,8 @@ def _add_smoothed(writer: Writer, smoothed: Smoothed, epoch: int) -> None:
         VIEWERS_TOPIC, "cdr", writer.register_schema(ros_messages.ODOMETRY, "ros2msg", text)
     )
     channel = writer.register_channel(SMOOTHED_TOPIC, "json", NO_SCHEMA)
-    used = smoothed.fitted.used.sum(1)
-    at = smoothed.instants
+    used = smoothed.statistics.used.sum(1)
+    at = smoothed.states_at_stamps
     for k, stamp in enumerate(smoothed.stamps):
         state = TrackState.TRACKING if used[k] else TrackState.COASTING
         twist, twist_covariance = at.twist[k], at.twist_covariance[k]

@@ -156,8 +156,8 @@ def message_from_pose(pose: SurfacePose) -> Message:
         "motion": {
             "moving": pose.motion.moving,
             "onset": _flat(np.array([pose.motion.onset])),
-            "moved": pose.motion.moved,
-            "turned": pose.motion.turned,
+            "moved": pose.motion.distance,
+            "turned": pose.motion.angle,
         },
         "warp": {
             **{name: [] if pose.warp is None else _flat(getattr(pose.warp, name)) for name in _WARP_ARRAYS},

@@ -348,7 +348,7 @@ def truth_from_estimate(
     if hits.sum() < MIN_REGISTRATION_TRACKS:
         return None
     start = truth.base_from_surface(np.array([pose.stamp]))[0]
-    tracks = PointTracks.of(observations.only(hits), points[hits])
+    tracks = PointTracks.from_observations(observations.select(hits), points[hits])
     estimate = solve_pose(known_rig, tracks, start, tolerance=1e-9, iterations=20)
     return np.asarray(se3.inverse(estimate.base_from_surface) @ pose.base_from_surface)
 

@@ -369,7 +369,7 @@ def usable_views(
     dropped.update((names[c], "more than are needed") for c in table.camera[usable & ~rows])
     points, sigma = board.corners, np.maximum(table.sigma, 1e-3)
     views = BoardViews(names, sizes, points, table.camera, table.instant, table.stamp, table.pixels, sigma)
-    return views.only(rows), dropped
+    return views.select(rows), dropped
 
 
 def _reason(table: CornerTable, row: int) -> str:

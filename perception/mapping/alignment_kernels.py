@@ -1,7 +1,7 @@
-"""The loops of patch alignment, compiled: grey levels under a grid, and the descent that shifts it until it fits.
+"""Compiled loops of patch alignment: interpolation of grey levels on a grid, Gauss-Newton on its shift, and a median.
 
-Grey levels are interpolated in floating point: OpenCV's `remap` rounds places to 1/32 px and its answer to whole grey
-levels, which the sum over a patch does not quite average out. The interpreter is free meanwhile. And a median.
+Grey levels are interpolated in floating point: OpenCV's `remap` rounds positions to 1/32 px and values to whole grey
+levels, which the sum over a patch does not average out. The loops release the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from perception.frames import Image
 
 Float32 = NDArray[np.float32]
 
-PATCH_RADIUS = 7  # samples: 15 x 15, of which 225 decide
+PATCH_RADIUS = 7  # samples: 15 x 15 in all
 PATCH_SIDE = 2 * PATCH_RADIUS + 1
 PATCH_SAMPLES = PATCH_SIDE * PATCH_SIDE
-CONVERGED_STEP = 0.03  # samples: a last step; what is left after it is a tenth of that
-MAX_UNCHECKED_STEP = 0.3  # samples: the longest step taken without a look at where it leads
-MAX_STEP = 3.0  # samples: the longest step at all
+CONVERGED_STEP = 0.03  # samples: a last step; the remaining error is a tenth of it
+MAX_UNCHECKED_STEP = 0.3  # samples: the longest step that is taken without evaluation of its end
+MAX_STEP = 3.0  # samples
 MIN_VARIANCE = 1e-6  # grey levels squared: no contrast at all
 
 
@@ -45,7 +45,7 @@ def _sample_clamped(image: Image, x: float, y: float, per_sample: Array, scale: 
 def _sample_inside(image: Image, x: float, y: float, per_sample: Array, scale: float, levels: Float32) -> bool:
     """`_sample_clamped` at half the time where the whole grid is inside the image; whether it is.
 
-    Single precision from the nearest whole pixel on, and unsigned indices, which numba need not check for a sign.
+    Single precision relative to a whole pixel, and unsigned indices, which numba need not check for a sign.
     """
     right, low = image.shape[1] - 1, image.shape[0] - 1
     across = PATCH_RADIUS * scale * (abs(per_sample[0, 0]) + abs(per_sample[0, 1]))
@@ -75,7 +75,7 @@ def _sample_inside(image: Image, x: float, y: float, per_sample: Array, scale: f
 def _sums(levels: Float32, picture: Float32, steepest: Float32) -> Array:
     """Sums over a patch of its grey levels, of their squares, and of them times picture (S,) and steepest (2, S).
 
-    Levels count from the middle of their range: so the squares' sum keeps its digits, and pictures have no mean.
+    Levels count from the middle of their range, so that the sum of squares keeps its precision.
     """
     total, squares = np.float32(0), np.float32(0)
     alike, across, down = np.float32(0), np.float32(0), np.float32(0)
@@ -117,10 +117,12 @@ def descend(
 ) -> Array:
     """Gauss-Newton on the shifts (N, 2), samples, in place, of those chosen (N,).
 
-    start: (N, 2) px of this image. per_sample: (N, 2, 2) px of the full image a sample; scale: of this image to it.
-    spacing: samples from one of the grid's to the next. The steepest descent pictures are free of brightness and
-    contrast, so the image need not be. Answers (N, 3): score and contrast, grey levels, at the place looked at last,
-    and what it would still have moved, samples.
+    start: (N, 2) px of this image.
+    per_sample: (N, 2, 2) px of the full image per sample. scale: of this image to the full one.
+    spacing: samples between neighbours of the grid.
+
+    The steepest descent pictures are invariant to brightness and contrast. Returns (N, 3): score and contrast, grey
+    levels, at the last evaluation, and the length of the next step, samples, 0 if converged.
     """
     outcome = np.zeros((len(start), 3))
     levels: Float32 = np.empty(PATCH_SAMPLES, np.float32)
@@ -152,29 +154,29 @@ def descend(
 
 @compiled("f8(f8[::1], b1[::1])")
 def median_of(values: Array, chosen: Mask) -> float:
-    """The upper median of those of values (N,) that are chosen (N,), one at least, by Hoare's selection.
+    """The upper median of the chosen (N,) values (N,), at least one, by Hoare's selection.
 
     numpy's sort and partition take seconds to compile.
     """
-    kept, count = np.empty(len(values)), 0
+    selected, count = np.empty(len(values)), 0
     for i in range(len(values)):
         if chosen[i]:
-            kept[count] = values[i]
+            selected[count] = values[i]
             count += 1
     low, high, middle = 0, count - 1, count // 2
     while low < high:
-        pivot, i, j = kept[middle], low, high
+        pivot, i, j = selected[middle], low, high
         while i <= j:
-            while kept[i] < pivot:
+            while selected[i] < pivot:
                 i += 1
-            while pivot < kept[j]:
+            while pivot < selected[j]:
                 j -= 1
             if i <= j:
-                kept[i], kept[j] = kept[j], kept[i]
+                selected[i], selected[j] = selected[j], selected[i]
                 i += 1
                 j -= 1
         if j < middle:
             low = i
         if middle < i:
             high = j
-    return float(kept[middle])
+    return float(selected[middle])

@@ -70,15 +70,15 @@ SWEEPS = (Sweep(2.0, 22.0, 1.1, 2), Sweep(1.5, 4.4, 0.55, 2), Sweep(1.0, 2.2, 0.
 FIT_ROUNDS = 4  # of least squares: more move the surface by less than its error
 SWEEP_WINDOW, FIT_WINDOW = 1.0, 1.3  # nodes, one sigma of the windows in which pictures are compared
 EVEN_WINDOW = 3.0  # nodes over which brightness and contrast are evened out: they differ by camera
-MIN_CONTRAST = 3.0  # grey levels added to the local contrast: noise of a plain patch is not blown up
-MIN_LIKENESS = 0.1  # added to what correlations are divided by: a plain patch tells nothing
-TRUST_POWER = 4  # by which the channel counts more whose best correlation is higher
+MIN_CONTRAST = 3.0  # grey levels added to the local contrast, against noise of plain patches
+MIN_LIKENESS = 0.1  # added to the correlation's denominator: 0 on plain patches
+TRUST_POWER = 4  # of the best correlation, in a channel's weight
 BENDING_COST, MAX_BENDING_COST = 0.1, 0.6  # of a slope of 1 between neighbours, and the most: a rim may be steep
 MIN_VIEW_FACING = 0.15  # cosine of the viewing angle below which a camera sees too little of a node
-SATURATED_GREY = 250  # where a picture tells nothing
-PROBE = 0.14  # nodes up and down, by which pictures' change with height is taken: a tenth of a pixel
+SATURATED_GREY = 250  # pixels above are not used
+PROBE = 0.14  # nodes up and down, for derivatives by height: a tenth of a pixel
 MAX_STEP = 0.8  # nodes, a round's: the windows lie on the surface to so much
-WIDE_WINDOW, WIDE_SHARE = 4.0, 0.02  # nodes, and share of a wider window's say: it decides where there is no texture
+WIDE_WINDOW, WIDE_SHARE = 4.0, 0.02  # nodes, and weight of a wider window, which decides without texture
 OUTLIER_SIGMAS = 1.5  # of the pictures' scatter, from which a picture counts by its distance only
 MIN_SCATTER = 0.05  # of evened pictures: sensors are not better
 HIDDEN_NODES, HIDDEN_CELL_PX = 4.0, 4  # nodes behind another part of the surface in the same cell of a picture
@@ -97,7 +97,7 @@ LINEAR_LIGHT = (np.arange(256) ** 2 / 255).astype(np.float32)  # displays' value
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sums:
-    """What all pictures say of the nodes (H, W) each."""
+    """Least-squares sums over all pictures for the nodes (H, W)."""
 
     information: Float32  # 1 / mm^2, of one independent window
     slope: Float32  # 1 / mm
@@ -105,44 +105,44 @@ class _Sums:
 
 
 class DenseFit:
-    """Fits a lattice to pictures, whose number decides how long that takes."""
+    """Fits a lattice to pictures; its time grows with their number."""
 
     def __init__(
         self, lenses: Lenses, views: Sequence[ScanView], progress: Callable[[float], None] = lambda share: None
     ) -> None:
-        """progress: called with the share that is done."""
+        """progress: called with the share done, 0 to 1."""
         self._lenses, self._views, self._progress = lenses, tuple(views), progress
         self._node = 1.0  # mm, of a finest one
         self._levels = [parallel_map(_channels, [view.image for view in views])]
         self._levels.append([np.asarray(cv2.pyrDown(each), np.float32) for each in self._levels[-1]])
-        self._bright = parallel_map(_saturated, [view.image for view in views])
+        self._bright = parallel_map(_saturation_mask, [view.image for view in views])
 
     def __call__(
         self, low: Array, high: Array, step: float, guess: Callable[[Array], Array], within: Mapping[int, Array]
     ) -> DenseSurface:
         """The surface over the rectangle from low (2,) to high (2,), mm, with nodes `step` mm apart.
 
-        guess: heights (N,) at (N, 2), mm, to begin with. within: polygon (N, 2) px by camera, in pictures of the first
-        instant, beyond which nothing is wanted.
+        guess: heights (N,) at (N, 2), mm, to begin with. within: polygon (N, 2) px by camera, of the region in
+        pictures of the first instant.
         """
         self._node, points, rounds = step, np.zeros((0, 0, 3)), len(SWEEPS) + FIT_ROUNDS + 1
         for number, sweep in enumerate(SWEEPS):
-            points = _resized(points, low, high, sweep.width * step, guess)
-            points = self._swept(points, sweep)
+            points = _resample(points, low, high, sweep.width * step, guess)
+            points = self._sweep(points, sweep)
             self._progress((number + 1) / rounds)
         directions = _normals(points, DIRECTION_WINDOW)
         for number in range(FIT_ROUNDS):
             sums = self._sums(points, directions)
             most = MAX_STEP * step
             off = np.clip(-sums.slope / (sums.information + 1e-6), -most, most)
-            points = _without_spikes(points + off[..., None] * directions, directions, MAX_JUMP * step)
+            points = _remove_spikes(points + off[..., None] * directions, directions, MAX_JUMP * step)
             self._progress((len(SWEEPS) + number + 1) / rounds)
-        return self._finished(points, directions, within)
+        return self._result(points, directions, within)
 
     # -- sweeping
 
-    def _swept(self, points: Array, sweep: Sweep) -> Array:
-        """The points (H, W, 3) where pictures correlate best up or down."""
+    def _sweep(self, points: Array, sweep: Sweep) -> Array:
+        """The points (H, W, 3) moved along their normals to the best correlation of pictures."""
         directions, level = _normals(points, DIRECTION_WINDOW / sweep.width), int(sweep.width > 1)
         reach = sweep.reach * self._node
         heights = np.arange(-sweep.reach, sweep.reach + sweep.step / 2, sweep.step) * self._node
@@ -152,14 +152,14 @@ class DenseFit:
         views = [n for n, view in enumerate(self._views) if view.instant in chosen]
         pairs = [(a, b) for a, b in combinations(views, 2) if self._views[a].instant == self._views[b].instant]
         seen = {n: self._facing(n, points, directions) for n in views}
-        ways = {n: [self._pixels(n, points + h * directions)[0] for h in (-reach, 0, reach)] for n in views}
+        paths = {n: [self._pixels(n, points + h * directions)[0] for h in (-reach, 0, reach)] for n in views}
         count = np.stack([seen[a] * seen[b] for a, b in pairs]).sum(0) + np.float32(1e-6)
 
         def score(height: float) -> Float32:
             even, power = {}, {}
             for n in views:
-                look = self._look(n, _on_way(ways[n], height / reach), level)
-                even[n] = _evened(look, seen[n])[0] * (seen[n] > 0)[..., None]
+                look = self._look(n, _parabola(paths[n], height / reach), level)
+                even[n] = _normalise(look, seen[n])[0] * (seen[n] > 0)[..., None]
                 power[n] = _blur(even[n] * even[n], SWEEP_WINDOW)
             total = np.zeros_like(even[views[0]])
             for a, b in pairs:
@@ -170,7 +170,7 @@ class DenseFit:
         scores = np.stack(parallel_map(score, heights), 2)  # (H, W, D, K)
         trust = scores.max(2, keepdims=True) ** TRUST_POWER + 1e-6
         cost = 1 - (trust * scores).sum(3) / trust.sum(3)
-        best = _lowest(_semi_global(cost, sweep.step / sweep.width), heights).astype(np.float32)
+        best = _best_height(_semi_global(cost, sweep.step / sweep.width), heights).astype(np.float32)
         return np.asarray(points + cv2.medianBlur(best, 5)[..., None] * directions)
 
     # -- fitting
@@ -183,7 +183,7 @@ class DenseFit:
         def look(n: int) -> tuple[Float32, Float32, Float32]:
             weight = self._facing(n, points, normals)
             value, above, below = (self._look(n, self._pixels(n, nodes)[0]) for nodes in (points, up, down))
-            even, contrast, sums = _evened(value, weight)
+            even, contrast, sums = _normalise(value, weight)
             slope = (above - below) / np.float32(2 * probe)
             slope = (slope - _blur(weight[..., None] * slope, EVEN_WINDOW) / sums) / contrast
             return even, np.asarray(slope, np.float32), weight
@@ -192,9 +192,9 @@ class DenseFit:
         evens, slopes, seen = (np.stack(part) for part in zip(*looks, strict=True))  # (V, H, W, K) twice, (V, H, W)
         channels = [_channel_sums(evens[..., k], slopes[..., k], seen) for k in range(evens.shape[3])]
         information, slope = (np.asarray(sum(each[i] for each in channels), np.float32) for i in (0, 1))
-        return _Sums(_wide(information), _wide(slope), channels[0][2])
+        return _Sums(_smooth(information), _smooth(slope), channels[0][2])
 
-    def _finished(self, points: Array, directions: Array, within: Mapping[int, Array]) -> DenseSurface:
+    def _result(self, points: Array, directions: Array, within: Mapping[int, Array]) -> DenseSurface:
         sums = self._sums(points, directions)
         heights = np.einsum("hwi,hwi->hw", points, directions).astype(np.float32)
         bend = _blur((heights - _blur(heights, BEND_WINDOW)) ** 2, BEND_WINDOW)
@@ -205,7 +205,7 @@ class DenseFit:
         wanted = self._wanted(points, within)
         wanted[:RIM_NODES] = wanted[-RIM_NODES:] = wanted[:, :RIM_NODES] = wanted[:, -RIM_NODES:] = False
         known = (sigma < MAX_SIGMA * self._node) & (noise < (MAX_NOISE * self._node) ** 2)
-        sure = _without_floaters(known & (seen.sum(0) >= 2) & wanted)
+        sure = _remove_floaters(known & (seen.sum(0) >= 2) & wanted)
         colours = self._colours(points, sums.weights)
         self._progress(1.0)
         return DenseSurface(points, _normals(points, 1.0), sigma, colours, seen, wanted, sure)
@@ -232,7 +232,7 @@ class DenseFit:
     # -- pictures
 
     def _pixels(self, n: int, nodes: Array) -> tuple[Float32, Mask]:
-        """Where a picture shows nodes (H, W, 3): (2, H, W) px, and whether the lens can (H, W)."""
+        """Pixels (2, H, W) of nodes (H, W, 3) in a picture, and which lie within the lens's range (H, W)."""
         view = self._views[n]
         inner = se3.inverse(view.surface_from_camera).astype(np.float32)
         x, y, z = inner[:3, :3] @ nodes.reshape(-1, 3).T.astype(np.float32) + inner[:3, 3:]
@@ -246,7 +246,7 @@ class DenseFit:
         return np.asarray(cv2.remap(self._levels[level][n], u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
     def _facing(self, n: int, points: Array, normals: Array) -> Float32:
-        """How well (H, W) a picture shows nodes: the cosine of the viewing angle, 0 where it does not."""
+        """Cosine (H, W) of the angle at which a picture shows nodes; 0 where hidden, saturated or outside."""
         view = self._views[n]
         away = view.surface_from_camera[:3, 3] - points
         distance = np.sqrt((away * away).sum(2))
@@ -270,14 +270,14 @@ def _channels(image: Image) -> Float32:
     return np.dstack([cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), difference])
 
 
-def _saturated(image: Image) -> NDArray[np.uint8]:
+def _saturation_mask(image: Image) -> NDArray[np.uint8]:
     bright = (image if image.ndim == 2 else image.max(2)) > SATURATED_GREY
     return np.asarray(cv2.dilate(bright.astype(np.uint8), np.ones((3, 3), np.uint8)))
 
 
-def _on_way(way: Sequence[Float32], part: float) -> Float32:
+def _parabola(path: Sequence[Float32], part: float) -> Float32:
     """Pixels on the parabola through those at -1, 0 and 1."""
-    below, middle, above = way
+    below, middle, above = path
     return np.asarray(middle + part * (above - below) / 2 + part**2 * ((above + below) / 2 - middle), np.float32)
 
 
@@ -285,12 +285,12 @@ def _blur(values: Float32, sigma: float) -> Float32:
     return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(values, np.float32), (0, 0), sigma))
 
 
-def _wide(values: Float32) -> Float32:
+def _smooth(values: Float32) -> Float32:
     return np.asarray(_blur(values, FIT_WINDOW) + WIDE_SHARE * _blur(values, WIDE_WINDOW))
 
 
-def _evened(values: Float32, weight: Float32) -> tuple[Float32, Float32, Float32]:
-    """Channels (H, W, K) less their mean around, over their contrast; that contrast; and the weights' sums."""
+def _normalise(values: Float32, weight: Float32) -> tuple[Float32, Float32, Float32]:
+    """Channels (H, W, K) with local mean 0 and contrast 1; that contrast; and the local sums of weights."""
     weights = weight[..., None]
     sums = (_blur(weight, EVEN_WINDOW) + np.float32(1e-3))[..., None]
     centred = values - _blur(weights * values, EVEN_WINDOW) / sums
@@ -314,7 +314,7 @@ def _channel_sums(even: Float32, slope: Float32, weight: Float32) -> tuple[Float
 
 
 def _semi_global(cost: Float32, slope: float) -> Float32:
-    """Costs (H, W, D) with those of the neighbours' heights, along rows and columns, both ways.
+    """Costs (H, W, D) aggregated along rows and columns, both ways (semi-global matching).
 
     slope: between heights that differ by one step at neighbours.
     """
@@ -331,7 +331,7 @@ def _semi_global(cost: Float32, slope: float) -> Float32:
     return total
 
 
-def _lowest(cost: Float32, heights: Array) -> Array:
+def _best_height(cost: Float32, heights: Array) -> Array:
     """The height (H, W) of the lowest cost (H, W, D), between steps by a parabola."""
     best = np.clip(cost.argmin(2), 1, cost.shape[2] - 2)
     row, column = np.indices(best.shape)
@@ -340,7 +340,7 @@ def _lowest(cost: Float32, heights: Array) -> Array:
     return np.asarray(heights[best] + shift * (heights[1] - heights[0]))
 
 
-def _resized(points: Array, low: Array, high: Array, step: float, guess: Callable[[Array], Array]) -> Array:
+def _resample(points: Array, low: Array, high: Array, step: float, guess: Callable[[Array], Array]) -> Array:
     """The lattice with nodes about `step` mm apart, by the guess where there is none yet."""
     x, y = (np.linspace(a, b, int(np.ceil((b - a) / step)) + 1) for a, b in zip(low, high, strict=True))
     if not points.size:
@@ -358,15 +358,15 @@ def _normals(points: Array, sigma: float) -> Array:
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12))
 
 
-def _without_spikes(points: Array, directions: Array, most: float) -> Array:
+def _remove_spikes(points: Array, directions: Array, most: float) -> Array:
     height = points[..., 2].astype(np.float32)
     off = height - cv2.medianBlur(height, 5)
     off = np.where(np.abs(off) > most, off, 0) / np.maximum(directions[..., 2], 0.3)
     return np.asarray(points - off[..., None] * directions)
 
 
-def _without_floaters(sure: Mask) -> Mask:
-    """The nodes without thin parts, and small ones that are connected to nothing."""
+def _remove_floaters(sure: Mask) -> Mask:
+    """The nodes without thin parts and small unconnected parts."""
     wide = cv2.morphologyEx(
         sure.astype(np.uint8), cv2.MORPH_OPEN, np.ones((MIN_WIDTH_NODES, MIN_WIDTH_NODES), np.uint8)
     )
@@ -392,9 +392,9 @@ def camera_place(surface: DenseSurface, weak: Mask, pose: Array, rig: Rig) -> tu
     distance = np.linalg.norm(stands - middle, axis=1)
     looks = (stands - middle) / distance[:, None]
     tilt, turn = np.meshgrid(np.radians(TILTS_DEG), np.linspace(0, 2 * np.pi, TURNS, endpoint=False))
-    ways = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], -1).reshape(-1, 3)
-    ways = ways @ pose[:3, :3].T
-    apart = np.degrees(np.arccos(np.clip(ways @ looks.T, -1, 1)))
-    worth = np.clip(ways @ normals.T, 0, 1).mean(1) * np.minimum(1, apart.min(1) / MIN_APART_DEG)
+    candidates = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], -1).reshape(-1, 3)
+    candidates = candidates @ pose[:3, :3].T
+    apart = np.degrees(np.arccos(np.clip(candidates @ looks.T, -1, 1)))
+    worth = np.clip(candidates @ normals.T, 0, 1).mean(1) * np.minimum(1, apart.min(1) / MIN_APART_DEG)
     best = int(worth.argmax())
-    return middle + float(np.median(distance)) * ways[best], int(apart[best].argmin()), float(apart[best].min())
+    return middle + float(np.median(distance)) * candidates[best], int(apart[best].argmin()), float(apart[best].min())

@@ -20,7 +20,7 @@ from estimation import se3
 from estimation.mapping.triangulation import epipolar_distance, rays, smooth_normals, triangulate
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, local_normals, moved_map, surface_frame
+from estimation.surface_map import SurfaceMap, local_normals, surface_frame, transform_map
 from perception.lens import Lenses, undistort
 from perception.mapping.features import Features, ImageMask, corners, matched_spots, polygon_mask, sift
 from perception.mapping.masks import trackable
@@ -55,7 +55,7 @@ def in_frame(first: FirstMap, base_from_new: Array) -> FirstMap:
     """The same map in another surface frame, as a scan's: base_from_new (4, 4)."""
     new_from_old = se3.inverse(base_from_new) @ first.base_from_surface
     templates = replace(first.templates, axes=new_from_old[:3, :3] @ first.templates.axes)
-    return FirstMap(base_from_new, moved_map(first.map, new_from_old), templates)
+    return FirstMap(base_from_new, transform_map(first.map, new_from_old), templates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.mapping.bundle_adjustment import of_frame
+from estimation.mapping.bundle_adjustment import rigid_motion_covariance
 from estimation.mapping.refiner import MIN_TRACK_SIGMA_PX
-from estimation.mapping.triangulation import meet_rays, rays, updated_by_looks
+from estimation.mapping.triangulation import intersect_rays_with_surface, rays, update_from_observations
 from estimation.observations import Observations
 from estimation.pose_solver import project
 from estimation.rig import Rig, ideal_pixels
 from estimation.se3 import Array
-from estimation.surface_map import SurfaceMap, Warp, joined_map
+from estimation.surface_map import SurfaceMap, Warp, merge_maps
 from perception.frames import Image
 from perception.lens import Lenses, undistort
 from perception.mapping.features import Features, ImageMask, corners, sift
@@ -122,8 +122,10 @@ def find_new_landmarks(rig: Rig, snapshot: SurfaceSnapshot, surface_map: Surface
     new += _monocular_parts(search, missing, parts)
     if sum(len(part.map) for part in new) < MIN_NEW_LANDMARKS:
         return None
-    new_map = reduce(joined_map, [part.map for part in new])
-    covariance = new_map.covariance + of_frame(new_map.points, snapshot.covariance)  # all share the pose's error
+    new_map = reduce(merge_maps, [part.map for part in new])
+    covariance = new_map.covariance + rigid_motion_covariance(
+        new_map.points, snapshot.covariance
+    )  # all share the pose's error
     templates, level = join([part.templates for part in new]), np.concatenate([part.sigma for part in new])
     points = new_map.points if snapshot.warp is None else snapshot.warp.undo(new_map.points)
     return NewLandmarks(snapshot, SurfaceMap(points, new_map.normals, covariance), templates, level, features)
@@ -163,7 +165,7 @@ def _monocular_landmarks(
     surface_from_base = se3.inverse(pose)
     origins, directions = se3.transform_points(surface_from_base, origins), directions @ surface_from_base[:3, :3].T
     angle = np.full(len(pixels), REFERENCE_SIGMA_PX / float(lens.matrix[0, 0]))
-    hits = meet_rays(surface_map.points, surface_map.covariance, origins, directions, angle)
+    hits = intersect_rays_with_surface(surface_map.points, surface_map.covariance, origins, directions, angle)
     good = np.flatnonzero(hits.good & (hits.sigma < MAX_PLACE_SIGMA_MM))
     good = good[~_visible_to_others(lenses, others, pose, camera, hits.points[good], hits.normals[good])]
     points, normals = hits.points[good], hits.normals[good]
@@ -210,7 +212,7 @@ def _seeds(search: GrowthSearch, a: int, b: int, features: dict[int, Features]) 
     """Seeds between two cameras: landmarks that both see, and matches on the unmapped part."""
     new_seeds = find_seeds(search.lenses, a, b, features, np.random.default_rng(0))
     tracks = search.snapshot.tracks
-    in_a, in_b = tracks.only(tracks.camera == a), tracks.only(tracks.camera == b)
+    in_a, in_b = tracks.select(tracks.camera == a), tracks.select(tracks.camera == b)
     rows, at_a, at_b = np.intersect1d(in_a.track, in_b.track, return_indices=True)
     pixels_a, pixels_b = in_a.pixels[at_a], in_b.pixels[at_b]
     points = se3.transform_points(search.snapshot.base_from_surface, search.map.points[rows])
@@ -259,9 +261,11 @@ class Probation:
         good = np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_NEW_RESIDUAL_PX
         mono = good & np.isfinite(self.new.level[tracks.track])
         if covariance is not None and mono.any():
-            looks, offsets = tracks.only(mono), projected[mono] - tracks.pixels[mono]
+            looks, offsets = tracks.select(mono), projected[mono] - tracks.pixels[mono]
             sigma = np.maximum(looks.sigma, MIN_TRACK_SIGMA_PX)
-            self.map, good[mono] = updated_by_looks(self.map, looks.track, offsets, jacobians[mono], sigma, covariance)
+            self.map, good[mono] = update_from_observations(
+                self.map, looks.track, offsets, jacobians[mono], sigma, covariance
+            )
         far = np.linalg.norm(rest_pixels - projected, axis=1) > MIN_PROOF_MOTION_PX
         np.add.at(self.moved_looks, tracks.track[good & far], 1)
         np.add.at(self.still_looks, tracks.track[good & ~far], 1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation import se3
-from estimation.mapping.bundle_adjustment import AdjustedMap, single_fit
+from estimation.mapping.bundle_adjustment import AdjustedMap, fit_single_camera
 from estimation.mapping.refiner import DelayedJob, Refiner, sets_until_ready
 from estimation.observations import Observations
 from estimation.online.estimator import Estimator
@@ -18,7 +18,7 @@ from estimation.pose import SurfacePose
 from estimation.scans.registration import Registration
 from estimation.scans.scan import Scan
 from estimation.se3 import Array, Index
-from estimation.surface_map import SurfaceMap, joined_map, moved_map
+from estimation.surface_map import SurfaceMap, merge_maps, transform_map
 from perception.frames import FrameSet, Image, Roi, region_polygons, whole_pictures
 from perception.lens import Lenses
 from perception.mapping.features import Relocaliser, calibration_hint
@@ -291,7 +291,7 @@ class Mapping:
             fit.solution.base_from_surface,
             self.camera_poses(tracked),
             fit.covariance + fit.parts.lasting,
-            tracked.observations.only(fit.inlier),
+            tracked.observations.select(fit.inlier),
             self._masks.print_head,
             None if pose is None else pose.warp,
         )
@@ -300,7 +300,7 @@ class Mapping:
         """Where the surface was (4, 4) at each camera's own exposure."""
         pose, points, rig = tracked.fit.solution.base_from_surface, self._matcher.map.points, self._lenses.rig
         tracks = tracked.observations
-        return {c: single_fit(rig, points, tracks, c, pose).base_from_surface for c in tracked.pyramids}
+        return {c: fit_single_camera(rig, points, tracks, c, pose).base_from_surface for c in tracked.pyramids}
 
     def _prove(self, probation: Probation, tracked: TrackedSet) -> None:
         """Align the new landmarks again; add those that move with the surface to the map."""
@@ -318,7 +318,7 @@ class Mapping:
         rows = (3 * index[:, None] + np.arange(3)).ravel()
         new, part = probation.new, probation.map
         part = SurfaceMap(part.points[index], part.normals[index], part.covariance[np.ix_(rows, rows)])
-        whole_map = joined_map(self._matcher.map, part)
+        whole_map = merge_maps(self._matcher.map, part)
         self._matcher.extend(whole_map, new.templates.take(index))
         self._estimator.replace_map(whole_map)
         self._refiner.extend(whole_map, probation.level[index])
@@ -340,7 +340,7 @@ class Mapping:
         self.registration = place
         self._set_caveat(place)
         new_from_old = se3.inverse(place.base_from_surface) @ pose
-        new_map = moved_map(estimator.map, new_from_old)
+        new_map = transform_map(estimator.map, new_from_old)
         on_scan, anchors = landmarks_on_scan(new_map, matcher.templates.camera, lenses, placing.scan, place)
         start = estimator.pose.base_from_surface @ se3.inverse(new_from_old)
         self._refiner.reframe(on_scan, new_from_old, anchors)

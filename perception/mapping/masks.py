@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import QhullError, cKDTree
 
 from estimation import se3
-from estimation.observations import NOTHING_DISPLACED, DisplacedPlaces
+from estimation.observations import NO_DISPLACED_PLACES, DisplacedPlaces
 from estimation.online.fit import solve_symmetric3
 from estimation.runtime import compiled, contiguous
 from estimation.se3 import Array, Mask
@@ -330,7 +330,7 @@ class Colours:
     ) -> DisplacedPlaces:
         """Where colours contradict a pose: `poses` (4, 4) at the exposures of the cameras that carry it."""
         if not self._first:
-            return NOTHING_DISPLACED
+            return NO_DISPLACED_PLACES
         points = self._points if warp is None else warp.apply(self._points)
         cameras = [camera for camera in self._first if camera in images and camera in poses]
         sums, count = np.zeros((len(points), PULL_COLUMNS + 3 * len(cameras))), 0
@@ -343,7 +343,7 @@ class Colours:
             pull, count = PULL_COLUMNS + 3 * count, count + 1
             add_equations(sums, pull, free, current, dark, first.ratios, first.slopes, first.noise)
         if not count:
-            return NOTHING_DISPLACED
+            return NO_DISPLACED_PLACES
         bell_sums = self._bells @ sums
         pulls = bell_sums[:, PULL_COLUMNS : PULL_COLUMNS + 3 * count].reshape(-1, count, 3).swapaxes(0, 1)
         enough = bell_sums[:, COUNT_COLUMN] > MIN_VISIBLE_SHARE * 2 * count * self._bell_sizes
@@ -357,7 +357,7 @@ class Colours:
         size, explained = np.linalg.norm(shift, axis=1), (shift * pull).sum(1)
         new = np.isfinite(expected_energy) & (size > MIN_SHIFT_MM) & (explained > MIN_EVIDENCE)
         if not (new.any() or self._sizes.any()):
-            return NOTHING_DISPLACED
+            return NO_DISPLACED_PLACES
         new &= explained > MIN_EXPLAINED_SHARE * (energy - expected_energy)
         if len(pulls) > 1:  # else it may be one camera's error: a print head in its first picture
             new &= np.sort((pulls * shift).sum(-1), axis=0)[-2] > MIN_SECOND_SHARE * explained
@@ -368,7 +368,7 @@ class Colours:
         self._sizes = np.where(new | lasting, np.maximum(self._sizes, np.where(new, size, 0.0)), 0.0)
         displaced = self._sizes > 0
         if not displaced.any():
-            return NOTHING_DISPLACED
+            return NO_DISPLACED_PLACES
         observable = np.linalg.eigvalsh(normal)[:, 1] > OBSERVABLE_SIGMA_MM**-2.0
         whole = int((displaced & observable).sum()) > WHOLE_SHARE * int(observable.sum())
         return DisplacedPlaces(self._centres[displaced], self._sizes[displaced], BELL_MM, whole)

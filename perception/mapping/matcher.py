@@ -255,12 +255,14 @@ class Matcher:
             of_camera = good & (camera == c)
             single[c] = fit.base_from_surface
             if of_camera.sum() < 8 <= (camera == c).sum():  # it contradicts the others: fit it alone
-                own = solve_pose(self.rig, tracks.only(camera == c), guess, scales=(8.0, 1.5), prior=CAMERA_POSE_PRIOR)
+                own = solve_pose(
+                    self.rig, tracks.select(camera == c), guess, scales=(8.0, 1.5), prior=CAMERA_POSE_PRIOR
+                )
                 single[c] = own.base_from_surface
             if of_camera.sum() >= 8 and fit.scale > 1.2:  # else the cameras agree within the flow's own error
                 own = solve_pose(
                     self.rig,
-                    tracks.only(of_camera),
+                    tracks.select(of_camera),
                     single[c],
                     prior=CAMERA_POSE_PRIOR,
                     iterations=2,

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation import se3
-from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, of_frame
+from estimation.mapping.bundle_adjustment import FREE_SIGMA_MM, Anchors, rigid_motion_covariance
 from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig, ideal_pixels
-from estimation.scans.registration import Registration, better_of, register, register_near
-from estimation.scans.scan import Scan, ScanIndex, cast_rays, foot_jacobians
+from estimation.scans.registration import Registration, register, register_near, resolve_ambiguity
+from estimation.scans.scan import Scan, ScanIndex, cast_rays, intersection_jacobians
 from estimation.se3 import Array
 from estimation.surface_map import SurfaceMap
 from perception.frames import Image
@@ -301,7 +301,7 @@ class ScanPlacing:
         if near.rival is None:
             return best
         other = self._settle(lenses, images, replace(near, base_from_surface=near.rival, rival=None))
-        return better_of(near, best, other, self._nodes[np.isfinite(self._nodes[..., 0])])
+        return resolve_ambiguity(near, best, other, self._nodes[np.isfinite(self._nodes[..., 0])])
 
     def _settle(self, lenses: Lenses, images: dict[int, Image], near: Registration) -> Registration:
         """Matched on the scan at its pose and registered again, REFINEMENT_ROUNDS times."""
@@ -388,13 +388,13 @@ def landmarks_on_scan(
         blocks[rows] = _intersection_covariances(rays, hits.normals[near], across, angle)
     covariance = np.zeros((len(points), 3, len(points), 3))
     covariance[np.arange(len(points)), :, np.arange(len(points))] = blocks
-    joint = covariance.reshape(3 * len(points), -1) + of_frame(points, frame)
+    joint = covariance.reshape(3 * len(points), -1) + rigid_motion_covariance(points, frame)
     return SurfaceMap(points, normals, joint), Anchors(points, normals, sigma, frame)
 
 
 def _intersection_covariances(rays: Array, normals: Array, across: float, angle: float) -> Array:
     """Covariances (N, 3, 3) mm^2 of where rays (N, 3), from the camera, each known to `angle` rad, meet planes with
     `normals` (N, 3), each known to `across` mm."""
-    shift, depth = foot_jacobians(rays, normals)
+    shift, depth = intersection_jacobians(rays, normals)
     sideways = (np.linalg.norm(rays, axis=1) * angle)[:, None, None] ** 2 * shift @ np.swapaxes(shift, 1, 2)
     return np.asarray(sideways + across**2 * depth[:, :, None] * depth[:, None])

@@ -268,7 +268,7 @@ class Grain:
         """
         self._extend(templates.picture)
         self._last_look = None
-        sample = tracks.only(tracks.track % GRAIN_STRIDE == 0)
+        sample = tracks.select(tracks.track % GRAIN_STRIDE == 0)
         current = self._measure(pyramids, sample, pose, surface_map, templates.axes)
         camera, landmark = sample.camera, sample.track
         self._last_look = camera, landmark, current

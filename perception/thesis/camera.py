@@ -1,4 +1,4 @@
-"""One camera's part: its region tracked from picture to picture, that region's motion, and its Kalman filter.
+"""One camera's part: its region found from picture to picture, that region's motion, and its Kalman filter.
 
 Features are followed in one of two ways: SIFT with FLANN, or corners with optical flow.
 """
@@ -24,18 +24,18 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, the last two excluded
 REGION_BORDER_PX = 5.0  # px around the region, Appendix A
 
 
-def corners_of(polygon: Array, size: tuple[int, int]) -> Array:
+def bounds_of(polygon: Array, size: tuple[int, int]) -> Array:
     """Lowest and highest x and y (2, 2) px of a polygon (N, 2) px, as far as an image of `size` (W, H) shows it."""
     shown = np.clip(polygon, 0.0, np.array(size) - 1.0)
     return np.stack([shown.min(0), shown.max(0)])
 
 
-def united(before: Array, now: Array, size: tuple[int, int]) -> Box:
+def union_box(before: Array, now: Array, size: tuple[int, int]) -> Box:
     """The box around where the region was and where it is, corners (2, 2) px each, and the border (thesis Fig. 3.4)."""
     return bounding_box(np.concatenate([before, now]), size, REGION_BORDER_PX)
 
 
-def cropped(view: Image, box: Box) -> Image:
+def crop(view: Image, box: Box) -> Image:
     """The box of a picture, its reflections filtered out and its contours kept (thesis Fig. 4.9)."""
     x0, y0, x1, y1 = box
     return bilateral(np.ascontiguousarray(view[y0:y1, x0:x1]))
@@ -115,7 +115,7 @@ class KeyPoints:
         self._before = self._now
 
     def _extract(self, view: Image, box: Box) -> tuple[Array, Descriptors]:
-        points, descriptors = self._sift.detectAndCompute(cropped(view, box), None)
+        points, descriptors = self._sift.detectAndCompute(crop(view, box), None)
         if not points:
             return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
         return np.array([point.pt for point in points]) + box[:2], np.asarray(descriptors, np.float32)
@@ -137,20 +137,20 @@ class Corners:
     def begin(self, view: Image, box: Box) -> Array:
         """Remember a picture; the corners (N, 2) px in a box of it."""
         self._before = self._now = view
-        return self._corners(cropped(view, box)) + box[:2]
+        return self._corners(crop(view, box)) + box[:2]
 
     def find(self, view: Image, box: Box) -> Pairs:
         """The corners of the remembered picture in the next one, those that the flow lost left out."""
         self._now = view
         assert self._before is not None
-        before, now = cropped(self._before, box), cropped(view, box)
+        before, now = crop(self._before, box), crop(view, box)
         source = self._corners(before)
         if not len(source):
             return NO_PAIRS
         start = source.astype(np.float32).reshape(-1, 1, 2)
         moved, status, _ = cv2.calcOpticalFlowPyrLK(before, now, start, np.empty_like(start))
-        tracked = np.asarray(status).reshape(-1) == 1
-        return Pairs(source[tracked], np.asarray(moved, float).reshape(-1, 2)[tracked])
+        valid = np.asarray(status).reshape(-1) == 1
+        return Pairs(source[valid], np.asarray(moved, float).reshape(-1, 2)[valid])
 
     def keep(self) -> None:
         """Remember the picture last looked at."""
@@ -206,20 +206,20 @@ class GaussianState:
     covariance: Array  # (n, n)
 
 
-def predict(belief: GaussianState, transition: Array, noise: Array) -> GaussianState:
+def predict(state: GaussianState, transition: Array, noise: Array) -> GaussianState:
     """The state one step later, thesis Eq. 4.12-4.13. transition: A (n, n). noise: Q (n, n).
 
     The term B U is left out: nothing that drives a wound is known.
     """
-    return GaussianState(transition @ belief.mean, transition @ belief.covariance @ transition.T + noise)
+    return GaussianState(transition @ state.mean, transition @ state.covariance @ transition.T + noise)
 
 
-def update(belief: GaussianState, measured: Array, observation: Array, noise: Array) -> GaussianState:
+def update(state: GaussianState, measured: Array, observation: Array, noise: Array) -> GaussianState:
     """The state after a measurement (m,), thesis Eq. 4.14-4.18. observation: H (m, n). noise: R (m, m)."""
-    residual = measured - observation @ belief.mean  # Eq. 4.14
-    spread = observation @ belief.covariance @ observation.T + noise  # Eq. 4.15
-    gain = np.linalg.solve(spread, observation @ belief.covariance).T  # Eq. 4.16; S and P are symmetric
-    return GaussianState(belief.mean + gain @ residual, belief.covariance - gain @ spread @ gain.T)  # Eq. 4.17, 4.18
+    residual = measured - observation @ state.mean  # Eq. 4.14
+    spread = observation @ state.covariance @ observation.T + noise  # Eq. 4.15
+    gain = np.linalg.solve(spread, observation @ state.covariance).T  # Eq. 4.16; S and P are symmetric
+    return GaussianState(state.mean + gain @ residual, state.covariance - gain @ spread @ gain.T)  # Eq. 4.17, 4.18
 
 
 def initial_velocity() -> GaussianState:
@@ -227,18 +227,18 @@ def initial_velocity() -> GaussianState:
     return GaussianState(np.zeros(3), np.diag(INITIAL_VELOCITY_SIGMA**2))
 
 
-def predict_velocity(belief: GaussianState, dt: float) -> GaussianState:
+def predict_velocity(state: GaussianState, dt: float) -> GaussianState:
     """The velocity `dt` s later: the same, less surely."""
-    return predict(belief, np.eye(3), np.diag((ACCELERATION_SIGMA * dt) ** 2))
+    return predict(state, np.eye(3), np.diag((ACCELERATION_SIGMA * dt) ** 2))
 
 
-def update_velocity(belief: GaussianState, move: Array, dt: float) -> GaussianState:
+def update_velocity(state: GaussianState, move: Array, dt: float) -> GaussianState:
     """The velocity after a move (3,) px, px, rad was measured over `dt` s.
 
     Thesis 4.4: the median displacement gives the velocity between the frames, which is the filter's observation and
     corrects its predictions. The thesis gives no matrices; here H = I, and R is that of a move divided by its time.
     """
-    return update(predict_velocity(belief, dt), move / dt, np.eye(3), np.diag((MOVE_SIGMA / dt) ** 2))
+    return update(predict_velocity(state, dt), move / dt, np.eye(3), np.diag((MOVE_SIGMA / dt) ** 2))
 
 
 class FlatView:
@@ -312,8 +312,8 @@ class CameraTrack:
     def begin(self, stamp: float, image: Image, polygon: Array) -> None:
         """The first picture at `stamp`, s, and the region in it, (N, 2) px as imaged."""
         size = self.view.camera.size
-        self._corners = corners_of(self.view.pixels(np.clip(polygon, 0, np.array(size) - 1.0)), size)
-        features = self._finder.begin(self.view.flatten(image), united(self._corners, self._corners, size))
+        self._corners = bounds_of(self.view.pixels(np.clip(polygon, 0, np.array(size) - 1.0)), size)
+        features = self._finder.begin(self.view.flatten(image), union_box(self._corners, self._corners, size))
         self._seen, self._sum = stamp, np.zeros(3)
         self._velocity = initial_velocity()
         self.motion, self.covariance, self.measured = self._sum, np.zeros((3, 3)), True
@@ -339,7 +339,7 @@ class CameraTrack:
     def _move(self, image: Image, expected: Array) -> Array | None:
         """The move (3,) since the picture last measured, or None; the region is looked for at `expected` (3,) too."""
         here = self._corners + self._sum[:2]
-        box = united(here, here + expected[:2], self.view.camera.size)
+        box = union_box(here, here + expected[:2], self.view.camera.size)
         pairs = self._finder.find(self.view.flatten(image), box)
         turned = turn(pairs)
         if turned is None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.batch.smoothed import Smoothed
-from estimation.mapping.bundle_adjustment import single_fit
+from estimation.mapping.bundle_adjustment import fit_single_camera
 from estimation.mapping.triangulation import smooth_normals
 from estimation.observations import Observations, no_observations
 from estimation.pose_solver import PointTracks, project, solve_pose
@@ -107,7 +107,7 @@ class KnownMotion:
         out = expected.camera_poses.copy()
         for c in range(len(out)):
             if (tracks.camera == c).sum() >= MIN_OWN_TRACKS:
-                out[c] = single_fit(self.rig, self.map.points, tracks, c, out[c]).base_from_surface
+                out[c] = fit_single_camera(self.rig, self.map.points, tracks, c, out[c]).base_from_surface
         return out
 
     def image_sigmas(self, expected: ExpectedSurface) -> tuple[Array, float]:
@@ -124,7 +124,7 @@ class KnownMotion:
 def _with_map_rows(observations: Observations, ids: NDArray[np.int64]) -> Observations:
     """Observations with rows in place of ids (L,), rising; without landmarks that are not in the map."""
     row = np.minimum(np.searchsorted(ids, observations.track), len(ids) - 1)
-    return replace(observations, track=row).only(ids[row] == observations.track)
+    return replace(observations, track=row).select(ids[row] == observations.track)
 
 
 MAX_RESIDUAL = 2.0  # px from the projection, plus as many sigmas: beyond, it is another spot
@@ -222,9 +222,11 @@ class Reobserver:
         self._add_offsets(tracks, new)
         projected = project(motion.rig, new.camera, poses, motion.map.points[new.track])[0]
         near = np.linalg.norm(new.pixels - projected, axis=1) < MAX_RESIDUAL * (1 + sigma[new.camera, new.track])
-        new = new.only(near & missing[new.camera, new.track])
+        new = new.select(near & missing[new.camera, new.track])
         observations = joined_observations(self._as_matcher_rows(tracks), new)
-        return new.only(np.isin(new.camera, self._showing_cameras(pyramids, expected.base_from_surface, observations)))
+        return new.select(
+            np.isin(new.camera, self._showing_cameras(pyramids, expected.base_from_surface, observations))
+        )
 
     def _add_offsets(self, tracks: Observations, new: Observations) -> None:
         """Add the offsets, px, of new observations from the tracks of the same frame set."""
@@ -262,14 +264,14 @@ class Reobserver:
             point_tracks = PointTracks(tracks.camera, points, tracks.pixels, sigma)
             fit = solve_pose(rig, point_tracks, joint, scales=ROUGH_START_SCALES)
             inlier = fit.weights > 0.2
-            cameras = self._showing_cameras(pyramids, fit.base_from_surface, tracks.only(inlier))
+            cameras = self._showing_cameras(pyramids, fit.base_from_surface, tracks.select(inlier))
             inlier &= np.isin(tracks.camera, cameras)
             if inlier.sum() < max(MIN_POSE_LANDMARKS, MIN_AGREEING_SHARE * len(tracks)):
                 break
             twist = se3.log(se3.inverse(fit.base_from_surface) @ pose) / (stamp - stamp_before)
             pose, stamp = fit.base_from_surface, stamp_before
-            new = self._as_motion_rows(tracks.only(inlier))
-            out.append(new.only(self._motion.unobserved(stamp_before)[new.camera, new.track]))
+            new = self._as_motion_rows(tracks.select(inlier))
+            out.append(new.select(self._motion.unobserved(stamp_before)[new.camera, new.track]))
         self._pending_sets.clear()
         return out[::-1]
 
@@ -279,7 +281,7 @@ class Reobserver:
 
     def _as_matcher_rows(self, observations: Observations) -> Observations:
         """Rows of the motion's map as the matcher's; without landmarks that it lacks."""
-        observations = observations.only(self._matcher_row[observations.track] >= 0)
+        observations = observations.select(self._matcher_row[observations.track] >= 0)
         return replace(observations, track=self._matcher_row[observations.track])
 
 
@@ -292,20 +294,20 @@ def _first_views(motion: KnownMotion) -> dict[tuple[int, int], Observations]:
     pending = np.ones(len(surface_map), bool)
     eyes = np.stack([camera.base_from_camera[:3, 3] for camera in motion.rig.cameras])
     for k, observations in enumerate(motion.observations):
-        tracks = observations.only(pending[observations.track])
+        tracks = observations.select(pending[observations.track])
         expected = motion.at(tracks.stamp)
         if not len(tracks) or expected is None:
             continue
         poses = motion.poses(expected, observations)
         projected = project(motion.rig, tracks.camera, poses, surface_map.points[tracks.track])[0]
-        tracks = tracks.only(np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_RESIDUAL)
+        tracks = tracks.select(np.linalg.norm(tracks.pixels - projected, axis=1) < MAX_RESIDUAL)
         towards = se3.transform_points(se3.inverse(expected.base_from_surface), eyes)[tracks.camera]
         towards = towards - surface_map.points[tracks.track]
         facing = (towards * surface_map.normals[tracks.track]).sum(1) / np.linalg.norm(towards, axis=1)
         order = np.lexsort((-facing, tracks.track))
         best = np.zeros(len(tracks), bool)
         best[order[np.unique(tracks.track[order], return_index=True)[1]]] = True
-        out |= {(k, int(c)): tracks.only(best & (tracks.camera == c)) for c in np.unique(tracks.camera[best])}
+        out |= {(k, int(c)): tracks.select(best & (tracks.camera == c)) for c in np.unique(tracks.camera[best])}
         pending[tracks.track] = False
     return out
 

@@ -266,7 +266,7 @@ class TrackingStep:
             carrier_poses = {c: exposed[c] for c in self._carrying_cameras(tracked)}
             displaced = self._colours(self._images, carrier_poses, estimator.expected(stamp).warp)
             pose = estimator.accept(fit, observations, elsewhere, aliases, displaced)
-            if not (fit.outliers or fit.rivals or len(aliases) or displaced.whole):
+            if not (fit.outliers or fit.rivals or len(aliases) or displaced.ambiguous):
                 self._mapping.offer(tracked, pose.twist)
             matcher.remember(pyramids, observations, fit.followed, fit.solution.base_from_surface)
         else:
@@ -309,7 +309,7 @@ class TrackingStep:
         """Why the tracks that carry a fit do not show the surface, or ''."""
         assert self._matcher is not None
         fit = tracked.fit
-        tracks, pose = tracked.observations.only(fit.inlier), fit.solution.base_from_surface
+        tracks, pose = tracked.observations.select(fit.inlier), fit.solution.base_from_surface
         unusual = self._estimator.looks_unusual(fit)
         return self._grain(tracked.pyramids, tracks, pose, self._matcher.map, self._matcher.templates, unusual)
 

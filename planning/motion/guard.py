@@ -142,7 +142,7 @@ class Guard:
         """The tool in the tissue where the move leads, as the trusted pose foretells it; a way out of it is free."""
         if self._tissue is None or pose is None:
             return None
-        surface_from_base = se3.inverse(pose.base_at(np.array([now + self._tick + self.lag]))[0])
+        surface_from_base = se3.inverse(pose.predicted_poses(np.array([now + self._tick + self.lag]))[0])
         place = surface_from_base @ nozzle_from_axes(self._arm, move.axes)
         if self._tissue.clear(place):
             return None
@@ -230,7 +230,7 @@ def _error(pose: SurfacePose, place: Array, ahead: float) -> float:
     jacobian = np.hstack([-se3.hat(place), np.eye(3)])
     spread = jacobian @ covariance @ jacobian.T
     if pose.warp is not None:
-        spread = spread + pose.warp.later(ahead).spread(place[None])[0]
+        spread = spread + pose.warp.propagate(ahead).displacement_covariance(place[None])[0]
     worst = float(np.linalg.eigvalsh(spread)[-1])
     if (local := pose.local) is not None:
         share = 1 - ((local.centres - place) ** 2).sum(1) / (2 * local.reach) ** 2

@@ -187,7 +187,7 @@ class Planner:
             text = f"surface turns at {np.rad2deg(turn):.1f} degrees/s, limit {np.rad2deg(limit):g} degrees/s"
             return HoldReason(text, RefusalCode.SURFACE_TURN, turn, limit)
         with np.errstate(invalid="ignore"):  # of a matrix that is no covariance: NaN, which is too much
-            error = float(pose.error_ahead(then, place[None])[0])
+            error = float(pose.predicted_error(then, place[None])[0])
         if not error <= POSE_LIMIT_FRACTION * limits.pose_error:
             text = f"the place under the nozzle is known to {error:.3f} mm, limit {limits.pose_error:g} mm"
             return HoldReason(text, RefusalCode.POSE_ERROR, error, limits.pose_error)
@@ -235,8 +235,8 @@ class Planner:
     def _nozzle(self, pose: SurfacePose, now: float) -> Array:
         """surface_from_nozzle (4, 4) as commanded, on the surface as it is at `now`, s."""
         base_from_nozzle = nozzle_from_axes(self._arm, self._follower.position)
-        nozzle = se3.inverse(pose.base_at(np.array([now]))[0]) @ base_from_nozzle
-        return nozzle if pose.warp is None else pose.warp.uncarry(nozzle[None])[0]
+        nozzle = se3.inverse(pose.predicted_poses(np.array([now]))[0]) @ base_from_nozzle
+        return nozzle if pose.warp is None else pose.warp.undo_on_poses(nozzle[None])[0]
 
     def _retreat(self, pose: SurfacePose, now: float) -> Command:
         """In a pause: up from where it began, for a look aside too, then at rest; what was interrupted is resumed."""
@@ -343,8 +343,8 @@ class Planner:
         times = now + np.array([0.0, self._tick, LOOKAHEAD - half, LOOKAHEAD, LOOKAHEAD + half])
         surface_from_nozzle = segment.curve.poses(segment.timing.at(times))
         if pose.warp is not None:
-            surface_from_nozzle = pose.warp.carry(surface_from_nozzle)
-        return axes_from_nozzle(self._arm, pose.base_at(times) @ surface_from_nozzle)
+            surface_from_nozzle = pose.warp.apply_to_poses(surface_from_nozzle)
+        return axes_from_nozzle(self._arm, pose.predicted_poses(times) @ surface_from_nozzle)
 
     def _stop(self, now: float, reason: str) -> Command:
         """Brake, and hold once at rest."""

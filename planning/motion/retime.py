@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.pose import SurfacePose, TrackState
-from estimation.runtime import left_out
+from estimation.runtime import stub_modules
 from estimation.se3 import Array
 from planning.command import MotionLimits
 from planning.kinematics import SimpleArm, axis_limits, limited_axes, max_axis_change, nozzle_from_axes
@@ -32,7 +32,7 @@ from planning.motion.curve import HORIZON_TIME, Gridpoints, PathCurve, curve_thr
 from planning.path import Path
 
 # a second, for plots, other curves and another solver, for which nobody asks
-with left_out("matplotlib", "matplotlib.pyplot", "scipy.interpolate", "toppra.solverwrapper.ecos_solverwrapper"):
+with stub_modules("matplotlib", "matplotlib.pyplot", "scipy.interpolate", "toppra.solverwrapper.ecos_solverwrapper"):
     from toppra import constraint
     from toppra.constants import MAX_TRIES, SMALL, TINY
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
@@ -76,8 +76,8 @@ def axis_derivatives(
     count = len(places)
     nozzle = curve.poses(np.concatenate([places - DIFFERENCE_STEP, places, places + DIFFERENCE_STEP]))
     if pose.warp is not None:
-        nozzle = pose.warp.carry(nozzle)
-    base = pose.base_at(np.concatenate([times - DIFFERENCE_TIME, times, times + DIFFERENCE_TIME]))
+        nozzle = pose.warp.apply_to_poses(nozzle)
+    base = pose.predicted_poses(np.concatenate([times - DIFFERENCE_TIME, times, times + DIFFERENCE_TIME]))
     nozzle, base = nozzle.reshape(3, count, 4, 4), base.reshape(3, count, 4, 4)
     now = base[1]
     # by place on the surface at rest, and by time at a fixed place: (2, 3, M, D)

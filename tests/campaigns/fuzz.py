@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from estimation import se3
-from estimation.batch.smoothed import Instants
+from estimation.batch.smoothed import SampledStates
 from estimation.errors import InputError
 from estimation.observations import no_observations
 from estimation.pose import SurfacePose, TrackState
@@ -212,7 +212,7 @@ def _make_smoothed(folder: Path) -> None:
     stamps = np.arange(FRAME_COUNT) / VIDEO_RATE
     spread = np.broadcast_to(np.eye(6) * 1e-4, (FRAME_COUNT, 6, 6))
     poses = BASE_FROM_REST @ se3.exp(np.outer(stamps, [0.1, 0, 0, 0, 0, 1.0]))
-    write_instants(folder / "smoothed.csv", Instants(stamps, poses, spread, np.zeros((FRAME_COUNT, 6)), spread))
+    write_instants(folder / "smoothed.csv", SampledStates(stamps, poses, spread, np.zeros((FRAME_COUNT, 6)), spread))
 
 
 def _make_binary_ply(folder: Path) -> None:

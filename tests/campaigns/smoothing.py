@@ -27,7 +27,7 @@ import numpy as np
 
 from estimation import se3, smooth
 from estimation.batch import smoothed
-from estimation.batch.initialisation import TrackArrays, pack_tracks, rough_start
+from estimation.batch.initialisation import TrackArrays, initial_estimate, pack_tracks
 from estimation.batch.normal_equations import BatchProblem, Estimate, NoiseModel
 from estimation.batch.smooth import FREE_LANDMARK_MM
 from estimation.batch.smoothed import Smoothed
@@ -178,7 +178,7 @@ def ceres_figures(seconds: float, count: int) -> list[Figure]:
         return [Figure(what, math.nan, "", None, "", PYCOLMAP_MISSING) for what in whats]
     world = synthetic_world("breathing", seconds, count=count)
     data = pack_tracks(list(world), len(world.rig))
-    poses, points = rough_start(world.rig, data, None, None)
+    poses, points = initial_estimate(world.rig, data, None, None)
     known = np.isfinite(points[:, 0])
     data, points = data.landmarks(known), points[known]
     own, theirs = adjust_ours(world.rig, data, poses, points), adjust_by_ceres(pycolmap, world.rig, data, poses, points)
@@ -194,7 +194,7 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
     """By our own elimination."""
     clock = ProcessorClock()
     start = clock.now()
-    cameras, rest = smoothed.cameras_of(rig), np.zeros((len(poses), 6))
+    cameras, rest = smoothed.cameras_from_rig(rig), np.zeros((len(poses), 6))
     sigmas = smoothed.correction_sigmas(smoothed.CalibrationPrior(clock=0.0), len(rig))
     calibration = smoothed.prior_information(sigmas, np.ones(len(rig), bool))
     known = Priors(
@@ -211,7 +211,7 @@ def adjust_ours(rig: Rig, data: TrackArrays, poses: Array, points: Array) -> Adj
         if len(costs) > 1 and costs[-2] - costs[-1] < COST_TOLERANCE * costs[-1]:
             break
         step = whole.shared_step()
-        estimate = estimate.moved(equations.eliminate(no_progress, step).chain.steps(), step, problem.free)
+        estimate = estimate.retract(equations.eliminate(no_progress, step).factor.steps(), step, problem.free)
     spent = clock.now() - start
     return AdjustedBundle(residual_rms(rig, data, estimate.states.poses, estimate.points), spent, len(costs) - 1)
 
