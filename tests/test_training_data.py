@@ -22,7 +22,9 @@ from perception.tracking.wound_step import MAX_EMPTY_LOOKS, RegionSearch, Region
 from perception.training.dataset import (
     PIECE_SIDES_PX,
     WOUND_MARGIN_PX,
+    Augmentation,
     Labelled,
+    Samples,
     fold_numbers,
     healthy_pieces,
     picture_groups,
@@ -136,6 +138,66 @@ def test_healthy_pieces_keep_away_from_the_wound() -> None:
         assert PIECE_SIDES_PX[0] <= piece.shape[0] <= PIECE_SIDES_PX[1]
         redness = piece[..., 0].astype(int) - piece[..., 1]
         assert (redness > 120).mean() < 0.001, f"wound within {WOUND_MARGIN_PX} px"
+
+
+def drawn(pictures: Sequence[Labelled], count: int, how: Augmentation, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures (N, 3, side, side) and wounds (N, side, side) of the first `count` samples."""
+    samples = Samples(pictures, np.ones(len(pictures)), how, seed)
+    pairs = [samples[number] for number in range(count)]
+    return np.stack([shown for shown, _ in pairs]), np.stack([wound[0] for _, wound in pairs])
+
+
+@pytest.mark.parametrize("wounded", [True, False])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_sample_has_its_size_and_its_wound_stays_on_the_wound(seed: int, wounded: bool) -> None:
+    pictures, wounds = drawn([labelled(seed, wounded)], 6, Augmentation(side=192, cover=0.0), seed)
+    assert pictures.shape == (6, 3, 192, 192) and wounds.shape == (6, 192, 192)
+    assert pictures.dtype == wounds.dtype == np.float32
+    assert pictures.min() >= 0 and pictures.max() <= 1
+    if not wounded:
+        assert not wounds.any()
+    for shown, wound in zip(pictures, wounds, strict=True):
+        inside = cv2.erode((wound > 0.99).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        outside = cv2.dilate((wound > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
+        redness = shown[0] - shown[1]
+        if inside.sum() > 50 and outside.sum() > 50 and redness.std() > 0.03:  # else the sample lost its colour
+            assert np.median(redness[inside]) > np.median(redness[outside])
+
+
+def test_a_sample_is_the_same_for_the_same_seed_and_number_and_none_like_another() -> None:
+    pictures = [labelled(seed) for seed in range(4)]
+    first, second = (Samples(pictures, np.ones(4), Augmentation(side=64), 9) for _ in range(2))
+    backwards = [second[number] for number in (3, 2, 1, 0)][::-1]
+    for number, again in enumerate(backwards):
+        assert all(np.array_equal(a, b) for a, b in zip(first[number], again, strict=True))
+    other = Samples(pictures, np.ones(4), Augmentation(side=64), 10)
+    assert len({float(each[k][0].mean()) for each in (first, other) for k in range(4)}) == 8
+
+
+def test_what_covers_a_wound_hides_it_or_brings_its_own() -> None:
+    """The same views with and without covers: where a cover's own wound is not, less is labelled."""
+    pictures = [labelled(seed) for seed in range(4)]
+    bare, covered = (
+        drawn(pictures, 32, Augmentation(side=96, whole=0.0, away=0.0, cover=share), 4)[1] for share in (0.0, 1.0)
+    )
+    hidden = ((bare > 0.5) & (covered < 0.5)).any((1, 2))
+    brought = ((bare < 0.5) & (covered > 0.5)).any((1, 2))
+    assert hidden.mean() > 0.4 and 0 < brought.mean() < hidden.mean()
+    assert covered.sum() / bare.sum() < 0.9
+
+
+def test_the_scale_of_a_sample_is_that_of_the_look_it_stands_for() -> None:
+    """A whole picture is about as long as the first look's; a wound takes the second look's share of the window."""
+    each = labelled(0, size=(480, 640))
+    whole = drawn([each], 60, Augmentation(side=384, whole=1.0, away=0.0, cover=0.0, stretch=0.0), 1)[1]
+    parts = [cv2.connectedComponentsWithStats((wound > 0.5).astype(np.uint8))[2][1:, 4] for wound in whole]
+    seen = [areas.max() for areas in parts if len(areas)]  # alone: the picture's edge as a mirror shows it twice
+    assert np.median(seen) == pytest.approx(each.wound.sum() * (320 / 640) ** 2, rel=0.2)
+    part = np.s_[40:200, 60:260]  # three times as large, so that the largest scale limits nothing
+    large = [plane[part].repeat(3, 0).repeat(3, 1) for plane in (labelled(0).picture, labelled(0).wound)]
+    near = drawn([Labelled("large", *large)], 60, Augmentation(whole=0.0, away=0.0, cover=0.0, stretch=0.0), 1)[1]
+    shares = 2 * (near.sum((1, 2)) / np.pi) ** 0.5 / 256
+    assert np.quantile(shares, 0.1) > 0.15 and np.quantile(shares, 0.9) < 0.95 and shares.std() > 0.1
 
 
 @given(st.integers(0, 10**6))

@@ -24,7 +24,14 @@ from estimation.errors import InputError, StillbedError
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
 from hardware.recording.session_reader import corrected_pictures, recording_damage
-from perception.training.dataset import Labelled, fold_numbers, healthy_pieces, picture_groups, read_dataset
+from perception.training.dataset import (
+    Labelled,
+    Samples,
+    fold_numbers,
+    healthy_pieces,
+    picture_groups,
+    read_dataset,
+)
 from perception.wound.network import TERMS_KEYS
 
 if TYPE_CHECKING:
@@ -76,7 +83,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     pictures = _pictures(options, render_view)
     if options.network == "shape":
         return _fit_shapes(out, pictures, options.seed)
-    from perception.training import loop
+    from perception.training import export, loop
 
     recipe, schedule = loop.Recipe(), loop.Schedule()
     if options.network == "thesis":
@@ -88,7 +95,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     if options.part is not None:
         return f"{_checkpoint(out, options.part)} is written; without --part, all are put together"
     curves = {"all folds" if part == ALL else f"without fold {part}": each.loss for part, each in trained.items()}
-    loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
+    export.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
     schedule = replace(schedule, device=trained[ALL].device)
     return _finish(options, trained, pictures, recipe, schedule, render_view)
 
@@ -98,15 +105,15 @@ def _trained(
 ) -> Trained:
     """The network of one part, from its checkpoint as far as that goes."""
     from perception.training import loop
-    from perception.training.samples import Pictures
 
     network = loop.build_network(options.network, schedule.seed)
     trained = [item for item, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
-    source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), schedule.device)
-    fingerprint = _fingerprint(options.network, [*trained, *pictures.others], schedule, recipe)
+    learned = [*trained, *pictures.others]
+    samples = Samples(learned, pictures.weights(len(trained)), recipe.augmentation, schedule.seed)
+    fingerprint = _fingerprint(options.network, learned, schedule, recipe)
     title = "train on all" if part == ALL else f"train without fold {part}"
     with _progress(title, "steps") as progress:
-        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe, fingerprint)
+        return loop.train(network, samples, schedule, _checkpoint(options.out, part), progress, recipe, fingerprint)
 
 
 def _fingerprint(network: str, pictures: Sequence[Labelled], schedule: Schedule, recipe: Recipe) -> str:
@@ -153,15 +160,6 @@ def _finish(
         with _progress("cover", "pictures") as progress:
             before, after = _covered(segmenters, pictures, rng, progress)
         silent = [metrics.silent_share(each, rendered) for each in segmenters]
-        figures = export.Figures(
-            metrics_of_folds,
-            [each.name for each in pictures.judged],
-            [float(each.wound.mean()) for each in pictures.judged],
-            len(healthy[0]),
-            float(np.mean(silent)),
-            before,
-            after,
-        )
         exported = Path(folder) / out.name
         export.export(trained[ALL].network, exported, settings, terms)
         agreement = export.agreement(trained[ALL].network, exported, pictures.judged[:COMPARED], recipe.looks)
@@ -171,12 +169,24 @@ def _finish(
             " turned; SIFT), never at random",
             f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
         )
-        count = loop.parameter_count(trained[ALL].network)
-        network = WoundNetwork(exported)
-        origin = export.NetworkOrigin(out.stem, options.network, count, data, str(schedule), agreement, network)
+        card = export.Card(
+            name=out.stem,
+            kind=options.network,
+            parameters=loop.parameter_count(trained[ALL].network),
+            data=data,
+            schedule=str(schedule),
+            agreement=agreement,
+            network=WoundNetwork(exported),
+            judged=metrics_of_folds,
+            pictures=pictures.judged,
+            pieces=len(healthy[0]),
+            rendered=float(np.mean(silent)),
+            before=before,
+            after=after,
+        )
         _write_names(out, [*pictures.judged, *pictures.others])
         export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), metrics_of_folds)
-        export.write_card(out.with_suffix(".md"), origin, figures)
+        export.write_card(out.with_suffix(".md"), card)
         for suffix in (".toml", ".onnx"):
             shutil.copy(exported.with_suffix(suffix), out.with_suffix(suffix))
     dice = metrics_of_folds.dice

@@ -1,9 +1,12 @@
-"""Labelled pictures and what training makes of them.
+"""Labelled pictures and what training makes of them: folds, pieces of healthy skin, and samples to learn from.
 
 A folder has `images/` and `labels/`, one mask of the same name and size for each picture. A group is the pictures that
 show one wound: two are joined when small colour copies of them agree, mirrored and turned ones included, or when SIFT
 finds one scene in both; groups are the connected components. A random split would put views of one wound on both sides
 and flatter the result.
+
+A sample is a view of a picture as one of the two looks takes it, with something in front and in other light. Everything
+that chance decides of it comes from a generator of its own: the same number gives the same sample.
 """
 
 from __future__ import annotations
@@ -16,8 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from estimation.errors import InputError
+from perception.wound.network import box_round
 from perception.wound.segmentation import picture_box
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
@@ -191,3 +197,162 @@ def skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(H, W) whether a pixel has a skin's colour (Chai and Ngan, 1999: Cr and Cb, whatever the brightness)."""
     _, red, blue = cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb))
     return np.asarray((red >= 133) & (red <= 178) & (blue >= 77) & (blue <= 130))
+
+
+LONGEST_SIDE_PX = 640  # of a picture that samples are drawn from: larger ones are made smaller first
+MAX_HALVINGS = 2  # of a picture before it is warped: shrinking by more in one warp would alias
+COVER_CELLS = 16  # places a side among which a cover's is drawn
+GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+BLUR_PX = (9, 9)  # window of the blur
+
+Planes = NDArray[np.float32]  # (side, side, 4) in 0..1: RGB and the wound
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """What is varied, and how often."""
+
+    side: int = 256  # px of a sample: the second look's window
+    long_side: float = 320.0  # px of a whole picture: the first look
+    whole: float = 0.42  # share of samples seen as the first look sees them
+    away: float = 0.13  # share seen at any place and scale; the rest is seen as by the second look
+    shares: tuple[float, float] = (0.2, 0.85)  # of the window that a wound takes in the second look
+    scales: tuple[float, float] = (0.3, 3.0)  # px of a sample per px of the picture
+    stretch: float = 0.1  # deviation of the logarithm of height over width
+    cover: float = 0.4  # share of samples with something in front
+
+
+class Samples:
+    """Samples by their number: picture (3, side, side) RGB and wound (1, side, side), float32 in 0..1."""
+
+    def __init__(
+        self, labelled: Sequence[Labelled], weights: NDArray[np.float64], how: Augmentation, seed: int
+    ) -> None:
+        """weights: (N,) how often each picture is drawn relative to the others."""
+        self._planes = [_reduced(each) for each in labelled]
+        self._boxes = [box_round(each[..., 3] > 127) for each in self._planes]  # of the wound; None: there is none
+        self._shares, self._how, self._seed = weights / weights.sum(), how, seed
+
+    def __getitem__(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """One sample."""
+        rng = np.random.default_rng([self._seed, number])
+        seen = self._view(rng)
+        if rng.random() < self._how.cover:
+            seen = self._covered(seen, rng)
+        planes = np.dstack([_relit(seen[..., :3], rng), seen[..., 3]]).transpose(2, 0, 1)
+        return np.ascontiguousarray(planes[:3], np.float32), np.ascontiguousarray(planes[3:], np.float32)
+
+    def _view(self, rng: np.random.Generator) -> Planes:
+        """A look at one picture, turned by any angle, mirrored half the time, stretched and sheared."""
+        number, side = int(rng.choice(len(self._planes), p=self._shares)), self._how.side
+        scale, centre = self._scale_and_centre(number, rng)
+        shrunk = 0.5 ** int(np.clip(np.floor(-np.log2(scale)), 0, MAX_HALVINGS))
+        planes = cv2.resize(self._planes[number], None, fx=shrunk, fy=shrunk, interpolation=cv2.INTER_AREA)
+        angle = rng.normal(0, 0.35) + rng.integers(4) * np.pi / 2
+        stretch, shear = np.exp(rng.normal(0, self._how.stretch / 2)), rng.normal(0, 0.06)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        shape = np.array([[stretch, shear], [0, 1 / stretch]]) @ np.diag([rng.choice((-1.0, 1.0)), 1.0])
+        warp = shrunk / scale * turn @ shape  # column and row of the picture from those of the sample
+        place = shrunk * centre[::-1] - warp @ np.full(2, (side - 1) / 2)
+        border = cv2.BORDER_REFLECT_101 if rng.random() < 0.5 else cv2.BORDER_CONSTANT  # black
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        planes = planes.astype(np.float32) / np.float32(255)  # rounded places between pixels would be seen as grain
+        seen = cv2.warpAffine(planes, np.column_stack([warp, place]), (side, side), flags=flags, borderMode=border)
+        return np.asarray(seen, np.float32)
+
+    def _scale_and_centre(self, number: int, rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
+        """Px of the sample per px of the picture, and the place (row, column) at its middle."""
+        how, size, box = self._how, np.array(self._planes[number].shape[:2], float), self._boxes[number]
+        kind, anywhere = rng.random(), rng.uniform(0.2, 0.8, 2) * size
+        if kind < how.away:
+            return float(np.exp(rng.uniform(np.log(0.4), np.log(3.0)))), anywhere
+        if kind < how.away + how.whole or box is None:
+            scale = how.long_side / size.max() * float(np.exp(rng.uniform(-0.3, 0.3)))
+            target = (box[:2] + box[2:]) / 2 if box is not None and rng.random() < 0.6 else anywhere
+            return scale, target + rng.uniform(-0.35, 0.35, 2) * how.side / scale
+        share = float(np.exp(rng.uniform(*np.log(how.shares))))
+        scale = float(np.clip(how.side * share / float(np.max(box[2:] - box[:2])), *how.scales))
+        return scale, (box[:2] + box[2:]) / 2 + rng.normal(0, 0.12, 2) * how.side / scale
+
+    def _covered(self, seen: Planes, rng: np.random.Generator) -> Planes:
+        """With one to three shapes in front: plain things, which hide the wound, or what another picture shows there,
+        wound and all."""
+        wound = seen[..., 3]
+        for _ in range(int(rng.integers(1, 4)) if rng.random() < 0.4 else 1):
+            shape = _shape(self._how.side, _cover_place(wound, rng), rng)
+            front = self._view(rng) if rng.random() < 0.3 else _plain(self._how.side, rng)
+            blend = np.dstack([shape] * 3 + [shape > 0.5])
+            seen = np.asarray(seen + blend * (front - seen), np.float32)
+        return seen
+
+
+def _reduced(labelled: Labelled) -> NDArray[np.uint8]:
+    planes = np.dstack([labelled.picture, labelled.wound.astype(np.uint8) * np.uint8(255)])
+    scale = min(1.0, LONGEST_SIDE_PX / max(labelled.wound.shape))
+    return np.asarray(cv2.resize(planes, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _cover_place(wound: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
+    """(2,) column and row, 0..1: on the wound four times of five, anywhere where there is none."""
+    likely = cv2.resize(wound, (COVER_CELLS, COVER_CELLS), interpolation=cv2.INTER_AREA).ravel().astype(float)
+    likely = likely * (rng.random() < 0.8) + 1e-9
+    cell = int(rng.choice(len(likely), p=likely / likely.sum()))
+    return (np.array([cell % COVER_CELLS, cell // COVER_CELLS]) + rng.random(2)) / COVER_CELLS
+
+
+def _shape(side: int, place: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
+    """(side, side) 0..1: a bar, everything beyond a line, or a lobed blob."""
+    right, down = (np.arange(side) + 0.5) / side - place[0], ((np.arange(side) + 0.5) / side - place[1])[:, None]
+    angle, kind = rng.uniform(0, 2 * np.pi), rng.random()
+    along, across = np.cos(angle) * right + np.sin(angle) * down, np.cos(angle) * down - np.sin(angle) * right
+    if kind < 0.5:
+        bar = kind < 0.25
+        length, width = (
+            rng.uniform(*(0.15, 0.8) if bar else (0.05, 0.5)),
+            rng.uniform(*(0.015, 0.1) if bar else (0.15, 1.0)),
+        )
+        beyond = np.maximum(np.abs(along - length) - length, np.abs(across) - width)
+    else:
+        turned, radius = np.arctan2(across, along * np.exp(rng.normal(0, 0.4))), rng.uniform(0.06, 0.3)
+        for lobes in range(2, 6):
+            radius = radius * (
+                1 + rng.normal(0, 0.25 / lobes**0.5) * np.cos(lobes * turned + rng.uniform(0, 2 * np.pi))
+            )
+        beyond = np.hypot(across, along) - radius
+    return np.asarray(expit(-beyond * side / rng.uniform(0.3, 1.0)), np.float32)
+
+
+def _plain(side: int, rng: np.random.Generator) -> Planes:
+    """Gloves, drapes, gauze, tools: one colour that slopes, with grain, a third of them woven; no wound."""
+    at = np.linspace(-1, 1, side)
+    down = at[:, None]
+    colour = rng.uniform(0, 1, 1 if rng.random() < 0.5 else 3)
+    shade = rng.normal(0, 0.1) * at + rng.normal(0, 0.1) * down
+    shade = shade + rng.uniform(0, 0.03) * rng.standard_normal((side, side))
+    if rng.random() < 0.33:
+        angle, threads = rng.uniform(0, np.pi), rng.uniform(15, 120)  # radians from the middle to the edge
+        one, other = threads * np.cos(angle), threads * np.sin(angle)
+        shade = shade + rng.uniform(0.03, 0.3) * np.sin(one * at + other * down) * np.sin(one * down - other * at)
+    planes = np.zeros((side, side, 4), np.float32)
+    planes[..., :3] = np.clip(colour + shade[..., None], 0, 1)
+    return planes
+
+
+def _relit(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """The picture (side, side, 3) as another camera might have taken it under other light, in 256 steps."""
+    balance = np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.08, 3)).astype(np.float32)
+    seen = cv2.pow(np.maximum(picture, np.float32(1e-4)), float(np.exp(rng.normal(0, 0.25)))) * balance
+    saturation = 0.0 if rng.random() < 0.04 else rng.uniform(0.5, 1.4)
+    hue = rng.normal(0, 0.15) if rng.random() < 0.3 else 0.0  # rad about the grey axis
+    turn = saturation * Rotation.from_rotvec(np.full(3, hue / 3**0.5)).as_matrix().astype(np.float32)
+    grey = (seen @ GREY)[..., None]
+    seen = grey + (seen - grey) @ turn.T
+    if rng.random() < 0.33:
+        at = np.linspace(-1, 1, len(seen))
+        light = 1 + rng.normal(0, 0.25) * at + rng.normal(0, 0.25) * at[:, None]
+        seen = seen * np.clip(light, 0.2, 2)[..., None].astype(np.float32)
+    if rng.random() < 0.25:
+        seen = cv2.GaussianBlur(seen, BLUR_PX, rng.uniform(0.4, 1.8), borderType=cv2.BORDER_REPLICATE)
+    if rng.random() < 0.3:
+        seen = seen + np.float32(rng.uniform(0.008, 0.04)) * rng.standard_normal(seen.shape, np.float32)
+    return np.asarray(np.round(np.clip(seen, 0, 1) * 255) / 255, np.float32)

