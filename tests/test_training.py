@@ -28,9 +28,9 @@ from perception.training.loop import (
     WoundNet,
     as_function,
     build_network,
+    learning_rate_at,
     parameter_count,
     pretrained_encoder,
-    rate_at,
     train,
     wound_loss,
 )
@@ -96,7 +96,7 @@ def test_training_begins_with_what_was_learned_before() -> None:
 
 
 def test_the_rate_rises_then_falls_to_nothing() -> None:
-    rates = [rate_at(step, Schedule(rounds=10, steps=100)) for step in range(1000)]
+    rates = [learning_rate_at(step, Schedule(rounds=10, steps=100)) for step in range(1000)]
     top = int(np.argmax(rates))
     assert rates[top] == pytest.approx(1e-3, rel=0.05) and top < 50
     assert all(a >= b for a, b in zip(rates[top:], rates[top + 1 :], strict=False)) and rates[-1] < 1e-7

@@ -31,12 +31,12 @@ from perception.training.dataset import (
     read_dataset,
 )
 from perception.training.metrics import (
-    Unseen,
+    HeldOutPredictions,
     calibration_error,
+    cover_half,
     dice_before_and_after_cover,
-    half_covered,
-    judge,
-    scores,
+    dice_scores,
+    evaluate_folds,
     silent_share,
 )
 from perception.wound.network import Looks, shipped_model
@@ -186,6 +186,15 @@ def test_what_covers_a_wound_hides_it_or_brings_its_own() -> None:
     assert covered.sum() / bare.sum() < 0.9
 
 
+def test_beyond_the_edge_of_a_picture_a_sample_is_a_mirror_or_black_with_no_fringe() -> None:
+    each = labelled(0)
+    all_wound = Labelled(each.name, each.picture, np.ones_like(each.wound))
+    wounds = drawn([all_wound], 24, Augmentation(side=96, whole=1.0, away=0.0, cover=0.0), 2)[1]
+    assert ((wounds < 1e-4) | (wounds > 1 - 1e-4)).all()
+    black = (wounds < 0.5).mean((1, 2)) > 0
+    assert 4 < black.sum() < 20
+
+
 def test_the_scale_of_a_sample_is_that_of_the_look_it_stands_for() -> None:
     """A whole picture is about as long as the first look's; a wound takes the second look's share of the window."""
     each = labelled(0, size=(480, 640))
@@ -204,11 +213,11 @@ def test_the_scale_of_a_sample_is_that_of_the_look_it_stands_for() -> None:
 @settings(max_examples=12)
 def test_half_covered_hides_half_of_the_wound(seed: int) -> None:
     each = labelled(seed)
-    _, cover = half_covered(each, np.random.default_rng(seed))
+    _, cover = cover_half(each, np.random.default_rng(seed))
     assert (each.wound & cover).sum() / each.wound.sum() == pytest.approx(0.5, abs=0.12)
 
 
-def unseen(seed: int, sureness: float, pieces: int = 40) -> Unseen:
+def predictions(seed: int, sureness: float, pieces: int = 40) -> HeldOutPredictions:
     """Pictures of a disc, found at logits near `sureness`, and of nothing, of which some is faintly taken for one."""
     rng = np.random.default_rng(seed)
     logits, wounds, piece = [], [], []
@@ -223,26 +232,28 @@ def unseen(seed: int, sureness: float, pieces: int = 40) -> Unseen:
         logits.append(seen.astype(np.float16))
         wounds.append(wound)
         piece.append(number >= 60)
-    return Unseen(logits, wounds, np.arange(60 + pieces) % 3, np.array(piece))
+    return HeldOutPredictions(logits, wounds, np.arange(60 + pieces) % 3, np.array(piece))
 
 
 def test_judged_by_folds_faint_masks_of_nothing_are_kept_silent_about_and_wounds_are_not() -> None:
-    settings, judged = judge(unseen(1, 5.0), Looks(), np.random.default_rng(0))
-    assert 0 < settings.trust < 1 and settings.slope > 0 and judged.silent == 1
+    settings, judged = evaluate_folds(predictions(1, 5.0), Looks(), np.random.default_rng(0))
+    assert 0 < settings.trust < 1 and settings.slope > 0 and judged.silent_share == 1
     assert len(judged.dice) == 60 and judged.dice.mean() > 0.95
-    assert judged.confidence[judged.right].min() > judged.confidence[~judged.right].max()
-    assert calibration_error(judged.confidence, judged.right) < 0.1
+    assert judged.confidence[judged.correct].min() > judged.confidence[~judged.correct].max()
+    assert calibration_error(judged.confidence, judged.correct) < 0.1
 
 
 def test_a_fold_is_judged_by_settings_that_never_saw_it() -> None:
     """Wounds of one fold are as faint as what other folds have taught to keep silent about."""
-    seen = unseen(2, 5.0)
+    seen = predictions(2, 5.0)
     parts = zip(seen.logits, seen.wounds, seen.fold, strict=True)
     faint = [np.where(wound, 1.0, -6.0).astype(np.float16) if fold == 0 else each for each, wound, fold in parts]
-    _, judged = judge(Unseen(faint, seen.wounds, seen.fold, seen.piece), Looks(), np.random.default_rng(0))
-    wounded = np.array([wound.any() for wound in seen.wounds])[~seen.piece]
-    assert judged.dice[wounded & (seen.fold[~seen.piece] == 0)].max() == 0
-    assert judged.dice[seen.fold[~seen.piece] != 0].mean() > 0.6
+    _, judged = evaluate_folds(
+        HeldOutPredictions(faint, seen.wounds, seen.fold, seen.healthy), Looks(), np.random.default_rng(0)
+    )
+    wounded = np.array([wound.any() for wound in seen.wounds])[~seen.healthy]
+    assert judged.dice[wounded & (seen.fold[~seen.healthy] == 0)].max() == 0
+    assert judged.dice[seen.fold[~seen.healthy] != 0].mean() > 0.6
 
 
 @given(st.integers(0, 10**6))
@@ -257,13 +268,15 @@ def test_the_calibration_error_is_nothing_for_the_honest_and_the_gap_for_the_boa
 
 def test_pixels_that_boast_are_brought_to_how_often_they_are_right() -> None:
     rng = np.random.default_rng(3)
-    honest = unseen(4, 3.0)
+    honest = predictions(4, 3.0)
     noisy = [
         np.where(rng.random(w.shape) < 0.15, -each, each) for each, w in zip(honest.logits, honest.wounds, strict=True)
     ]
-    settings, judged = judge(Unseen(noisy, honest.wounds, honest.fold, honest.piece), Looks(), rng)
+    settings, judged = evaluate_folds(
+        HeldOutPredictions(noisy, honest.wounds, honest.fold, honest.healthy), Looks(), rng
+    )
     assert settings.pixel_slope < 0.8
-    assert calibration_error(judged.pixel, judged.pixel_wound) < 0.05
+    assert calibration_error(judged.pixel_probability, judged.pixel_wound) < 0.05
 
 
 def test_a_segmenter_that_knows_the_truth_scores_one_and_one_that_sees_wounds_everywhere_nothing() -> None:
@@ -275,8 +288,8 @@ def test_a_segmenter_that_knows_the_truth_scores_one_and_one_that_sees_wounds_ev
     def everything(image: np.ndarray) -> Segmentation:
         return Segmentation(np.ones(image.shape[:2], bool), 1.0, 0.7)
 
-    assert scores(red, pictures, lambda done, of: None) == pytest.approx([1, 1], abs=0.01)
-    assert scores(everything, pictures, lambda done, of: None)[1] == 0
+    assert dice_scores(red, pictures, lambda done, of: None) == pytest.approx([1, 1], abs=0.01)
+    assert dice_scores(everything, pictures, lambda done, of: None)[1] == 0
     assert silent_share(red, [pictures[1].picture]) == 1 and silent_share(everything, [pictures[1].picture]) == 0
     before, after = dice_before_and_after_cover(red, pictures, np.random.default_rng(0))
     assert before == pytest.approx(1, abs=0.01) and after == pytest.approx(1, abs=0.02)
