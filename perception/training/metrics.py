@@ -90,6 +90,7 @@ def cover_half(labelled: Labelled, rng: np.random.Generator) -> tuple[NDArray[np
 
 EDGE_CHOICES = (0.4, 0.45, 0.5, 0.55, 0.6)
 SMALLEST_CHOICES = (0.0, 0.05, 0.2)
+CONFIDENCE_CHOICES = np.arange(2, 100, 2) / 100
 LOGISTIC_PRIOR = (4.0, 0.25)  # precision of the prior of slope and offset: means 1 and 0
 TARGET_SILENT_SHARE = 0.952  # of pieces without a wound: what is promised is 0.95
 SILENCE_PRICE = 0.5  # of mean Dice that a share of them is worth
@@ -197,16 +198,12 @@ def _choose(
     has_mask = training & np.isfinite(best.mean_logit)
     correct = (best.dice > MIN_HIT_DICE) & ~empty
     slope, offset = _fit_logistic(best.mean_logit[has_mask], correct[has_mask])
-    confidence = expit(slope * best.mean_logit + offset)
-    trust, highest = 0.5, -np.inf
-    for level in np.arange(0.02, 0.99, 0.02):
-        silent = ~(confidence >= level)
-        pieces = training & predictions.healthy
-        silent_share = silent[pieces].mean() if pieces.any() else 1.0
-        score = np.where(silent, empty, best.dice)[training & ~predictions.healthy].mean()
-        score -= SILENCE_PRICE * max(0.0, TARGET_SILENT_SHARE - silent_share)
-        if score > highest + 1e-9:
-            trust, highest = float(round(level, 2)), score
+    silent = ~(expit(slope * best.mean_logit + offset) >= CONFIDENCE_CHOICES[:, None])  # (T, N); nan: no mask
+    pieces, whole = training & predictions.healthy, training & ~predictions.healthy
+    silent_share = silent[:, pieces].mean(1) if pieces.any() else 1.0
+    score = np.where(silent, empty, best.dice)[:, whole].mean(1)
+    score = score - SILENCE_PRICE * np.maximum(0.0, TARGET_SILENT_SHARE - silent_share)
+    trust = float(CONFIDENCE_CHOICES[np.argmax(score.round(9))])
     return best, replace(best.settings, slope=slope, offset=offset, trust=trust)
 
 
