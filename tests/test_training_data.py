@@ -40,7 +40,14 @@ from perception.training.metrics import (
     silent_share,
 )
 from perception.wound.network import Looks, shipped_model
-from perception.wound.segmentation import SHEET_CELL_PX, SHEET_COLUMNS, JudgedPicture, Segmentation, contact_sheet, dice
+from perception.wound.segmentation import (
+    SHEET_CELL_PX,
+    SHEET_COLUMNS,
+    EvaluatedPicture,
+    Segmentation,
+    contact_sheet,
+    dice,
+)
 from perception.wound.shape_matching import (
     COLOUR_TERMS,
     OUTLINE_FEATURES,
@@ -456,7 +463,7 @@ def test_a_camera_that_does_not_see_the_wound_is_searched_whole() -> None:
 
 def test_a_contact_sheet_has_three_rows_however_few_pictures_there_are() -> None:
     image, truth = picture((60, 50), 20, (100, 120))
-    shown = [JudgedPicture(image, Segmentation(disc((100, 120), (60, 50), r), 0.9, 0.7), truth) for r in (20, 10, 4)]
+    shown = [EvaluatedPicture(image, Segmentation(disc((100, 120), (60, 50), r), 0.9, 0.7), truth) for r in (20, 10, 4)]
     assert contact_sheet(shown).shape == (3 * SHEET_CELL_PX, SHEET_COLUMNS * SHEET_CELL_PX, 3)
-    nothing = JudgedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)
+    nothing = EvaluatedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)
     assert contact_sheet([nothing]).dtype == np.uint8

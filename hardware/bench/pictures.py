@@ -36,7 +36,7 @@ from perception.training.metrics import (
 )
 from perception.wound.network import THESIS_MODEL, WoundNetwork, shipped_model
 from perception.wound.segmentation import (
-    JudgedPicture,
+    EvaluatedPicture,
     NetworkSegmenter,
     Segmentation,
     WoundBand,
@@ -71,8 +71,8 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
     rng = np.random.default_rng(options.seed)
     if options.sheet is not None:
         images = [(bgr(each.picture), each.wound) for each in pictures or wounds]
-        judged = [JudgedPicture(image, segmenter(image), wound) for image, wound in images]
-        options.sheet.write_bytes(encode(contact_sheet(judged), SHEET_QUALITY)[1])
+        evaluated = [EvaluatedPicture(image, segmenter(image), wound) for image, wound in images]
+        options.sheet.write_bytes(encode(contact_sheet(evaluated), SHEET_QUALITY)[1])
     shapes = shipped_model("shape", ".toml")
     figures = [*_dice(segmenter, pictures), *_reference_figures(pictures, new_to(dataset, shapes), shapes, rng)]
     pieces = healthy_pieces(pictures, rng, HEALTHY_PIECES)
