@@ -196,7 +196,7 @@ def test_what_covers_a_wound_hides_it_or_brings_its_own() -> None:
 def test_beyond_the_edge_of_a_picture_a_sample_is_a_mirror_or_black_with_no_fringe() -> None:
     each = labelled(0)
     all_wound = Labelled(each.name, each.picture, np.ones_like(each.wound))
-    wounds = drawn([all_wound], 24, Augmentation(side=96, whole=1.0, away=0.0, cover=0.0), 2)[1]
+    wounds = drawn([all_wound], 24, Augmentation(side=96, long_side=96.0, whole=1.0, away=0.0, cover=0.0), 2)[1]
     assert ((wounds < 1e-4) | (wounds > 1 - 1e-4)).all()
     black = (wounds < 0.5).mean((1, 2)) > 0
     assert 4 < black.sum() < 20

@@ -263,7 +263,7 @@ def conformal_spread(residuals: Array) -> float:
 
 def reliability(probability: Array, correct: NDArray[np.bool_], bins: int = 10) -> tuple[Array, Array, Array]:
     """Mean probability, share that is correct, and count of the bins of equal width that are not empty, (B,) each."""
-    weights = (None, probability, correct)
+    weights = (None, probability, correct.astype(float))
     count, said, right = (np.histogram(probability, bins, (0, 1), weights=each)[0] for each in weights)
     used = count > 0
     return said[used] / count[used], right[used] / count[used], count[used]
