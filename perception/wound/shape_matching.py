@@ -132,7 +132,7 @@ RANK_TERMS = (OUTLINE_FEATURES + 1) * (OUTLINE_FEATURES + 2) // 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeModel:
-    """What was learned from labelled pictures."""
+    """Parameters that were fitted to labelled pictures."""
 
     colour: Array  # (COLOUR_TERMS,) weights of the log odds of the wound's colours
     rank: Array  # (RANK_TERMS,) weights of the expected Dice of an outline, against a scan's outline and size
@@ -260,20 +260,22 @@ NEWTON_STEPS = 25  # steps of the logistic regression
 RANK_RIDGE = 30.0  # of the ranking, against 210 terms
 PATTERN_COUNT = 8
 PATTERN_CORNERS = 24  # of a stored pattern
-AREA_LOG_SIGMA = 0.2  # how well a scan and the camera's distance tell the area in px, deviation of its logarithm
-MIN_EXPECTED_DICE = 0.4  # expected Dice below which no outline is worth giving out
+AREA_LOG_SIGMA = 0.2  # standard deviation of the logarithm of an area in px from a scan and the camera's distance
+MIN_EXPECTED_DICE = 0.4  # below this expected Dice, no outline is returned
 
 
-def fit_shapes(pictures: Sequence[Outlined], seed: int, seen: Callable[[int, int], None]) -> ShapeModel:
-    """The model of these pictures; `seen(done, of)` after each. Outlines are ranked against their own wound's shape and
-    size, as a scan gives them, and against the usual shapes."""
+def fit_shapes(pictures: Sequence[Outlined], seed: int, report: Callable[[int, int], None]) -> ShapeModel:
+    """The model of these pictures; `report(done, total)` after each.
+
+    Outlines are ranked against the wound's true shape and size, as a scan gives them, and against the usual shapes.
+    """
     rng = np.random.default_rng(seed)
     wounded = [each for each in pictures if each[1].any()]
     colour = _colours(wounded, rng)
     patterns = _usual_outlines(wounded, rng)
     scanned: list[Array] = []
     usual: list[Array] = []
-    reached: list[float] = []
+    dices: list[float] = []
     for number, (picture, wound) in enumerate(wounded):
         scene = small_picture(picture, colour)
         truth = _made_small(wound, scene)
@@ -284,9 +286,9 @@ def fit_shapes(pictures: Sequence[Outlined], seed: int, seen: Callable[[int, int
         for outline in find_outlines(scene):
             scanned.append(outline_features(scene, outline, [own], area))
             usual.append(outline_features(scene, outline, patterns, None))
-            reached.append(dice(_outline_mask(outline, truth.shape), truth))
-        seen(number + 1, len(wounded))
-    ranks = [_ranking(np.array(features), np.array(reached)) for features in (scanned, usual)]
+            dices.append(dice(_outline_mask(outline, truth.shape), truth))
+        report(number + 1, len(wounded))
+    ranks = [_ranking(np.array(features), np.array(dices)) for features in (scanned, usual)]
     return ShapeModel(colour, ranks[0], ranks[1], MIN_EXPECTED_DICE, tuple(patterns))
 
 
@@ -328,14 +330,14 @@ def _logistic_weights(terms: Array, outcomes: Array) -> Array:
     return weights
 
 
-def _ranking(features: Array, reached: Array) -> Array:
+def _ranking(features: Array, dices: Array) -> Array:
     """Ridge regression of Dice on the products of features, whitened for it."""
     terms = products(features)
     middle, spread = terms.mean(0), terms.std(0) + 1e-9
     white = (terms - middle) / spread
     normal = white.T @ white + RANK_RIDGE * np.eye(white.shape[1])
-    weights = np.linalg.solve(normal, white.T @ (reached - reached.mean())) / spread
-    weights[0] += reached.mean() - middle @ weights  # the first product is one times one
+    weights = np.linalg.solve(normal, white.T @ (dices - dices.mean())) / spread
+    weights[0] += dices.mean() - middle @ weights  # the first product is one times one
     return np.asarray(weights)
 
 
