@@ -304,7 +304,7 @@ def gtsam_solution(equations: NormalEquations) -> tuple[gtsam.GaussianBayesTree,
     problem, estimate, known = equations.problem, equations.estimate, equations.known
     part, links = condense(problem, 0, len(problem.data), estimate, equations.noise), equations._motion_prior
     count, q, size = len(problem.data), len(problem.free), problem.size
-    equations._begin(0, count, part.information, part.gradient)
+    equations._add_initial_priors(0, count, part.information, part.gradient)
     graph, none = gtsam.GaussianFactorGraph(), np.zeros((size, size))
     for k in range(count):
         own = part.information[k], part.cross[k], -part.gradient[k]

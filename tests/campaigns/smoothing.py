@@ -180,7 +180,7 @@ def ceres_figures(seconds: float, count: int) -> list[Figure]:
     data = pack_tracks(list(world), len(world.rig))
     poses, points = initial_estimate(world.rig, data, None, None)
     known = np.isfinite(points[:, 0])
-    data, points = data.landmarks(known), points[known]
+    data, points = data.select_landmarks(known), points[known]
     own, theirs = adjust_ours(world.rig, data, poses, points), adjust_by_ceres(pycolmap, world.rig, data, poses, points)
     costs = f"residuals of {own.rms:.6f} against {theirs.rms:.6f} px RMS"
     times = f"{own.spent:.2f} s in {own.steps} steps against {theirs.spent:.2f} s in {theirs.steps}, of one core"
