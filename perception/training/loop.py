@@ -51,7 +51,7 @@ def thesis_loss(logits: Tensor, wound: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How long and how fast: six minutes of a large GPU for six networks at once, or ten hours of a core for one."""
+    """How long and how fast; on a processor one network takes many hours."""
 
     rounds: int = 22
     steps: int = 200  # a round
