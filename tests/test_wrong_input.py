@@ -263,6 +263,24 @@ def test_refusals_name_files(folder: Path, monkeypatch: pytest.MonkeyPatch, caps
     assert capsys.readouterr().err == "stillbed: typo.toml/below: not a directory\n"
 
 
+@pytest.mark.parametrize(
+    ("line", "work"),
+    [
+        ("plan --example forearm -o /proc/p.csv", "hardware.plan.run.subject_of"),
+        ("plan --example forearm -o p.csv --gcode /proc/p.gcode", "hardware.plan.run.subject_of"),
+        ("cameras usb:A1 -o /proc/s.jpg", "hardware.cameras.live.sources_named"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(
+    line: str, work: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(work, lambda *_, **__: pytest.fail("the work began"))
+    assert main(line.split()) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("stillbed: /proc: --") and told.endswith("allowed a folder that can be written to\n")
+
+
 def test_the_same_from_a_shell(folder: Path) -> None:
     command = [sys.executable, "-m", "hardware.cli.main", "track", str(folder / "missing"), "-o", str(folder / "OUT")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)

@@ -45,7 +45,8 @@ from hardware.operator.view import (
     hold_cause,
     tracking_from_pose,
 )
-from hardware.process.progress import TimeLeft, open_in_browser
+from hardware.process.progress import TimeLeft
+from hardware.report.page import open_in_browser
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.motion.retime import run_times

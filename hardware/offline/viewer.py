@@ -35,7 +35,6 @@ from hardware.operator.server import CONTENT_TYPES, page_files
 from hardware.operator.settings import AccessControl, OperatorSettings, check_settings, response_headers
 from hardware.operator.shared_state import CameraPicture, PagePictures, PageScene, scene_from
 from hardware.operator.view import Activity, MotionView, RunStage, TrackingView, tracking_from_pose
-from hardware.process.progress import open_in_browser
 from hardware.recording.mcap_file import ChunkMessages, FileMetadata, epoch_of, walk
 from hardware.recording.ros_messages import LOG, unpacked
 from hardware.recording.session_reader import (
@@ -47,6 +46,7 @@ from hardware.recording.session_reader import (
     used_inputs,
 )
 from hardware.report.evaluation import associate
+from hardware.report.page import open_in_browser
 from perception.frames import Frame, FrameSet, frame_set, mean_stamp
 from planning.command import Command, Move
 from planning.path import Path as Toolpath

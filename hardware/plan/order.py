@@ -17,7 +17,7 @@ from hardware.files.arm_file import read_arm, tool_body_of
 from hardware.files.mesh_file import read_raw_mesh
 from hardware.files.path_file import read_contour
 from hardware.plan.question import parse_clicks, scan_colour, write_question
-from hardware.process.progress import ProgressReport, check_apart, no_progress
+from hardware.process.progress import ProgressReport, check_apart, check_new, no_progress
 from planning.clearance import BASE_MARGIN, ToolBody
 from planning.fill import PatternKind
 from planning.fill.bead import Pattern
@@ -323,7 +323,7 @@ class PlanFiles:
 def check_out(request: PlanRequest) -> None:
     """Make the folder of the file that is written; InputError where it stands there already and no --force is given.
 
-    InputError as well where the scan or the outline would be overwritten.
+    InputError as well where the scan or the outline would be overwritten, or nothing can be written there.
     """
     out, gcode = request.out, request.gcode
     if out.suffix.lower() != ".csv":
@@ -335,9 +335,9 @@ def check_out(request: PlanRequest) -> None:
     if gcode in (out, *PlanFiles(out).companions):
         raise InputError(COMMAND_LINE, "--gcode", gcode, "another file than those of the plan")
     for option, file in zip(("--out", "--gcode"), written, strict=False):
-        if file.is_dir() or (file.exists() and not request.force):
-            got = "a folder" if file.is_dir() else "a file that exists"
-            raise InputError(file, option, got, "a new one, or --force")
+        if file.is_dir():
+            raise InputError(file, option, "a folder", "a file")
+        check_new(file, request.force, option)
         file.parent.mkdir(parents=True, exist_ok=True)
 
 

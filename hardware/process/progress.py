@@ -237,13 +237,25 @@ def prepare_out(out: Path, force: bool) -> None:
 
 
 def check_new(out: Path, force: bool, option: str = "--out", read: Path | None = None) -> None:
-    """InputError where `out` is a file, or a folder that holds something, and `force` is not set; or what is read."""
+    """InputError where `out` holds something and `force` is not set, is `read`, or cannot be written."""
     if read is not None:
         check_apart(option, out, read)
     if out.is_dir() and any(out.iterdir()) and not force:
         raise InputError(out, option, "a folder that is not empty", "a new or empty one, or --force")
     if out.exists() and not out.is_dir() and not force:
         raise InputError(out, option, "a file that exists", "a new one, or --force")
+    _check_writable(out, option)
+
+
+def _check_writable(out: Path, option: str) -> None:
+    """InputError where nothing can be created in the folder of `out`, before the work whose result would be lost."""
+    from tempfile import TemporaryFile  # its imports are slow, and help needs none of them
+
+    folder = next(each for each in (out, *out.absolute().parents) if each.is_dir())
+    try:
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(folder, option, str(error.strerror).lower(), "a folder that can be written to") from None
 
 
 def check_apart(option: str, written: Path, read: Path) -> None:
@@ -378,19 +390,6 @@ def clear_cache(cache: Path) -> tuple[int, int]:
         shutil.rmtree(folder, ignore_errors=True)
     clear_unfinished(cache)
     return len(scenes), size
-
-
-def open_in_browser(address: str) -> bool:
-    """Open an address with what the system opens addresses with; whether there is such a thing. Waits for nothing."""
-    import shutil
-    import subprocess
-
-    opener = shutil.which("xdg-open") or shutil.which("open")
-    if opener is None:
-        return False
-    null = subprocess.DEVNULL
-    subprocess.Popen([opener, address], stdin=null, stdout=null, stderr=null, start_new_session=True)
-    return True
 
 
 def cache_error(folder: Path, error: OSError) -> InputError:

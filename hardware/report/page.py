@@ -325,3 +325,16 @@ def two_views(curves: Sequence[tuple[Array, str]]) -> str:
             plot.dots(across, up, style, 3.5)
         plots.append(plot.svg())
     return f'<div class="two">{"".join(plots)}</div>'
+
+
+def open_in_browser(address: str) -> bool:
+    """Open an address with what the system opens addresses with; whether there is such a thing. Waits for nothing."""
+    import shutil
+    import subprocess
+
+    opener = shutil.which("xdg-open") or shutil.which("open")
+    if opener is None:
+        return False
+    null = subprocess.DEVNULL
+    subprocess.Popen([opener, address], stdin=null, stdout=null, stderr=null, start_new_session=True)
+    return True

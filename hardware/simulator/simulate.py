@@ -35,9 +35,10 @@ from hardware.files.pose_file import read_poses
 from hardware.offline.track import FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
-from hardware.process.progress import Progress, open_in_browser, prepare_out
+from hardware.process.progress import Progress, prepare_out
 from hardware.process.system import provenance
 from hardware.report.evaluation import Evaluation, evaluate, write_summary
+from hardware.report.page import open_in_browser
 from hardware.report.report import write_report
 from hardware.simulator.camera_pipeline import Exposures, PictureStore
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras
