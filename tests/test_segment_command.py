@@ -71,6 +71,21 @@ def test_masks_have_the_pictures_names_and_sizes_and_are_black_and_white(tmp_pat
     assert all(float(row["ms"]) > 0 for row in table.values())
 
 
+def test_with_force_nothing_of_an_earlier_run_stays_but_what_is_read(tmp_path: Path) -> None:
+    out, other = tmp_path / "out", tmp_path / "out" / "other.txt"
+    for name in ("first.png", "second.png"):
+        cv2.imwrite(str(tmp_path / name), picture((30, 40), 15, (120, 160))[0])
+    run_segment([tmp_path / "first.png"], out, SEGMENTER, SegmentOptions(overlay=True))
+    other.touch()
+    run_segment([tmp_path / "second.png"], out, SEGMENTER, SegmentOptions(force=True))
+    assert {file.name for file in out.rglob("*") if file.is_file()} == {"second.png", "wounds.csv", "other.txt"}
+    run_segment([out / "second.png"], out / "masks", SEGMENTER, SegmentOptions())
+    (out / "masks" / "wounds.csv").replace(out / "wounds.csv")
+    with pytest.raises(InputError, match="would be overwritten"):
+        run_segment([out / "second.png"], out, SEGMENTER, SegmentOptions(force=True))
+    assert (out / "second.png").exists()
+
+
 def test_a_video_gives_a_mask_a_frame(tmp_path: Path) -> None:
     write_video(tmp_path / "ward.avi", 5)
     run_segment([tmp_path / "ward.avi"], tmp_path / "masks", SEGMENTER, SegmentOptions())

@@ -17,7 +17,7 @@ import numpy as np
 from estimation.errors import InputError
 from hardware.files.images import Video, decode, encode
 from hardware.files.session import Session
-from hardware.process.checks import read_bytes
+from hardware.process.checks import read_bytes, read_csv
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, check_apart, count_text, prepare_out
 from hardware.recording.session_reader import open_session
@@ -93,6 +93,7 @@ def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options
     for file in files:
         check_apart("--out", _mask_file(out, _name(file)), file)
     prepare_out(out, options.force)
+    _remove_earlier(out, files)
     if options.overlay:
         (out / OVERLAY_FOLDER).mkdir(exist_ok=True)
     clock, errors, lost = WallClock(), list[InputError](), list[str]()
@@ -311,10 +312,26 @@ def _mask_file(out: Path, name: str) -> Path:
     return out / f"{name}.png"
 
 
+def _overlay_file(out: Path, name: str) -> Path:
+    return out / OVERLAY_FOLDER / f"{name}.jpg"
+
+
+def _remove_earlier(out: Path, inputs: Sequence[Path]) -> None:
+    """Remove an earlier run's masks and overlays, as its table names them; what is an input stays."""
+    if not (out / WOUND_TABLE).exists():
+        return
+    read = {file.resolve() for file in inputs}
+    for _, row in read_csv(out / WOUND_TABLE)[1:]:
+        if row and Path(row[0]).name == row[0]:
+            for file in (_mask_file(out, row[0]), _overlay_file(out, row[0])):
+                if file.resolve() not in read:
+                    file.unlink(missing_ok=True)
+
+
 def _write(out: Path, name: str, image: Image, result: Segmentation, options: SegmentOptions) -> None:
     _mask_file(out, name).write_bytes(encode(result.mask.astype(np.uint8) * np.uint8(255))[1])
     if options.overlay:
-        (out / OVERLAY_FOLDER / f"{name}.jpg").write_bytes(encode(draw_overlay(image, result), OVERLAY_QUALITY)[1])
+        _overlay_file(out, name).write_bytes(encode(draw_overlay(image, result), OVERLAY_QUALITY)[1])
 
 
 def _raise_errors(errors: list[InputError], done: int, out: Path) -> None:
