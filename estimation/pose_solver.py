@@ -128,9 +128,8 @@ def solve_pose(
     if shared is None:
         return PoseFit(pose, EFFICIENCY / scale**2 * information, residuals, weights, jacobians, scale)
     shared_information, right_side = _shared_equations(grams)
-    return PoseFit(
-        pose, information, residuals, weights, jacobians, scale, SharedFit(shared_information, right_side.ravel())
-    )
+    shared_fit = SharedFit(shared_information, right_side.ravel())
+    return PoseFit(pose, information, residuals, weights, jacobians, scale, shared_fit)
 
 
 exp_entries = compiled("UniTuple(f8, 12)(f8, f8, f8, f8, f8, f8)")(se3.exp_entries)
@@ -361,10 +360,7 @@ def _gauss_newton(
     twist: Array,
     effects: Array,
 ) -> tuple[Array, Array, Array, Array, Array, float, Array]:
-    """The loop of `solve_pose`: its pose, information, residuals, weights, Jacobians, residual scale and grams.
-
-    effects: (3C, 3C) prior covariance of the shared errors, used if `shared`.
-    """
+    """The loop of `solve_pose`, for a `PoseFit`'s parts and grams; effects: (3C, 3C) prior of the shared errors."""
     count, pose, residual_scale, total_step = len(matrices), start, 1.0, np.zeros((6, 1))
     weight, track_information, information = np.zeros(len(points)), np.zeros(len(points)), np.zeros((6, 6))
     grams, effect = np.zeros((count, TRACK_COLUMNS, TRACK_COLUMNS)), np.zeros((3, count))
@@ -372,10 +368,8 @@ def _gauss_newton(
     residual = pose_residual
     for gate_factor in scales:
         for iteration in range(iterations if gate_factor == scales[-1] else 3):
-            # robust weights; the residual scale is estimated anew in the first three iterations
-            weight, residual_scale = robust_weights(
-                residual, precision, depth, GATE * gate_factor, 0.0 if iteration < 3 else residual_scale
-            )
+            known_scale = 0.0 if iteration < 3 else residual_scale  # 0: estimated anew
+            weight, residual_scale = robust_weights(residual, precision, depth, GATE * gate_factor, known_scale)
             # normal equations (information, gradient), damped
             efficiency = EFFICIENCY / residual_scale**2 if shared else 1.0
             for i in range(len(weight)):

@@ -384,7 +384,7 @@ MUTANTS = (
     Mutant(
         "a scan of something else fits",
         "estimation/scans/registration.py",
-        "fits = not words",
+        "fits = not problems",
         "fits = True",
         ("test_placement.py::test_the_scan_of_something_else_cannot_be_used_at_all",),
     ),

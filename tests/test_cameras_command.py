@@ -56,7 +56,7 @@ def test_a_sheet_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.Capt
 
 def test_no_cameras_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     if not list_devices():
-        assert main(["cameras"]) == 0 and "plug one in" in capsys.readouterr().out
+        assert main(["cameras"]) == 0 and "connect one" in capsys.readouterr().out
         assert main(["cameras", "--json"]) == 0 and json.loads(capsys.readouterr().out) == []
 
 

@@ -256,9 +256,8 @@ class FrameTracks:
         if not left_out:
             return solve_pose(self.rig, tracks, start, scales=scales, shared=self.shared)
         kept = ~np.isin(tracks.camera, list(left_out))
-        return self._with_rest(
-            solve_pose(self.rig, tracks.select(kept), start, scales=scales, shared=self.shared), kept
-        )
+        alone = solve_pose(self.rig, tracks.select(kept), start, scales=scales, shared=self.shared)
+        return self._with_rest(alone, kept)
 
     def _with_rest(self, fit: PoseFit, fitted: Mask) -> PoseFit:
         """A fit to the tracks `fitted` (N,) with the residuals of the others, which have no weight."""
@@ -370,13 +369,10 @@ class FrameTracks:
     def _only(self, cameras: frozenset[int], start: Array) -> tuple[PoseFit, float]:
         """The fit of these cameras' tracks alone, and its noise, px, in their pictures."""
         mine = np.isin(self.observations.camera, list(cameras))
-        tracks, prior = (
-            PointTracks.from_observations(self.observations, self.points),
-            SINGLE_POSE_PRIOR if len(cameras) == 1 else None,
-        )
-        alone = solve_pose(self.rig, tracks.select(mine), start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
-        fit = self._with_rest(alone, mine)
-        return fit, picture_noise(fit, mine)
+        tracks = PointTracks.from_observations(self.observations, self.points).select(mine)
+        prior = SINGLE_POSE_PRIOR if len(cameras) == 1 else None
+        alone = solve_pose(self.rig, tracks, start, scales=(4.0, 1.0), prior=prior, shared=self.shared)
+        return (fit := self._with_rest(alone, mine)), picture_noise(fit, mine)
 
     def weak_fit_reason(self, fit: PoseFit, outliers: Collection[int], sparse: bool, expected: SurfacePose) -> str:
         """Why a fit to few tracks or to one camera is rejected, or ''.

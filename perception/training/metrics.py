@@ -127,7 +127,7 @@ class FoldEvaluation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
+class _SettingsCandidate:
     """The masks by one edge and smallest part, with no minimum confidence."""
 
     settings: Settings
@@ -145,7 +145,7 @@ def evaluate_folds(
 
     `report(done, total)` counts the settings that were tried.
     """
-    choices, candidates = list(product(EDGE_CHOICES, SMALLEST_CHOICES)), list[_Candidate]()
+    choices, candidates = list(product(EDGE_CHOICES, SMALLEST_CHOICES)), list[_SettingsCandidate]()
     for edge, smallest in choices:
         candidates.append(_candidate(predictions, Settings(looks=looks, edge=edge, smallest=smallest, trust=0.0)))
         report(len(candidates), len(choices))
@@ -177,19 +177,19 @@ def evaluate_folds(
     return replace(settings, pixel_slope=slope, pixel_offset=offset, spread=spread), evaluation
 
 
-def _candidate(predictions: HeldOutPredictions, settings: Settings) -> _Candidate:
+def _candidate(predictions: HeldOutPredictions, settings: Settings) -> _SettingsCandidate:
     dices, mean_logits = np.zeros(len(predictions.wounds)), np.full(len(predictions.wounds), np.nan)
     for number, (half, wound) in enumerate(zip(predictions.logits, predictions.wounds, strict=True)):
         logits = half.astype(np.float32)
         mask = segmentation_from_logits(logits, settings).mask
         dices[number] = dice(mask, wound)
         mean_logits[number] = logits[mask].mean() if mask.any() else np.nan
-    return _Candidate(settings, dices, mean_logits)
+    return _SettingsCandidate(settings, dices, mean_logits)
 
 
 def _choose(
-    candidates: Sequence[_Candidate], predictions: HeldOutPredictions, training: NDArray[np.bool_]
-) -> tuple[_Candidate, Settings]:
+    candidates: Sequence[_SettingsCandidate], predictions: HeldOutPredictions, training: NDArray[np.bool_]
+) -> tuple[_SettingsCandidate, Settings]:
     """By the entries in `training`: edge and smallest part by the best mean Dice of wounds, then the logistic of the
     mean logit, and the minimum confidence."""
     empty = predictions.empty
