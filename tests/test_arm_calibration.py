@@ -96,6 +96,7 @@ def test_a_moved_base_moves_the_answer_and_nothing_else() -> None:
     assert np.allclose(there.sigma, here.sigma, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_is_claimed_and_blunders_are_left_out() -> None:
     squares = []
     for seed in range(4):

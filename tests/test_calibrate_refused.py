@@ -161,6 +161,7 @@ def test_lenses_that_cannot_be_are_named(session: Path, refused: Refused, row: s
     refused(words, "--keep-lenses")
 
 
+@pytest.mark.slow
 def test_a_distance_by_tape_that_does_not_agree_is_named(session: Path, refused: Refused) -> None:
     refused("board.toml: square_mm = '54 mm, which puts a and b", "--distance-mm", "a,b,900")
     refused("--distance-mm: camera = 'd', allowed a, b, c", "--distance-mm", "a,d,900")

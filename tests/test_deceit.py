@@ -65,6 +65,7 @@ def test_a_dot_is_drawn_where_the_camera_model_says(session: Session, rise: floa
         assert np.abs(off).max() < 0.1
 
 
+@pytest.mark.slow
 def test_rows_of_a_rolling_shutter_are_seen_one_after_another(session: Session) -> None:
     speed, readout, t = 200.0, 0.03, 0.5
     rest = session.world.base_from_surface(t)

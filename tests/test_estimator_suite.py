@@ -71,6 +71,7 @@ def test_errors_are_near_the_bound_and_states_say_what_was_done(movement: str, c
     near_the_bound(movement, case)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["clean", "churn", "restart"])
 def test_at_rest_errors_are_near_the_bound_too(case: str) -> None:
     near_the_bound("still", case)
@@ -312,6 +313,7 @@ def test_pooled_figures_are_those_of_all_poses_together() -> None:
     assert 0.5 < both.error_mm / both.bound_mm < 1.5 and both.measured == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mapping", ["seen", *slowly("told")])
 def test_the_bound_of_an_estimated_frame_holds_the_error_of_the_look_that_laid_it(mapping: Mapping) -> None:
     """Over many starts, since that error is one draw for a whole run."""

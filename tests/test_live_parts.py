@@ -301,6 +301,7 @@ def test_a_sender_that_a_signal_interrupts_goes_on_where_it_was() -> None:
         assert all(np.array_equal(frame.image, image(0, number)) for number, frame in enumerate(entry.frames))
 
 
+@pytest.mark.slow
 def test_raw_pixels_are_recorded_exactly_also_those_that_came_before_the_rig(tmp_path: Path) -> None:
     ours, theirs = Pipe(duplex=False)
     kept = LiveSettings(record=tmp_path / "run.mcap", arm="virtual", trace=False, jpeg_quality=0)
@@ -321,6 +322,7 @@ def test_raw_pixels_are_recorded_exactly_also_those_that_came_before_the_rig(tmp
         assert all(np.array_equal(frame.image, image(frame.camera, number)) for frame in frames.frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("real_time", [True, False])
 def test_a_recorder_that_is_behind_goes_before_ordinary_work_until_it_is_not(tmp_path: Path, real_time: bool) -> None:
     ours, theirs = Pipe(duplex=False)

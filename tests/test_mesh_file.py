@@ -489,6 +489,7 @@ SKIN = scans.height_field(scans.body)
 SCATTERED = np.random.default_rng(2).permutation(SKIN.vertices)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
 def test_a_surface_is_laid_through_a_cloud_its_outside_up(tmp_path: Path, suffix: str) -> None:
     mesh = read_mesh(cloud_file(tmp_path / f"cloud{suffix}", SCATTERED)).scan

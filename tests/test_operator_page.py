@@ -237,6 +237,7 @@ def test_old_news_are_greyed_and_said_to_be_old_and_stop_still_stops(browser: Br
     run.close()
 
 
+@pytest.mark.slow
 def test_a_window_says_when_the_run_is_gone_and_comes_back_by_itself(run: Run) -> None:
     page = run.open()
     run.served.put(replace(run.view, stamp=99.0, stage=RunStage.DONE))

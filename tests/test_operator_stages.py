@@ -362,6 +362,7 @@ def test_the_history_keeps_the_largest_error_and_every_hold_in_a_fixed_number_of
         assert history.rows[int(np.searchsorted(stamps, stamp, "right")) - 1].held
 
 
+@pytest.mark.slow
 def test_the_log_is_kept_is_sent_to_a_new_window_and_is_filtered(run: Run) -> None:
     page = run.open()
     lines = [LogLine(k + 1, float(k), k % 10 == 0, f"line {k} of the arm") for k in range(40)]
@@ -381,6 +382,7 @@ def test_the_log_is_kept_is_sent_to_a_new_window_and_is_filtered(run: Run) -> No
     assert page.js("document.getElementById('log').hidden && document.activeElement.id") == "opener"
 
 
+@pytest.mark.slow
 def test_sound_is_told_at_hold_stop_and_end_once_each_and_stays_muted(run: Run) -> None:
     page = run.open()
     told = "document.getElementById('sound').dataset.told"

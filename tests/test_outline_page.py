@@ -128,6 +128,7 @@ def test_a_point_that_is_dragged_is_asked_for_where_it_was_let_go_and_no_other_p
     assert np.array_equal(found[NAMES[1]], wanted[NAMES[1]])
 
 
+@pytest.mark.slow
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(index=st.integers(0, 3), x=st.floats(-0.4, 0.4), y=st.floats(-0.4, 0.4))
 def test_a_point_follows_the_pointer_in_the_near_picture_too(run: Outlined, index: int, x: float, y: float) -> None:

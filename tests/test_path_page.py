@@ -162,6 +162,7 @@ def test_the_path_is_dragged_to_where_the_pointer_lets_it_go_and_may_then_be_con
     run.still()
 
 
+@pytest.mark.slow
 def test_the_handle_turns_the_path_about_its_middle(run: Moved) -> None:
     frame = tangent_of(run.placement, PATH, GROUND)
     flat = se3.transform_points(se3.inverse(frame), PATH.surface_from_nozzle[:, :3, 3])
@@ -193,6 +194,7 @@ def test_arrow_keys_move_it_a_millimetre_as_the_picture_shows_it(run: Moved, cod
     assert np.linalg.norm(run.middle - before) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_many_presses_are_few_requests_and_nothing_of_them_is_lost(run: Moved) -> None:
     run.page.click("[data-step='5']")
     for _ in range(3):
@@ -247,6 +249,7 @@ def test_a_click_is_no_drag_and_what_is_refused_is_drawn_no_longer(run: Moved) -
     run.still()
 
 
+@pytest.mark.slow
 def test_no_picture_is_dragged_at_any_other_stage(run: Moved) -> None:
     begin, goal = run.spot(np.stack([run.middle, ground_at(10.0, 5.0)]))
     run.turn, run.stamp = run.turn + 1, run.stamp + 1

@@ -93,6 +93,7 @@ def test_with_a_tool_that_is_clear_the_plan_is_the_one_without() -> None:
     assert np.array_equal(plan.path.speed, free.path.speed)
 
 
+@pytest.mark.slow
 def test_more_motion_leaves_out_more() -> None:
     lengths = [printed_length(deep_plan(*more)) for more in ((), (BASE_MARGIN + 2.0,))]
     assert lengths[0] > lengths[1] > 0
@@ -257,6 +258,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Array]:
     return said.getvalue(), read_path(folder / "p.csv").surface_from_nozzle
 
 
+@pytest.mark.slow
 def test_two_shells_one_under_the_other_are_planned_as_the_upper_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], plain: tuple[str, Array]
 ) -> None:
@@ -276,6 +278,7 @@ def test_two_shells_that_face_apart_are_refused(tmp_path: Path, capsys: pytest.C
     assert code == 2 and "seen from one side" in error
 
 
+@pytest.mark.slow
 def test_a_scan_a_quarter_turn_off_is_planned_in_its_own_frame(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], plain: tuple[str, Array]
 ) -> None:
@@ -299,6 +302,7 @@ def test_triangles_of_noise_are_one_error(count: int, tmp_path: Path, capsys: py
     assert code == 2 and error.isprintable()
 
 
+@pytest.mark.slow
 def test_skin_that_is_nothing_but_rough_has_no_wound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vertices, triangles = scan_of()
     rough = np.column_stack([vertices[:, :2], np.random.default_rng(0).normal(0, 3, len(vertices))])
@@ -306,6 +310,7 @@ def test_skin_that_is_nothing_but_rough_has_no_wound(tmp_path: Path, capsys: pyt
     assert code == 2 and error.isprintable()
 
 
+@pytest.mark.slow
 def test_a_syringe_over_the_examples_is_clear() -> None:
     """The default tool needs no turn over an ordinary wound: else every plan with an arm would change."""
     plan = make_plan(wound_of("chest"), order(tool_body(SYRINGE)))

@@ -254,6 +254,7 @@ def test_a_wound_is_found_on_its_scan_to_a_tenth_of_a_millimetre() -> None:
     assert off.mean() < 0.1 and off.max() < 0.15
 
 
+@pytest.mark.slow
 def test_its_claimed_covariance_is_of_the_errors_size() -> None:
     found = place("wound")
     error = se3.log(se3.inverse(found.base_from_surface) @ POSE @ se3.inverse(SCAN_FROM_SURFACE))

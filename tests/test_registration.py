@@ -55,6 +55,7 @@ def test_noise_costs_accuracy_as_the_covariance_says(seed: int) -> None:
     assert np.linalg.det(coarse.covariance) > np.linalg.det(fine.covariance)
 
 
+@pytest.mark.slow
 def test_errors_and_covariance_agree() -> None:
     squared = []
     for seed in range(5):

@@ -156,6 +156,7 @@ def test_the_session_tracks_to_the_very_poses_of_the_run(recorded: Path, tmp_pat
     assert same_columns(tmp_path / "out" / "poses.csv", recorded / "one" / "tracking" / "poses.csv")
 
 
+@pytest.mark.slow
 def test_what_the_tool_of_an_arm_file_covers_is_not_tracked(recorded: Path, tmp_path: Path) -> None:
     (tmp_path / "arm.toml").write_text("tool_mm = [[0, 90], [30, 90]]\n")
     session, arm = str(recorded / "one" / "session"), str(tmp_path / "arm.toml")

@@ -112,6 +112,7 @@ def test_a_carved_wound_is_found_and_its_skin_restored_better_than_by_a_thin_pla
     assert score.skin < 0.8 * wound.plate and np.rad2deg(score.tilt) < 3 and 0.85 < score.volume < 1.1
 
 
+@pytest.mark.slow
 def test_three_clicks_are_as_good_as_an_outline() -> None:
     wound = thigh(0)
     scan, _ = repair_mesh(wound.vertices, wound.triangles, "scan")
@@ -202,6 +203,7 @@ def test_where_the_scan_lies_does_not_matter() -> None:
     assert areas[0] == pytest.approx(areas[1], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [0.6, 2.0])
 def test_a_second_shell_under_the_first_changes_nothing(apart: float) -> None:
     vertices, triangles = two_pits((3.0, 0.0))

@@ -257,6 +257,7 @@ def rhythms_of(times: np.ndarray, positions: np.ndarray) -> tuple[Rhythm, Rhythm
     return breathing, pulse_rhythm(times, positions, breathing)
 
 
+@pytest.mark.slow
 def test_a_pulse_is_found_where_there_is_one_within_its_claim_and_none_where_there_is_none() -> None:
     found = []
     for seed in range(8):

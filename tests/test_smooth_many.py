@@ -88,6 +88,7 @@ def table(out: Path) -> dict[str, dict[str, str]]:
         return {Path(row["session"]).name: row for row in csv.DictReader(stream)}
 
 
+@pytest.mark.slow
 def test_failures_are_listed(sessions: Path, address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["smooth", str(sessions), "-o", str(tmp_path), "--scheduler", address]
     assert main(words) == 1

@@ -138,6 +138,7 @@ def test_the_report_counts_what_carries_the_pose(sets: list[FrameSet]) -> None:
         assert len(seen.pixels) == len(seen.sigma) == len(seen.track) == len(seen) and (seen.sigma > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, *slowly(1, 2)])
 def test_a_camera_that_misses_frames_costs_little(sets: list[FrameSet], lost: int) -> None:
     holes = [change(s, lambda c, i: None if c == lost else i) if k % 3 == 2 else s for k, s in enumerate(sets[:12])]
@@ -212,6 +213,7 @@ def struck() -> list[FrameSet]:
     return shot(jolted, np.arange(16) / 10)
 
 
+@pytest.mark.slow
 def test_a_jolt_that_no_motion_model_expects_is_followed(struck: list[FrameSet]) -> None:
     """At rest alignment begins where the model says; 5 mm and 2 degrees between two sets are beyond its reach."""
     poses = run(struck)

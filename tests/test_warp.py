@@ -138,6 +138,7 @@ def test_a_rigid_motion_gives_no_warp_at_all(motion: Motion) -> None:
     assert all(pose.state is TrackState.TRACKING for pose in rigid.poses[FIRST:])
 
 
+@pytest.mark.slow
 def test_a_warp_keeps_the_checkpoints_on_the_tissue(bulging: Follow) -> None:
     with_warp, without = (np.percentile(errors, 95) for errors in (bulging.errors, bulging.rigid))
     assert without > 0.4

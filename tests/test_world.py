@@ -111,6 +111,7 @@ def test_a_hidden_clock_offset_costs_the_speed_of_the_surface_alone(offset: floa
     assert np.linalg.norm(off - wanted, axis=1).max() < 0.01 * np.linalg.norm(wanted) + early
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planted", ["rig_offset_mm", "arm_offset_mm"])
 @pytest.mark.parametrize("motion", [[STEADY], *slowly([])], ids=["moving", "still"])
 def test_a_planted_offset_comes_out_as_that_offset(planted: str, motion: list[object], tmp_path: Path) -> None:

@@ -177,6 +177,7 @@ def test_the_area_of_the_same_pictures_goes_with_the_square_of_the_rigs_scale() 
         assert getattr(after, name) == pytest.approx(1.44 * getattr(before, name), rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_moved_as_a_whole_with_what_it_sees_measures_the_same_area() -> None:
     taken = rendered(14)
     somewhere = se3.make(se3.exp_rotation([0.4, -1.1, 2.0]), [300.0, -120.0, 45.0])
@@ -232,6 +233,7 @@ def at_the_border(bands: dict[int, WoundBand], camera: int) -> dict[int, WoundBa
     return {**bands, camera: exact(cut)}
 
 
+@pytest.mark.slow
 def test_what_cannot_be_measured_is_said_and_no_number_is_given() -> None:
     taken = rendered(14)
     images, bands = dict(enumerate(taken.images)), true_bands(taken)
