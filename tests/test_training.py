@@ -167,7 +167,7 @@ def test_the_command_trains_parts_by_themselves_and_puts_them_together(
         out.unlink()
         assert main([*words, "--add", str(run)]) == 2  # the checkpoints that lie there are of fewer pictures
         told = capsys.readouterr().err
-        assert "own_0.ckpt" in told and "of other pictures or options" in told and "--force" in told
+        assert "own_0.ckpt" in told and "of other pictures or options" in told and "delete it" in told
         assert main([*words, "--licence", "mine"]) == 0
     assert (tmp_path / "own_1.ckpt").read_bytes() == made
     assert WoundNetwork(out).terms.licence == "mine"
