@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import fftconvolve
 
@@ -22,7 +22,7 @@ from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
 from hardware.simulator.deposit import convolved, deposit_figures, deposit_map, planned_line, row_volumes
 from hardware.simulator.dispenser import DispenserModel, DispenserPort
-from hardware.simulator.material import IDEAL, SimulatedDispensers
+from hardware.simulator.material import BEAD_STEP, IDEAL, SimulatedDispensers, piece_ends
 from hardware.simulator.nozzle_error import MaterialFigures, material_figures, nozzle_errors
 from hardware.simulator.scenario import read_scenario
 from hardware.simulator.truth import divide_path
@@ -88,6 +88,17 @@ def test_what_is_laid_is_the_integral_of_the_true_flow() -> None:
     times = np.arange(0.0005, sink.log.stamps[-1], 1e-3)
     flown = float(world.dispensers.flow(times, np.zeros(len(times))).sum()) * 1e-3
     assert figures(**LATE, **OOZING).volume == pytest.approx(flown, rel=2e-3) and flown > 10.0
+
+
+@given(st.lists(st.integers(1, 4000), min_size=1, max_size=30).map(sorted))
+@example([1795])  # whose last instant numpy puts a rounding error beyond
+def test_pieces_of_beads_end_in_equal_steps_and_never_in_the_future(counts: list[int]) -> None:
+    start = 0.0
+    for until in (count * BEAD_STEP for count in counts):
+        ends = piece_ends(start, until)
+        assert (ends < until).all() and np.allclose(np.diff([start, *ends]), BEAD_STEP)
+        start = float(ends[-1]) if len(ends) else start
+        assert until - start <= 1.001 * BEAD_STEP  # nothing that has left the needle waits longer
 
 
 @given(st.lists(st.floats(0, 9), min_size=5, max_size=5))

@@ -262,6 +262,12 @@ BEAD_STEP = 0.01  # s between the ends of the pieces in which a bead is drawn
 AREA_PIECES, MIN_LENGTH = 7, 0.05  # pieces with one cross-section; mm, least length of it: at rest, a puddle
 
 
+def piece_ends(start: float, until: float) -> Array:
+    """Instants (N,), s, at which pieces of beads end, after `start` and before `until`."""
+    ends = np.arange(start + BEAD_STEP, until, BEAD_STEP)
+    return ends[ends < until]  # numpy's own last one may be a rounding error beyond
+
+
 class BeadDrawing:
     """Draws what leaves the needle into a scene: as ink of the planned width, or as gel of the true volume."""
 
@@ -282,7 +288,7 @@ class BeadDrawing:
 
     def draw(self, scene: Scene, until: float) -> None:
         """Draw what has left the needle up to `until`, s."""
-        ends = np.arange(self._until + BEAD_STEP, until, BEAD_STEP)
+        ends = piece_ends(self._until, until)
         if not len(ends):
             return
         self._until = float(ends[-1])

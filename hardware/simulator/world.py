@@ -319,9 +319,10 @@ class SimulatedWorld:
 
     def _print_beads(self, until: float) -> None:
         if self._scene is not None and self.scenario.beads:
-            self._device.advance(self._time.now())
+            now = max(self._time.now(), until)  # an event's time is ahead of the loop's, which writes nothing before it
+            self._device.advance(now)
             if self.scenario.gel is not None:
-                self.dispensers.advance(self._time.now())
+                self.dispensers.advance(now)
             self._beads.draw(self._scene, until)
 
     # -- inputs and outputs of the motion
