@@ -91,6 +91,7 @@ INSTEAD = {  # (what is run in its place, why)
     "stillbed bench calibration": ("stillbed bench calibration --instants 12 --runs 1", LONG),
     "python -m tests.campaigns cameras": ("python -m tests.campaigns cameras --minutes 0.05", LONG),
     "python -m tests.campaigns estimator": (STILL, LONG),
+    "python -m tests.campaigns estimator --maps seen --only 'breathing, [cno]*' --seeds 6 --seconds 4": (STILL, LONG),
     "python -m tests.campaigns estimator --maps told seen --seeds 8 --seconds 10": (STILL, LONG),
     "python -m tests.campaigns estimator --only 'breathing, [cno]*' --maps seen --seeds 2 --seconds 6": (
         "python -m tests.campaigns estimator --only 'breathing, [c]*' --maps seen --seeds 1 --seconds 0.5",
