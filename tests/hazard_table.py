@@ -12,7 +12,7 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -107,6 +107,12 @@ def _is_test(file: str, function: str, root: Path) -> bool:
     return marks is not None and not marks & {"pytest.mark.skip", "pytest.mark.xfail"}
 
 
+def only_slow(names: Sequence[str], root: Path = ROOT) -> list[str]:
+    """The names, where none of their tests runs in `make test`: all are marked as slow."""
+    marks = [_functions(root / file).get(function, set()) for file, function in (name.split("::") for name in names)]
+    return list(names) if all("pytest.mark.slow" in each for each in marks) else []
+
+
 @cache
 def _functions(path: Path) -> dict[str, set[str]]:
     """The functions of a file, and what each is marked with."""
@@ -126,7 +132,10 @@ def main(arguments: list[str]) -> int:
     """Write the page; with --run, once its tests have passed. With --check, say which of them failed last."""
     names = [name for each in hazards() for name in each.tests]
     if "--check" in arguments:
-        broken = [f"{each.id}: {name}" for each in hazards() for name in (*missing(each.tests), *failed(each.tests))]
+        without = [
+            (each.id, [*missing(each.tests), *failed(each.tests)] or only_slow(each.tests)) for each in hazards()
+        ]
+        broken = [f"{hazard}: {name}" for hazard, names in without for name in names]
         print("\n".join(["hazards without a passing test:", *broken]) if broken else "every hazard has its tests")
         return int(bool(broken))
     if "--run" in arguments:

@@ -86,6 +86,16 @@ def test_with_force_nothing_of_an_earlier_run_stays_but_what_is_read(tmp_path: P
     assert (out / "second.png").exists()
 
 
+def test_pictures_that_a_table_of_somebody_else_names_stay(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for file in (tmp_path / "first.png", out / "own.png"):
+        cv2.imwrite(str(file), picture((30, 40), 15, (120, 160))[0])
+    (out / WOUND_TABLE).write_text("name,patient\nown,7\n")
+    run_segment([tmp_path / "first.png"], out, SEGMENTER, SegmentOptions(force=True))
+    assert (out / "own.png").exists() and [row["name"] for row in rows(out)] == ["first"]
+
+
 def test_a_video_gives_a_mask_a_frame(tmp_path: Path) -> None:
     write_video(tmp_path / "ward.avi", 5)
     run_segment([tmp_path / "ward.avi"], tmp_path / "masks", SEGMENTER, SegmentOptions())

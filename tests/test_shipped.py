@@ -17,7 +17,7 @@ from perception import named_path, shipped_file
 from tests import dependency_table
 from tests.audit import NOBODY, NONE, SOME, main, told
 from tests.campaigns.__main__ import CAMPAIGNS
-from tests.hazard_table import DOCUMENT, document, failed, hazards, missing
+from tests.hazard_table import DOCUMENT, document, failed, hazards, missing, only_slow
 
 ROOT = Path(__file__).parents[1]
 
@@ -115,7 +115,7 @@ def test_every_hazard_has_a_control_and_tests_that_are_there() -> None:
     assert len({each.id for each in found}) == len(found)
     for each in found:
         assert all((each.hazard, each.cause, each.control, each.tests)), each.id
-        assert not missing(each.tests), each.id
+        assert not missing(each.tests) and not only_slow(each.tests), each.id
 
 
 def test_every_figure_is_measured_by_a_bench_or_a_campaign() -> None:
@@ -136,6 +136,11 @@ def test_a_test_that_is_not_there_or_skipped_or_failed_is_found(tmp_path: Path) 
     (tmp_path / "tests" / "test_x.py").write_text(f"import pytest\n\n\ndef test_one() -> None: ...\n\n\n{skipped}")
     names = [f"tests/test_x.py::test_{name}" for name in ("one", "two", "no")]
     assert missing([*names, "tests/y.py::test_one"], tmp_path) == [*names[1:], "tests/y.py::test_one"]
+    slow = "import pytest\n\n\n@pytest.mark.slow\ndef test_one() -> None: ...\n\n\ndef test_two() -> None: ...\n"
+    (tmp_path / "tests" / "test_y.py").write_text(slow)
+    assert only_slow(["tests/test_y.py::test_one"], tmp_path) and not only_slow(
+        [f"tests/test_y.py::test_{name}" for name in ("one", "two")], tmp_path
+    )
     (tmp_path / "lastfailed").write_text(json.dumps({"tests/test_x.py::test_one[3]": True}))
     assert failed(names, tmp_path / "lastfailed") == names[:1]
     assert not failed(names, tmp_path / "none")

@@ -317,15 +317,18 @@ def _overlay_file(out: Path, name: str) -> Path:
 
 
 def _remove_earlier(out: Path, inputs: Sequence[Path]) -> None:
-    """Remove an earlier run's masks and overlays, as its table names them; what is an input stays."""
-    if not (out / WOUND_TABLE).exists():
+    """Remove an earlier run's masks and overlays, as its table names them; inputs stay.
+
+    A table of other columns is not this command's: what it names may be somebody's own pictures.
+    """
+    rows = [row for _, row in read_csv(out / WOUND_TABLE)] if (out / WOUND_TABLE).exists() else []
+    if not rows or tuple(rows[0]) != WOUND_COLUMNS:
         return
     read = {file.resolve() for file in inputs}
-    for _, row in read_csv(out / WOUND_TABLE)[1:]:
-        if row and Path(row[0]).name == row[0]:
-            for file in (_mask_file(out, row[0]), _overlay_file(out, row[0])):
-                if file.resolve() not in read:
-                    file.unlink(missing_ok=True)
+    names = [row[0] for row in rows[1:] if row and Path(row[0]).name == row[0]]
+    for file in (path for name in names for path in (_mask_file(out, name), _overlay_file(out, name))):
+        if file.resolve() not in read:
+            file.unlink(missing_ok=True)
 
 
 def _write(out: Path, name: str, image: Image, result: Segmentation, options: SegmentOptions) -> None:
