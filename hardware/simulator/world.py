@@ -319,10 +319,9 @@ class SimulatedWorld:
 
     def _print_beads(self, until: float) -> None:
         if self._scene is not None and self.scenario.beads:
-            now = max(self._time.now(), until)  # an event's time is ahead of the loop's, which writes nothing before it
-            self._device.advance(now)
+            self._device.advance(self._time.now())
             if self.scenario.gel is not None:
-                self.dispensers.advance(now)
+                self.dispensers.advance(self._time.now())
             self._beads.draw(self._scene, until)
 
     # -- inputs and outputs of the motion
