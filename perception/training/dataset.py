@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import cos, exp, sin
 from pathlib import Path
 
 import cv2
@@ -202,7 +203,7 @@ def is_skin(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
 LONGEST_SIDE_PX = 640  # of the pictures that samples are drawn from
 MAX_HALVINGS = 2  # of a picture before it is warped: one warp that shrinks by more would alias
 COVER_CELLS = 16  # columns and rows of the grid in which an occlusion's place is drawn
-GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601
 BLUR_PX = (9, 9)  # window of the blur
 
 Planes = NDArray[np.float32]  # (side, side, 4) in 0..1: RGB and the wound
@@ -219,7 +220,7 @@ class Augmentation:
     shares: tuple[float, float] = (0.2, 0.85)  # of the window that a wound takes in the second pass
     scales: tuple[float, float] = (0.3, 3.0)  # px of a sample per px of the picture
     stretch: float = 0.1  # standard deviation of the logarithm of height over width
-    cover: float = 0.4  # share of samples with an occlusion
+    cover: float = 0.5  # share of samples with an occlusion
 
 
 class Samples:
@@ -309,33 +310,33 @@ def _cover_place(wound: NDArray[np.float32], rng: np.random.Generator) -> NDArra
 
 def _cover_shape(side: int, place: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
     """(side, side) opacity in 0..1: a bar, a half plane, or a lobed blob."""
-    at = (np.arange(side) + 0.5) / side
-    right, down = at - place[0], (at - place[1])[:, None]
+    at = (np.arange(side, dtype=np.float32) + 0.5) / side
+    right, down = at - place.astype(np.float32)[0], (at - place.astype(np.float32)[1])[:, None]
     angle, kind = rng.uniform(0, 2 * np.pi), rng.random()
-    along, across = np.cos(angle) * right + np.sin(angle) * down, np.cos(angle) * down - np.sin(angle) * right
-    if kind < 0.5:
-        lengths, widths = ((0.15, 0.8), (0.015, 0.1)) if kind < 0.25 else ((0.05, 0.5), (0.15, 1.0))
+    along, across = cos(angle) * right + sin(angle) * down, cos(angle) * down - sin(angle) * right
+    if kind < 0.65:
+        lengths, widths = ((0.15, 0.8), (0.015, 0.1)) if kind < 0.2 else ((0.05, 0.5), (0.15, 1.0))
         length, width = rng.uniform(*lengths), rng.uniform(*widths)
         distance = np.maximum(np.abs(along - length) - length, np.abs(across) - width)
     else:
-        direction = np.arctan2(across, along * np.exp(rng.normal(0, 0.4)))
+        direction = np.arctan2(across, along * exp(rng.normal(0, 0.4)))
         radius = np.full_like(direction, rng.uniform(0.06, 0.3))
         for lobes in range(2, 6):
             radius *= 1 + rng.normal(0, 0.25 / lobes**0.5) * np.cos(lobes * direction + rng.uniform(0, 2 * np.pi))
-        distance = np.hypot(across, along) - radius
-    return np.asarray(expit(-distance * side / rng.uniform(0.3, 1.0)), np.float32)
+        distance = cv2.magnitude(across, along) - radius
+    return expit(-distance * (side / rng.uniform(0.3, 1.0)))
 
 
 def _cover_material(side: int, rng: np.random.Generator) -> Planes:
     """Gloves, drapes, gauze, tools: one colour with a gradient and grain, a third of them woven; no wound."""
-    at = np.linspace(-1, 1, side)
+    at = np.linspace(-1, 1, side, dtype=np.float32)
     down = at[:, None]
-    colour = rng.uniform(0, 1, 1 if rng.random() < 0.5 else 3)
+    colour = rng.uniform(0, 1, 1 if rng.random() < 0.5 else 3).astype(np.float32)
     shade = rng.normal(0, 0.1) * at + rng.normal(0, 0.1) * down
-    shade = shade + rng.uniform(0, 0.03) * rng.standard_normal((side, side))
+    shade = shade + rng.uniform(0, 0.03) * rng.standard_normal((side, side), np.float32)
     if rng.random() < 0.33:
         angle, threads = rng.uniform(0, np.pi), rng.uniform(15, 120)  # radians from the middle to the edge
-        u, v = threads * np.cos(angle), threads * np.sin(angle)
+        u, v = threads * cos(angle), threads * sin(angle)
         shade = shade + rng.uniform(0.03, 0.3) * np.sin(u * at + v * down) * np.sin(u * down - v * at)
     planes = np.zeros((side, side, 4), np.float32)
     planes[..., :3] = np.clip(colour + shade[..., None], 0, 1)
@@ -344,17 +345,18 @@ def _cover_material(side: int, rng: np.random.Generator) -> Planes:
 
 def _change_light(picture: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """The picture (side, side, 3) with other gamma, white balance, saturation, hue, light gradient, blur and noise."""
-    balance = np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.08, 3)).astype(np.float32)
-    out = cv2.pow(np.maximum(picture, np.float32(1e-4)), float(np.exp(rng.normal(0, 0.25)))) * balance
+    balance, gamma = np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.08, 3)), exp(rng.normal(0, 0.25))
     saturation = 0.0 if rng.random() < 0.04 else rng.uniform(0.5, 1.4)
     hue = rng.normal(0, 0.15) if rng.random() < 0.3 else 0.0  # rad about the grey axis
-    mix = saturation * Rotation.from_rotvec(np.full(3, hue / 3**0.5)).as_matrix().astype(np.float32)
-    grey = (out @ GREY)[..., None]
-    out = grey + (out - grey) @ mix.T
+    mix = saturation * Rotation.from_rotvec(np.full(3, hue / 3**0.5)).as_matrix()
+    grey = np.tile(GREY, (3, 1))
+    out = cv2.transform(
+        cv2.pow(np.maximum(picture, np.float32(1e-4)), gamma), (grey + mix @ (np.eye(3) - grey)) * balance
+    )
     if rng.random() < 0.33:
-        at = np.linspace(-1, 1, len(out))
+        at = np.linspace(-1, 1, len(out), dtype=np.float32)
         light = 1 + rng.normal(0, 0.25) * at + rng.normal(0, 0.25) * at[:, None]
-        out = out * np.clip(light, 0.2, 2)[..., None].astype(np.float32)
+        out = out * np.clip(light, 0.2, 2)[..., None]
     if rng.random() < 0.25:
         out = cv2.GaussianBlur(out, BLUR_PX, rng.uniform(0.4, 1.8), borderType=cv2.BORDER_REPLICATE)
     if rng.random() < 0.3:

@@ -53,7 +53,7 @@ def thesis_loss(logits: Tensor, wound: Tensor) -> Tensor:
 class Schedule:
     """How long and how fast; on a processor one network takes many hours."""
 
-    rounds: int = 22
+    rounds: int = 26
     steps: int = 200  # a round
     batch: int = 32
     rate: float = 1e-3  # the highest, after the warm-up; falls to nothing as half a cosine
@@ -216,7 +216,8 @@ def _step(
     wounds: Tensor,
 ) -> Tensor:
     """One step down the loss of one batch; the loss before it."""
-    with torch.autocast(pictures.device.type, torch.bfloat16):  # half the time, the same result but noise
+    on_gpu = pictures.device.type == "cuda"  # there, half the time; 13 times as long on a processor without bfloat16
+    with torch.autocast(pictures.device.type, torch.bfloat16, enabled=on_gpu):
         logits = network(pictures.contiguous(memory_format=torch.channels_last))
     loss = loss_function(logits.float(), wounds)
     optimiser.zero_grad(set_to_none=True)
