@@ -1,8 +1,8 @@
 """docs/hazards.md from data/hazards.toml, the pinned versions, and the tests that prove each control.
 
 python -m tests.hazard_table            writes docs/hazards.md
-python -m tests.hazard_table --run      runs all the tests that it names first; nothing is written where one fails
-python -m tests.hazard_table --check    tells those that failed when they last ran here; exit code 1 where one did
+python -m tests.hazard_table --run      runs all named tests first; writes nothing if one fails
+python -m tests.hazard_table --check    prints the tests that failed in their last run here; exit code 1 if any did
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ LAST_FAILED = ROOT / ".pytest_cache" / "v" / "cache" / "lastfailed"
 KEYS = {"id", "hazard", "cause", "control", "tests", "figure", "command"}
 OPENING = """# Hazards
 
-A stop by software is no safety function, nor is anything else on this page: it runs on an ordinary computer that may
-hang, and nobody has assessed it. An arm near a patient needs an emergency stop in hardware that takes its power away,
-within reach of somebody who watches. This is research software, not a medical device.
+A stop by software is not a safety function, and neither is any other control on this page: the software runs on an
+ordinary computer that may hang, and nobody has assessed it. An arm near a patient needs an emergency stop in hardware that
+disconnects its power, within reach of a person who watches. This is research software, not a medical device.
 
-What can fool the tracker, how often it does, and what no three cameras can tell: [deceptions.md](deceptions.md).
+[deceptions.md](deceptions.md) shows what can mislead the tracker, how often it does, and what three cameras cannot detect.
 
-Made from `data/hazards.toml` by `make hazards`, which runs the tests named here. `make check` fails where one of them
-is not there, may be skipped, or failed when it last ran on the machine, or where this page is not what that file says.
+`make hazards` runs the tests named here and writes this page from `data/hazards.toml`. `make check` fails if one of the
+tests does not exist, may be skipped, or failed in its last run on the machine, or if this page differs from that file.
 
 | | hazard | cause | control | proved by | figure |
 |---|---|---|---|---|---|
@@ -38,11 +38,11 @@ is not there, may be skipped, or failed when it last ran on the machine, or wher
 PARTS = """
 ## Parts by others
 
-What stillbed loads when it runs, in the versions that were tested together (`constraints.txt`):
+The libraries that stillbed loads at run time, in the versions that were tested together (`constraints.txt`):
 
 {parts}.
 
-| part | what is known of it | why it does no harm here |
+| part | known fault | why it does no harm here |
 |---|---|---|
 """
 
