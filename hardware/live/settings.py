@@ -28,7 +28,7 @@ from hardware.process import checks
 
 FROM_CAMERAS = "from the cameras"  # instead of a scan's file: they scan, and it is planned, before the run
 VIRTUAL_ARM = "virtual"  # the arm that needs no device
-MAX_LIFT_MM = 100.0  # mm of a dry run: above, the arm leaves the room that was looked at
+MAX_LIFT_MM = 100.0  # mm of a dry run: above this the arm may leave the checked space
 MAX_PATIENCE = 600.0  # s of patience
 MAX_CORES = 1024
 MAX_PORT = 65535
@@ -45,64 +45,87 @@ class LiveSettings:
     """All settings of a run, in the order of the file."""
 
     rig: Path | None = _key(
-        "cameras.rig", '"rig.toml"', "session folder, recording or rig.toml: which cameras, where they stand"
+        "cameras.rig", '"rig.toml"', "rig.toml, session folder or recording with the calibrated cameras"
     )
     simulated: Path | None = _key(
-        "cameras.simulated", '"x.toml"', "a scenario instead, rendered once and then shown in real time"
+        "cameras.simulated", '"x.toml"', "instead of cameras: scenario, rendered once, then played in real time"
     )
-    patience: float = _key(  # s: somebody finds a loose cable in that
-        "cameras.patience_s", "10.0", "without pictures, after which the arm is stopped; 1 to 600", 10.0
+    patience: float = _key(  # s: enough to find a loose cable
+        "cameras.patience_s", "10.0", "s without pictures until the arm is stopped; 1 to 600", 10.0
     )
     model: Path | None = _key(
         "cameras.model",
         '"x.onnx"',
-        "network that finds the wound: your own; left out: the one that comes along",
+        "your own network that finds the wound; default: the one of stillbed",
     )
-    path: Path | None = _key("print.path", '"path.csv"', "checkpoints on the surface; a scenario has its own")
+    path: Path | None = _key(
+        "print.path", '"path.csv"', "path to print, with its checkpoints; not for a scenario, which has one"
+    )
     scan: Path | None = _key(
         "print.scan",
         '"scan.ply"',
-        f'scan of the surface, mm, in the path\'s frame, or "{FROM_CAMERAS}"; without one you move the path into place',
+        f'scan of the surface, mm, in the path\'s frame, or "{FROM_CAMERAS}"; without it you place the path by hand',
     )
     look: str = _key(
-        "print.look", '"layer"', 'when the needle steps aside and what was laid is looked at: "layer", or "4" beads', ""
+        "print.look",
+        '"layer"',
+        'when the needle moves aside to measure the print: after each "layer", or after each "4" beads',
+        "",
     )
-    adapt: bool = _key("print.adapt", "true", "each layer takes its flow from what a look found under it", False)
-    dry_run: bool = _key("print.dry_run", "false", "nothing is extruded, and the nozzle stays above", False)
-    lift: float = _key(  # mm: above a wound's rim, below what a hand would be put under
-        "print.lift_mm", "10.0", "how far above, in a dry run; 0 to 100", 10.0
+    adapt: bool = _key(
+        "print.adapt", "true", "adapt the flow of each layer to the measured layer below; needs look", False
     )
-    unattended: bool = _key("print.unattended", "false", "nobody confirms; a scan must be found for certain", False)
-    arm: str = _key("arm.device", '"/dev/ttyUSB0"', 'path of a port, URL of pyserial\'s, or "virtual"', "")
-    profile: Path | None = _key("arm.profile", '"arm.toml"', "arm file: place, limits, dialect, lag, tool")
-    stands_home: bool = _key("arm.stands_home", "false", "an arm that does not answer stands at its home now", False)
-    pause_frame: bool = _key("arm.pause_frame", "true", "its controller knows the frame that stops it at once", True)
-    real_time: bool = _key("arm.real_time", "true", "ask the system for real-time priority", True)
+    dry_run: bool = _key(
+        "print.dry_run", "false", "true: nothing is extruded, and the nozzle stays above the surface", False
+    )
+    lift: float = _key(  # mm: above the rim of a wound, too low for a hand below it
+        "print.lift_mm", "10.0", "mm above the surface in a dry run; 0 to 100", 10.0
+    )
+    unattended: bool = _key(
+        "print.unattended",
+        "false",
+        "true: no confirmation by an operator; the scan must be found with certainty",
+        False,
+    )
+    arm: str = _key("arm.device", '"/dev/ttyUSB0"', 'serial port, URL of pyserial, or "virtual": a simulated arm', "")
+    profile: Path | None = _key("arm.profile", '"arm.toml"', "arm file: its place, limits, protocol, lag and tool")
+    stands_home: bool = _key(
+        "arm.stands_home",
+        "false",
+        "true: the arm is at its home position now; for an arm that reports no position",
+        False,
+    )
+    pause_frame: bool = _key(
+        "arm.pause_frame", "true", "true: the controller supports the pause frame, which stops the arm at once", True
+    )
+    real_time: bool = _key("arm.real_time", "true", "request real-time priority from the operating system", True)
     dispensers: Path | None = _key(
-        "material.dispensers", '"dispenser.toml"', "what lets material out; left out: nothing is extruded"
+        "material.dispensers", '"dispenser.toml"', "dispenser file; default: nothing is extruded"
     )
-    record: Path | None = _key("record.file", '"run.mcap"', "the recording; what else a run leaves stands beside it")
+    record: Path | None = _key(
+        "record.file", '"run.mcap"', "recording; the other files of the run are written beside it"
+    )
     jpeg_quality: int = _key(  # three cameras' exact pictures take three cores to encode
-        "record.jpeg_quality", "90", "of pictures that come unencoded, 1 to 100; 0: exact", 90
+        "record.jpeg_quality", "90", "for pictures that are not compressed by the camera, 1 to 100; 0: lossless", 90
     )
-    trace: bool = _key("record.trace", "true", "where the time of each frame set went: stillbed trace", True)
-    operator: str = _key("record.operator", '"A. Name"', "who runs it, as recording and reports keep it", "")
-    foxglove_port: int = _key(
-        "record.foxglove_port", "8765", "port on which Foxglove sees the run on this machine; 0: none", 0
-    )
+    trace: bool = _key("record.trace", "true", "record the times of each frame set, for stillbed trace", True)
+    operator: str = _key("record.operator", '"A. Name"', "name of the operator, for recording and reports", "")
+    foxglove_port: int = _key("record.foxglove_port", "8765", "port for Foxglove on this machine; 0: none", 0)
     page: bool = _key("page.serve", "true", "the operator's page in the browser", True)
     page_address: str = _key(
-        "page.address", '"0.0.0.0"', "where it is served; other machines are let in by TLS alone", LOOPBACK
+        "page.address", '"0.0.0.0"', "address of the page; access from other machines needs TLS", LOOPBACK
     )
-    page_port: int = _key("page.port", "8443", "0: any that is free", 0)
+    page_port: int = _key("page.port", "8443", "port of the page; 0: any free one", 0)
     page_certificate: Path | None = _key(
-        "page.certificate", '"page.pem"', "PEM file, with all between it and an authority"
+        "page.certificate", '"page.pem"', "certificate for TLS: PEM file with the whole chain"
     )
-    page_key: Path | None = _key("page.key", '"page.key"', "its PEM file, without a password")
-    page_names: tuple[str, ...] = _key("page.names", '["printer.local"]', "by which browsers call this machine", ())
-    cores_tracking: tuple[int, ...] = _key("cores.tracking", "[0]", "processor cores to run on; left out: all", ())
-    cores_motion: tuple[int, ...] = _key("cores.motion", "[1]", default=())
-    cores_recorder: tuple[int, ...] = _key("cores.recorder", "[0]", default=())
+    page_key: Path | None = _key(
+        "page.key", '"page.key"', "private key of the certificate: PEM file without a password"
+    )
+    page_names: tuple[str, ...] = _key("page.names", '["printer.local"]', "host names of this machine in browsers", ())
+    cores_tracking: tuple[int, ...] = _key("cores.tracking", "[0]", "processor cores of tracking; default: all", ())
+    cores_motion: tuple[int, ...] = _key("cores.motion", "[1]", "of the motion process", ())
+    cores_recorder: tuple[int, ...] = _key("cores.recorder", "[0]", "of the recorder", ())
     region: RegionSettings = ANY_REGION  # a table of its own, whose keys are cameras
 
 
