@@ -97,16 +97,58 @@ def test_kalibr_is_in_metres(tmp_path: Path) -> None:
     assert "-0.3" in (tmp_path / "chain.yaml").read_text()
 
 
+KALIBR_CAMERA = (
+    "cam{n}: {{camera_model: pinhole, distortion_model: radtan, intrinsics: [900, 901, 640, 360], rostopic: {topic},"
+    " distortion_coeffs: [{k1}, 0, 0, 0], resolution: [1280, 720],"
+    " T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("topics", "names"),
+    [
+        (["/left/image", "/right/image"], ["left", "right"]),
+        (["/camera/infra1/image", "/camera/infra2/image"], ["cam0", "cam1"]),
+        (["/left/image", "''"], ["cam0", "cam1"]),
+    ],
+)
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_kalibrs_cameras_have_the_names_of_their_topics_where_these_differ(
+    topics: list[str], names: list[str], order: tuple[int, int], tmp_path: Path
+) -> None:
+    path = tmp_path / "chain.yaml"
+    path.write_text("".join(KALIBR_CAMERA.format(n=n, topic=topics[n], k1=(n + 1) / 10) for n in order))
+    back = FORMATS["kalibr"].read(path).cameras
+    assert [(camera.name, camera.distortion[0]) for camera in back] == list(zip(names, [0.1, 0.2], strict=True))
+
+
+@pytest.mark.parametrize("name", ["opencv", "anipose"])
+def test_a_fisheye_is_refused_as_its_lens_has_another_formula(name: str, tmp_path: Path) -> None:
+    FORMATS[name].write(tmp_path / "rig", one())
+    file = tmp_path / "rig" / "left.yaml" if name == "opencv" else tmp_path / "rig"
+    text = file.read_text()
+    for mark, fisheye in (("1", True), ("0", False)):
+        anipose = text.replace("matrix", f"fisheye = {str(fisheye).lower()}\nmatrix", 1)
+        file.write_text(anipose if name == "anipose" else f"{text}fisheye_model: {mark}\n")
+        if fisheye:
+            with pytest.raises(InputError, match="fisheye lens"):
+                FORMATS[name].read(tmp_path / "rig")
+        else:
+            assert FORMATS[name].read(tmp_path / "rig").cameras[0].name == "left"
+
+
 @pytest.mark.parametrize(
     ("name", "text", "named"),
     [
         ("kalibr", "cam0: {camera_model: omni}", "cam0.camera_model"),
+        ("kalibr", KALIBR_CAMERA.format(n=0, topic="/a", k1=".nan"), "cam0.distortion_coeffs"),
+        ("kalibr", KALIBR_CAMERA.format(n=0, topic="/a", k1=0).replace("resolution", "size"), "cam0.resolution"),
         ("kalibr", "cam0: [1", "file"),
         ("kalibr", "- 1", "file"),
         ("kalibr", "a: " + 2000 * "[", "a YAML file"),
         ("opencv", "image_width: 3", "camera_matrix"),
         ("ros", "distortion_model: equidistant", "distortion_model"),
-        ("anipose", "[cam_0]\nmatrix = [[1, 2], [3, 4]]", "rotation"),
+        ("anipose", "[cam_0]\nmatrix = [[1, 2], [3, 4]]", "cam_0.rotation"),
         ("anipose", "[metadata]", "camera"),
     ],
 )

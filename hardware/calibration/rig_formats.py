@@ -98,9 +98,10 @@ def _rig_of(path: Path, cameras: Sequence[Table]) -> Rig:
 
 
 def _numbers(path: Path, table: Table, key: str, shape: tuple[int | None, ...]) -> Array:
-    if key not in table:
+    word = key.rpartition(".")[2]
+    if word not in table:
         raise InputError(path, key, "nothing", "numbers")
-    return checks.numbers(path, key, table[key], shape)
+    return checks.numbers(path, key, table[word], shape)
 
 
 def _matrix(path: Path, table: Table, key: str) -> Array:
@@ -179,7 +180,14 @@ def _yaml_camera(path: Path, table: Table, name: str) -> Table:
     width, height = (checks.integer(path, key, table.get(key), 1) for key in ("image_width", "image_height"))
     place = _matrix(path, table, "base_from_camera") if "base_from_camera" in table else None
     offset = checks.number(path, "clock_offset_s", table.get("clock_offset_s", 0.0))
+    _refuse_fisheye(path, "fisheye_model", table)
     return _camera_table(name, (width, height), focal, distortion, place, offset)
+
+
+def _refuse_fisheye(path: Path, key: str, table: Table) -> None:
+    """InputError where a lens is a fisheye: its four numbers would be read as k1 k2 p1 p2."""
+    if table.get(key.rpartition(".")[2]):
+        raise InputError(path, key, "a fisheye lens", "none: calibrate with k1 k2 p1 p2 k3")
 
 
 def _ros_camera(path: Path) -> Table:
@@ -194,9 +202,17 @@ def _ros_matrix(values: Array) -> Table:
 
 
 def read_kalibr(path: Path) -> Rig:
-    """The rig of a camchain; its base is the first camera. Cameras have the names of their topics, else cam0, cam1."""
+    """The rig of a camchain; its base is the first camera.
+
+    Cameras have the names of their topics' first words. Where two are equal, as in /camera/infra1 and /camera/infra2,
+    or a camera has no topic, all are cam0, cam1.
+    """
     chain = read_yaml(path)
     place, cameras = np.eye(4), []
+    tables = [(key, table) for key, table in chain.items() if isinstance(table, dict)]
+    names = {key: str(table.get("rostopic", "")).strip("/").split("/")[0] for key, table in tables}
+    if not all(names.values()) or len(set(names.values())) < len(names):
+        names = {key: str(key) for key in names}
     for number, key in enumerate(sorted(chain, key=lambda k: int(k[3:]) if str(k)[3:].isdigit() else -1)):
         table = chain[key]
         if not isinstance(table, dict) or key != f"cam{number}":
@@ -205,12 +221,13 @@ def read_kalibr(path: Path) -> Rig:
             if table.get(word) != known:
                 raise InputError(path, f"{key}.{word}", table.get(word), known)
         if number:
-            place = place @ se3.inverse(_scaled(_numbers(path, table, "T_cn_cnm1", (4, 4)), MM_PER_M))
-        topic = str(table.get("rostopic", "")).strip("/").split("/")[0]
-        size = _numbers(path, table, "resolution", (2,)).astype(int).tolist()
-        focal, distortion = (_numbers(path, table, word, (4,)) for word in ("intrinsics", "distortion_coeffs"))
+            place = place @ se3.inverse(_scaled(_numbers(path, table, f"{key}.T_cn_cnm1", (4, 4)), MM_PER_M))
+        size = _numbers(path, table, f"{key}.resolution", (2,)).astype(int).tolist()
+        focal, distortion = (
+            _numbers(path, table, f"{key}.{word}", (4,)) for word in ("intrinsics", "distortion_coeffs")
+        )
         shift = checks.number(path, f"{key}.timeshift_cam_imu", table.get("timeshift_cam_imu", 0.0))
-        cameras.append(_camera_table(topic or str(key), size, focal, distortion, place, shift))
+        cameras.append(_camera_table(names[key], size, focal, distortion, place, shift))
     return _rig_of(path, cameras)
 
 
@@ -251,10 +268,11 @@ def read_anipose(path: Path) -> Rig:
     for key, table in checks.read_toml(path).items():
         if not isinstance(table, dict) or "matrix" not in table:
             continue  # metadata and other tables of caliscope
-        turn, shift = (_numbers(path, table, word, (3,)) for word in ("rotation", "translation"))
+        turn, shift = (_numbers(path, table, f"{key}.{word}", (3,)) for word in ("rotation", "translation"))
         place = se3.inverse(se3.make(se3.exp_rotation(turn), shift))
-        focal = _pinhole(path, _numbers(path, table, "matrix", (3, 3)))
-        distortion = _numbers(path, table, "distortions", (None,))
+        _refuse_fisheye(path, f"{key}.fisheye", table)
+        focal = _pinhole(path, _numbers(path, table, f"{key}.matrix", (3, 3)))
+        distortion = _numbers(path, table, f"{key}.distortions", (None,))
         offset = checks.number(path, f"{key}.clock_offset_s", table.get("clock_offset_s", 0.0))
         name, size = str(table.get("name", key)), table.get("size", [])
         cameras.append(_camera_table(name, size, focal, distortion, place, offset))
