@@ -69,7 +69,7 @@ def pieces_between(
     bead = np.cumsum(begins) - 1
     begun, done = np.clip(first - ways + 1, 0.0, 1.0), np.clip(last - ways + 1, 0.0, 1.0)  # shares of each way
     share = np.ones(len(ways))
-    if told is not AS_PLANNED:
+    if told is not AS_PLANNED and len(ways):
         ways, begun, done, share = _cut_ways(ways, begun, done, told)
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[ways - 1] * (done - begun) > MIN_SPACING
     ways, begun, done, share = (column[path.extrude[ways] & moved] for column in (ways, begun, done, share))

@@ -18,8 +18,8 @@ VALUES = {  # what a reader puts in; tests/workspace.py makes the files
     "PATH.csv": "path.csv",
     "B.toml": "board.toml",
     "X.mcap": "run.mcap",
-    "X.json": "run.json",
-    "X.html": "run.trace.html",
+    "X.json": "trace.json",
+    "X.html": "trace.html",
     "X.dot": "window.dot",
     "FOLDER": "sessions/monday",
     "/dev/ttyUSB0": "./serving",
@@ -246,11 +246,19 @@ MADE = (  # by these tests/workspace.py makes what the others name
     "stillbed smooth out/calm/session.mcap -o out/smoothed --rate 1000",
 )
 TRAINED = "tests/test_training.py trains, where torch is installed"
+ROBOT = "needs a robot; tests/test_arm_laws.py meets a simulated one"
+CALM = "data/scenarios/breathing_calm.toml"
 NOT_RUN = {  # and why not
     "pip install 'stillbed[franka]'": "installs from a network",
     "python -m tests.dependency_table": "tests/test_shipped.py asks whether what it would write is there",
-    "stillbed arm franka://172.16.0.2": "needs a robot; tests/test_arm_laws.py meets a simulated one",
+    "stillbed arm franka://172.16.0.2": ROBOT,
+    "stillbed live session.toml --arm franka://172.16.0.2 --profile fr3.toml": ROBOT,
+    f"stillbed live --simulated {CALM} --arm franka://127.0.0.1 --record run.mcap": "tests/test_franka_live.py runs it",
+    "stillbed reach path.csv --arm data/arms/fr3.toml --amplitude-mm 5": "needs pinocchio; see tests/test_urdf.py",
     "stillbed arm gcode:///dev/ttyACM0 --arm data/arms/gantry.toml": "needs a machine; see tests/test_gcode.py",
+    "stillbed live session.toml --arm gcode:///dev/ttyACM0 --profile gantry.toml": "the same",
+    "stillbed cameras genicam://Basler-21876543": "needs a camera; see tests/test_genicam.py",
+    "stillbed live session.toml --foxglove 8765": "tests/test_foxglove.py runs it",
     "python -m tests.stop_latency": "needs a machine with little else to do for minutes",
     "pip install -c constraints.txt .": "installs what the tests run with, from a network",
     "stillbed bench --all": "tests/test_bench.py runs the whole with small parts; all of them take 20 minutes",
@@ -265,6 +273,7 @@ NOT_RUN = {  # and why not
     "stillbed calibrate dispenser dispenser.toml --from lines": DRAWN,
     "stillbed train DATASET --network thesis": TRAINED,
     "stillbed train DATASET -o X.onnx": TRAINED,
+    "stillbed train data/fuseg data/medetec -o wound.onnx": TRAINED,
 }
 
 

@@ -267,12 +267,9 @@ def resting(stamp: float) -> Array:
     return breathing(min(stamp, BEGINS_S))
 
 
-PARTED = [(slipping, 0.2), (resting, 0.7), *slowly((slipping, 0.5), (slipping, 0.7), (resting, 0.2), (resting, 0.5))]
-
-
-@pytest.mark.parametrize("case", [PARTED[0], *slowly(*PARTED[1:])])
-def test_without_a_region_the_claim_covers_both_groups(case: tuple[Motion, float]) -> None:
-    slides, share = case
+@pytest.mark.parametrize("slides", [slipping, *slowly(resting)])
+@pytest.mark.parametrize("share", [0.2, *slowly(0.5, 0.7)])
+def test_without_a_region_the_claim_covers_both_groups(slides: Motion, share: float) -> None:
     poses, off, _ = parted(share, False, slides)
     apart = np.array([np.linalg.norm((slides(p.stamp) - breathing(p.stamp))[:3, 3]) for p in poses])
     radius = np.array([p.radius_at(MIDDLE, 0.95)[0] for p in poses])

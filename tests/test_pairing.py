@@ -7,7 +7,7 @@ from heapq import heapify, heappop, heappush
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perception.frames import (
@@ -159,6 +159,8 @@ def test_live_sets_rise_hold_a_frame_once_and_never_wait(seed: int, cameras: int
 @given(seed=st.integers(0, 2**32 - 1), cameras=st.integers(1, 4), drop=st.floats(0, 0.4))
 def test_live_sets_are_the_recordings_where_frames_are_hardly_late(seed: int, cameras: int, drop: float) -> None:
     arrivals = shaken(seed, cameras, 30, 0.0095, 0.0195, drop)
+    by_camera = [[now for now, frame in arrivals if frame.camera == camera] for camera in range(cameras)]
+    assume(max(np.diff(times).max(initial=0.0) for times in by_camera) < SILENT_PERIODS * PERIOD)  # else: not waited for
     out, pairing = live(arrivals, cameras)
     in_order = sorted((f for _, f in arrivals), key=lambda f: f.stamp)
     recorded = list(pair(in_order, pairing_tolerance(PERIOD), cameras))
@@ -212,6 +214,7 @@ def late_by(delays: list[float], count: int = 40) -> list[tuple[float, Frame]]:
 @given(delay=st.floats(0, 0.99), other=st.floats(0, 0.99))
 def test_a_camera_that_is_always_late_is_soon_waited_for(delay: float, other: float) -> None:
     """Where stamps do not tell that a camera exposes later than the others, only its frames' arrival does."""
+    assume(min(abs(delay - 0.5), abs(other - 0.5)) > 1e-6)  # at the deadline itself, rounding decides
     out, _ = live(late_by([0.0, delay * PERIOD, other * PERIOD]), 3)
     assert all(len(s.frames) == 3 for _, s in out[DELAY_SAMPLES + 1 :])
 
