@@ -327,7 +327,7 @@ class Look:
             return "nothing could be judged: the beads are not seen"
         crest = self.laid.stations.crest
         off = self.laid.height - crest
-        parts = [f"{volume:.1f} of {planned:.1f} mm³ lie there ({volume / planned:.0%})"]
+        parts = [f"{volume:.1f} of {planned:.1f} mm³ lie there ({100 * volume / planned:.0f} %)"]
         parts.append(f"beads {np.nanmedian(self.laid.height):.2f} mm high (planned {np.median(crest):.2f})")
         parts.append(f"{np.nanmedian(self.laid.stations.width):.1f} mm wide, {np.nanstd(off):.2f} mm uneven")
         parts += [f"clogged from {a:.0f} to {b:.0f} mm of the path" for a, b in self.laid.clogs]
@@ -335,7 +335,7 @@ class Look:
         parts += [
             f"{n} of {len(crest)} pieces {word}" for n, word in ((gaps, "lack gel"), (blobs, "have too much")) if n
         ]
-        parts += [f"{1 - seen:.0%} not seen"] if seen < 0.99 else []
+        parts += [f"{100 * (1 - seen):.0f} % not seen"] if seen < 0.99 else []
         return ", ".join(parts) + ("" if self.flow is None else f"; {self.flow.text}")
 
 

@@ -95,7 +95,9 @@ class FlowShares:
     @property
     def text(self) -> str:
         """In words."""
-        return f"the next layer flows at {self.share.min():.0%} to {self.share.max():.0%} of the planned"
+        return (
+            f"the next layer flows at {100 * self.share.min():.0f} % to {100 * self.share.max():.0f} % of the planned"
+        )
 
 
 _FLOW = "begin", "end", "share"  # of FlowShares

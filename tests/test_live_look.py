@@ -34,7 +34,7 @@ def test_it_looks_after_each_layer_and_when_somebody_asks_and_goes_on(tmp_path: 
         run.press("o")
         run.wait_for(r"\npaused: looked at: ")
         run.press("r")
-        run.wait_for(r"\nprint: looked at: .*; the next layer flows at \d+% to 150% of the planned")
+        run.wait_for(r"\nprint: looked at: .*; the next layer flows at \d+ % to 150 % of the planned")
         run.wait_for(r"\nthe path is printed")
         run.end()
     finally:

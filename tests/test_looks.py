@@ -254,7 +254,7 @@ def test_the_report_says_and_draws_what_was_found() -> None:
     assert "clog" not in some_look(gap=False).text and looks_section([], path) == ""
     adapted = replace(look, flow=FlowShares(np.array([1.2, 1.6]), np.array([1.6, 2.4]), np.array([1.3, 0.8])))
     page = looks_section([adapted], path)
-    assert adapted.text.endswith("; the next layer flows at 80% to 130% of the planned")
+    assert adapted.text.endswith("; the next layer flows at 80 % to 130 % of the planned")
     assert page.count("<svg") == 2 and page.count("% of the planned flow</title>") == 2
 
 

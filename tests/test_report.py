@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from html.parser import HTMLParser
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -337,3 +338,23 @@ def test_a_run_cut_short_says_so_first() -> None:
 @pytest.mark.parametrize(("share", "text"), [(1.0, "100 %"), (0.965, "96.5 %"), (0.5, "50 %"), (0.0, "0 %")])
 def test_percent(share: float, text: str) -> None:
     assert percent(share) == text
+
+
+def test_percent_keeps_the_decimals_asked_for() -> None:
+    assert [percent(0.965, digits) for digits in (0, 2)] == ["96 %", "96.50 %"]
+
+
+@pytest.mark.parametrize("folder", ["estimation", "perception", "planning", "hardware"])
+def test_a_share_is_written_with_a_space_before_the_sign(folder: str) -> None:
+    sources = {path: path.read_text(encoding="utf-8") for path in (Path(__file__).parents[1] / folder).rglob("*.py")}
+    assert [str(path) for path, text in sources.items() if re.search(r":\.\d%\}", text)] == []
+
+
+def test_a_chart_keeps_its_words_readable_on_a_phone() -> None:
+    chart = Plot(900, 130, (0.0, 1.0), (0.0, 1.0)).svg()
+    least = float(re.findall(r"min-width:(\d+)px", chart)[0])
+    assert 11 * least / 900 >= 8  # px: the size of its words, where the window is narrower
+    style = (files("hardware.report") / "report.css").read_text(encoding="utf-8")
+    assert re.search(
+        r"^section \{ overflow-x: auto; \}", style, re.MULTILINE
+    )  # so that the page itself does not scroll

@@ -133,7 +133,7 @@ def _assess(candidates: list[_Candidate], points: Array, sigma: float) -> Regist
     if best.rms > 2 * sigma:
         problems.append(f"poor fit: {best.rms:.3g} mm rms, {sigma:.3g} mm expected")
     if best.share < 0.7:
-        problems.append(f"poor fit: only {best.share:.0%} of the points lie on the scan")
+        problems.append(f"poor fit: only {100 * best.share:.0f} % of the points lie on the scan")
     fits = not problems
     # another pose that fits as well as the best, within what chance explains
     bound, min_distance = max(best.cost, sigma**2) * (1 + 4 * np.sqrt(2 / len(points))), 0.1 * _radius(points)

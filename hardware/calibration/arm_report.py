@@ -15,7 +15,7 @@ from estimation.se3 import Array
 from hardware.calibration.arm_solve import ArmCalibration, kinematics_of
 from hardware.calibration.report import CalibrationVerdict, bullets, figure, figure_row, picture_frame
 from hardware.files.images import encode
-from hardware.report.page import document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.page import chart, document, figures_table, legend, line_key, row_of_tiles, section, tile
 
 MAX_TIP_ERROR = 0.1  # mm, of the tip in the working volume: a fourth of a bead
 MAX_HELD_OUT_ERROR = 0.3  # mm, median of held-out pictures: outliers and a bent arm are beyond it
@@ -237,9 +237,8 @@ def _latency(result: ArmCalibration) -> str:
         f'<text x="{width - 8}" y="{height - 8}" text-anchor="end">{most:.0f} mm/s</text>'
         f'<text x="8" y="16">{top:.1f} mm behind</text>'
     )
-    svg = f'<svg class="plot" viewBox="0 0 {width} {height + 2}" role="img" aria-label="latency">'
     keys = [line_key("truth", f"{1e3 * total:.1f} ms")]
-    return f"{svg}{axis}{line}{dots}{labels}</svg>{legend(keys)}"
+    return chart(width, height + 2, "latency", f"{axis}{line}{dots}{labels}") + legend(keys)
 
 
 def arm_text(

@@ -166,7 +166,7 @@ def inspection_text(inspection: Inspection) -> str:
     health, tables = inspection.health, inspection_table(inspection)["cameras"]
     paragraphs = ["\n  ".join([one["name"], *camera_lines(one)]) for one in tables]
     if len(health.cameras) > 1:
-        share = f" ({health.complete / health.sets:.1%})" if health.sets else ""
+        share = f" ({100 * health.complete / health.sets:.1f} %)" if health.sets else ""
         sets = f"{health.sets} sets, {health.complete} with all cameras{share}"
         paragraphs.append(f"{sets}, {health.late} frames too late")
     return "\n\n".join(paragraphs)
@@ -184,7 +184,8 @@ def camera_lines(one: dict[str, Any]) -> list[str]:
         f"{width} x {height} px, {_number(one['rate_hz'])} Hz, jitter {_number(one['jitter_ms'])} ms, "
         f"lag {_number(one['lag_ms'])} ms, stamped {STAMP_SOURCES[one['stamped'] or '']}",
         _offset_text(one),
-        f"sharpness {one['sharpness']:.0f}, grey level {one['grey_level']:.0f}, {one['blown_out']:.1%} blown out",
+        f"sharpness {one['sharpness']:.0f}, grey level {one['grey_level']:.0f}, "
+        f"{100 * one['blown_out']:.1f} % blown out",
         f"{one['frames']} frames; {one['missed']} missed; left out: {left_out or 'none'}",
     ]
     lines += [f"controls: {controls}"] if controls else []

@@ -174,7 +174,7 @@ def run_checks(
 ) -> tuple[Check, ...]:
     """The checks of a run at `now`, s. waited: s for which it has been checked."""
     path, start = task.path, task.start
-    resume_text = f"; goes on at checkpoint {start:.2f}, {start / max(len(path) - 1, 1):.0%}" if start else ""
+    resume_text = f"; goes on at checkpoint {start:.2f}, {100 * start / max(len(path) - 1, 1):.0f} %" if start else ""
     layers = count_text(len(np.unique(path.layer)), "layer")
     return (
         *_camera_checks(reports.tracking, now, waited),

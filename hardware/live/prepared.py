@@ -229,7 +229,7 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
         from hardware.live.recorded_run import asked_flows, read_run  # loads OpenCV
 
         task = replace(task, flows=asked_flows(read_run(record, "/loop")))
-    place = f"{start / max(len(path) - 1, 1):.0%}: checkpoint {start:.2f} of {len(path) - 1}"
+    place = f"{100 * start / max(len(path) - 1, 1):.0f} %: checkpoint {start:.2f} of {len(path) - 1}"
     return replace(prepared, task=task, notes=(f"goes on at {place}, where {record.name} stopped", *prepared.notes))
 
 

@@ -35,6 +35,7 @@ from hardware.process.checks import read_toml
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, cache_folder, cached, duration_text, write_atomically
 from hardware.process.system import SharedLatest
+from hardware.report.evaluation import percent
 from hardware.report.page import document, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
@@ -100,9 +101,9 @@ class SurfaceScan:
     @property
     def words(self) -> str:
         """What was scanned and how well, in words."""
-        median, high = np.percentile(self.sigma, [50, 95])
+        share, (median, high) = percent(self.coverage, 0), np.percentile(self.sigma, [50, 95])
         return (
-            f"{self.area / 100:.1f} cm² scanned from {self.sets} frame sets, {self.coverage:.0%} of the region; "
+            f"{self.area / 100:.1f} cm² scanned from {self.sets} frame sets, {share} of the region; "
             f"standard deviation {median:.3f} mm (median), {high:.3f} mm (95 %); fused in {duration_text(self.seconds)}"
         )
 
@@ -343,7 +344,7 @@ TILTS_DEG, TURNS = (0.0, 20.0, 40.0, 60.0), 12  # camera places that are tried, 
 
 def scan_page(scanned: SurfaceScan, name: str) -> str:
     """The report as one HTML page."""
-    sigma, surface = scanned.sigma, scanned.surface
+    sigma, surface, area = scanned.sigma, scanned.surface, f"{scanned.area / 100:.1f}"
     pictures = "".join(
         _figure(title, render_scan(scanned.scan, scanned.colours, np.array(direction), VIEW_PIXELS)[..., ::-1])
         for title, direction in VIEWS
@@ -351,15 +352,15 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     limits = np.percentile(sigma, [50, 95])
     masks = {camera.name: surface.seen[c] for c, camera in enumerate(scanned.rig.cameras)}
     masks["two cameras or more"], wanted = surface.seen.sum(0) >= 2, surface.wanted
-    rows = [(name, f"{(mask & wanted).sum() / max(1, wanted.sum()):.0%}") for name, mask in masks.items()]
-    rows.append(("scanned", f"{scanned.coverage:.0%}"))
+    rows = [(name, percent((mask & wanted).sum() / max(1, wanted.sum()), 0)) for name, mask in masks.items()]
+    rows.append(("scanned", percent(scanned.coverage, 0)))
     largest = max(2 * WEAK_SIGMA_MM, float(np.percentile(sigma, SHADED_PERCENT)))
     colours = np.where(surface.sure[::-1, :, None], _shaded(surface.sigma[::-1] / largest), 255)
     scale = _figure(f"0 to {largest:.2g} mm", np.asarray(_shaded(np.tile(np.linspace(0, 1, 256), (10, 1))), np.uint8))
     caption = "Standard deviation across the surface, blue to red. White lies outside, or no two cameras saw it alike."
     from_above = _figure("from above", np.asarray(colours, np.uint8))
     sigmas = [(f"{v:.3f}", "mm", f"standard deviation, {w}") for v, w in zip(limits, ("median", "95 %"), strict=True)]
-    tiles = (f"{scanned.area / 100:.1f}", "cm²", "scanned"), (f"{scanned.coverage:.0%}", "", "of the region"), *sigmas
+    tiles = (area, "cm²", "scanned"), (f"{100 * scanned.coverage:.0f}", "%", "of the region"), *sigmas
     body = [
         row_of_tiles([tile(*item) for item in tiles]),
         section("The scan", "In plain light, from three sides.", f'<div class="pictures">{pictures}</div>'),
@@ -391,10 +392,9 @@ def camera_advice(scanned: SurfaceScan) -> str:
     share = weak.sum() / max(1, surface.wanted.sum())
     if share < WEAK_SHARE:
         return "No further camera is needed: nearly all of the region is known well."
-    place, near, apart = camera_place(surface, weak, scanned.first.base_from_surface, scanned.rig)
-    x, y, z = place
+    (x, y, z), near, apart = camera_place(surface, weak, scanned.first.base_from_surface, scanned.rig)
     return (
-        f"{share:.0%} of the region is open or known to no better than {WEAK_SIGMA_MM:g} mm. A camera at "
+        f"{percent(share, 0)} of the region is open or known to no better than {WEAK_SIGMA_MM:g} mm. A camera at "
         f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base frame, {apart:.0f} degrees from {cameras[near].name} as seen from "
         f"there, would show it best."
     )

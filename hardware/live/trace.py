@@ -247,7 +247,7 @@ def trace_text(trace: RunTrace) -> str:
     all_causes = causes(trace)
     lines = [f"frames to wire, {len(ways)} sets: {median:.1f} / {p99:.1f} / {largest:.1f} ms (median, 99 %, largest)"]
     width = max(len(cause.name) for cause in all_causes)
-    lines.append(f"{'what was done meanwhile, ms a set':<{width}}  {'all':>7}  slowest {SLOWEST_SHARE:.0%}")
+    lines.append(f"{'what was done meanwhile, ms a set':<{width}}  {'all':>7}  slowest {100 * SLOWEST_SHARE:.0f} %")
     lines += [f"{c.name:<{width}}  {1000 * c.usual:7.2f}  {1000 * c.slowest:7.2f}" for c in all_causes]
     return "\n".join(lines)
 
@@ -290,7 +290,7 @@ def trace_page(trace: RunTrace, title: str) -> str:
         section(
             "What was done meanwhile",
             "Milliseconds a set, from its pixels in memory to the first move on the wire; processes work side by side.",
-            figures_table(("what", "all sets", f"slowest {SLOWEST_SHARE:.0%}"), rows),
+            figures_table(("what", "all sets", f"slowest {100 * SLOWEST_SHARE:.0f} %"), rows),
         ),
         section("The slowest sets", "Each lane a process; the grey band is the set's way.", _legend(trace) + charts),
     ]

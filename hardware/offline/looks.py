@@ -28,6 +28,7 @@ from hardware.process.system import step_back
 from hardware.recording import messages
 from hardware.recording.session_reader import read_channels
 from hardware.report import page
+from hardware.report.evaluation import percent
 from perception.frames import FrameSet
 from perception.lens import Lenses
 from perception.mapping.scan_map import node_size
@@ -364,7 +365,7 @@ def look_picture(look: Look, path: Path) -> str:
     for share in look.laid.share.tolist():
         measured = not math.isnan(share)
         colours.append(next(c for limit, c in SHARE_COLOURS if share < limit) if measured else "#999")
-        titles.append(f"{share:.0%} of the planned" if measured else "not seen")
+        titles.append(f"{percent(share, 0)} of the planned" if measured else "not seen")
     return _beads_picture(places, widths, colours, titles, path, "beads by how much lies there")
 
 
@@ -373,7 +374,7 @@ def flow_picture(flow: FlowShares, below: Stations, path: Path) -> str:
     places_on_path = np.linspace(flow.begin, flow.end, STATION_POINTS, axis=1)
     places = [np.interp(places_on_path, np.arange(len(path)), path.surface_from_nozzle[:, k, 3]) for k in range(2)]
     colours = [next(c for limit, c in FLOW_COLOURS if share < limit) for share in flow.share.tolist()]
-    titles = [f"{share:.0%} of the planned flow" for share in flow.share.tolist()]
+    titles = [f"{percent(share, 0)} of the planned flow" for share in flow.share.tolist()]
     width = np.full(len(titles), np.median(below.width))
     return _beads_picture(np.stack(places, axis=-1), width, colours, titles, path, "the next layer by its flow")
 

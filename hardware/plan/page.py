@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from estimation.se3 import Array
 from hardware.process.progress import count_text, duration_text
+from hardware.report.evaluation import percent
 from hardware.report.page import document, figures_table, round_step, row_of_tiles, section, tile
 from planning.fill.bead import Bead
 from planning.layers.checkpoints import tool_rotations
@@ -124,7 +125,8 @@ def layer_bounds(layers: Iterable[PlannedLayer]) -> tuple[float, float, float, f
 
 def _captions(title: str, layer: PlannedLayer, figures: LayerFigures, scale: float, height: float) -> str:
     facts = (
-        f"{figures.coverage.covered:.2%} covered, {figures.coverage.double:.2%} twice, {figures.gap:.2f} mm² open · "
+        f"{percent(figures.coverage.covered, 2)} covered, {percent(figures.coverage.double, 2)} twice, "
+        f"{figures.gap:.2f} mm² open · "
         f"{len_text(figures.printed)} of bead in {figures.beads} runs, {len_text(figures.travelled)} of travel"
     )
     bar = round_step(60 / scale)
@@ -222,7 +224,7 @@ def page_text(
     lead = (
         f"{count_text(len(layers), 'layer')}, {len_text(total.printed)} of bead, "
         f"printing time {duration_text(total.seconds)}: {inks}. "
-        f"{total.covered:.2%} of the layers' area is covered, {total.double:.2%} twice."
+        f"{percent(total.covered, 2)} of the layers' area is covered, {percent(total.double, 2)} twice."
     )
     return document("plan", text.title, lead, body, "mm, s, degrees; 1 mm³ is 1 µl")
 
@@ -260,15 +262,15 @@ def _layer_table(layers: Sequence[LayerFigures], total: PlanTotal) -> str:
     )  # fmt: skip
     rows = [
         (
-            str(f.number + 1), f.tissue, f.material, f"{f.area:.0f}", f"{f.coverage.covered:.2%}",
-            f"{f.coverage.double:.2%}", f"{f.coverage.over:.2%}", f"{f.gap:.2f}", f"{f.half_gap:.2f}",
+            str(f.number + 1), f.tissue, f.material, f"{f.area:.0f}", percent(f.coverage.covered, 2),
+            percent(f.coverage.double, 2), percent(f.coverage.over, 2), f"{f.gap:.2f}", f"{f.half_gap:.2f}",
             f"{f.bead_gap:.2f}", str(f.beads), len_text(f.printed), len_text(f.travelled), " ".join(_clock(f.seconds)),
             f"{f.volume:.1f}",
         )
         for f in reversed(layers)
     ]  # fmt: skip
     rows.append((
-        "all", "", "", f"{total.area:.0f}", f"{total.covered:.2%}", f"{total.double:.2%}", f"{total.over:.2%}",
+        "all", "", "", f"{total.area:.0f}", percent(total.covered, 2), percent(total.double, 2), percent(total.over, 2),
         f"{total.gap:.2f}", f"{sum(f.half_gap for f in layers):.2f}", f"{total.bead_gap:.2f}",
         str(sum(f.beads for f in layers)), len_text(total.printed), len_text(total.travelled),
         " ".join(_clock(total.seconds)),

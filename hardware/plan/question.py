@@ -15,6 +15,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
+from hardware.report.evaluation import percent
 from hardware.report.page import document, section
 from planning.layers.grid import HeightMap, axes_along, height_map
 from planning.layers.outline import ScanColour, WoundPlace, WoundQuestionError, points_on
@@ -102,7 +103,7 @@ def write_question(
     parts = [section("The scan from above", "Click three places on the wound's rim to name it by them.", whole)]
     parts[0] += f'<p><code id="scan-clicks">--clicks=...</code></p>{_click_data(above)}{CLICK_SCRIPT}'
     for number, place in enumerate(question.places, 1):
-        colour = "" if np.isnan(place.colour) else f", {place.colour:.0%} of it coloured like a wound"
+        colour = "" if np.isnan(place.colour) else f", {percent(place.colour, 0)} of it coloured like a wound"
         caption = f"{place.area:.0f} mm², {place.depth:.1f} mm deep{colour}. It is this one: --wound {number}"
         parts.append(section(f"Place {number}", caption, _view(above, image, [place], place, f"place-{number}")))
     title = "Which is the wound?"

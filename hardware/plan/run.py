@@ -42,6 +42,7 @@ from hardware.plan.page import (
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, count_text, duration_text, write_atomically
 from hardware.process.system import provenance
+from hardware.report.evaluation import percent
 from planning.layers.plan import (
     LayerFigures,
     Plan,
@@ -207,8 +208,8 @@ def _summary_text(plan: Plan, subject: PlanSubject, total: PlanTotal, out: Path,
         + ("" if f.given else f"; outline detected at a depth of {f.level:.2f} mm"),
         f"path: {count_text(sum(bool(layer.beads) for layer in plan.layers), 'layer')}, {len(plan.path)} checkpoints, "
         f"{len_text(total.printed)} of bead, {len_text(total.travelled)} of travel, {duration_text(total.seconds)}",
-        f"coverage: {total.covered:.2%} covered, {total.double:.2%} twice, {total.over:.2%} beside, "
-        f"{total.gap:.2f} mm^2 open",
+        f"coverage: {percent(total.covered, 2)} covered, {percent(total.double, 2)} twice, "
+        f"{percent(total.over, 2)} beside, {total.gap:.2f} mm^2 open",
         "ink: " + ", ".join(f"{volume / 1000:.3f} ml of {material_text(name)}" for name, volume in total.volume),
     ]
     lines += [f"bumps: {bumps_text(plan)}"] if layers_with_bumps(plan) else []

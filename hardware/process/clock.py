@@ -273,7 +273,8 @@ class Evenness:
     def __str__(self) -> str:
         """In words."""
         usual, largest = 1000 * self.usual, 1000 * self.largest
-        return f"{usual:.2f} ms of work took {largest:.0f} ms at the worst; {self.slow:.1%} of the time work was slow"
+        share = f"{100 * self.slow:.1f} %"
+        return f"{usual:.2f} ms of work took {largest:.0f} ms at the worst; {share} of the time work was slow"
 
 
 def measure_evenness(clock: Clock, pieces: int) -> Evenness:

@@ -263,9 +263,9 @@ def _judgement(comparison: Comparison) -> list[str]:
     return [*sentences, f"{subject} an error above {MAX_TRACKING_ERROR_MM:.0f} mm in state TRACKING."]
 
 
-def percent(share: float) -> str:
-    """0.965 as 96.5 %, without needless zeros."""
-    return f"{100 * share:.1f}".removesuffix(".0") + " %"
+def percent(share: float, digits: int = 1) -> str:
+    """0.965 as 96.5 %, with `digits` decimals; a single one is omitted if it is zero."""
+    return f"{100 * share:.{digits}f}".removesuffix(".0") + " %"
 
 
 def figure(value: float) -> str:

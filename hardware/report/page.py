@@ -72,12 +72,19 @@ def area_key(style: str, text: str) -> str:
     return f"<span>{patch}{escape(text)}</span>"
 
 
+def chart(width: float, height: float, label: str, inside: str) -> str:
+    """A drawing of `width` x `height` px as one SVG element; it shrinks with the window, to MIN_SCALE at least."""
+    box = f'viewBox="0 0 {width:g} {height:g}" style="min-width:{MIN_SCALE * width:.0f}px"'
+    return f'<svg class="plot" {box} role="img" aria-label="{escape(label)}">{inside}</svg>'
+
+
 def legend(keys: Sequence[str]) -> str:
     """The entries of a legend in a row."""
     return f'<div class="legend">{"".join(keys)}</div>'
 
 
 NAMELESS = "chart, as the words above it say"  # for a screen reader, of a chart without a label
+MIN_SCALE = 0.75  # of a chart, so that its words stay readable; in a narrower window the card scrolls
 VIEW_WIDTH_PX, VIEW_HEIGHT_PX = 440, 300  # of one of two pictures that stand side by side
 MAX_LINE_POINTS = 3000  # a line is thinned to its extremes beyond: no screen shows more
 CURVE_SPACING = 2.0  # px between the points of a curve that is drawn
@@ -121,7 +128,7 @@ def round_step(rough: float) -> float:
 
 
 def spanning(values: Sequence[Array], margin: float = 0.06, min_span: float = 1e-3) -> tuple[float, float]:
-    """Low and high that hold all finite `values` with a margin; a span under `least` is widened to it."""
+    """Low and high that hold all finite `values` with a margin; a span under `min_span` is widened to it."""
     flat = np.concatenate([np.ravel(v) for v in values]) if values else np.empty(0)
     flat = flat[np.isfinite(flat)]
     if not len(flat):
@@ -258,10 +265,8 @@ class Plot:
 
     def svg(self) -> str:
         """The chart as one SVG element."""
-        label = escape(self.label)
-        name = f'<text class="label" x="{self.left}" y="{self.top - 12}">{label}</text>'
-        box = f'viewBox="0 0 {self.width} {self.height}"'
-        return f'<svg class="plot" {box} role="img" aria-label="{label or NAMELESS}">{"".join(self._parts)}{name}</svg>'
+        name = f'<text class="label" x="{self.left}" y="{self.top - 12}">{escape(self.label)}</text>'
+        return chart(self.width, self.height, self.label or NAMELESS, f"{''.join(self._parts)}{name}")
 
     def _text(self, x: float, y: float, text: str, anchor: str) -> None:
         attributes = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
@@ -284,7 +289,7 @@ def ribbon(edges: Array, styles: Sequence[str], titles: Sequence[str], x: tuple[
                 f"<title>{escape(titles[start])}</title></rect>"
             )
             start = i
-    return f'<svg class="plot" viewBox="0 0 {width} 24" role="img" aria-label="states over time">{"".join(parts)}</svg>'
+    return chart(width, 24, "states over time", "".join(parts))
 
 
 def data_url(data: bytes) -> str:

@@ -65,8 +65,7 @@ class TopView:
         length = page.round_step((self.high[0] - self.low[0]) / 6)
         bar = f'<path class="scale" d="M2 {self.height + 10:.1f}v6h{length * self.scale:.1f}v-6"/>'
         bar += f'<text x="2" y="{self.height + 29:.1f}">{length:g} mm</text>'
-        box = f'viewBox="0 0 {self.width:g} {self.height + SCALE_HEIGHT_PX:.1f}"'
-        return f'<svg class="plot" {box} role="img" aria-label="{escape(name)}">{body}{bar}</svg>'
+        return page.chart(self.width, self.height + SCALE_HEIGHT_PX, name, body + bar)
 
 
 def whole_map_view(deposit: DepositMap, width: float) -> TopView:

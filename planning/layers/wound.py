@@ -194,13 +194,13 @@ def _checked_wound(scan: Scan, found: OutlinedWound, given: bool, others: int, w
     inside = nodes_within(fine.grid, shape)
     known = inside & fine.known
     if known.sum() < 0.5 * inside.sum():
-        share = f"{known.sum() / inside.sum():.0%} of the outline"
+        share = f"{100 * known.sum() / inside.sum():.0f} % of the outline"
         raise InputError(where, "scanned part of the wound", share, "half of it or more: scan it again, or the outline")
     cell, depth = fine.grid.step**2, np.where(fine.known, skin - fine.heights, 0.0)
     cut = share_cut(fine, shape)
     if cut > MAX_CUT_SHARE:
-        allowed = f"{MAX_CUT_SHARE:.0%} or less: scan 20 mm of skin around the wound"
-        raise InputError(where, "share of the outline at the scan's own rim", f"{cut:.0%}", allowed)
+        allowed = f"{100 * MAX_CUT_SHARE:.0f} % or less: scan 20 mm of skin around the wound"
+        raise InputError(where, "share of the outline at the scan's own rim", f"{100 * cut:.0f} %", allowed)
     sigma, volume_sigma = _deviations(found)
     findings = WoundFindings(
         given=given, area=float(shape.area), volume=float(np.maximum(depth, 0)[inside].sum() * cell),
@@ -255,7 +255,9 @@ def _notes(findings: WoundFindings) -> Sequence[str]:
     if findings.closed > 0.02 * findings.area:
         notes.append(f"{findings.closed:.0f} mm^2 of the wound were not scanned and are guessed from around")
     if findings.cut > 0:
-        notes.append(f"{findings.cut:.0%} of the outline lie at the scan's own rim: no skin holds the surface there")
+        notes.append(
+            f"{100 * findings.cut:.0f} % of the outline lie at the scan's own rim: no skin holds the surface there"
+        )
     if findings.others:
         notes.append(f"{findings.others} further depressions were left alone; give --outline for one of them")
     if findings.noise > 0.2:
