@@ -56,7 +56,8 @@ PAGE_STYLE = """
 #plan-legend i.travel { height: 0; border-radius: 0; border-top: 2px dashed #d6006c; }
 .plan-bar button { font: inherit; padding: 3px 12px; border-radius: 8px; border: 1px solid var(--grey);
   background: var(--card); color: var(--ink); cursor: pointer; }
-.layer-picture svg { width: 100%; height: auto; border-radius: 8px; } .layer-picture { margin-top: 12px; }
+.layer-picture svg { width: 100%; min-width: 720px; height: auto; border-radius: 8px; }
+.layer-picture { margin-top: 12px; }
 .plan-note { border-left: 3px solid var(--amber); padding-left: 12px; margin: 6px 0; }
 .sideways { overflow-x: auto; }
 .sideways td { white-space: nowrap; padding: 5px 7px; } .sideways th { padding: 4px 7px; }
