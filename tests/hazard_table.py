@@ -24,10 +24,11 @@ KEYS = {"id", "hazard", "cause", "control", "tests", "figure", "command"}
 OPENING = """# Hazards
 
 A stop by software is not a safety function, and neither is any other control on this page: the software runs on an
-ordinary computer that may hang, and nobody has assessed it. An arm near a patient needs an emergency stop in hardware that
-disconnects its power, within reach of a person who watches. This is research software, not a medical device.
+ordinary computer that may hang, and nobody has assessed it. An arm near a patient needs an emergency stop in hardware
+that disconnects its power, within reach of a person who watches. This is research software, not a medical device.
 
-[deceptions.md](deceptions.md) shows what can mislead the tracker, how often it does, and what three cameras cannot detect.
+[deceptions.md](deceptions.md) shows what can mislead the tracker, how often it does, and what three cameras cannot
+detect.
 
 `make hazards` runs the tests named here and writes this page from `data/hazards.toml`. `make check` fails if one of the
 tests does not exist, may be skipped, or failed in its last run on the machine, or if this page differs from that file.
