@@ -15,6 +15,7 @@ from estimation.rig import Rig, pixels_from_points
 from estimation.se3 import Array
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
 from hardware.arm.device import DONE, ArmState, ArmStatus
+from hardware.files import folder_tables
 from hardware.files.arm_file import read_arm
 from hardware.files.folder_tables import SessionFolderWriter, read_tum
 from hardware.files.images import encode
@@ -225,6 +226,24 @@ def test_a_session_folder_numbers_its_frames_and_names_them_by_kind(tmp_path: Pa
     assert (tmp_path / "session" / "frames.csv").read_text().splitlines()[1:] == ["cam_1,0,0.1", "cam_1,1,0.2"]
     assert not (tmp_path / "session" / "roi.toml").exists()
     assert not (tmp_path / "session" / "truth.tum").exists()
+
+
+def test_a_picture_without_its_line_after_an_interrupt_does_not_spoil_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig: Rig = scenario(tmp_path).rig
+    with pytest.raises(KeyboardInterrupt), SessionFolderWriter(tmp_path / "session", rig, ()) as session:
+        for number in range(2):
+            for camera in range(3):
+                session.picture(camera, 0.1 * number, *picture(camera, number))
+        monkeypatch.setattr(folder_tables, "frame_line", interrupted)  # the picture is written, its line is not
+        session.picture(1, 0.2, *picture(1, 2))
+    assert len(open_session(tmp_path / "session")) == 2
+    assert sorted(f.name for f in (tmp_path / "session" / "cam_1").iterdir()) == ["000000.jpg", "000001.jpg"]
+
+
+def interrupted(*_: object) -> str:
+    raise KeyboardInterrupt
 
 
 RIG = arc_rig()

@@ -10,6 +10,7 @@ import csv
 import glob
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -306,6 +307,7 @@ class SessionFolderWriter(ExitStack):
             write_roi(folder / "roi.toml", rig, rois, [0] * len(rois))
         write_frames(folder / "frames.csv", rig, [])
         write_recorded(folder, began)
+        self.callback(self._remove_unlisted)
         self._frames = self.enter_context((folder / "frames.csv").open("a", encoding="utf-8"))
 
     def picture(self, camera: int, stamp: float, kind: str, data: bytes) -> None:
@@ -315,6 +317,14 @@ class SessionFolderWriter(ExitStack):
         self._frames.write(frame_line(self._rig, FrameRef(camera, number, stamp, stamp)))
         self._frames.flush()
         self._counts[camera] += 1
+
+    def _remove_unlisted(self) -> None:
+        """Remove the picture that an interrupt left without its line in frames.csv."""
+        lines = (self.folder / "frames.csv").read_text(encoding="utf-8").splitlines()
+        listed = Counter(line.split(",")[0] for line in lines[1:])
+        for camera in self._rig.cameras:
+            for suffix in PICTURE_SUFFIXES.values():
+                (self.folder / camera.name / f"{listed[camera.name]:06d}{suffix}").unlink(missing_ok=True)
 
     def head_row(self, row: Array, extruding: bool) -> None:
         """Where the print head was at a frame set: (8,) stamp x y z qx qy qz qw, s and mm; stamps rise."""
