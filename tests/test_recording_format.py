@@ -201,6 +201,7 @@ ONE_FRAME = [("/rig", RIG), ("/camera/left/image", old_image(image(0, 0))), ("/f
     ("messages", "words"),
     [
         ([("/other", {})], "/rig"),
+        ([("/cam0/image_raw", {})], "go into a session folder: docs/conventions.md"),  # a ROS bag
         ([("/rig", [])], "/rig"),
         ([("/rig", {"camera": [{"name": "a"}]})], "camera[0].size = 'missing'"),
         ([("/rig", RIG)], "/frames"),

@@ -196,8 +196,10 @@ def test_a_place_that_cannot_be_written_is_one_error(tmp_path: Path) -> None:
 def test_the_wrong_kind_of_thing_is_one_error(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "s")
     import_folder(folder, tmp_path / "a.mcap")
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="session = 'a file', allowed a session folder"):
         import_folder(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    with pytest.raises(InputError, match="no such folder"):
+        import_folder(tmp_path / "nowhere", tmp_path / "b.mcap")
     with pytest.raises(InputError, match=r"allowed an \.mcap file"):
         export_recording(folder, tmp_path / "out")
     with pytest.raises(InputError, match=r"0 \.\. 100"):

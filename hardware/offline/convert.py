@@ -60,7 +60,8 @@ def import_folder(
     """
     folder, target = Path(folder), Path(mcap_path)
     if not folder.is_dir():
-        raise InputError(folder, "session", "no such folder", "a session folder (with rig.toml)")
+        got = "a file" if folder.exists() else "no such folder"
+        raise InputError(folder, "session", got, "a session folder (with rig.toml, see docs/conventions.md)")
     if target.is_dir() or (target.exists() and not overwrite):
         raise InputError(target, "recording", "exists already", "a new file, or --force")
     if jpeg_quality is not None and not 0 <= jpeg_quality <= 100:

@@ -96,15 +96,15 @@ def open_recording(path: Path) -> Session:
     contents = _contents(path)
     rig = contents.rig
     if rig is None:
-        raise InputError(path, "/rig", contents.damage or "no message", "a stillbed.Rig (written at the first stamp)")
+        allowed = "a stillbed.Rig; pictures of others go into a session folder: docs/conventions.md"
+        raise InputError(path, "/rig", contents.damage or "no message", allowed)
     frames = list(contents.frames.values())
     _check_frames(path, contents, rig)
     stamps = [np.array(sorted(r.stamp for r in frames if r.camera == c)) for c in range(len(rig))]
     for camera, times in zip(rig.cameras, stamps, strict=True):
         if (np.diff(times) <= 0).any():
             raise InputError(path, f"/frames: stamp of camera {camera.name!r}", "one stamp twice", "each stamp once")
-    open_reader = partial(RecordingReader, path, rig, contents.places)
-    reader = open_reader()
+    reader = (open_reader := partial(RecordingReader, path, rig, contents.places))()
     for ref in {ref.camera: ref for ref in reversed(frames)}.values():  # the first image of each camera
         reader.read(ref)
     reader.close()
