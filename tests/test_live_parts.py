@@ -559,6 +559,8 @@ def test_a_dispenser_without_a_watchdog_is_told_to_the_operator(tmp_path: Path) 
     assert len(notes) == 1 and notes[0].startswith("dispenser syringe has no watchdog")
     (note,) = prepare(dispensing(tmp_path, dispensers=None), "here", False).notes
     assert note == "no dispenser is given: nothing is extruded"
+    (note,) = prepare(dispensing(tmp_path, dispensers=None, adapt=True), "here", False).notes
+    assert note == "no dispenser is given: nothing is extruded, and no flow is adapted"
 
 
 def test_limits_far_beyond_the_usual_ones_are_told_to_the_operator(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
+from estimation.rig import Rig
 from hardware.files.region_table import (
     ANY_REGION,
     MAX_CORNERS,
@@ -27,7 +28,7 @@ from hardware.files.region_table import (
     region_from_table,
 )
 from hardware.live.settings import LiveSettings, check_settings, read_settings, settings_text
-from hardware.offline.track import DRAW_TEXT, region_search
+from hardware.offline.track import DRAW_TEXT, region_search, tracker
 from hardware.operator.shared_state import DrawnRegion
 from hardware.process.system import SharedLatest
 from perception.frames import FrameSet, Roi, region_polygons, region_since
@@ -256,3 +257,12 @@ def test_a_drawn_region_is_waited_for_and_taken_once_it_is_there() -> None:
 
 def test_nothing_is_looked_for_where_nobody_asks() -> None:
     assert region_search(rig(), ANY_REGION, SharedLatest()) is None
+
+
+def test_a_rig_of_one_camera_is_refused_before_its_pictures_are_read() -> None:
+    alone = Rig(rig().cameras[:1])
+    with (
+        pytest.raises(InputError, match="cameras = 1, allowed 2 or more: one camera sees no depth"),
+        tracker(alone, ()),
+    ):
+        pass

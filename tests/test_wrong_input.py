@@ -328,7 +328,7 @@ from hardware.live.ipc import ProcessGroup
 from hardware.offline.track import tracker
 
 def tracked():
-    with tracker(None, [None]):
+    with tracker([None, None], [None]):
         time.sleep(60)
 
 def begun():

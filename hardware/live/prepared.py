@@ -320,7 +320,9 @@ def _dispenser_notes(settings: LiveSettings, dispensers: str) -> list[str]:
     if settings.dry_run:
         return []
     if not dispensers:
-        return [] if settings.simulated is not None else ["no dispenser is given: nothing is extruded"]
+        adapted = ", and no flow is adapted" if settings.adapt else ""
+        note = f"no dispenser is given: nothing is extruded{adapted}"
+        return [] if settings.simulated is not None and not adapted else [note]
     warning = "has no watchdog: if this computer dies while it is on, it stays on until you switch it off"
     given = (each for each in dispensers_from_text(dispensers, "") if each.extruder is None)
     return [f"dispenser {each.profile.name} {warning}" for each in given if each.profile.watchdog is None]

@@ -97,13 +97,16 @@ def tracker(
 
     roi: where the surface is at the start; without one `find`, given one thread, makes what finds it, by default the
     search of the wound by a network. model: the network, an ONNX file; None: the one that comes along. surface: the
-    scan, or its file, mm; InputError where it cannot be read. now: s, by which the stages are timed. tool: (K, 2) mm,
-    profile of the tool on the arm as `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
+    scan, or its file, mm. now: s, by which the stages are timed. tool: (K, 2) mm, profile of the tool on the arm as
+    `ArmProfile.tool`. prefilter: a key of perception.lens.PREFILTERS.
 
     waits: whether a map that is not ready when it is due is waited for, so that a recording gives the same poses again.
+
+    InputError for a scan that cannot be read, and for a rig of one camera.
     """
     from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
+    from estimation.errors import InputError
     from hardware.files.mesh_file import read_mesh
     from perception.lens import PREFILTERS
     from perception.mapping.masks import Tool
@@ -111,6 +114,8 @@ def tracker(
     from perception.tracking.wound_step import RegionTrackingStep
 
     scan = read_mesh(surface).scan if isinstance(surface, Path) else surface
+    if len(rig) < 2:
+        raise InputError("rig", "cameras", len(rig), "2 or more: one camera sees no depth")
     with ProcessPoolExecutor(1, SPAWN, _start_map_process) as executor:
         with blocked_sigint():
             first = executor.submit(int)
