@@ -559,7 +559,10 @@ def test_a_dispenser_without_a_watchdog_is_told_to_the_operator(tmp_path: Path) 
     assert len(notes) == 1 and notes[0].startswith("dispenser syringe has no watchdog")
     (note,) = prepare(dispensing(tmp_path, dispensers=None), "here", False).notes
     assert note == "no dispenser is given: nothing is extruded"
-    (note,) = prepare(dispensing(tmp_path, dispensers=None, adapt=True), "here", False).notes
+    adapting, path = dispensing(tmp_path, dispensers=None, look="layer", adapt=True), raster()
+    extra = {name: np.full(len(path), size) for name, size in (("width_mm", 0.6), ("height_mm", 0.3))}
+    write_path(tmp_path / "path.csv", replace(path, extra=extra))
+    (note,) = prepare(adapting, "here", False).notes
     assert note == "no dispenser is given: nothing is extruded, and no flow is adapted"
 
 
