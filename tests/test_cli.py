@@ -315,7 +315,11 @@ def test_one_is_not_told_as_many() -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("simulat", ["'simulat' is none", "did you mean simulate?"]),
+        ("simulat", ["'simulat' is unknown", "did you mean simulate?"]),
+        (
+            "calibrate import x --format colmap -o r.toml",
+            ["'colmap' is unknown", "allowed: opencv, ros, kalibr, anipose"],
+        ),
         ("track x --outt y", ["stillbed track: unknown option --outt", "did you mean --out?"]),
         ("plan --example forarm -o x.csv", ["--example", "did you mean forearm?"]),
         ("simulate breathing_clam -o x", ["did you mean 'data/scenarios/breathing_calm.toml'?"]),

@@ -24,6 +24,7 @@ MODEL_HELP = "network that segments the wound, as `stillbed train` writes it; de
 FAILED = 1  # exit code of a command whose result is not good enough
 WRONG_INPUT = 2  # exit code
 INTERRUPTED = 130  # exit code after Ctrl-C
+MAX_LISTED = 8  # choices that an error lists
 WRONG_CHOICE = re.compile(r"invalid choice: '(.*?)' \(choose from (.*)\)")  # message of argparse
 USAGE = re.compile(r"python \S+\.py.*?(?=\s{2,}|$)", re.MULTILINE)  # a line of the docstring
 
@@ -48,9 +49,11 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the line, and exit."""
-        if (choice := WRONG_CHOICE.search(message)) is not None:  # the help lists all
-            choices = re.findall(r"'([^']+)'", choice[2])
-            message = f"{message[: choice.start()]}{choice[1]!r} is none{suggestion_text(choice[1], choices)}"
+        if (choice := WRONG_CHOICE.search(message)) is not None:
+            choices = re.findall(r"'([^']+)'", choice[2]) or choice[2].split(", ")  # quoted before Python 3.12 only
+            listed = f"; allowed: {', '.join(choices)}" if len(choices) <= MAX_LISTED else ""  # the help lists all
+            suggestion = suggestion_text(choice[1], choices)
+            message = f"{message[: choice.start()]}{choice[1]!r} is unknown{suggestion}{listed}"
         print(f"{self.prog}: {painted(message, BAD, sys.stderr)}; see {self.prog} --help", file=sys.stderr)
         sys.exit(WRONG_INPUT)
 
