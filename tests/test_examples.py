@@ -245,7 +245,9 @@ def run_live(words: list[str], cache: Path) -> int:
     live = Running(*words, cache=cache, cwd=Path.cwd())
     try:
         if "--yes" not in words:
-            at = live.wait_for("now: .*\n")
+            at = live.wait_for("now: .*\n|is over\n")
+            if "is over" in live.said:  # a short session, where the machine is slow to find its surface
+                return live.process.wait(LONGEST)
             if "move the path" in live.said:  # without a scan it is a guess
                 asks_to_move(live, MoveRequest(0.5, 0.0, 0.0))
                 at = live.wait_for("moved by hand")
