@@ -137,6 +137,7 @@ INSTEAD = {  # (what is run in its place, why)
         "has a small one",
     ),
     "stillbed bench segmentation --areas 40": ("stillbed bench segmentation --areas 1", LONG),
+    "stillbed bench segmentation --rendered 60 --areas 0": ("stillbed bench segmentation --areas 1", LONG),
     f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios still hand breathing_calm "
     "breathing_deep turns steps_300um camera_lost --rendered 6": (
         f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",
