@@ -143,6 +143,11 @@ INSTEAD = {  # (what is run in its place, why)
         f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios --rendered 6",
         LONG,
     ),
+    f"{SMOOTHING} --movements still sway --seeds 1 --seconds 4": (
+        f"{SMOOTHING} --movements still --seeds 1 --seconds 1 --sessions 0 --minutes --landmarks --adjusted 0 "
+        "--scenarios",
+        LONG,
+    ),
     SMOOTHING: (f"{SMOOTHING} --movements --minutes --landmarks --adjusted 0 --sessions 0 --scenarios", LONG),
     f"{SMOOTHING} --movements still breathing steps sway --seeds 4 --seconds 4 --sessions 0 --minutes 1 3": (
         f"{SMOOTHING} --movements still --seeds 1 --seconds 1 --sessions 0 --minutes --landmarks --adjusted 0 "
@@ -235,7 +240,6 @@ SHORT = {  # of these kinds, and no longer than it may take as it stands
     "stillbed bench --list",
     "python -m tests.campaigns consistency --scenes 1 --seconds 4",
     "python -m tests.campaigns fill --count 0 --picture docs/patterns.svg",
-    "python -m tests.campaigns smoothing --movements still sway --seeds 1 --seconds 4",
 }
 MOVED = "tests/test_arm_console.py moves a virtual arm before cameras that see its needle, which takes a minute"
 RECORDED = "--cameras rig.toml --record"
