@@ -50,7 +50,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the line, and exit."""
         if (choice := WRONG_CHOICE.search(message)) is not None:
-            choices = re.findall(r"'([^']+)'", choice[2]) or choice[2].split(", ")  # quoted before Python 3.12 only
+            choices = re.findall(r"'([^']+)'", choice[2]) or choice[2].split(", ")  # newer Pythons do not quote them
             listed = f"; allowed: {', '.join(choices)}" if len(choices) <= MAX_LISTED else ""  # the help lists all
             suggestion = suggestion_text(choice[1], choices)
             message = f"{message[: choice.start()]}{choice[1]!r} is unknown{suggestion}{listed}"

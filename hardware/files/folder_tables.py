@@ -289,7 +289,7 @@ def read_recorded(folder: Path) -> int | None:
 
 
 class SessionFolderWriter(ExitStack):
-    """Writes a session folder; readable at every instant, whole once the context ends."""
+    """Writes a session folder: readable after every picture, and once the context has ended, also by an interrupt."""
 
     def __init__(self, folder: Path, rig: Rig, rois: Sequence[Roi], began: int | None = None) -> None:
         """folder: made if it is not there. rois: where the surface is in the first picture of each camera.

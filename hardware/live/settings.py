@@ -69,7 +69,7 @@ class LiveSettings:
     look: str = _key(
         "print.look",
         '"layer"',
-        'when the needle moves aside to measure the print: after each "layer", or after each "4" beads',
+        'when the needle moves aside to measure the print: "layer": after each layer; "4": after every 4 beads',
         "",
     )
     adapt: bool = _key(
