@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import lru_cache
@@ -42,11 +43,11 @@ class Forecast:
 
     def covariance(self, start: Array, ahead: float) -> Array:
         """Covariance (6, 6) at `ahead`, 0 to `end` s, with `start` (6, 6) at the pose; linear between horizons."""
-        times = np.concatenate([[0.0], self.horizons])
-        k = min(int(np.searchsorted(times, ahead, "right")), len(times) - 1)
-        u = (ahead - times[k - 1]) / (times[k] - times[k - 1])
-        before = start if k == 1 else self.covariances[k - 2]
-        return np.asarray((1 - u) * before + u * self.covariances[k - 1])
+        times = self.horizons.tolist()
+        k = min(bisect_right(times, ahead), len(times) - 1)  # of the horizon after it
+        earlier, before = (0.0, start) if k == 0 else (times[k - 1], self.covariances[k - 1])
+        u = (ahead - earlier) / (times[k] - earlier)
+        return np.asarray((1 - u) * before + u * self.covariances[k])
 
     def remainder(self, ahead: float) -> Forecast | None:
         """The forecast from `ahead` s on, relative to the predicted pose there; None at its end and beyond."""

@@ -103,9 +103,10 @@ def test_exp_log_adjoint_and_inverse_are_gtsams(xi: Array) -> None:
 
 
 @given(tangents())
-def test_log_of_one_is_log_of_a_stack_of_one(xi: Array) -> None:
+def test_log_of_one_is_log_of_a_stack(xi: Array) -> None:
     t = se3.exp(xi)
-    assert close(se3.log(t), se3.log(t[None])[0])
+    for rows in (1, 40):  # few are taken one by one
+        assert close(se3.log(t), se3.log(np.array([t] * rows))[-1])
 
 
 @given(transforms, tangents(angle=3.0), st.floats(0, 1))
@@ -187,14 +188,25 @@ def test_one_vector_alone_gives_what_many_give(angle: float) -> None:
         assert np.allclose(se3.exp(one), among_many, rtol=0, atol=1e-13)
 
 
-def test_one_call_serves_any_shape() -> None:
-    xi = np.random.default_rng(1).uniform(-1, 1, size=(2, 5, 6))
+@pytest.mark.parametrize("shape", [(2, 5), (2, 2), (0, 3)])
+def test_one_call_serves_any_shape(shape: tuple[int, int]) -> None:
+    xi = np.random.default_rng(1).uniform(-1, 1, size=(*shape, 6))
     many = se3.exp(xi)
-    assert many.shape == (2, 5, 4, 4)
-    for i in np.ndindex(2, 5):
+    assert many.shape == (*shape, 4, 4) and se3.log(many).shape == (*shape, 6)
+    for i in np.ndindex(shape):
         assert np.allclose(many[i], se3.exp(xi[i]), rtol=0, atol=1e-14)  # one alone takes the short way
         assert np.allclose(se3.log(many)[i], xi[i])
         assert np.array_equal(se3.adjoint(many)[i], se3.adjoint(many[i]))
+
+
+@pytest.mark.parametrize("rows", [3, 40])
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_what_is_not_finite_stays_in_its_row(rows: int) -> None:
+    xi = np.full((rows, 6), 0.1)
+    whole, xi[1] = se3.exp(xi), np.inf
+    spoiled = se3.exp(xi)
+    assert not np.isfinite(spoiled[1]).all() and np.array_equal(np.delete(spoiled, 1, 0), np.delete(whole, 1, 0))
+    assert np.isfinite(np.delete(se3.log(spoiled), 1, 0)).all()
 
 
 @pytest.mark.parametrize(
