@@ -236,10 +236,10 @@ def test_a_covariance_that_claims_half_the_error_has_four_times_the_nees() -> No
     assert comparison is not None and comparison.aligned.mean_nees / 6 == pytest.approx(4, abs=0.16)
 
 
-@pytest.mark.parametrize(("share", "honest"), [(1.0, True), (0.25, False), (4.0, False)])
+@pytest.mark.parametrize(("share", "honest"), [(1.0, True), (0.1, False), (10.0, False)])
 def test_the_report_says_where_covariances_are_not_calibrated(share: float, honest: bool) -> None:
     table, truth = run(3000, sigma=SIGMA)
-    table.covariance[:] *= share
+    table.covariance[:] = share * (table.covariance + table.covariance[1:2])  # the first pose's error is in all
     assert ("inconsistent" in track_page(evaluate(table, truth, "run"))) is not honest
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import tomllib
 from dataclasses import replace
@@ -107,6 +108,15 @@ def test_the_report_says_what_was_found(out: Path) -> None:
         assert f"<h2>{part}" in text
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["poses"] == 60 and summary["landmarks"] == 40 and 0 < summary["live_rms_mm"] < 0.2
+
+
+def test_the_covariances_are_judged_in_the_frame_of_the_fixed_pose(
+    recording: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", str(out / "smoothed.mcap"), str(recording)]) == 0
+    texts = capsys.readouterr().out, json.loads((out / "summary.json").read_text(encoding="utf-8"))["text"]
+    compared, summarised = (float(re.search(r"NEES/6: ([\d.]+)", text)[1]) for text in texts)
+    assert compared == summarised and 0.5 < summarised < 2
 
 
 def test_what_is_done_is_not_done_again(

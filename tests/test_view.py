@@ -332,7 +332,7 @@ def test_the_command_writes_page_and_figures(tmp_path: Path, capsys: pytest.Capt
     assert figures["pairs"] == 90 and figures["reference_is_exact"]
     plain, aligned = (figures[name]["ape"]["translation_mm"]["rmse"] for name in ALIGNMENTS[:2])
     assert aligned < plain and f"{plain:#.3g} mm" in told
-    assert told.partition(". ")[0].endswith("over 90 of 90 poses, in a common surface frame")
+    assert f"over 90 of 90 poses, in a common surface frame, against {tmp_path / 'truth.tum'}." in told
     page = (out / "report.html").read_text()
     assert "Absolute pose error" in page and "NEES" not in page and "http" not in page.replace("http://www.w3.org", "")
 
@@ -345,8 +345,10 @@ def test_the_truth_in_a_recording_is_found_by_itself(tmp_path: Path, capsys: pyt
         for each in poses:
             recorder.frame(Frame(0, each.stamp, image(0, 0)))
             recorder.write(each)
-    assert main(["compare", str(tmp_path / "x.mcap")]) == 0
-    assert "9 of 9 poses" in capsys.readouterr().out
+    for words in (["x.mcap"], ["x.mcap:pose", "x.mcap"]):  # of a reference the truth comes first
+        assert main(["compare", *(str(tmp_path / word) for word in words)]) == 0
+        told = capsys.readouterr().out
+        assert "9 of 9 poses" in told and "x.mcap:truth." in told
 
 
 @pytest.mark.parametrize(
@@ -365,8 +367,12 @@ def test_errors_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert words in told and told.count("\n") == 1
 
 
-@pytest.mark.parametrize(("nees", "honest"), [(0.79, False), (0.81, True), (1.24, True), (1.81, False)])
-def test_covariances_that_are_not_calibrated_are_said_not_to_be(nees: float, honest: bool) -> None:
-    words = consistency_text(nees)
+@pytest.mark.parametrize(
+    ("nees", "fixed", "honest"),
+    [(0.79, True, False), (0.81, True, True), (1.24, True, True), (1.81, True, False)]
+    + [(0.19, False, False), (0.3, False, True), (1.81, False, True), (2.5, False, False)],
+)
+def test_covariances_that_are_not_calibrated_are_said_not_to_be(nees: float, fixed: bool, honest: bool) -> None:
+    words = consistency_text(nees, fixed)
     assert ("inconsistent" in words) is not honest
     assert honest or f"{nees**0.5:.2g} times" in words

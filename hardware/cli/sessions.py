@@ -220,7 +220,8 @@ def add_compare(commands: Commands) -> None:
         "Compare poses with reference poses of the same instants, with the error figures of evo: absolute and\n"
         "relative errors, translation and rotation, unaligned and aligned (without scale); and NEES if there are\n"
         "covariances. A and B: a TUM or CSV file, an .mcap file, or a folder written by stillbed. Poses of an\n"
-        ".mcap file: FILE:smoothed, FILE:pose or FILE:truth. With -o, writes report.html and compare.json.",
+        ".mcap file: FILE:smoothed, FILE:pose or FILE:truth, in this order for A, in the opposite one for B.\n"
+        "With -o, writes report.html and compare.json.",
         "stillbed compare out/smoothed out/calm/session/truth.tum -o out/compared",
     ).add_argument
     add("estimated", metavar="A", help="estimated poses")

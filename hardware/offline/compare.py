@@ -30,6 +30,7 @@ from hardware.report.evaluation import (
     errors_under,
     figure,
     finite,
+    fixed_row,
     percent,
 )
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
@@ -39,7 +40,6 @@ ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at o
 ALIGNMENT_LABELS = dict(
     zip(ALIGNMENTS, ("unaligned", "aligned, SE(3)", "common surface frame", "frame of one pose"), strict=True)
 )
-FIXED_POSE_SIGMA_MM = 1e-3  # mm, of all axes: only the pose that a smoothed run holds fixed has a smaller one
 UNFITTED_ALIGNMENTS = ALIGNMENTS[0], ALIGNMENTS[3]  # those that covariances can be checked under: nothing is fitted
 RowNumbers = NDArray[np.int64]
 MIN_PAIRS = 3  # pairs of poses: fewer are aligned without a residual
@@ -93,6 +93,7 @@ class TrajectoryComparison:
     gap: float  # s, median difference of the two stamps of a pair
     delta: int  # poses between the two of a relative error
     alignments: tuple[AlignedErrors, ...]  # in order; without SE(3) where the positions do not determine it
+    fixed: bool  # whether the one pose of the last alignment is the one that smoothing holds fixed
 
     def of(self, name: str) -> AlignedErrors | None:
         """The errors under the alignment of that name, None where it is left out."""
@@ -148,19 +149,14 @@ def compare(estimated: PoseSeries, reference: PoseSeries, delta: int = 1) -> Tra
         pairs.append((ALIGNMENTS[1], motion @ ours, target))
     changes = se3.inverse(target) @ ours
     pairs.append((ALIGNMENTS[2], ours, target @ best_constant(changes)))
-    pairs.append((ALIGNMENTS[3], ours, target @ changes[_fixed_row(covariance)]))
+    fixed = fixed_row(covariance)
+    pairs.append((ALIGNMENTS[3], ours, target @ changes[fixed or 0]))
     alignments = tuple(
         AlignedErrors(name, a, b, errors_under(np.eye(4), b, a, covariance), relative_errors(a, b, delta))
         for name, a, b in pairs
     )
     gap = float(np.median(np.abs(stamps[rows] - their_stamps[theirs])))
-    return TrajectoryComparison(estimated, reference, stamps[rows], gap, delta, alignments)
-
-
-def _fixed_row(covariance: Array) -> int:
-    """The row of the pose that a smoothed run holds fixed, by its tiny covariance (M, 6, 6); 0 where there is none."""
-    size = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
-    return int(np.argmin(size)) if np.isfinite(size).all() and size.min() < FIXED_POSE_SIGMA_MM**2 else 0
+    return TrajectoryComparison(estimated, reference, stamps[rows], gap, delta, alignments, fixed is not None)
 
 
 def relative_errors(estimated: Array, reference: Array, delta: int) -> RelativeErrors:
@@ -206,7 +202,8 @@ def comparison_verdict(comparison: TrajectoryComparison) -> str:
     """The verdict in a few sentences."""
     fit = [error_statistics(values).rmse for _, values in _by_unit(comparison.fitted.absolute)]
     paired = f"over {len(comparison.stamps)} of {len(comparison.estimated)} poses"
-    texts = [f"RMSE: {figure(fit[0])} mm and {figure(fit[1])}° {paired}, in a common surface frame."]
+    frame = f"in a common surface frame, against {comparison.reference.name}"
+    texts = [f"RMSE: {figure(fit[0])} mm and {figure(fit[1])}° {paired}, {frame}."]
     if comparison.gap > 1e-6:
         texts.append(f"Difference of the stamps: {figure(1000 * comparison.gap)} ms (median).")
     for aligned in comparison.alignments[:-1]:
@@ -218,7 +215,7 @@ def comparison_verdict(comparison: TrajectoryComparison) -> str:
         texts.append("No SE(3) alignment: the positions lie on a line.")
     nees = comparison.at_one_pose.absolute.mean_nees / 6
     if np.isfinite(nees):
-        texts.append(f"NEES/6: {figure(nees)} in the frame of one pose, {consistency_text(nees)}.")
+        texts.append(f"NEES/6: {figure(nees)} in the frame of one pose, {consistency_text(nees, comparison.fixed)}.")
     return " ".join(texts)
 
 
@@ -370,7 +367,7 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     if delta < 1:
         raise InputError("command line", "--delta", delta, "1 or more poses")
     ours = read_pose_series(estimated)
-    theirs = read_truth_series(estimated) if reference is None else read_pose_series(reference)
+    theirs = read_truth_series(estimated) if reference is None else read_pose_series(reference, reference=True)
     if theirs.name == ours.name:
         raise InputError(ours.name, "poses", "the same as the reference", "two different trajectories")
     comparison = compare(ours, theirs, delta)

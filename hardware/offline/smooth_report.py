@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from hardware.report.evaluation import (
     consistency_text,
     errors_under,
     figure,
+    fixed_row,
     spread,
 )
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
@@ -121,7 +122,12 @@ def _reference_errors(
     if not len(rows):
         return None
     covariance = smoothed.covariance[rows, :6, :6]
-    ours = _aligned_errors(smoothed.states.poses[rows], truth.base_from_surface[true_rows], covariance)
+    poses, target = smoothed.states.poses[rows], truth.base_from_surface[true_rows]
+    ours = _aligned_errors(poses, target, covariance)
+    if (fixed := fixed_row(covariance)) is not None:  # the covariances are relative to that pose
+        ours = replace(
+            ours, nees=errors_under(se3.inverse(target[fixed]) @ poses[fixed], target, poses, covariance).nees
+        )
     if live is None:
         return ours, None
     rows, true_rows = associate(smoothed.stamps[live.rows], truth.stamps)
@@ -173,8 +179,8 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
         ours, live = (None if rmse is None else figure(rmse) for rmse in evaluation.rmse)
         live_text = "" if live is None else f", live {live} mm"
         texts.append(f"Error against the {_reference_name(evaluation)}: smoothed {ours} mm{live_text} (RMS, aligned).")
-        nees = evaluation.errors[0].mean_nees / 6
-        texts += [f"NEES/6: {figure(nees)}, {consistency_text(nees)}."] if np.isfinite(nees) else []
+        nees, fixed = evaluation.errors[0].mean_nees / 6, fixed_row(result.covariance[:, :6, :6]) is not None
+        texts += [f"NEES/6: {figure(nees)}, {consistency_text(nees, fixed)}."] if np.isfinite(nees) else []
     texts += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
     return " ".join(texts)
 

@@ -121,7 +121,7 @@ def _colour(colours: NDArray[np.int64], image: Image, rig: Rig, camera: int, poi
 
 
 FOLDER_FILES = ("smoothed.mcap", "smoothed.csv", "poses.csv", "truth.tum", "reference.tum")  # the first that is there
-POSE_CHANNELS = ("smoothed", "pose", "truth")  # of a recording; the first that holds something
+POSE_CHANNELS = ("smoothed", "pose", "truth")  # of a recording; the first that holds something, of a reference the last
 POSE_READERS: dict[str, Callable[[Path], Iterator[SurfacePose]]] = {"smoothed": read_smoothed, "pose": read_poses}
 POSE_SOURCES = f"a TUM or CSV file, an .mcap file, or a folder with one of {', '.join(FOLDER_FILES)}"
 
@@ -138,10 +138,11 @@ class PoseSeries:
         return len(self.trajectory)
 
 
-def read_pose_series(text: str) -> PoseSeries:
+def read_pose_series(text: str, reference: bool = False) -> PoseSeries:
     """The trajectory that an argument of the command line names; InputError says what is wrong.
 
-    text: a path; of an .mcap file also PATH:CHANNEL, with one of POSE_CHANNELS.
+    text: a path; of an .mcap file also PATH:CHANNEL, with one of POSE_CHANNELS. reference: whether others are compared
+    with it: of an .mcap file without CHANNEL the truth then comes first.
     """
     path, channel = _path_and_channel(text)
     if path.is_dir():
@@ -152,7 +153,8 @@ def read_pose_series(text: str) -> PoseSeries:
     if not path.exists():
         raise InputError(path, "file", "no such file or folder", POSE_SOURCES)
     if path.suffix == ".mcap":
-        return _of_recording(path, (channel,) if channel else POSE_CHANNELS)
+        any_channel = POSE_CHANNELS[::-1] if reference else POSE_CHANNELS
+        return _of_recording(path, (channel,) if channel else any_channel)
     if path.suffix == ".csv":
         return _of_csv(path)
     return _without_covariance(str(path), read_tum(path, exact=path.name == "truth.tum"))

@@ -223,8 +223,8 @@ def _consistency(comparison: Comparison) -> str:
         f"and {figure(aligned.mean_nees / 6)} aligned. "
         f"{inside} of the aligned poses have a NEES under {NEES_BOUND:.1f}; expected: 95 %. "
     )
-    if comparison.exact and math.isfinite(aligned.mean_nees):
-        text += f"Aligned, {consistency_text(aligned.mean_nees / 6)}. "
+    if comparison.exact and math.isfinite(start.mean_nees):
+        text += f"{consistency_text(start.mean_nees / 6, fixed=False).capitalize()}. "
     if not comparison.exact:
         text += "It is of little use here: it includes the error of the reference."
     return f'<p class="note">{escape(text)}</p>'
