@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -307,6 +308,13 @@ def test_a_run_in_which_nothing_could_be_printed_has_a_report(tmp_path: Path) ->
     assert "Nothing was printed" in outcome.text and not outcome.met
     assert (tmp_path / "out" / "report.html").exists()
     assert len(read_path(tmp_path / "path.csv")) == 2
+
+
+def test_a_path_that_was_never_placed_has_the_reason(tmp_path: Path) -> None:
+    off = {"off": [[camera, 0.0, 9.0] for camera in ("cam_0", "cam_1")]}  # two of three
+    file = write_scenario(tmp_path, IDEAL, seconds=1.0, limits={}, tracking={"by": "tracks"}, cameras=off)
+    text = run_simulation(file, tmp_path / "out").text
+    assert re.search(r"the path was not placed, as no pose was TRACKING; \d+ of \d+ were \w+ \(", text)
 
 
 def test_a_scenario_is_not_run_over_itself(tmp_path: Path) -> None:

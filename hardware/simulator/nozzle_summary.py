@@ -6,12 +6,14 @@ A scenario's table [limits] has keys of BOUNDS, all optional. Those without a un
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from estimation.pose import TrackState
 from hardware.process import checks
 from hardware.process.progress import count_text
 from hardware.recording.messages import message_from_look
@@ -207,7 +209,7 @@ def nozzle_verdict(result: NozzleResult) -> list[str]:
     f, deposit = result.figures.nozzle, result.figures.deposit
     sentences = [] if result.run.complete else [INCOMPLETE_TEXT]
     if not math.isfinite(f.position.p95):
-        return [*sentences, "Nothing was printed: there is no nozzle error.", *_limit_sentences(result)]
+        return [*sentences, f"Nothing was printed{_why_nothing(result.run.tracking)}.", *_limit_sentences(result)]
     sentences.append(
         f"Nozzle error while printing: {figure(f.position.rmse)} mm RMS, {figure(f.position.p95)} mm at 95 %, "
         f"{figure(f.position.max)} mm largest."
@@ -223,6 +225,16 @@ def nozzle_verdict(result: NozzleResult) -> list[str]:
     if f.without_target > 0:
         sentences.append(f"Material left the nozzle for {f.without_target:.3f} s outside of the planned beads.")
     return sentences + _limit_sentences(result)
+
+
+def _why_nothing(tracking: Evaluation | None) -> str:
+    """Why a run printed nothing, where no pose allowed the path to be placed; else that there is no error."""
+    poses = Counter() if tracking is None else Counter(zip(tracking.table.states, tracking.table.reasons, strict=True))
+    if not poses or any(state is TrackState.TRACKING for state, _ in poses):
+        return ": there is no nozzle error"
+    ((state, reason), count), *_ = poses.most_common(1)
+    why = f" ({reason})" if reason else ""
+    return f": the path was not placed, as no pose was TRACKING; {count} of {poses.total()} were {state.value}{why}"
 
 
 def _limit_sentences(result: NozzleResult) -> list[str]:
