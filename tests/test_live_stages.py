@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tracemalloc
 from base64 import b64encode
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from estimation import se3
 from estimation.pose import SurfacePose, TrackState
 from hardware.arm.device import ArmState, ArmStatus, Reason
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile
+from hardware.live import records
 from hardware.live.checklist import FIRST_PICTURE_TIME, PrintTask, run_checks
 from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, RunFiles
@@ -845,6 +847,34 @@ def test_the_track_of_the_nozzle_keeps_every_bead_apart_however_long_the_run() -
     path = np.array([[0.0, 0, 0], [10, 0, 0], [10, 1, 0], [0, 1, 0]])
     drawn = track_map(rows[:120], path, np.array([0, 1, 0, 1], bool))
     assert drawn.count('class="estimate" d="') > 2 and drawn.count('class="aside" d="') >= 1
+
+
+def test_the_track_of_the_nozzle_takes_no_more_memory_the_longer_the_run() -> None:
+    track, poses = NozzleTrack(), np.tile(np.eye(4), (2, 1, 1))
+    tracemalloc.start()
+    try:
+        begun = tracemalloc.get_traced_memory()[0]
+        for number in range(TRACK_PLACES // 2):
+            tip = poses[0] @ poses[1]
+            tip[0, 3] = number
+            track.add(tip[:3, 3])  # as the claims have it: it would keep the whole transform
+        grown = tracemalloc.get_traced_memory()[0] - begun
+    finally:
+        tracemalloc.stop()
+    assert grown < 10_000 and track.places[-1, 0] == TRACK_PLACES // 2 - 1  # bytes
+
+
+def test_the_track_of_the_nozzle_stays_as_short_where_beads_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "TRACK_PLACES", 100)
+    track = NozzleTrack()
+    for bead in range(1000):
+        for x in range(0, 100, 50):
+            track.add(np.array([x, bead, 0.0]))
+        track.lift()
+    rows = track.places
+    steps = np.diff(rows[:, 1])
+    assert len(rows) <= 2 * 100 and rows[-1, 1] > 900
+    assert not steps[np.isfinite(steps)].any()  # no line from bead to bead
 
 
 def test_a_way_to_a_checkpoint_has_the_largest_error_of_all_stretches_on_it() -> None:

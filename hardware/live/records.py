@@ -348,33 +348,41 @@ class ErrorTimeline:
         self.held[self._last_bin] += held
 
 
-TRACK_STEP, TRACK_PLACES = 0.2, 8000  # mm between places at first, and how many are kept
+TRACK_STEP, TRACK_PLACES = 0.2, 8000  # mm between places at first, and how many are kept: an even number
 
 
 class NozzleTrack:
-    """Where the tip was on the surface while material left; when it is full every second place goes."""
+    """Where the tip was on the surface while material left; when it is full every second place goes.
+
+    It takes the same memory from the start on, however long the run and however many its beads.
+    """
 
     def __init__(self) -> None:
-        self._rows: list[Array] = []
-        self._step, self._lifted = TRACK_STEP, True
+        self._places, self._begins = np.full((TRACK_PLACES, 3), np.nan), np.zeros(TRACK_PLACES, bool)  # mm; of a bead
+        self._count, self._step, self._lifted = 0, TRACK_STEP, True
 
     @property
     def places(self) -> Array:
         """(N, 3) mm, a row of NaN between two beads."""
-        return np.array(self._rows).reshape(-1, 3)
+        cuts = 1 + np.flatnonzero(self._begins[1 : self._count])
+        return np.insert(self._places[: self._count], cuts, np.nan, axis=0)
 
     def add(self, place: Array) -> None:
         """The tip is at `place` (3,), mm, and material leaves."""
-        if self._lifted and self._rows:
-            self._rows.append(np.full(3, np.nan))
-        if self._lifted or float(np.linalg.norm(place - self._rows[-1])) >= self._step:
-            self._rows.append(place)
-        self._lifted = False
-        if len(self._rows) > TRACK_PLACES:
-            self._step *= 2
-            keep = [k % 2 == 0 or not np.isfinite(row[0]) for k, row in enumerate(self._rows[:-1])]
-            self._rows = [*(row for row, kept in zip(self._rows, keep, strict=False) if kept), self._rows[-1]]
+        if not self._lifted and float(np.linalg.norm(place - self._places[self._count - 1])) < self._step:
+            return
+        if self._count == TRACK_PLACES:
+            self._thin()
+        self._places[self._count], self._begins[self._count] = place, self._lifted
+        self._count, self._lifted = self._count + 1, False
 
     def lift(self) -> None:
         """No material leaves."""
         self._lifted = True
+
+    def _thin(self) -> None:
+        """Drop every second place; the next one begins a bead where a dropped one did."""
+        begins, self._count = self._begins, TRACK_PLACES // 2
+        self._step, self._lifted = 2 * self._step, self._lifted or bool(begins[-1])
+        self._places[: self._count] = self._places[::2]
+        begins[1 : self._count] = begins[2::2] | begins[1:-1:2]
