@@ -118,6 +118,7 @@ def test_it_comes_back_from_a_recording_and_a_viewer_reads_it(tmp_path: Path) ->
     assert min(event["ts"] for event in spans) == 0.0 <= min(event["dur"] for event in spans)
     page = trace_page(trace, "x")
     assert page.count("<svg role") + page.count("<svg view") >= 12 and "tracking: idle" in page
+    assert page.count(">-20</text>") == page.count(">0</text>") == page.count("<svg role") + page.count("<svg view")
 
 
 def test_a_run_that_left_none_keeps_its_own_end_and_says_why(tmp_path: Path) -> None:

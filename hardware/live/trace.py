@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
 import resource
 from bisect import bisect_left
@@ -35,6 +36,7 @@ MIN_WRITE_S = 0.005  # s of a batch of the recorder, from which it is in the tra
 SLOWEST_SHARE = 0.01  # of all sets
 DRAWN_SETS = 12  # of the slowest, in the picture
 DRAWN_BEFORE_S, LANE_PX, CHART_PX = 0.03, 16, 900  # s drawn before a set is handed over
+TICK_S = 0.01  # s between ticks of a lane's time
 BATCH_S = 1.0  # s of entries that are handed to the recorder as one: what a set's entry costs is then 0.03 ms
 SCHEDULER_FILE = Path("/proc/thread-self/schedstat")  # ns run, ns in the run queue, time slices: Linux
 TOPIC = "/trace"
@@ -292,7 +294,11 @@ def trace_page(trace: RunTrace, title: str) -> str:
             "Milliseconds a set, from its pixels in memory to the first move on the wire; processes work side by side.",
             figures_table(("what", "all sets", f"slowest {100 * SLOWEST_SHARE:.0f} %"), rows),
         ),
-        section("The slowest sets", "Each lane a process; the grey band is the set's way.", _legend(trace) + charts),
+        section(
+            "The slowest sets",
+            "Each lane is a process; the grey band is the set's way. Time in ms since its pixels were in memory.",
+            _legend(trace) + charts,
+        ),
     ]
     return document("trace", title, lead, body, "stillbed")
 
@@ -329,6 +335,11 @@ def _lanes(trace: RunTrace, way: SetWay) -> str:
             text = escape(f"{entry.lane}: {name}, {1000 * (stop - start):.1f} ms")
             place = f'x="{left:.1f}" y="{row * LANE_PX + 1}" width="{max(width, 0.5):.1f}" height="{LANE_PX - 2}"'
             parts.append(f'<rect {place} fill="{colours[name]}"><title>{text}</title></rect>')
+    low = LANE_PX * len(lanes)
+    for tick in range(math.ceil((begin - way.handed) / TICK_S), math.floor((end - way.handed) / TICK_S) + 1):
+        x = (tick * TICK_S + way.handed - begin) * scale
+        label = f'<text x="{x:.1f}" y="{low + 11}" font-size="10" fill="currentColor">{1000 * tick * TICK_S:.0f}</text>'
+        parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{low + 3}" stroke="#8888"/>{label}')
     text = f"stamp {way.stamp:.3f} s: {1000 * (way.wired - way.handed):.1f} ms; from above: {', '.join(lanes)}"
-    size = f'viewBox="0 0 {CHART_PX} {LANE_PX * len(lanes)}" width="100%"'
+    size = f'viewBox="0 0 {CHART_PX} {low + 13}" width="100%"'
     return f'<p>{escape(text)}</p><svg {size} role="img" aria-label="{escape(text)}">{"".join(parts)}</svg>'
