@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.errors import InputError
 from estimation.rig import Camera, pixels_from_points
 from estimation.scans.scan import face_normals, scan_from_triangles
 from estimation.se3 import Array
 from estimation.synthetic.movements import ComposedMotion
 from estimation.synthetic.world import BASE_FROM_REST, arc_rig
-from hardware.files.images import decode
+from hardware.files.images import decode, encode
 from hardware.simulator import camera_pipeline
 from hardware.simulator.camera_pipeline import PictureRenderer
 from hardware.simulator.cameras import Fate, Shot, TrueCameras
@@ -440,7 +441,11 @@ def shape_instant(number: int) -> WorldState:
 def shape_taken(source: PictureRenderer, shots: list[Shot]) -> list[tuple[str, bytes]]:
     for one in shots:
         source.expose(one, shape_instant(one.picture))
-    return [source.take(one) for one in shots]
+    return encoded(source, shots)
+
+
+def encoded(source: PictureRenderer, shots: list[Shot]) -> list[tuple[str, bytes]]:
+    return [(picture.kind, picture.data) for picture in map(source.take, shots)]
 
 
 ALL = [shot(camera, number) for number in range(2) for camera in range(3)]
@@ -457,7 +462,9 @@ def test_noise_differs_by_seed_and_from_picture_to_picture_of_the_same_thing() -
     def noisy(seed: int, number: int) -> Image:
         source = pictures(seed, None)
         source.expose(shot(0, number), shape_instant(0))
-        return decode(source.take(shot(0, number))[1], "", "").astype(int)
+        picture = source.take(shot(0, number))
+        assert isinstance(picture.image, np.ndarray) and (picture.image == decode(picture.data, "", "")).all()
+        return picture.image.astype(int)
 
     first, other_seed, later = noisy(3, 0), noisy(4, 0), noisy(3, 1)
     assert 0 < np.abs(first - other_seed).mean() < 6 and 0 < np.abs(first - later).mean() < 6
@@ -472,6 +479,20 @@ def test_a_repeated_frame_is_the_same_and_a_damaged_one_has_the_header_of_the_wh
     damaged = shape_taken(pictures(), [shot(2, 0, Fate.GARBLED)])[0]
     assert damaged[1] != whole[1] and damaged[1][:100] == whole[1][:100]
     assert damaged == shape_taken(pictures(), [shot(2, 0, Fate.GARBLED)])[0]
+
+
+def test_a_picture_that_cannot_be_decoded_says_whose_it_is() -> None:
+    damaged = [shot(1, number, Fate.GARBLED) for number in range(12)]
+    source, undecodable = pictures(quality=30), list[str]()
+    for one in damaged:
+        source.expose(one, shape_instant(0))
+    for one in damaged:
+        picture = source.take(one)
+        if isinstance(picture.image, InputError):
+            undecodable.append(str(picture.image))
+            start = f"camera {SHAPE_RIG.cameras[1].name}: picture {one.number} = '{len(picture.data)} bytes"
+            assert undecodable[-1].startswith(start)
+    assert 0 < len(undecodable) < len(damaged)
 
 
 def test_pictures_are_jpegs_or_lossless_as_asked() -> None:
@@ -505,15 +526,15 @@ def test_pictures_made_in_the_background_are_the_same_and_no_bead_is_laid_meanwh
 ) -> None:
     making, laid = threading.Event(), list[bool]()
 
-    def slow_render(*arguments: Any) -> list[Image]:
+    def slow_encode(*arguments: Any) -> tuple[str, bytes]:
         making.set()
         time.sleep(0.05)
-        images = render(*arguments)
+        result = encode(*arguments)
         making.clear()
-        return images
+        return result
 
     expected = shape_taken(pictures(), ALL)
-    monkeypatch.setattr(camera_pipeline, "render", slow_render)
+    monkeypatch.setattr(camera_pipeline, "encode", slow_encode)
 
     def note(until: float) -> None:
         laid.append(making.is_set())
@@ -523,5 +544,5 @@ def test_pictures_made_in_the_background_are_the_same_and_no_bead_is_laid_meanwh
         for one in ALL[3 * number : 3 * number + 3]:
             source.expose(one, shape_instant(one.picture))
         source.start()
-    assert [source.take(one) for one in ALL] == expected
+    assert encoded(source, ALL) == expected
     assert laid == [False, False]

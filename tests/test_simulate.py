@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from hardware.recording.session_reader import open_session
 from hardware.simulator import camera_pipeline
 from hardware.simulator.camera_pipeline import PictureStore
 from hardware.simulator.scenario import read_scenario
-from hardware.simulator.scene.render import render
+from hardware.simulator.scene.render import begin_render
 from hardware.simulator.simulate import SimulationOptions, run_simulation
 from tests.nozzle_logs import read_nozzle
 from tests.simulated_worlds import IDEAL, SMALL, write_path, write_scenario
@@ -89,10 +90,10 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     counts: list[int] = []
 
     def counting(*arguments: Any) -> Any:
-        counts.append(len(arguments[1]))
-        return render(*arguments)
+        counts.append(len(arguments[2]))
+        return begin_render(*arguments)
 
-    monkeypatch.setattr(camera_pipeline, "render", counting)
+    monkeypatch.setattr(camera_pipeline, "begin_render", counting)
     return counts
 
 
@@ -116,7 +117,8 @@ def test_what_a_fault_changes_is_rendered_and_no_more(recorded: Path, rendered: 
 def test_a_store_of_pictures_that_another_run_writes_or_that_is_damaged_is_done_without(tmp_path: Path) -> None:
     file = write_scenario(tmp_path, IDEAL)
     one, other = PictureStore(file, tmp_path / "cache"), PictureStore(file, tmp_path / "cache")
-    one.put(b"1", ("jpeg", b"picture"))
+    with ThreadPoolExecutor(1) as renderer:
+        renderer.submit(one.put, b"1", ("jpeg", b"picture")).result()
     other.put(b"2", ("jpeg", b"lost"))
     assert other.get(b"2") is None
     other.close()

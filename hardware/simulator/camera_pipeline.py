@@ -6,10 +6,11 @@ import hashlib
 import heapq
 import sqlite3
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from logging import WARNING
 from pathlib import Path
@@ -30,9 +31,9 @@ from hardware.process.progress import content_of, folder_size, size_text
 from hardware.simulator.cameras import Fate, Shot, SimulatedCameras, TrueCameras, garble
 from hardware.simulator.scenario import Scenario
 from hardware.simulator.scene.appearance import Sensor
-from hardware.simulator.scene.render import cover_wound, render
+from hardware.simulator.scene.render import begin_render, cover_wound, submit_after
 from hardware.simulator.scene.scene import Scene, WorldState
-from perception.frames import Frame, FrameSet, Pairing, PrintHead
+from perception.frames import Frame, FrameSet, Image, Pairing, PrintHead
 from perception.tracking.step import StepReport
 
 Action = Callable[[float], None]  # of the instant, s
@@ -79,12 +80,12 @@ class PictureStore:
         parts = [content_of(scenario), *sources, np.__version__.encode(), cv2.__version__.encode()]
         name = hashlib.sha256(b"".join(b"%d " % len(part) + part for part in parts)).hexdigest()[:12]
         self.folder = cache / f"{scenario.stem}-{name}-pictures"
-        self._put_count = self._run = 0
+        self._put_count, self._run, self._lock = 0, 0, threading.RLock()
         self._database: sqlite3.Connection | None = None
         with suppress(OSError, sqlite3.Error):
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "scenario").write_text(str(scenario.resolve()), encoding="utf-8")
-            self._database = sqlite3.connect(self.folder / "pictures.db", timeout=0)
+            self._database = sqlite3.connect(self.folder / "pictures.db", timeout=0, check_same_thread=False)
             self._database.execute(
                 "CREATE TABLE IF NOT EXISTS picture (key BLOB PRIMARY KEY, run INT, kind TEXT, data BLOB)"
             )
@@ -98,12 +99,13 @@ class PictureStore:
         return None if row is None else (str(row[0]), bytes(row[1]))
 
     def put(self, key: bytes, picture: tuple[str, bytes]) -> None:
-        """Store a picture."""
-        self._execute("INSERT OR REPLACE INTO picture VALUES (?, ?, ?, ?)", key, self._run, *picture)
-        self._put_count += 1
-        if self._database is not None and self._put_count % COMMIT_INTERVAL == 0:
-            with suppress(sqlite3.Error):
-                self._database.commit()
+        """Store a picture; from any thread."""
+        with self._lock:
+            self._execute("INSERT OR REPLACE INTO picture VALUES (?, ?, ?, ?)", key, self._run, *picture)
+            self._put_count += 1
+            if self._database is not None and self._put_count % COMMIT_INTERVAL == 0:
+                with suppress(sqlite3.Error):
+                    self._database.commit()
 
     def finish(self) -> None:
         """The run is over: delete the pictures that neither it nor the one before used."""
@@ -111,23 +113,26 @@ class PictureStore:
 
     def close(self) -> None:
         """Close the file."""
-        if self._database is not None:
-            with suppress(sqlite3.Error):
-                self._database.commit()
-            self._database.close()
+        with self._lock:
+            if self._database is not None:
+                with suppress(sqlite3.Error):
+                    self._database.commit()
+                self._database.close()
+                self._database = None  # a picture may still be in progress
         if self._put_count:
             print(f"pictures are kept in {self.folder}: {size_text(folder_size(self.folder))}", file=sys.stderr)
 
     def _execute(self, text: str, *values: object) -> Any:
         """The first row of a statement's result; None without one, or without a usable file."""
-        if self._database is None:
-            return None
-        try:
-            return self._database.execute(text, values).fetchone()
-        except sqlite3.Error:  # another run writes it, or the disk is full
-            self._database.close()
-            self._database = None
-            return None
+        with self._lock:
+            if self._database is None:
+                return None
+            try:
+                return self._database.execute(text, values).fetchone()
+            except sqlite3.Error:  # another run writes it, or the disk is full
+                self._database.close()
+                self._database = None
+                return None
 
 
 def picture_key(shot: Shot, state: WorldState, camera: Camera, scene: Scene) -> bytes:
@@ -148,12 +153,17 @@ def picture_key(shot: Shot, state: WorldState, camera: Camera, scene: Scene) -> 
 NOISE_STREAM, DAMAGE_STREAM = 5, 6  # streams of random numbers of one picture
 
 
-Pending = list[tuple[Shot, WorldState]]  # exposed and not yet rendered
-Rendered = list[tuple[Shot, bytes, tuple[str, bytes]]]  # with the picture's key
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A picture as its camera sent it."""
+
+    kind: str  # "jpeg" or "png"
+    data: bytes
+    image: Image | InputError  # decoded, or why it cannot be
 
 
 class PictureRenderer:
-    """Renders and encodes exposed pictures in the background while time goes on.
+    """Renders, encodes and decodes exposed pictures in the background while time goes on.
 
     Pending pictures are rendered together, one of each camera at a time, with the printed material of the first one's
     instant.
@@ -172,80 +182,66 @@ class PictureRenderer:
     ) -> None:
         """print_beads: brings the scene's printed material up to an instant, s. store: pictures of earlier runs."""
         self._scene, self._true_cameras, self._sensor, self._quality = scene, true_cameras, sensor, jpeg_quality
-        self._seed, self._threads, self._print_beads, self._store = seed, threads, print_beads, store
-        self._waiting: Pending = []
-        self._done: dict[tuple[int, int], tuple[str, bytes]] = {}
-        self._background = ThreadPoolExecutor(1)
-        self._job: Future[Rendered] | None = None
+        self._seed, self._print_beads, self._store, self._names = seed, print_beads, store, true_cameras.names
+        self._waiting: list[tuple[Shot, WorldState]] = []
+        self._pictures: dict[tuple[int, int], Future[Picture]] = {}
+        self._in_progress: list[Future[Picture]] = []
+        self._pool = ThreadPoolExecutor(threads)
 
     def expose(self, shot: Shot, state: WorldState) -> None:
         """Queue a shot with the world at its exposure."""
         self._waiting.append((shot, state))
 
     def start(self) -> None:
-        """Begin to render the pending pictures after those in progress: no bead is printed during rendering."""
+        """Begin to make the pending pictures after those in progress: no bead is printed during rendering."""
         if not self._waiting:
             return
-        self._join()
+        wait(self._in_progress)
         self._print_beads(min(state.stamp for _, state in self._waiting))
-        missing = [(*pair, self._key(*pair)) for pair in self._waiting]
-        missing = [entry for entry in missing if not self._load(entry[0], entry[2])]
+        pending = list[tuple[Shot, WorldState, bytes]]()
+        for shot, state in self._waiting:
+            key = picture_key(shot, state, self._true_cameras(shot), self._scene)
+            stored = None if self._store is None else self._store.get(key)
+            if stored is None:
+                pending.append((shot, state, key))
+            else:
+                self._pictures[shot.camera, shot.number] = self._pool.submit(self._decode, shot, *stored)
         self._waiting = []
-        if missing:
-            self._job = self._background.submit(self._render_all, missing)
-
-    def take(self, shot: Shot) -> tuple[str, bytes]:
-        """Format and bytes of an exposed picture; each once."""
-        key = shot.camera, shot.number
-        if key not in self._done:
-            self._join()
-        if key not in self._done:
-            self.start()
-            self._join()
-        return self._done.pop(key)
-
-    def _join(self) -> None:
-        """Wait for the pictures in progress."""
-        job, self._job = self._job, None
-        for shot, key, picture in () if job is None else job.result():
-            self._done[shot.camera, shot.number] = picture
-            if self._store is not None:
-                self._store.put(key, picture)
-
-    def _load(self, shot: Shot, key: bytes) -> bool:
-        """Take a picture from the store; whether it was there."""
-        picture = None if self._store is None else self._store.get(key)
-        if picture is not None:
-            self._done[shot.camera, shot.number] = picture
-        return picture is not None
-
-    def _key(self, shot: Shot, state: WorldState) -> bytes:
-        return picture_key(shot, state, self._true_cameras(shot), self._scene)
-
-    def _render_all(self, pending: list[tuple[Shot, WorldState, bytes]]) -> Rendered:
-        rendered: Rendered = []
         while pending:
             batch = {entry[0].camera: entry for entry in reversed(pending)}  # the first of each camera
             pending = [entry for entry in pending if entry is not batch[entry[0].camera]]
-            shots, states, keys = zip(*batch.values(), strict=True)
-            rendered += zip(shots, keys, self._render(shots, states), strict=True)
-        return rendered
+            wait(self._in_progress)
+            self._begin(*zip(*batch.values(), strict=True))
 
-    def _render(self, shots: Sequence[Shot], states: Sequence[WorldState]) -> list[tuple[str, bytes]]:
+    def take(self, shot: Shot) -> Picture:
+        """An exposed picture; each once."""
+        if (shot.camera, shot.number) not in self._pictures:
+            self.start()
+        return self._pictures.pop((shot.camera, shot.number)).result()
+
+    def _begin(self, shots: Sequence[Shot], states: Sequence[WorldState], keys: Sequence[bytes]) -> None:
         cameras = [self._true_cameras(shot) for shot in shots]
         rngs = [self._rng(NOISE_STREAM, shot.camera, shot.picture) for shot in shots]
-        images = render(self._scene, cameras, states, self._sensor, rngs, self._threads)
-        for i, (shot, camera, state) in enumerate(zip(shots, cameras, states, strict=True)):
-            if shot.covered is not None:
-                images[i] = cover_wound(images[i], camera, state.base_from_surface, shot.covered)
-        with ThreadPoolExecutor(self._threads) as pool:
-            encoded = list(pool.map(lambda image: encode(image, self._quality), images))
-        return [
-            (kind, garble(data, self._rng(DAMAGE_STREAM, shot.camera, shot.number)))
-            if shot.fate is Fate.GARBLED
-            else (kind, data)
-            for shot, (kind, data) in zip(shots, encoded, strict=True)
-        ]
+        images = begin_render(self._pool, self._scene, cameras, states, self._sensor, rngs)
+        parts = zip(shots, states, keys, images, strict=True)
+        self._in_progress = [submit_after(self._pool, self._encode, *each) for each in parts]
+        self._pictures |= {(s.camera, s.number): p for s, p in zip(shots, self._in_progress, strict=True)}
+
+    def _encode(self, shot: Shot, state: WorldState, key: bytes, image: Image) -> Picture:
+        if shot.covered is not None:
+            image = cover_wound(image, self._true_cameras(shot), state.base_from_surface, shot.covered)
+        kind, data = encode(image, self._quality)
+        if shot.fate is Fate.GARBLED:
+            data = garble(data, self._rng(DAMAGE_STREAM, shot.camera, shot.number))
+        if self._store is not None:
+            self._store.put(key, (kind, data))
+        return self._decode(shot, kind, data)
+
+    def _decode(self, shot: Shot, kind: str, data: bytes) -> Picture:
+        try:
+            return Picture(kind, data, decode(data, f"camera {self._names[shot.camera]}", f"picture {shot.number}"))
+        except InputError as error:
+            return Picture(kind, data, error)
 
     def _rng(self, stream: int, camera: int, number: int) -> np.random.Generator:
         """A picture's own random numbers: they depend on nothing but its camera and number."""
@@ -340,14 +336,12 @@ class CameraPipeline:
     def _arrive(self, shot: Shot, now: float) -> None:
         frame = Frame(shot.camera, shot.stamp, np.zeros((0, 0), np.uint8))  # without renderer it is not used
         if self._pictures is not None:
-            kind, data = self._pictures.take(shot)
-            try:
-                image = decode(data, f"camera {self._scenario.rig.cameras[shot.camera].name}", f"picture {shot.number}")
-            except InputError as error:  # as a driver drops what it cannot decode
-                self._sink.event(now, str(error))
+            picture = self._pictures.take(shot)
+            if isinstance(picture.image, InputError):  # as a driver drops what it cannot decode
+                self._sink.event(now, str(picture.image))
                 return
-            self._sink.picture(shot, kind, data)
-            frame = replace(frame, image=image)
+            self._sink.picture(shot, picture.kind, picture.data)
+            frame = replace(frame, image=picture.image)
         self._take_sets(self._pairer.add(frame, now), now)
         self._events.at(
             now + self._pairer.patience, ARRIVAL_EVENT, lambda due: self._take_sets(self._pairer.due(due), due)

@@ -266,7 +266,7 @@ class TrueCameras:
     """The true cameras of a rig; a bumped one is the same object for as long as its fault lasts."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
-        self._cameras = cameras
+        self._cameras, self.names = cameras, [camera.name for camera in cameras]
         self._bumped: dict[tuple[int, Fault], Camera] = {}
 
     def __call__(self, shot: Shot) -> Camera:

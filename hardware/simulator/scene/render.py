@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ from hardware.simulator.scene.surface_picture import SurfacePicture, surface_pic
 from perception.boards.board import Board, ink_cells
 from perception.frames import Image
 
+Result = TypeVar("Result")
+
 
 def render(
     scene: Scene,
@@ -38,16 +41,30 @@ def render(
     threads: int = 2,
 ) -> list[Image]:
     """Images (H, W, 3) BGR, one per camera with its instant and its noise; the same for any number of threads."""
-    shared = {key: scene_state(scene, instant) for key, instant in {id(i): i for i in instants}.items()}
     with ThreadPoolExecutor(threads) as pool:
-        jobs = [(shared[id(i)], scene.view(c)) for c, i in zip(cameras, instants, strict=True)]
-        skins = [pool.submit(surface_picture, s, v) for s, v in jobs]
-        cloths = [pool.submit(drape_picture, s, v) for s, v in jobs]
-        images = [
-            pool.submit(_picture, s, v, skin.result(), cloth.result(), sensor, rng)
-            for (s, v), skin, cloth, rng in zip(jobs, skins, cloths, rngs, strict=True)
-        ]
-        return [image.result() for image in images]
+        return [image.result() for image in begin_render(pool, scene, cameras, instants, sensor, rngs)]
+
+
+def begin_render(
+    pool: Executor,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    instants: Sequence[WorldState],
+    sensor: Sensor,
+    rngs: Sequence[Generator],
+) -> list[Future[Image]]:
+    """As `render`, without waiting. pool: begins its jobs in the order of their submission, as they wait for others."""
+    states = {key: pool.submit(scene_state, scene, instant) for key, instant in {id(i): i for i in instants}.items()}
+    jobs = [(states[id(i)], scene.view(c)) for c, i in zip(cameras, instants, strict=True)]
+    skins = [submit_after(pool, surface_picture, *job) for job in jobs]
+    cloths = [submit_after(pool, drape_picture, *job) for job in jobs]
+    parts = zip(jobs, skins, cloths, rngs, strict=True)
+    return [submit_after(pool, _picture, *job, *layers, sensor, rng) for job, *layers, rng in parts]
+
+
+def submit_after(pool: Executor, function: Callable[..., Result], *arguments: object) -> Future[Result]:
+    """Submit a call with the results of those arguments that are futures, submitted to the same pool before."""
+    return pool.submit(lambda: function(*(each.result() if isinstance(each, Future) else each for each in arguments)))
 
 
 class StillScene:
