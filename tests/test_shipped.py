@@ -39,7 +39,7 @@ def test_a_type_checker_believes_what_is_installed() -> None:
 def test_the_page_of_dependencies_says_what_is_pinned_and_why() -> None:
     page = dependency_table.DOCUMENT.read_text(encoding="utf-8")
     assert dependency_table.stale(page) == [], "python -m tests.dependency_table"
-    for wrong in (page.replace("| toppra | 0.6.10", "| toppra | 0.6.9"), page.replace("every array", "some arrays")):
+    for wrong in (page.replace("| toppra | 0.6.10", "| toppra | 0.6.9"), page.replace("all arrays", "some arrays")):
         assert len(dependency_table.stale(wrong)) == 1
     assert dependency_table.stale(page + "| numpy-too | 1 | why | who | MIT | 1 | 1 | 1 |\n")
 

@@ -53,7 +53,7 @@ def run_arm(
     if not request.seconds > 0:
         raise InputError("command line", "--seconds", request.seconds, "above 0")
     if request.moves and not request.confirmed:
-        raise InputError("arm", "--yes", "missing", "given by whoever sees that nobody is within the arm's reach")
+        raise InputError("arm", "--yes", "missing", "the confirmation that nobody is within the arm's reach")
     start, settings = clock.now(), LinkSettings() if settings is None else settings
     arm = Arm(driver, profile, start, settings)
     if arm.state is ArmState.UNPLUGGED and (request.moves or np.isfinite(request.seconds)):
