@@ -38,11 +38,13 @@ KEY_FRAMES = 120  # of the first estimate of landmarks and cameras
 NOISE_STRETCH = 240  # neighbouring frame sets of the first noise estimate, in recordings three times as long
 GATE_WIDENINGS = (8.0, 4.0, 2.0)  # factors of the gate, from coarse to fine (graduated non-convexity)
 LOSS_SLOPE = 0.7  # of Geman-McClure's residuals for normal errors, over the mean of their weights
-MAX_STEPS = 10  # at the narrowest gate
-CONVERGED_SIGMAS = 0.3  # largest last step of a landmark or camera; the next would be a tenth of it
+MAX_STEPS = 40  # at the narrowest gate
+CONVERGED_SIGMAS = (
+    0.3  # last step of the cameras and of 95 % of the landmarks: single ones may go on between two places
+)
 INITIAL_JERK_PSD = np.array([1e3] * 3 + [1e7] * 3)  # rad^2/s^5, mm^2/s^5
 INITIAL_DELAY_SIGMA_S, INITIAL_SHIFT_SIGMA_PX = 5e-4, 0.02
-MAX_NOISE_PASSES = 10  # that estimate the jerk's density and the tracks' noise
+MAX_NOISE_PASSES = 30  # that estimate the jerk's density and the tracks' noise
 PSD_CONVERGED = 0.15  # mean change of the density's logarithm in a last pass
 PSD_START_RATIO = 10.0  # initial density of the whole by that of the segment: it converges from above
 COVARIANCE_SAMPLES = 1500  # frame sets at which the shared part of the covariance is computed
@@ -176,6 +178,7 @@ class _Solver:
     noise: NoiseModel
     report: PassReport
     passes: int = 0
+    last_step: float = 0.0  # as `_step` returns it
 
     def solve(self) -> Smoothed:
         """Run them."""
@@ -190,7 +193,8 @@ class _Solver:
                 self._step(gate)
         self._learn_noise()
         for _ in range(MAX_STEPS):
-            if self._step(1.0) < CONVERGED_SIGMAS:
+            self.last_step = self._step(1.0)
+            if self.last_step < CONVERGED_SIGMAS:
                 break
         return self._result()
 
@@ -239,13 +243,14 @@ class _Solver:
         return NormalEquations(self.problem, self.estimate, self.known, self.noise)
 
     def _step(self, gate: float) -> float:
-        """One step of all unknowns; the largest step of a landmark or camera, in sigmas."""
+        """One step of all unknowns; in sigmas, the larger of the cameras' largest step and 95 % of the landmarks'."""
         equations = self._equations(gate, LOSS_SLOPE if gate == 1.0 else 1.0)
         done = equations.eliminate(self._reporter("landmarks and poses"))
         step = done.shared_step()
         sigma = np.sqrt(np.diag(done.shared_covariance()))
         self._apply_step(equations.eliminate(self._reporter("poses"), step), step)
-        return float(np.abs(step / sigma).max())
+        sizes, cameras = np.abs(step / sigma), len(self.problem.free)
+        return float(max(sizes[:cameras].max(initial=0.0), np.quantile(sizes[cameras:], 0.95)))
 
     def _step_states(self, gate: float) -> tuple[NormalEquations, Elimination]:
         """One step of the states only; the equations before it."""
@@ -329,7 +334,8 @@ class _Solver:
         rms = np.sqrt(np.divide(pixels, 2 * used, out=np.full(len(used), np.nan), where=used > 0))
         shape, noise = (len(data), n), self.noise
         counts = used.reshape(shape), observed.reshape(shape), rms.reshape(shape)
-        return FitStatistics(*counts, noise.residual_scale, noise.delay_sigma, noise.shift_sigma, cost, self.passes)
+        sigmas = noise.residual_scale, noise.delay_sigma, noise.shift_sigma
+        return FitStatistics(*counts, *sigmas, cost, self.passes, self.last_step, self.last_step < CONVERGED_SIGMAS)
 
 
 def _information(surface: SurfaceMap, data: TrackArrays) -> Array:

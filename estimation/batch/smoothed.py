@@ -210,6 +210,8 @@ class FitStatistics:
     shift_sigma: float  # px, of an image's shift in one frame set
     cost: float  # robust, half of squared sigmas
     passes: int  # over all frame sets
+    last_step: float  # of cameras and landmarks, in sigmas
+    converged: bool  # whether that is small enough
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -149,6 +149,7 @@ def _figures(result: Smoothed, evaluation: SmoothEvaluation, session: Session) -
         "error_mm": ours,
         "live_error_mm": live,
         "passes": fitted.passes,
+        "converged": fitted.converged,
         "cost": fitted.cost,
         "damage": session.damage,
     }

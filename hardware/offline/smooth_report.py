@@ -181,6 +181,11 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
         texts.append(f"Error against the {_reference_name(evaluation)}: smoothed {ours} mm{live_text} (RMS, aligned).")
         nees, fixed = evaluation.errors[0].mean_nees / 6, fixed_row(result.covariance[:, :6, :6]) is not None
         texts += [f"NEES/6: {figure(nees)}, {consistency_text(nees, fixed)}."] if np.isfinite(nees) else []
+    if not result.statistics.converged:
+        texts.append(
+            f"Not converged: the last of {result.statistics.passes} passes moved cameras or landmarks by "
+            f"{figure(result.statistics.last_step)} sigma; errors may be larger than reported."
+        )
     texts += [rhythm.words(name) for name, rhythm in evaluation.spectrum.rhythms]
     return " ".join(texts)
 
