@@ -20,6 +20,7 @@ from hardware.bench.figures import (
     Target,
     at_least,
     at_most,
+    memory_figures,
     memory_growth,
     read_figures,
     save,
@@ -159,6 +160,15 @@ def test_what_grows_is_told_process_by_process() -> None:
     assert memory_growth(warming)["map"] == pytest.approx((0.0, 115.0), abs=1e-6)
     (slope, size), nothing = memory_growth(warming[:60])["map"], memory_growth([])
     assert np.isnan(slope) and size == 115.0 and nothing == {}  # too short to tell
+
+
+def test_the_growth_of_memory_leaves_out_the_first_minutes_and_says_so() -> None:
+    steps = [(s, {"run": 50.0 + min(s, 90.0), "map": 100.0 + s / 1800}) for s in np.arange(0.0, 600.0, 2.0).tolist()]
+    grown, size = memory_figures("live", steps)
+    assert grown.value == pytest.approx(2.0) and grown.note == "run +0.0, map +2.0; without the first 2 min"
+    assert size.value == pytest.approx(240.33, abs=0.01) and grown.target == at_most(5)
+    short = memory_figures("live", steps[:60])[0]
+    assert np.isnan(short.value) and short.target is None and "4 min and more" in short.note
 
 
 def test_solve_pnp_finds_exact_tracks_exactly_and_no_pose_of_too_few() -> None:

@@ -291,3 +291,17 @@ def memory_growth(memory: Sequence[tuple[float, dict[str, float]]]) -> dict[str,
         slope = np.polyfit(stamps[known] - stamps[0], megabytes[known], 1)[0] if known.sum() > 5 else np.nan
         growth[name] = float(3600 * slope), float(megabytes[-1])
     return growth
+
+
+def memory_figures(name: str, memory: Sequence[tuple[float, dict[str, float]]]) -> list[Figure]:
+    """Growth of all processes together and its parts, by least squares, and their size in the end; of s and MB each."""
+    growth = memory_growth(memory)
+    slope, size = (sum(each[k] for each in growth.values()) if growth else np.nan for k in (0, 1))
+    note, target = TOO_SHORT, None
+    if np.isfinite(slope):
+        slopes = ", ".join(f"{process} {by:+.1f}" for process, (by, _) in growth.items())
+        note, target = f"{slopes}; without the first {MEMORY_WARM_UP / 60:g} min", at_most(5)
+    return [
+        Figure(f"{name}: memory grows", slope, "MB/h", target, "", note),
+        Figure(f"{name}: memory", size, "MB"),
+    ]

@@ -25,7 +25,7 @@ import numpy as np
 from estimation.errors import InputError
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
-from hardware.bench.figures import TOO_SHORT, Figure, append_rows, at_least, at_most, memory_growth, with_progress
+from hardware.bench.figures import Figure, append_rows, at_least, at_most, memory_figures, with_progress
 from hardware.bench.link import burning
 from hardware.bench.recordings import FRAME_RATE, beside_figures, packed_sets, rendered_recording, unpacked_set
 from hardware.bench.whole import LiveSession
@@ -273,15 +273,11 @@ def _holds_text(summary: dict[str, Any]) -> str:
 
 
 def _load(name: str, summary: dict[str, Any], memory: Sequence[tuple[float, dict[str, float]]]) -> list[Figure]:
-    growth, recorder = memory_growth(memory), 100 * (summary["recorder_share_of_core"] or np.nan) / 2
-    slope, size = (sum(each[k] for each in growth.values()) if growth else np.nan for k in (0, 1))
-    slopes = ", ".join(f"{process} {by:+.0f}" for process, (by, _) in growth.items())
-    slopes = slopes if np.isfinite(slope) else TOO_SHORT
+    recorder = 100 * (summary["recorder_share_of_core"] or np.nan) / 2
     return [
         Figure(f"{name}: recorder", recorder, "%", at_most(3), "", "of two cores, its start included"),
         Figure(f"{name}: not recorded", summary["unrecorded"], "", at_most(0)),
-        Figure(f"{name}: memory grows", slope, "MB/h", at_most(5) if np.isfinite(slope) else None, "", slopes),
-        Figure(f"{name}: memory", size, "MB"),
+        *memory_figures(name, memory),
     ]
 
 
