@@ -432,6 +432,18 @@ def test_the_place_of_a_path_is_kept_and_read_back(tmp_path: Path) -> None:
         read_progress(tmp_path / "x.toml", raised_path(path, 1.0))
 
 
+def test_a_place_is_kept_without_a_new_name_in_the_table_of_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interned, intern = list[str](), sys.intern
+    monkeypatch.setattr(sys, "intern", lambda name: interned.append(name) or intern(name))
+    file = tmp_path / "x.toml"
+    interned.clear()
+    for fraction in (1.0, 2.0):  # ten a second for hours
+        write_progress_durably(file, "abc", fraction)
+    assert not interned and "fraction = 2.0" in file.read_text(encoding="utf-8")
+
+
 def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
     pose = se3.make(se3.exp_rotation([0.1, 0.2, 0.3]), np.array([1 / 3, 2 / 3, 1e-9]))
