@@ -39,9 +39,8 @@ NOISE_STRETCH = 240  # neighbouring frame sets of the first noise estimate, in r
 GATE_WIDENINGS = (8.0, 4.0, 2.0)  # factors of the gate, from coarse to fine (graduated non-convexity)
 LOSS_SLOPE = 0.7  # of Geman-McClure's residuals for normal errors, over the mean of their weights
 MAX_STEPS = 40  # at the narrowest gate
-CONVERGED_SIGMAS = (
-    0.3  # last step of the cameras and of 95 % of the landmarks: single ones may go on between two places
-)
+# last step of the cameras and of 95 % of the landmarks: single ones may go on between two places
+CONVERGED_SIGMAS = 0.3
 INITIAL_JERK_PSD = np.array([1e3] * 3 + [1e7] * 3)  # rad^2/s^5, mm^2/s^5
 INITIAL_DELAY_SIGMA_S, INITIAL_SHIFT_SIGMA_PX = 5e-4, 0.02
 MAX_NOISE_PASSES = 30  # that estimate the jerk's density and the tracks' noise
