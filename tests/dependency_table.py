@@ -84,6 +84,17 @@ these files say. Size: what a package itself takes, unpacked. Alone: by how much
 it, as what comes along for nothing else would go too. Import: time of the processor in a new process, on the machine
 that wrote the page; it says what is worth loading late (toppra: without plots and curves a seventh). `make audit`
 asks for known vulnerabilities of the pins.
+
+## Known weaknesses
+
+Read on 28 November 2026: PyPA's advisories until October 2024 for all pins, and the packages' issue threads until
+September 2026. No valid advisory applies to a pin. Two weaknesses are in no advisory read:
+
+* The wheel of OpenCV 5.0.0.93 contains FFmpeg 8.1.1. Its decoder of MagicYUV writes beyond its memory (CVE-2026-8461),
+  and CVE-2026-70628 to 70632 are reported (opencv/opencv-python, issues 1248 and 1272). There is no wheel of OpenCV 5
+  with a newer one yet. stillbed opens videos and streams with it: **open only videos and streams that you trust.**
+* numexpr 2.14.2, which comes with evo for the tests: its check of expressions can be bypassed (pydata/numexpr, pull
+  request 564). stillbed gives it none.
 """
 HEAD = "| package | pin | why | kept by | licence | size, MB | alone, MB | import, ms |\n" + 8 * "|---" + "|\n"
 UNKNOWN = "–"
