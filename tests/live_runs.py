@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -77,12 +78,13 @@ class Running:
         self.keys, theirs = pty.openpty()
         more = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         environment = os.environ | {"PYTHONPATH": more, "XDG_CACHE_HOME": str(cache), "OPENBLAS_NUM_THREADS": "1"}
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - closed with this object
         self.process = subprocess.Popen(
             [sys.executable, "-m", *program, *arguments],
             cwd=cwd,
             env=environment,
             stdin=theirs,
-            stdout=subprocess.DEVNULL,
+            stdout=self._output,
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
@@ -109,7 +111,13 @@ class Running:
                     return found.end()
                 break
             CLOCK.wait_until(CLOCK.now() + 0.01)
-        raise AssertionError(f"{pattern!r} was not said:\n{self.said}")
+        ended = self.process.poll()
+        state = "it runs" if ended is None else f"it ended with {ended}"
+        raise AssertionError(f"{pattern!r} was not said, {state}:\n{self.said}\nits output:\n{self.output()}")
+
+    def output(self) -> str:
+        """What it wrote to its standard output so far."""
+        return os.pread(self._output.fileno(), 1 << 20, 0).decode(errors="replace")
 
     def pid(self, name: str) -> int:
         """The process of that name among its children."""
