@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -202,6 +203,20 @@ def test_hairs_that_are_combed_aside_are_not_taken_for_the_skin(variant: int) ->
     assert not any(v.wrong for v in verdicts)
     assert all(p.state is TrackState.TRACKING for p in poses[5:TRICK])
     assert any("off the texture" in p.reason for p in poses) or max(v.error for v in verdicts[5:]) < 1.0
+
+
+def test_the_first_colours_are_those_of_the_pose_they_are_learned_at() -> None:
+    """A busy machine leaves no time between frame sets: the surface is then learned some of them later."""
+    session, pause = made("plain"), 8
+    step, poses = tracker(session), []
+    for number, frames in enumerate(islice(frame_sets(session), 40)):
+        poses.append(step(frames))
+        if number % pause == pause - 1:
+            step.idle()
+    places = np.array([p.base_from_surface[:3, 3] for p in poses])
+    assert np.linalg.norm(places[pause:] - places[:-pause], axis=1).max() > MIN_SHIFT_MM
+    assert [p.reason for p in poses if "off the texture" in p.reason] == []
+    assert sum(p.state is TrackState.TRACKING for p in poses) > 20
 
 
 def test_the_claim_of_displaced_places_reaches_as_far_as_they_are() -> None:

@@ -112,7 +112,8 @@ class TrackingStep:
         self._mapping = Mapping(self._lenses, roi, self._search, self._estimator, self._masks, executor, scan, waits)
         self._matcher: Matcher | None = None
         self._reset_appearance()
-        self._unverified_set: TrackedSet | None = None  # from which the verification learns the surface
+        # what the verification learns the surface from, and its pictures as received: `idle` may come frame sets later
+        self._unverified_set: tuple[TrackedSet, dict[int, Image]] | None = None
         self._images: dict[int, Image] = {}  # of the frame set, as received
         self._pictures: dict[int, Pyramid] = {}  # of the last frame set
         self._search_pyramids: dict[int, Pyramid] = {}  # of cameras in which `idle` searches for the surface
@@ -177,11 +178,11 @@ class TrackingStep:
         if self._matcher is not None:
             self._mapping.update()
         if self._unverified_set is not None and self._estimator.map is not None:
-            tracked, self._unverified_set = self._unverified_set, None
+            (tracked, images), self._unverified_set = self._unverified_set, None
             poses = self._mapping.camera_poses(tracked)
             self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
             carrier_poses = {c: poses[c] for c in self._carrying_cameras(tracked) if c in poses}
-            self._colours.begin(self._images, carrier_poses, self._estimator.map)
+            self._colours.begin(images, carrier_poses, self._estimator.map)
         if self._mapping.look_for_hint(self._pictures, repeats=len(self._verification.aliases) > 0):
             self._matcher = self._unverified_set = None
         self._relocalise()
@@ -216,8 +217,7 @@ class TrackingStep:
         start = self._mapping.start(frames, pyramids)
         self._add_time("search")
         if isinstance(start, str):
-            none = np.zeros(len(self.rig), np.int64)
-            return identity_pose(frames.stamp, start), no_observations(frames.stamp), none
+            return identity_pose(frames.stamp, start), no_observations(frames.stamp), np.zeros(len(self.rig), np.int64)
         self._matcher, pose, tracked = start
         self._reset_appearance()
         return pose, tracked.observations, tracked.fit.used
@@ -247,9 +247,11 @@ class TrackingStep:
                     self._matcher = None
                 reason = f"the first map waits for a second look by two cameras ({fit.reason or 'one sees it'})"
                 return estimator.hold(stamp, reason), tracked.observations, fit.used
-            tracked = self._unverified_set = self._mapping.confirm(tracked)
+            tracked = self._mapping.confirm(tracked)
+            self._unverified_set = tracked, self._images
         elif fit.measured and not fit.outliers and estimator.too_fast_for_map(fit):
-            tracked = self._unverified_set = self._mapping.rebuild(tracked)
+            tracked = self._mapping.rebuild(tracked)
+            self._unverified_set = tracked, self._images
         elif fit.measured:
             tracked, aliases = self._verify(tracked)
 
@@ -260,8 +262,7 @@ class TrackingStep:
             self._absent_sets = 0
             exposed = estimator.as_exposed(fit.solution.base_from_surface, fit.twist)
             fit = replace(fit, shadowed=matcher.shadowed_tracks(pyramids, exposed, observations, ~fit.inlier))
-            query = estimator.elsewhere(fit, observations)
-            start = fit.solution.base_from_surface
+            query, start = estimator.elsewhere(fit, observations), fit.solution.base_from_surface
             elsewhere = None if query is None else matcher.align_at(stamp, pyramids, start, query.rows, query.points)
             carrier_poses = {c: exposed[c] for c in self._carrying_cameras(tracked)}
             displaced = self._colours(self._images, carrier_poses, estimator.expected(stamp).warp)
