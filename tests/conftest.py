@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,9 @@ settings.register_profile("fixed", deadline=None, derandomize=True, max_examples
 settings.register_profile("many", settings.get_profile("fixed"), max_examples=250)  # `make slow`
 settings.register_profile("unshrunk", settings.get_profile("fixed"), phases=[Phase.explicit, Phase.generate])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))  # mutants need no smallest example
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background: what tests start inherits it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest_plugins = ["estimation.synthetic.plugin"]  # by name, so that a checkout that is not installed has it too
 
