@@ -468,9 +468,23 @@ MUTANTS = (
     Mutant(
         "two groups in a region are no doubt",
         "estimation/online/parted_texture.py",
-        "if not self._core or self._ambiguous(np.flatnonzero(self._members), MAX_PARTED_SHARE):",
-        "if not self._core:",
+        "if periodic or not self._core or self._ambiguous(np.flatnonzero(self._members), MAX_PARTED_SHARE):",
+        "if periodic or not self._core:",
         ("test_local_error.py::test_a_region_that_holds_two_groups_is_sure_of_neither",),
+    ),
+    Mutant(
+        "cloth that slips over tissue is sure to be the surface",
+        "estimation/online/parted_texture.py",
+        "if periodic or not self._core or",
+        "if not self._core or",
+        ("test_local_error.py::test_where_the_texture_repeats_as_cloth_does_even_a_small_group_may_be_the_surface",),
+    ),
+    Mutant(
+        "a part of cloth that moves says nothing of the rest",
+        "estimation/online/parted_texture.py",
+        "self._moved = moved if periodic else 0.0",
+        "self._moved = 0.0",
+        ("test_local_error.py::test_a_bump_is_a_matter_of_its_place_and_in_cloth_of_all_of_it",),
     ),
 )
 

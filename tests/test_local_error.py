@@ -240,10 +240,11 @@ def test_a_place_without_a_landmark_around_it_is_not_known(region: bool, span: f
 
 
 def parted(
-    share: float, region: bool, slides: Motion, seconds: float = 3.0, motion: Motion = breathing
+    share: float, region: bool, slides: Motion, seconds: float = 3.0, motion: Motion = breathing, periodic: bool = False
 ) -> tuple[list[SurfacePose], Array, Followed]:
     """Poses, and errors (T,) mm at the middle, where the landmarks left of a line move by `slides` on their own."""
     follow, rate = Followed(SPARSE, 30.0, motion, region=region), 30.0
+    follow.estimator.periodic = periodic
     across = np.sort(SPARSE[:, 0])[int(share * len(SPARSE))]
     left = SPARSE[:, 0] < across
     poses, off = [], []
@@ -293,6 +294,27 @@ def test_a_region_that_holds_two_groups_is_sure_of_neither(share: float) -> None
     poses, _, _ = parted(share, True, slipping, 1.0)
     last = poses[-1]
     assert not last.state.measured or last.error_at(MIDDLE)[0] > LIMIT_MM
+
+
+def test_where_the_texture_repeats_as_cloth_does_even_a_small_group_may_be_the_surface() -> None:
+    poses, off, _ = parted(0.15, True, slipping, 0.5, periodic=True)
+    apart = np.array([np.linalg.norm((slipping(p.stamp) - breathing(p.stamp))[:3, 3]) for p in poses])
+    far = np.array([p.radius_at(np.array([[40.0, 0.0, 0.0]]), 0.95)[0] for p in poses])
+    assert off.max() < 0.2 and (far[apart > 0.7] > apart[apart > 0.7] / 3).all() and (apart > 0.7).sum() > 10
+    assert far[apart < 0.1].max() < LIMIT_MM
+    assert any("so that may be the surface" in p.reason for p in poses)
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_a_bump_is_a_matter_of_its_place_and_in_cloth_of_all_of_it(periodic: bool) -> None:
+    follow, bump, lifts = Followed(DENSE, 30.0, breathing), Deformation(bulge=1.0, radius=BUMP_MM), rise(1.0, 0.5)
+    follow.estimator.periodic, rim = periodic, 0.45 * np.ptp(DENSE, axis=0)[None]
+    high = np.array([lifts(k / 30.0) for k in range(1, int((BEGINS_S + 1.0) * 30.0))])
+    poses = [follow(bump.displacement(DENSE, h)) for h in high.tolist()]
+    claims = np.array([pose.error_at(rim)[0] for pose in poses])
+    assert claims[high == 0].max() < LIMIT_MM / 2
+    risen = claims[high > LIMIT_MM]
+    assert (risen > LIMIT_MM / 2).all() if periodic else (risen < LIMIT_MM / 4).all()
 
 
 def test_texture_that_moves_as_one_is_never_told_apart() -> None:

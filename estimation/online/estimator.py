@@ -57,7 +57,7 @@ class Estimator:
 
     def __init__(self, rig: Rig, settings: EstimatorSettings | None = None, region: Region = "drawn") -> None:
         """region: who says what the surface is, on which all landmarks of the first map lie."""
-        self.rig, self._region = rig, region
+        self.rig, self._region, self.periodic = rig, region, False  # periodic: whether the surface's texture repeats
         self.settings, self.cameras = settings or EstimatorSettings(), CameraErrors(len(rig))
         self.health = CameraHealth([camera.name for camera in rig.cameras])
         self._earlier_cameras = CameraErrorHistory(self.cameras)
@@ -297,8 +297,8 @@ class Estimator:
         surface.detector(fit.stamp, fit.solution.base_from_surface, fit.parts.noise)
         self._update_health(fit)
         self.health.rivals.update(self.rig, fit.stamp, fit.solution.base_from_surface, fit.rivals, fit.outliers)
-        surface.local_motion(observations, fit, sigma, surface.map, self._smear(fit))
-        surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map))
+        moved = surface.local_motion(observations, fit, sigma, surface.map, self._smear(fit))
+        surface.parted(observations, fit, elsewhere, surface.warp.points(surface.map), self.periodic, moved)
         lasting = fit.parts.lasting + surface.calibration_error.covariance(fit, self.cameras)
         rebuilds = self._smoother.rebuilds
         base_from_surface = fit.solution.base_from_surface @ se3.exp(fit.parts.step)

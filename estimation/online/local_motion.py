@@ -107,8 +107,8 @@ class LocalMotion:
 
     def __call__(
         self, observations: Observations, fit: FrameFit, sigma: Array, surface_map: SurfaceMap, smeared: float
-    ) -> None:
-        """Take an accepted fit to `observations`. sigma: (N,) px. Cameras that were left out do not count.
+    ) -> float:
+        """Take an accepted fit to `observations`; the new `size`. sigma: (N,) px. Cameras left out do not count.
 
         smeared: mm that the surface moves in one sigma of the cameras' exposure delays.
         """
@@ -130,6 +130,7 @@ class LocalMotion:
         self._learn(normal, right, weight, square, supported)
         self._look_at_small(normal, excess, weight, SMEAR_SIGMAS * smeared)
         self._set_error(np.where(self._moving, HEIGHT_RATIO * np.maximum(size, MIN_DISPLACEMENT_MM), 0.0), unseen)
+        return self.size
 
     def _look_at_small(self, normal: Array, excess: Array, weight: Array, smear: float) -> None:
         """Learn how far landmarks stand out from the others of their bell; stored until they are in place again.

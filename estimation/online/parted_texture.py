@@ -4,7 +4,8 @@ A drape lies beside a wound, a dressing on the skin, or a wound moves in a windo
 moves as one body, no picture shows which part is the surface. Once landmarks that were inliers are missing or outliers,
 they are searched at rest in the base frame, where they were last inliers, and then along their own motion. If one rigid
 pose fits most of them they are a group. Which of both groups is the surface, only the operator's region decides:
-without one, or if the region contains too much of both, the reported covariance covers either.
+without one, or if the region contains too much of both, the reported covariance covers either. It also does where the
+texture is periodic: cloth is, tissue is not, so what moves by itself may be the tissue, however few landmarks it has.
 """
 
 from __future__ import annotations
@@ -38,8 +39,10 @@ PARTED_MEMORY_S = 10.0  # some breaths: groups that met again may part again
 COMPANY_MM = 10.0  # within which a landmark that parted has another one: alone, a group's motion fits it by chance
 PLACE_MM = 4.0  # reach of what it says about its place: landmarks stand that far apart
 MAX_SOUGHT = 40  # landmarks that are looked for elsewhere
-VANISHED = np.diag([0.0] * 3 + [MAX_UNSEEN_MM**2] * 3)  # (6, 6) while half of it is lost: that may be the surface
+SHIFTED = np.diag([0.0] * 3 + [1.0] * 3)  # (6, 6) mm^2
+VANISHED = MAX_UNSEEN_MM**2 * SHIFTED  # while half of it is lost: that may be the surface
 REGION_HINT = "the region holds both: draw it tighter"
+CLOTH_HINT = "the rest repeats, as cloth does, so that may be the surface"
 PICTURE_HINT = "no region says which is the surface: draw one"
 
 
@@ -72,15 +75,17 @@ class PartedTexture:
         self._group_lost = False  # whether the lost landmarks once moved as a group, and have not come back
         self._vanished = False  # whether so many are lost, without being a group, that they may be the surface
         self._ambiguity: tuple[float, Array] | None = None  # s, and covariance (6, 6) that held both groups then
+        self._moved = 0.0  # mm, by which a part of a periodic texture moves without being a group
 
     def covariance(self, stamp: float) -> Array | None:
         """(6, 6) to be added to that of a pose: either group may be the surface; None where that is decided."""
-        vanished = VANISHED if self._vanished else None
-        if self._ambiguity is None:
-            return vanished
-        since, covariance = self._ambiguity
-        remaining = covariance * float(np.exp(-2 * max(stamp - since, 0.0) / PARTED_MEMORY_S))
-        return remaining if vanished is None else remaining + vanished
+        parts = [VANISHED] if self._vanished else []
+        if self._moved:
+            parts.append(self._moved**2 * SHIFTED)
+        if self._ambiguity is not None:
+            since, covariance = self._ambiguity
+            parts.append(covariance * float(np.exp(-2 * max(stamp - since, 0.0) / PARTED_MEMORY_S)))
+        return np.sum(parts, axis=0) if parts else None
 
     def widened(self, pose: SurfacePose) -> SurfacePose:
         """The pose with a covariance that also covers its place by the other group, if there is one."""
@@ -125,9 +130,19 @@ class PartedTexture:
         return Elsewhere(rows[far], expected_points[far]) if far.sum() >= MIN_GROUP_LANDMARKS else None
 
     def __call__(
-        self, observations: Observations, fit: FrameFit, elsewhere: Observations | None, points: Array
+        self,
+        observations: Observations,
+        fit: FrameFit,
+        elsewhere: Observations | None,
+        points: Array,
+        periodic: bool = False,
+        moved: float = 0.0,
     ) -> None:
-        """Take the accepted fit that `search` was called with, and observations elsewhere. points: (N, 3) mm."""
+        """Take the accepted fit that `search` was called with, and observations elsewhere. points: (N, 3) mm.
+
+        periodic: whether the texture repeats. moved: mm, by which a part of the surface moves by itself (LocalMotion).
+        """
+        self._moved = moved if periodic else 0.0
         if len(self._lost_rows) < MIN_GROUP_LANDMARKS and not self.message:
             return
         off = self._off(fit) & np.isin(observations.track, self._lost_rows)
@@ -141,7 +156,7 @@ class PartedTexture:
         self._sets = 0 if group is None else self._sets + 1
         self._vanished = False
         if group is not None:
-            self._take(group[0], group[1], fit, points)
+            self._take(group[0], group[1], fit, points, periodic)
         ambiguous = self._ambiguous(self._lost_rows, MAX_LOST_SHARE)
         self._group_lost = ambiguous and (self._group_lost or group is not None)
         if ambiguous and self._sets < GROUP_SETS and (self._group_lost or not self._core):
@@ -182,7 +197,7 @@ class PartedTexture:
             return None
         return best[1].base_from_surface, best[2]
 
-    def _take(self, pose: Array, rows: Mask, fit: FrameFit, points: Array) -> None:
+    def _take(self, pose: Array, rows: Mask, fit: FrameFit, points: Array, periodic: bool) -> None:
         """A group of rows (N,) is at `pose` (4, 4)."""
         surface, last, members = fit.solution.base_from_surface, self._group, points[rows]
         twist = np.zeros(6) if last is None else se3.log(se3.inverse(last[1]) @ pose) / (fit.stamp - last[0])
@@ -194,8 +209,8 @@ class PartedTexture:
         self._members, self._size = self._members | rows, size
         side = self._side(members.mean(0) - self._middle(points), surface)
         self.message = f"texture on the {side} moves by itself, by {size:.1f} mm"
-        if not self._core or self._ambiguous(np.flatnonzero(self._members), MAX_PARTED_SHARE):
-            self.message = f"{self.message}; {self._hint}"
+        if periodic or not self._core or self._ambiguous(np.flatnonzero(self._members), MAX_PARTED_SHARE):
+            self.message = f"{self.message}; {CLOTH_HINT if periodic else self._hint}"
             self._hold(fit.stamp, np.outer(difference, difference))
 
     @property

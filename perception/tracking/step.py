@@ -181,9 +181,10 @@ class TrackingStep:
             (tracked, images), self._unverified_set = self._unverified_set, None
             poses = self._mapping.camera_poses(tracked)
             self._verification.begin(tracked.fit.stamp, tracked.pyramids, poses, self._estimator.map)
+            self._estimator.periodic = len(self._verification.aliases) > 0
             carrier_poses = {c: poses[c] for c in self._carrying_cameras(tracked) if c in poses}
             self._colours.begin(images, carrier_poses, self._estimator.map)
-        if self._mapping.look_for_hint(self._pictures, repeats=len(self._verification.aliases) > 0):
+        if self._mapping.look_for_hint(self._pictures, repeats=self._estimator.periodic):
             self._matcher = self._unverified_set = None
         self._relocalise()
 
@@ -298,8 +299,7 @@ class TrackingStep:
         aliases = np.delete(verdict.sizes, ruled_out) if tracked is original else verdict.sizes
         if tracked is not original:
             self._estimator.forget_motion()
-        reason = self._light_reason(tracked)
-        if reason:
+        if reason := self._light_reason(tracked):
             return replace(tracked, fit=replace(tracked.fit, reason=reason)), aliases
         if not len(aliases):
             self._verification.confirm(tracked.fit.stamp, poses)
