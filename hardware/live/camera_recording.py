@@ -9,13 +9,11 @@ from __future__ import annotations
 import signal
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, TextIO
 
 from estimation.errors import InputError
@@ -35,7 +33,7 @@ from hardware.operator.shared_state import DrawnRegion, OperatorLink, RecordingS
 from hardware.operator.view import CameraView, CheckVerdict, RequestAnswer, Wish, refusal
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
-from hardware.process.system import SPAWN, SharedLatest
+from hardware.process.system import SPAWN, SharedLatest, handled_signals
 from perception.frames import FrameSet, region_since
 
 if TYPE_CHECKING:  # who draws no region needs no tracker, which takes two seconds to load
@@ -49,7 +47,6 @@ SHARPNESS_PERIOD = 1.0  # s between looks at the pictures' sharpness, which take
 LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 WRITE_TIMEOUT = 30.0  # s in which the recorder writes what waits
 BLUNT_SHARE = 0.6  # of the sharpest picture so far, below which a camera is perhaps out of focus
-ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 MEGABYTE = 1e6
 RECORDER = "recorder"
 
@@ -164,7 +161,7 @@ class CameraRecording:
     def __call__(self) -> None:
         """Record until the time is over or somebody ends it."""
         with ExitStack() as stack:
-            stack.enter_context(self._signals())
+            stack.enter_context(handled_signals(self.on_signal))
             self._source = LiveCameraSource(self._order.rig)
             stack.callback(self._source.close)
             rig = self._source.rig
@@ -182,18 +179,9 @@ class CameraRecording:
                 self._cycle(progress)
             self._finish(reason)
 
-    def on_signal(self, number: int, frame: FrameType | None) -> None:
+    def on_signal(self, number: int) -> None:
         """Handle a signal that asks the recording to end."""
         self._signal = number
-
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        previous = [signal.signal(number, self.on_signal) for number in ENDING_SIGNALS]
-        try:
-            yield
-        finally:
-            for number, handler in zip(ENDING_SIGNALS, previous, strict=True):
-                signal.signal(number, handler)
 
     def _start_recorder(self, stack: ExitStack) -> None:
         settings = LiveSettings(record=self._order.out, jpeg_quality=self._order.jpeg_quality)

@@ -101,13 +101,6 @@ class SurfacePlacement:
     verdict: str = ""  # by what it was placed, in words
 
 
-def write_placement(file: File, placement: SurfacePlacement) -> None:
-    """Write beside the file and rename: there is always one that can be read, or none."""
-    temporary = file.with_name(file.name + ".new")
-    temporary.write_text(placement_text(placement), encoding="utf-8")
-    temporary.replace(file)
-
-
 def placement_text(placement: SurfacePlacement) -> str:
     """The placement as TOML."""
     values = {

@@ -19,7 +19,6 @@ from logging import INFO, WARNING
 from multiprocessing.connection import wait
 from pathlib import Path as File
 from threading import Thread
-from types import FrameType
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from hardware.live.checklist import PlacedPath, checks_table
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
-from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
+from hardware.live.prepared import Prepared, SurfacePlacement, placement_text
 from hardware.live.records import EventEntry, OutlineOrder, PlacedScanEntry, RunReports, UsedEntry
 from hardware.live.settings import page_settings, settings_text, used_files
 from hardware.live.state_machine import Orders, RunStateMachine
@@ -46,7 +45,8 @@ from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
-from hardware.process.system import answer_first, state_inputs
+from hardware.process.progress import write_atomically
+from hardware.process.system import answer_first, handled_signals, state_inputs
 from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT, recorded_arm, recorded_begin
 from planning.material import with_offsets
 from planning.placement import PlacedBy
@@ -119,7 +119,7 @@ class LiveRun:
         end = self._signal, self._channels.place.value, self._channels.link.pictures.get()
         return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *end)
 
-    def on_signal(self, number: int, frame: FrameType | None) -> None:
+    def on_signal(self, number: int) -> None:
         """Handle a signal that asks the run to end."""
         self._signal = number
 
@@ -279,7 +279,7 @@ class LiveRun:
             link.scene.put(replace(self._scene(surface, scan), laid=parts[3]))
         if (placement := self._placement()) is not None:
             self._placement_text = placement_text(placement)
-            write_placement(self._prepared.files.surface, placement)
+            write_atomically(self._prepared.files.surface, self._placement_text)
 
     def _scene(self, surface: Array | None, scan: ScanDrawing | None) -> PageScene:
         """The static part of the view, in the surface frame: path and scan as they are placed, and the landmarks."""
@@ -387,14 +387,11 @@ def _signal_wakeup(run: LiveRun) -> Iterator[socket.socket]:
     ours, theirs = socket.socketpair()
     for end in (ours, theirs):
         end.setblocking(False)
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    previous = [signal.signal(number, run.on_signal) for number in numbers]
     file = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     try:
-        yield ours
+        with handled_signals(run.on_signal):
+            yield ours
     finally:
         signal.set_wakeup_fd(file)
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
         ours.close()
         theirs.close()

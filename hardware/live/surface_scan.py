@@ -146,8 +146,7 @@ def run_scan(order: ScanOrder, stream: TextIO | None = None) -> str:
     write_atomically(order.out, lambda file: write_scan(
         file, scanned.scan.vertices, scanned.scan.triangles, scanned.colours, scanned.sigma
     ))  # fmt: skip
-    page = scan_page(scanned, order.source.name)
-    write_atomically(order.report, lambda file: file.write_text(page, encoding="utf-8"))
+    write_atomically(order.report, scan_page(scanned, order.source.name))
     return f"{scanned.words}\n{camera_advice(scanned)}\nscan: {order.out}\nreport: {order.report}"
 
 

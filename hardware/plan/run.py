@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.scans.scan import triangulate_lattice
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.files.arm_file import read_arm
@@ -105,7 +106,7 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     PlanFiles(request.out).remove_companions()
     write_atomically(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
-        write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
+        write_atomically(request.gcode, gcode_text(plan.path))
     with _progress("measure", "layers") as progress:
         profile = ArmProfile() if request.arm is None else read_arm(request.arm)
         moments = run_times(path, profile.arm, profile.limits, profile.tick)
@@ -145,7 +146,7 @@ def _tables(
         "bumps": bump_facts(plan), "feasible": arm, "tool": tool_facts(plan),
         "surface_from_plane": plan.wound.surface_from_plane.tolist(), "provenance": provenance().table(),
     }  # fmt: skip
-    write_atomically(files.summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
+    write_atomically(files.summary, json.dumps(facts, indent=1) + "\n")
     meshes = {files.scan: None if subject.repairs is None else _surface(plan.wound), files.example: subject.example}
     for file, mesh in meshes.items():
         if mesh is not None:
@@ -172,9 +173,7 @@ def _surface(wound: WoundVolume) -> tuple[Array, Index]:
     """The used scan around the wound, holes closed: vertices (V, 3) mm, scan frame, and triangles (T, 3)."""
     every = max(1, round(REPAIRED_SCAN_STEP / wound.grid.step))
     nodes = np.dstack([wound.grid.nodes, wound.bed])[::every, ::every]
-    number = np.arange(nodes.shape[0] * nodes.shape[1]).reshape(nodes.shape[:2])
-    a, b, c, d = (m.ravel() for m in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    _, triangles = triangulate_lattice(np.ones(nodes.shape[:2], bool))
     return se3.transform_points(wound.surface_from_plane, nodes.reshape(-1, 3)), triangles
 
 
@@ -196,8 +195,7 @@ def _pictures(
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("reachable checkpoints", arm), ("clearance of the tool", tool_text(plan))]
     text = ReportText(subject.name, findings, repairs, request.settings.rows(), plan_notes(plan))
-    page = page_text(plan, layers, total, text, pictures, moments)
-    write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
+    write_atomically(report, page_text(plan, layers, total, text, pictures, moments))
     return [f"{folder.name}/ ({len(pictures)} pictures)", report.name]
 
 
