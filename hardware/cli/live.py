@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -314,6 +313,8 @@ def add_cameras(commands: Commands) -> None:
 
 
 def _run_cameras(a: argparse.Namespace) -> int:
+    import json
+
     from hardware.cameras.genicam import INSTALL, list_industrial
     from hardware.cameras.sources import list_devices
 
@@ -357,6 +358,8 @@ def list_text(devices: tuple[CameraDevice, ...], industrial: tuple[IndustrialCam
 
 
 def _watch_cameras(a: argparse.Namespace) -> int:
+    import json
+
     from hardware.cameras.inspection import inspect, inspection_sheet, inspection_table, inspection_text
     from hardware.cameras.live import LiveCameras, places_without_rig, sources_named
     from hardware.files.images import encode
