@@ -27,7 +27,7 @@ from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, open_arm
+from hardware.arm.profile import AXIS_UNITS, ArmProfile, open_arm
 from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, MoveOptions, move_arm, read_commanded
 from hardware.calibration.arm_report import MAX_TIP_ERROR, ArmTruth, arm_page, arm_text, judge_arm
@@ -50,7 +50,6 @@ MAX_TOUCH_REPROJECTION = 10.0  # px, beyond which the cameras do not show the sa
 MAX_TOUCH_SIGMAS = 4.0  # of a good point's residual
 DEAD_TIME_RANGE, DEAD_TIME_STEP = 0.03, 1e-4  # s, of the search for a virtual arm's dead time about its own
 COMPARISON_STEP = 0.005  # s between the instants compared
-_TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +71,7 @@ def read_touches(path: Path, rig: Rig) -> TouchPoints:
         checks.check_keys(path, key, entry, ("arm_mm_deg",), ("base_mm", "pixels"))
         if ("base_mm" in entry) == ("pixels" in entry):
             raise InputError(path, key + "base_mm, pixels", "both or neither", "one of the two")
-        axes.append(checks.numbers(path, key + "arm_mm_deg", entry["arm_mm_deg"], (6,), "mm and degrees") * _TO_RAD)
+        axes.append(checks.numbers(path, key + "arm_mm_deg", entry["arm_mm_deg"], (6,), "mm and degrees") * AXIS_UNITS)
         if "base_mm" in entry:
             points.append(checks.numbers(path, key + "base_mm", entry["base_mm"], (3,), "mm"))
             sigma.append(TOUCH_SIGMA)

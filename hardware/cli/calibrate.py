@@ -340,12 +340,9 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     check_record(a.record)
     copy_rig_json(a.cameras, a.record)
     driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
-    try:
-        with progress_bar("moves", "ticks") as moves:
-            live = LiveCameras(rig, sources, clock)
-            record_live(live, rig, driver, profile, clock, a.record, position, options, moves, link)
-    finally:
-        driver.release()
+    with progress_bar("moves", "ticks") as moves:
+        live = LiveCameras(rig, sources, clock)
+        record_live(live, rig, driver, profile, clock, a.record, position, options, moves, link)
     return _folder(a)
 
 

@@ -97,15 +97,9 @@ def _serve(a: argparse.Namespace) -> int:
 
 
 def _connect(a: argparse.Namespace) -> int:
-    from hardware.files.dispenser_file import dispenser_from_settings, read_dispensers
+    from hardware.files.dispenser_file import dispenser_from_settings
 
-    path = named_path(a.which)
-    dispensers = read_dispensers(path)
-    if a.name is not None:
-        names = [each.profile.name for each in dispensers]
-        dispensers = tuple(each for each in dispensers if each.profile.name == a.name)
-        if not dispensers:
-            raise option_error("--name", a.name, f"one of {', '.join(names)}")
+    dispensers = _selected(named_path(a.which), a.name, single=a.on is not None)
     if a.on is None:
         for option in ("flow", "celsius", "yes"):
             if getattr(a, option):
@@ -113,8 +107,6 @@ def _connect(a: argparse.Namespace) -> int:
         return max(listen(each, a.seconds or 5.0, wall_clock()) for each in dispensers)
     if a.seconds is not None:
         raise option_error("--seconds", a.seconds, "only without --on S")
-    if len(dispensers) > 1:
-        raise option_error("--name", "missing", f"one of {', '.join(each.profile.name for each in dispensers)}")
     if a.on > MAX_OPEN:
         raise option_error("--on", a.on, f"at most {MAX_OPEN:g} s")
     if not a.yes:
@@ -296,7 +288,7 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
         if getattr(a, name) is None:
             raise option_error(f"--{name}", "missing", f"given with --{sources[0]}")
     options = LineOptions(a.speeds, a.lines, a.length_mm, a.spacing_mm, a.height_mm, a.area_mm2)
-    settings = _named(a)
+    (settings,) = _selected(a.file, a.name, single=True)
     if a.virtual:
         from dataclasses import replace
 
@@ -320,17 +312,16 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
     return 0 if verdict.passed else FAILED
 
 
-def _named(a: argparse.Namespace) -> DispenserSettings:
-    """The dispenser of the file that --name selects."""
+def _selected(file: Path, name: str | None, single: bool) -> list[DispenserSettings]:
+    """The dispensers of a file, or the one that --name selects. single: whether it has to be one."""
     from hardware.files.dispenser_file import read_dispensers
 
-    dispensers = read_dispensers(a.file)
-    selected = [each for each in dispensers if a.name in (None, each.profile.name)]
-    if len(selected) != 1:
-        raise option_error(
-            "--name", a.name or "missing", f"one of {', '.join(each.profile.name for each in dispensers)}"
-        )
-    return selected[0]
+    dispensers = read_dispensers(file)
+    selected = [each for each in dispensers if name in (None, each.profile.name)]
+    if not selected or (single and len(selected) > 1):
+        names = ", ".join(each.profile.name for each in dispensers)
+        raise option_error("--name", name or "missing", f"one of {names}")
+    return selected
 
 
 def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
@@ -365,12 +356,7 @@ def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptio
     rig, sources = read_live_rig(a.cameras)
     dispenser = dispenser_from_settings(settings)
     driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
-    try:
-        with progress_bar("lines", "ticks") as progress:
-            live = LiveCameras(rig, sources, clock)
-            record_live(
-                live, rig, driver, profile, dispenser, clock, a.record, places, options, a.celsius, progress, link
-            )
-    finally:
-        driver.release()
+    with progress_bar("lines", "ticks") as progress:
+        live = LiveCameras(rig, sources, clock)
+        record_live(live, rig, driver, profile, dispenser, clock, a.record, places, options, a.celsius, progress, link)
     return watchdog_text(settings.profile)

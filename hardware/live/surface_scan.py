@@ -6,7 +6,6 @@ taken (`perception.mapping.dense_surface`). The scan stands in the surface frame
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, cache_folder, cached, duration_text, write_atomically
 from hardware.process.system import SharedLatest
 from hardware.report.evaluation import percent
-from hardware.report.page import document, figures_table, row_of_tiles, section, tile
+from hardware.report.page import captioned, data_url, document, figure_row, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
 from perception.mapping.dense_surface import DenseFit, DenseSurface, ScanView, camera_place
@@ -344,7 +343,7 @@ TILTS_DEG, TURNS = (0.0, 20.0, 40.0, 60.0), 12  # camera places that are tried, 
 def scan_page(scanned: SurfaceScan, name: str) -> str:
     """The report as one HTML page."""
     sigma, surface, area = scanned.sigma, scanned.surface, f"{scanned.area / 100:.1f}"
-    pictures = "".join(
+    pictures = figure_row(
         _figure(title, render_scan(scanned.scan, scanned.colours, np.array(direction), VIEW_PIXELS)[..., ::-1])
         for title, direction in VIEWS
     )
@@ -362,8 +361,8 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     tiles = (area, "cm²", "scanned"), (f"{100 * scanned.coverage:.0f}", "%", "of the region"), *sigmas
     body = [
         row_of_tiles([tile(*item) for item in tiles]),
-        section("The scan", "In plain light, from three sides.", f'<div class="pictures">{pictures}</div>'),
-        section("How well it is known", caption, f'<div class="pictures">{from_above}{scale}</div>'),
+        section("The scan", "In plain light, from three sides.", pictures),
+        section("How well it is known", caption, figure_row([from_above, scale])),
         section("Who saw it", "Share of the region that each camera shows.", figures_table(("camera", "share"), rows)),
         section("Where to put a camera", camera_advice(scanned), ""),
     ]
@@ -373,9 +372,7 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
 def _figure(title: str, image: NDArray[np.uint8]) -> str:
     from hardware.files.images import encode
 
-    data = base64.b64encode(encode(image)[1]).decode("ascii")
-    picture = f'<img alt="the scan: {title}" src="data:image/png;base64,{data}">'
-    return f"<figure>{picture}<figcaption>{title}</figcaption></figure>"
+    return captioned(f'<img alt="the scan: {title}" src="{data_url(encode(image)[1])}">', title)
 
 
 def _shaded(share: Array) -> Array:

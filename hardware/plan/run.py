@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.rig import ideal_pixels
 from estimation.scans.scan import triangulate_lattice
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
@@ -377,18 +379,10 @@ def _sighting(camera: Camera, mask: NDArray[np.bool_], pose: Array, outline: Arr
 
     if not mask.any():
         return WoundSighting(camera.name, float("nan"), float("nan"))
-    points_camera = se3.transform_points(se3.inverse(camera.base_from_camera) @ pose, outline)
-    pixels = points_camera[:, :2] / points_camera[:, 2:] * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
-    area, middle = _area_and_centroid(pixels)
+    pixels, depth = ideal_pixels(camera, se3.transform_points(pose, outline))
+    planned = shapely.Polygon(pixels)
+    middle = shapely.get_coordinates(planned.centroid)[0]
     distance = np.linalg.norm(undistort(camera, centroid(mask)[None])[0] - middle)
-    scale = float(points_camera[:, 2].mean()) / float(camera.matrix[0, 0])  # mm per px
-    areas = sorted([area, float(mask.sum())])
+    scale = float(depth.mean()) / float(camera.matrix[0, 0])  # mm per px
+    areas = sorted([planned.area, float(mask.sum())])
     return WoundSighting(camera.name, float(distance) * scale, areas[0] / max(areas[1], 1e-9))
-
-
-def _area_and_centroid(ring: Array) -> tuple[float, Array]:
-    """Area and centroid (2,) inside a ring (N, 2)."""
-    (x, y), (u, v) = ring.T, np.roll(ring, -1, axis=0).T
-    cross = x * v - u * y
-    area = float(cross.sum()) / 2
-    return abs(area), np.array([(x + u) @ cross, (y + v) @ cross]) / (6 * area)
