@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from estimation import se3
@@ -380,9 +379,16 @@ def _sighting(camera: Camera, mask: NDArray[np.bool_], pose: Array, outline: Arr
     if not mask.any():
         return WoundSighting(camera.name, float("nan"), float("nan"))
     pixels, depth = ideal_pixels(camera, se3.transform_points(pose, outline))
-    planned = shapely.Polygon(pixels)
-    middle = shapely.get_coordinates(planned.centroid)[0]
+    area, middle = _area_and_centroid(pixels)
     distance = np.linalg.norm(undistort(camera, centroid(mask)[None])[0] - middle)
     scale = float(depth.mean()) / float(camera.matrix[0, 0])  # mm per px
-    areas = sorted([planned.area, float(mask.sum())])
+    areas = sorted([area, float(mask.sum())])
     return WoundSighting(camera.name, float(distance) * scale, areas[0] / max(areas[1], 1e-9))
+
+
+def _area_and_centroid(ring: Array) -> tuple[float, Array]:
+    """Area and centroid (2,) inside a ring (N, 2)."""
+    (x, y), (u, v) = ring.T, np.roll(ring, -1, axis=0).T
+    cross = x * v - u * y
+    area = float(cross.sum()) / 2
+    return abs(area), np.array([(x + u) @ cross, (y + v) @ cross]) / (6 * area)
