@@ -21,7 +21,7 @@ from hardware.live.view import NozzleErrorEstimate
 from hardware.motion.loop import Tick
 from hardware.operator.overlays import SurfaceOutline
 from hardware.operator.process import THUMBNAIL_PERIOD, THUMBNAIL_WIDTH, CameraShot, Thumbnailer, crop_around
-from hardware.operator.shared_state import PICTURES_CAPACITY, PagePictures, RequestLine
+from hardware.operator.shared_state import PICTURES_CAPACITY, PagePictures, PageStatus
 from hardware.process.system import SharedLatest
 from perception.frames import Roi
 from planning.command import Move
@@ -38,7 +38,7 @@ def shot(width: int = 1280, height: int = 720) -> CameraShot:
 
 def looked_at(capacity: int = PICTURES_CAPACITY) -> tuple[SharedLatest[PagePictures], Thumbnailer]:
     """Where pictures go, and who makes them, with one window open."""
-    pictures, line = SharedLatest[PagePictures](capacity), RequestLine()
+    pictures, line = SharedLatest[PagePictures](capacity), PageStatus()
     line.windows = 1
     return pictures, Thumbnailer(pictures, line)
 
@@ -96,7 +96,7 @@ def test_the_near_picture_rests_while_the_wound_breathes_and_follows_it_when_it_
 
 def test_nothing_is_taken_while_nobody_looks_nor_sooner_than_is_due() -> None:
     pictures: SharedLatest[PagePictures] = SharedLatest(PICTURES_CAPACITY)
-    line = RequestLine()
+    line = PageStatus()
     taker = Thumbnailer(pictures, line)
     assert not taker.offer(0.0, [shot()])
     line.windows = 1

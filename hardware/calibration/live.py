@@ -58,7 +58,7 @@ class WavingPage:
     def __init__(self, clock: Clock) -> None:
         self._clock, self._link = clock, OperatorLink()
         self._page = OperatorPage(self._link, OperatorSettings(page="waving.html"))
-        self._taker = Thumbnailer(self._link.pictures, self._link.requests, near=False)
+        self._taker = Thumbnailer(self._link.pictures, self._link.status, near=False)
         self._view = INITIAL_VIEW
         self.address = self._page.address
 
@@ -71,7 +71,7 @@ class WavingPage:
             self.enter(WavingStage.STOPPED, "the corners are kept; the same command goes on from there")
         elif error is not None:
             self.enter(WavingStage.FAILED, str(error))
-        if self._link.requests.windows:
+        if self._link.status.windows:
             self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
         self._taker.close()
         self._page.close()

@@ -29,7 +29,7 @@ from hardware.live.settings import LiveSettings
 from hardware.offline.track import region_search
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import DrawnRegion, OperatorLink, RecordingStage, RecordingView, scene_from
+from hardware.operator.shared_state import OperatorLink, Polygons, RecordingStage, RecordingView, scene_from
 from hardware.operator.view import CameraView, CheckVerdict, RequestAnswer, Wish, refusal
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
@@ -87,7 +87,7 @@ class RecordingPage:
     def __init__(self, clock: Clock, rig: Rig) -> None:
         self._clock, self.link = clock, OperatorLink()
         self._page = OperatorPage(self.link, OperatorSettings(page="recording.html"))
-        self._thumbnailer = Thumbnailer(self.link.pictures, self.link.requests, near=False)
+        self._thumbnailer = Thumbnailer(self.link.pictures, self.link.status, near=False)
         self._names = [camera.name for camera in rig.cameras]
         self._view = RecordingView(clock.now(), 1, RecordingStage.RECORD, 0.0, 0, 0, 0)
         self.link.scene.put(scene_from(rig))
@@ -109,13 +109,13 @@ class RecordingPage:
 
     def pictures(self, frames: FrameSet) -> None:
         """Offer the pictures, where anybody has the page open."""
-        if self.link.requests.windows:
+        if self.link.status.windows:
             shots = [CameraShot(self._names[frame.camera], frame.image) for frame in frames.frames]
             self._thumbnailer.offer(frames.stamp, shots)
 
     def close(self) -> None:
         """End the page, once its windows had time for the last view."""
-        if self.link.requests.windows:
+        if self.link.status.windows:
             self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
         self._thumbnailer.close()
         self._page.close()
@@ -208,7 +208,7 @@ class CameraRecording:
         """Record the region, or prepare to find it in the pictures."""
         for roi in self._order.region.rois(rig, self._start):
             self._sender.put(roi)
-        drawn = SharedLatest[DrawnRegion]() if self._page is None else self._page.link.regions
+        drawn = SharedLatest[Polygons]() if self._page is None else self._page.link.regions
         search = region_search(rig, self._order.region, drawn)
         if search is not None:
             self._find_region = search(stack.enter_context(ThreadPoolExecutor(1)))

@@ -29,7 +29,7 @@ from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
 from hardware.live.frame_source import LiveCameraSource, SourceEnded
 from hardware.live.settings import read_settings
 from hardware.offline.track import region_search, tracker
-from hardware.operator.shared_state import DrawnRegion
+from hardware.operator.shared_state import Polygons
 from hardware.process.checks import read_toml
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, cache_folder, cached, duration_text, write_atomically
@@ -211,7 +211,7 @@ def scan_surface(
     Ctrl-C while it is tracked ends that: what was seen until then is fused.
     """
     clock = WallClock()
-    selection, find = _FrameSelection(sets, seconds), region_search(source.rig, region, SharedLatest[DrawnRegion]())
+    selection, find = _FrameSelection(sets, seconds), region_search(source.rig, region, SharedLatest[Polygons]())
     with tracker(source.rig, source.roi, find=find) as step:
         with Progress("scan", "frame sets", clock.now, stream) as progress:
             progress.note = "the surface is being looked for"

@@ -141,7 +141,7 @@ class _TrackingLoop:
         session, placement = self._session, prepared.placement
         self._rig, self._truth = rig, None if session is None else session.truth
         self._surface = agreed_scan(prepared.scan, None if session is None else session.surface, prepared.session)
-        self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
+        self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.status)
         self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
         channels.reports.put(self.report)
@@ -365,7 +365,7 @@ class _TrackingLoop:
 
     def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Offer the pictures to the page, if it is open in a browser."""
-        if not self._channels.link.requests.windows:
+        if not self._channels.link.status.windows:
             return
         observations, names = self._step.last.observations, self.report.cameras
         base_from_surface = pose.base_from_surface if pose.state.measured else None

@@ -25,7 +25,7 @@ import numpy as np
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.operator.settings import LOOPBACK, OperatorSettings, WindowLimits, allowed_hosts, check_settings
-from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
+from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, PageStatus
 from hardware.process.clock import WallClock
 from hardware.process.system import NICE_LEVEL, SPAWN, SharedLatest, ask_to_go_first, blocked_sigint, step_back
 from perception.frames import Image
@@ -89,15 +89,15 @@ class OperatorPage:
 
     def hand_out_report(self) -> None:
         """Wait until each open window has taken the report of the run that is over, for REPORT_FETCH_TIME at most."""
-        clock, requests = WallClock(), self._link.requests
+        clock, status = WallClock(), self._link.status
         until = clock.now() + REPORT_FETCH_TIME
-        while requests.reports < requests.windows and clock.now() < until:
+        while status.reports < status.windows and clock.now() < until:
             clock.wait_until(clock.now() + REPORT_POLL_PERIOD)
 
     def close(self) -> None:
         """End the process and give the port back."""
         if self.process is not None:
-            if self._link.requests.windows:  # else nobody sees that the run is gone
+            if self._link.status.windows:  # else nobody sees that the run is gone
                 self.process.terminate()
                 self.process.join(EXIT_TIMEOUT)
             self.process.kill()
@@ -155,9 +155,9 @@ class CameraShot:
 class Thumbnailer:
     """Makes thumbnails in a thread. made: instants whose pictures were put out; dropped: those too large."""
 
-    def __init__(self, pictures: SharedLatest[PagePictures], requests: RequestLine, near: bool = True) -> None:
+    def __init__(self, pictures: SharedLatest[PagePictures], status: PageStatus, near: bool = True) -> None:
         """near: whether the part around outline and tracks is shown as well."""
-        self._pictures, self._requests, self._clock, self._near = pictures, requests, WallClock(), near
+        self._pictures, self._status, self._clock, self._near = pictures, status, WallClock(), near
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
         self.made = self.dropped = 0
@@ -167,7 +167,7 @@ class Thumbnailer:
     def offer(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None = None) -> bool:
         """Whether the shots of one instant (s) will be shown; never waits. base_from_surface: (4, 4) mm then."""
         now, busy = self._clock.now(), self._job is not None and not self._job.done()
-        if busy or now < self._due or not self._requests.windows:
+        if busy or now < self._due or not self._status.windows:
             return False
         self._due = now + THUMBNAIL_PERIOD
         self._job = self._thread.submit(self._make, stamp, shots, base_from_surface)
@@ -194,7 +194,7 @@ class Thumbnailer:
         if crop is not None:
             self._crops[shot.camera] = crop
             x, y, width, height = crop
-            size = (FINE_CROP_WIDTH, FINE_QUALITY) if self._requests.fine else (CROP_WIDTH, THUMBNAIL_QUALITY)
+            size = (FINE_CROP_WIDTH, FINE_QUALITY) if self._status.fine else (CROP_WIDTH, THUMBNAIL_QUALITY)
             near = small_jpeg(shot.image[y : y + height, x : x + width], *size)
         return CameraPicture(shot.camera, whole, shot.outline, shot.tracks, near, crop)
 

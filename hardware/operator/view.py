@@ -104,6 +104,7 @@ STAGE_QUESTIONS = {
     RunStage.ENDED: "The run was finished early; the rest can be resumed",
     RunStage.FAILED: "The run cannot go on; the rest can be resumed",
 }
+CHANGED_TEXT = "the run has changed since this was shown: look again, then ask again"
 DRAW_QUESTION = "Mark the corners of the region to track, in two or more pictures"
 
 
@@ -116,7 +117,7 @@ def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> st
     if wish is Wish.STOP:
         return ""
     if wish not in CALMING_WISHES and turn != present:
-        return "the run has changed since this was shown: look again, then ask again"
+        return CHANGED_TEXT
     return "" if wish in offers else f"{WISH_WORDS[wish]} cannot be done at this stage"
 
 
