@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from hardware.cameras.genicam import IndustrialCamera
     from hardware.cameras.sources import CameraDevice
 
-SETTINGS_FLAGS = ("rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift",
-    "stands_home", "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port",
-    "page_certificate", "page_key", "look", "adapt")  # fmt: skip
 NO_CAMERA_TEXT = """no camera is connected, or this user may not see it
   connect one: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, pass it (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
@@ -149,21 +146,22 @@ def add_init(commands: Commands) -> None:
 
 
 def _run_live(a: argparse.Namespace) -> int:
+    from dataclasses import fields
+
     from hardware.cli.plan import scanned_settings
     from hardware.files.region_table import read_region
     from hardware.live.settings import LiveSettings, named_by_flag, override_settings, parse_host_names, read_settings
     from hardware.process.faults import faults_from_texts
 
     faults = faults_from_texts("command line", "--fault", a.fault)
-    flags = {name: getattr(a, name) for name in SETTINGS_FLAGS}
+    flags = {field.name: getattr(a, field.name, None) for field in fields(LiveSettings)}
     traces = False if a.no_trace else True if a.trace is not None else None
     flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": traces}
+    flags["region"] = None if a.region is None else read_region(a.region)
     if a.trace is not None and a.no_trace:
         raise option_error("--trace", a.trace, "left out beside --no-trace")
     if a.trace is not None and a.trace.exists() and not a.force:
         raise option_error("--trace", a.trace, "a new file, or --force")
-    if a.region is not None:
-        flags["region"] = read_region(a.region)
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is not None and (a.settings is not None or a.record is not None):

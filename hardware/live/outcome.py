@@ -53,7 +53,7 @@ class RunStatistics:
 
     stages: dict[str, float] = field(default_factory=dict)  # s in each stage
     states: Counter[str] = field(default_factory=Counter)  # frame sets in each state of the tracker
-    holds: dict[str, records.HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
+    holds: dict[str, HoldRow] = field(default_factory=dict)  # by reason, its numbers left out
     extruding: float = 0.0  # s in which material left
     printing: float = 0.0  # s in which it should have left
     times: records.StageHistograms = field(default_factory=records.StageHistograms)
@@ -117,8 +117,7 @@ class RunStatistics:
     @property
     def holds_by_time(self) -> list[HoldRow]:
         """The holds by reason, the longest first."""
-        rows = (HoldRow(reason, hold.count, hold.seconds) for reason, hold in self.holds.items())
-        return sorted(rows, key=lambda row: -row.seconds)
+        return sorted(self.holds.values(), key=lambda row: -row.seconds)
 
     @property
     def duty(self) -> float:
@@ -133,7 +132,7 @@ class RunStatistics:
             return
         if reason := _NUMBER_PATTERN.sub("…", command.reason):
             hold_name = reason if reason in self.holds or len(self.holds) < MAX_REASONS else OTHER_REASONS
-            hold = self.holds.setdefault(hold_name, records.HoldTotal())
+            hold = self.holds.setdefault(hold_name, HoldRow(hold_name))
             hold.count += hold_name != self._reason
             hold.seconds += step
         self._reason = reason

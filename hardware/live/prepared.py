@@ -175,8 +175,6 @@ def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fa
     is rendered, and before anything of an earlier run is taken away.
     """
     settings = check_settings(settings, where)
-    if settings.page:
-        page_settings(settings, where)
     assert settings.record is not None
     files = RunFiles(settings.record)
     if settings.record.exists() and not force:
@@ -205,8 +203,6 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
     placement = read_placement(files.surface) if files.surface.exists() else None
     again = files.next()
     settings = check_settings(replace(settings, record=again.record), files.session)
-    if settings.page:
-        page_settings(settings, files.session)
     prepared = _prepared(settings, again, placement, faults, files.session)
     path, profile = prepared.task.path, prepared.task.profile
     start = read_progress(files.progress, path) if files.progress.exists() else 0.0
@@ -233,6 +229,8 @@ def _prepared(
     faults: tuple[Fault, ...],
     where: object,
 ) -> Prepared:
+    if settings.page:
+        page_settings(settings, where)
     notes = [f"dry run, {settings.lift:g} mm above the path"] if settings.dry_run else []
     scenario, session, virtual = settings.simulated, settings.rig, None
     _check_live_faults(settings, faults)

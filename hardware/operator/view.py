@@ -325,13 +325,13 @@ class LogLine:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class HoldRow:
     """The holds for one reason."""
 
     reason: str
-    count: int
-    seconds: float
+    count: int = 0
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
