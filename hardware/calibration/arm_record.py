@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats.qmc import Halton
 
 from estimation.calibration.arm_model import SetPoint
 from estimation.errors import InputError
@@ -44,7 +45,6 @@ COMMANDED_FILE = "commanded.csv"
 COMMANDED_HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
 STAMP_RESOLUTION = 2e-6  # s: nearer knots are equal in six digits
 PEAK_SPEED_RATIO = 1.875  # peak to mean speed of a minimum-jerk move (10 s^3 - 15 s^4 + 6 s^5)
-HALTON_BASES = (2, 3, 5, 7, 11, 13)  # even for any number of places
 UPRIGHT_EVERY = 3  # one place in so many has no turn
 SWING_SINES = np.array([6.0, 5.0, 4.0]), np.array([2.2, 1.7, 1.3])  # mm and Hz of X Y Z
 SWING_LOAD = 0.6  # of the speed and acceleration limits
@@ -91,21 +91,12 @@ def plan_moves(start: Array, limits: MotionLimits, tick: float, options: MoveOpt
 
 def places(start: Array, limits: MotionLimits, options: MoveOptions) -> Array:
     """Places (P, 6), mm and rad, spread evenly about the start, within the arm's bounds."""
-    spread = np.array([[_halton(i + 1, base) for base in HALTON_BASES] for i in range(options.places)])
+    spread = Halton(len(start), scramble=False).random(options.places + 1)[1:]  # even for any number; the first is 0
     half = np.array([options.reach, options.reach, (options.up + options.down) / 2, *[options.turn] * 3])
     middle = start + np.array([0, 0, (options.up - options.down) / 2, 0, 0, 0])
     out = middle + (2 * spread - 1) * half
     out[::UPRIGHT_EVERY, 3:] = start[3:]
     return np.asarray(np.clip(out, limits.low + AXIS_MARGIN, limits.high - AXIS_MARGIN))
-
-
-def _halton(index: int, base: int) -> float:
-    out, share = 0.0, 1.0
-    while index:
-        share /= base
-        index, digit = divmod(index, base)
-        out += share * digit
-    return out
 
 
 def straight_move(start: Array, goal: Array, tick: float, options: MoveOptions) -> Iterator[Array]:

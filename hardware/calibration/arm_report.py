@@ -28,7 +28,6 @@ from hardware.report.page import (
     tile,
 )
 
-MAX_TIP_ERROR = 0.1  # mm, of the tip in the working volume: a fourth of a bead
 MAX_HELD_OUT_ERROR = 0.3  # mm, median of held-out pictures: outliers and a bent arm are beyond it
 MAX_LAG_SIGMA = 0.005  # s, one sigma of the arm's lag: at 20 mm/s a tenth of a millimetre
 MIN_TIP_SHARE = 0.3  # of a camera's pictures in which the tip is found

@@ -38,13 +38,12 @@ from hardware.files.rig_file import MIN_RIG_SPAN, ImageSource, read_rig
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
 from hardware.operator.shared_state import OperatorLink, WavingCamera, WavingStage, WavingView
-from hardware.operator.view import RequestAnswer, Wish, refusal
+from hardware.operator.view import Wish, refusal
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
 from perception.boards.board import Board, CornerTable
 from perception.frames import FrameSet, Image
 
-INITIAL_VIEW = WavingView(0.0, 1, WavingStage.WAVE)
 LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 OPENING_TIMEOUT = 15.0  # s until every camera has shown a picture
 WAVING_POLL = 0.5  # s between checks of the time
@@ -59,7 +58,7 @@ class WavingPage:
         self._clock, self._link = clock, OperatorLink()
         self._page = OperatorPage(self._link, OperatorSettings(page="waving.html"))
         self._taker = Thumbnailer(self._link.pictures, self._link.status, near=False)
-        self._view = INITIAL_VIEW
+        self._view = WavingView(0.0, 1, WavingStage.WAVE)
         self.address = self._page.address
 
     def __enter__(self) -> WavingPage:
@@ -96,12 +95,9 @@ class WavingPage:
     def poll(self) -> Wish | None:
         """STOP or END if a window has requested it; keeps the page alive."""
         self._page.tend(self._clock.now())
-        wish = None
-        for request in self._link.requests.take():
-            why = refusal(request.wish, request.turn, self._offers(), self._view.turn)
-            self._put(replace(self._view, answer=RequestAnswer(request.number, request.wish, not why, why)))
-            wish = wish if why else request.wish
-        return wish
+        requests, offers, turn = self._link.requests.take(), self._offers(), self._view.turn
+        wishes = [each.wish for each in requests if not refusal(each.wish, each.turn, offers, turn)]
+        return wishes[-1] if wishes else None
 
     def _offers(self) -> tuple[Wish, ...]:
         return (Wish.END,) if self._view.stage is WavingStage.WAVE else ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -142,12 +141,12 @@ def watchdog_text(profile: DispenserProfile) -> str:
     return "HAS NO WATCHDOG: it stays on when this machine or its cable fails; have a switch at hand"
 
 
-def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Callable[[str], None] = print) -> int:
+def listen(settings: DispenserSettings, seconds: float, clock: Clock) -> int:
     """Print the messages of a device, and send nothing; exit code."""
     from hardware.dispenser.dispenser import DispenserState
     from hardware.dispenser.line_dispenser import LineDispenser
 
-    say(description(settings))
+    print(description(settings))
     if settings.line is None:
         return 0
     dispenser = LineDispenser(settings.profile, settings.line)
@@ -159,22 +158,15 @@ def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Calla
     status, messages = dispenser.status, list(dispenser.heard)
     dispenser.hang_up()
     if status.state is DispenserState.FAILED:
-        say(f"  failed: {status.reason}")
+        print(f"  failed: {status.reason}")
         return FAILED
-    say(f"  its line is open; it said {len(messages)} lines in {seconds:g} s, and was sent nothing")
+    print(f"  its line is open; it said {len(messages)} lines in {seconds:g} s, and was sent nothing")
     for stamp, text in messages:
-        say(f"  {stamp - start:.3f} s: {text}")
+        print(f"  {stamp - start:.3f} s: {text}")
     return 0
 
 
-def open_for(
-    dispenser: Dispenser,
-    seconds: float,
-    flow: float | None,
-    celsius: float | None,
-    clock: Clock,
-    say: Callable[[str], None] = print,
-) -> int:
+def open_for(dispenser: Dispenser, seconds: float, flow: float | None, celsius: float | None, clock: Clock) -> int:
     """Prepare a dispenser, open it for `seconds` s, and close it in every case; exit code."""
     from hardware.dispenser.dispenser import Dispensers, DispenserState, close_dispensers
 
@@ -188,27 +180,27 @@ def open_for(
     def wait(end: float, state: DispenserState) -> bool:
         while (now := clock.now()) < end and dispenser.status.state is state:
             dispenser.poll(now)
-            _tell(dispenser, start, say)
+            _tell(dispenser, start)
             clock.wait_until(now + DISPENSER_POLL)
         return dispenser.status.state is not DispenserState.FAILED
 
-    say(watchdog_text(profile))
+    print(watchdog_text(profile))
     try:
         dispenser.prepare(start, celsius)
         succeeded = wait(start + PREPARE_TIME, DispenserState.PREPARING)
         if succeeded and (reason := dispenser.on(flow, clock.now())):
-            say(reason)
+            print(reason)
             succeeded = False
         succeeded = succeeded and wait(clock.now() + seconds, DispenserState.ON)
     finally:
         failure = close_dispensers(Dispensers([dispenser]), clock)
-        _tell(dispenser, start, say)
+        _tell(dispenser, start)
     return 0 if succeeded and not failure else FAILED
 
 
-def _tell(dispenser: Dispenser, start: float, say: Callable[[str], None]) -> None:
+def _tell(dispenser: Dispenser, start: float) -> None:
     for event in dispenser.events():
-        say(f"{event.stamp - start:.3f} s: {event.text}")
+        print(f"{event.stamp - start:.3f} s: {event.text}")
 
 
 def add_calibrate_dispenser(parts: Commands) -> None:

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
 from estimation.rig import Rig
@@ -30,7 +30,7 @@ from hardware.offline.track import region_search
 from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
 from hardware.operator.settings import OperatorSettings
 from hardware.operator.shared_state import OperatorLink, Polygons, RecordingStage, RecordingView, scene_from
-from hardware.operator.view import CameraView, CheckVerdict, RequestAnswer, Wish, refusal
+from hardware.operator.view import CameraView, CheckVerdict, Wish, refusal
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
 from hardware.process.system import SPAWN, SharedLatest, handled_signals
@@ -94,18 +94,16 @@ class RecordingPage:
         self.address = self._page.address
 
     def show(self, view: RecordingView) -> bool:
-        """Show the state; turn and answer are filled in here. Returns whether the end was requested on the page."""
-        previous, end_requested = self._view, False
+        """Show the state; its turn is filled in here. Returns whether the end was requested on the page."""
+        previous = self._view
         turn = previous.turn + ((previous.stage, previous.draws) != (view.stage, view.draws))
         offers = (Wish.END,) if view.stage is RecordingStage.RECORD else ()
-        self._view = replace(view, turn=turn, answer=previous.answer, offers=offers)
-        for request in self.link.requests.take():
-            reason = refusal(request.wish, request.turn, offers, turn)
-            end_requested |= not reason and request.wish in (Wish.STOP, Wish.END)
-            self._view = replace(self._view, answer=RequestAnswer(request.number, request.wish, not reason, reason))
+        self._view = replace(view, turn=turn, offers=offers)
         self.link.views.put(self._view)
         self._page.tend(self._clock.now())
-        return end_requested
+        requests = self.link.requests.take()
+        wishes = [each.wish for each in requests if not refusal(each.wish, each.turn, offers, turn)]
+        return Wish.STOP in wishes or Wish.END in wishes
 
     def pictures(self, frames: FrameSet) -> None:
         """Offer the pictures, where anybody has the page open."""
@@ -141,10 +139,9 @@ class Sharpness:
 class CameraRecording:
     """One recording. Call it; then `words` has its outcome as a text, and `failed` whether it was cut short."""
 
-    def __init__(self, order: RecordOrder, stream: TextIO | None = None) -> None:
-        """stream: for progress, by default stderr."""
+    def __init__(self, order: RecordOrder) -> None:
         self.words, self.failed = "", False
-        self._order, self._clock, self._stream = order, WallClock(), stream
+        self._order, self._clock = order, WallClock()
         self._signal = 0
         self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
         self._start = self._clock.now()
@@ -171,7 +168,7 @@ class CameraRecording:
             self._sender.put(rig)
             if self._order.page:
                 self._open_page(stack, rig)
-            progress = stack.enter_context(Progress("record", "frame sets", self._clock.now, self._stream))
+            progress = stack.enter_context(Progress("record", "frame sets", self._clock.now))
             self._wait_for_recorder(progress)
             self._seek_region(stack, rig)
             reason = ""
@@ -202,7 +199,7 @@ class CameraRecording:
     def _open_page(self, stack: ExitStack, rig: Rig) -> None:
         self._page = RecordingPage(self._clock, rig)
         stack.callback(self._page.close)
-        self._say(f"open {self._page.address} to see what is recorded")
+        print(f"open {self._page.address} to see what is recorded", file=sys.stderr, flush=True)
 
     def _seek_region(self, stack: ExitStack, rig: Rig) -> None:
         """Record the region, or prepare to find it in the pictures."""
@@ -325,9 +322,6 @@ class CameraRecording:
     def _span(self) -> str:
         seconds = self._last_stamp - self._first_stamp
         return f"of {seconds:.1f} s, {self._size() / MEGABYTE:.1f} MB"
-
-    def _say(self, text: str) -> None:
-        print(text, file=sys.stderr if self._stream is None else self._stream, flush=True)
 
 
 def _losses(state: CameraState) -> str:

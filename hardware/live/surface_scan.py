@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,11 +136,11 @@ def check_scan(order: ScanOrder) -> ScanOrder:
     return order
 
 
-def run_scan(order: ScanOrder, stream: TextIO | None = None) -> str:
+def run_scan(order: ScanOrder) -> str:
     """Scan into the order's file, with a report beside it; returns a summary. InputError, StillbedError."""
     order = check_scan(order)
     with open_source(order) as source:
-        scanned = scan_surface(source, order.sets, order.seconds, order.region, stream)
+        scanned = scan_surface(source, order.sets, order.seconds, order.region)
     write_atomically(order.out, lambda file: write_scan(
         file, scanned.scan.vertices, scanned.scan.triangles, scanned.colours, scanned.sigma
     ))  # fmt: skip
@@ -203,9 +202,7 @@ def _rendered(scenario: Path, seconds: float) -> Path:
 # -- scanning
 
 
-def scan_surface(
-    source: ScanSource, sets: int, seconds: float, region: RegionSettings = ANY_REGION, stream: TextIO | None = None
-) -> SurfaceScan:
+def scan_surface(source: ScanSource, sets: int, seconds: float, region: RegionSettings = ANY_REGION) -> SurfaceScan:
     """Track the surface for `seconds`, and fuse the pictures of `sets` instants. StillbedError where it is not found.
 
     Ctrl-C while it is tracked ends that: what was seen until then is fused.
@@ -213,7 +210,7 @@ def scan_surface(
     clock = WallClock()
     selection, find = _FrameSelection(sets, seconds), region_search(source.rig, region, SharedLatest[Polygons]())
     with tracker(source.rig, source.roi, find=find) as step:
-        with Progress("scan", "frame sets", clock.now, stream) as progress:
+        with Progress("scan", "frame sets", clock.now) as progress:
             progress.note = "the surface is being looked for"
             progress(0, 0)
             try:
@@ -235,7 +232,7 @@ def scan_surface(
             raise StillbedError(f"{NO_SURFACE}: {selection.reason or 'no pictures came'}")
         roi, landmarks = step.roi, step.map.points
     selected = selection.selected()
-    with Progress("fuse", "%", clock.now, stream) as progress:
+    with Progress("fuse", "%", clock.now) as progress:
         progress(0, 100)
         return fuse(source.rig, roi, landmarks, selected, lambda share: progress(round(100 * share), 100))
 

@@ -200,9 +200,8 @@ class ViewBuilder:
             return None
         points = None if tracking is None else tracking.surface
         tangent = None if points is None else tangent_of(placement, self.prepared.task.path, points)
-        sigmas = placement.sigma, placement.turn_sigma
         validity = placement.certain, machine.moves > 0, machine.confirmable
-        return PlacementView(placement.by.value, placement.verdict, *validity, tangent, *sigmas)
+        return PlacementView(placement.by.value, placement.verdict, *validity, tangent)
 
     def _motion(
         self,

@@ -284,7 +284,7 @@ class DemoRun:
     def _placement_view(self) -> PlacementView:
         placed, tangent = self.placement, tangent_of(self.placement, self._path, self._points)
         worth = placed.verdict, not self._moved, self._moved, True
-        return PlacementView(placed.by.value, *worth, tangent, placed.sigma, placed.turn_sigma)
+        return PlacementView(placed.by.value, *worth, tangent)
 
     def _motion(self, now: float) -> MotionView:
         moves = self.stage in (RunStage.PRINT, RunStage.APPROACH)

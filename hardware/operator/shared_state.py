@@ -27,7 +27,6 @@ from hardware.operator.view import (
     CameraView,
     MoveRequest,
     OperatorView,
-    RequestAnswer,
     Wish,
 )
 from hardware.process.system import SharedLatest
@@ -277,7 +276,6 @@ class RecordingView:
     cameras: tuple[CameraView, ...] = ()
     words: str = ""  # what ended it
     offers: tuple[Wish, ...] = ()
-    answer: RequestAnswer | None = None
     draws: bool = False  # whether a region may be drawn now
 
 
@@ -316,7 +314,6 @@ class WavingView:
     looked: int = 0  # frame sets looked at
     words: tuple[str, ...] = ()  # the result
     offers: tuple[Wish, ...] = ()
-    answer: RequestAnswer | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

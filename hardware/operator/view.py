@@ -301,8 +301,6 @@ class PlacementView:
     moved: bool  # whether the operator has moved it
     confirmable: bool  # whether it may be confirmed as it lies
     surface_from_tangent: Array | None  # (4, 4) mm, in which a move is meant; None where the surface is not mapped
-    sigma: float = nan  # mm, of the path's middle
-    turn_sigma: float = nan  # rad
 
 
 @dataclass(frozen=True, slots=True)
