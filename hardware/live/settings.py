@@ -225,11 +225,17 @@ def _check_foxglove(port: int, where: object) -> None:
         raise InputError(where, key, port, "0, or stillbed with its extra: pip install 'stillbed[foxglove]'")
     if not 0 <= port <= MAX_PORT:
         raise InputError(where, key, port, free)
-    if port:
-        try:
-            socket.create_server((LOOPBACK, port)).close()
-        except OSError as error:
-            raise InputError(where, key, port, f"{free} ({error.strerror})") from None
+    if reason := port and _port_problem(LOOPBACK, port):
+        raise InputError(where, key, port, f"{free} ({reason})")
+
+
+def _port_problem(host: str, port: int) -> str:
+    """Why nobody can listen at an address of this machine; "" where one can."""
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        return str(error.strerror)
+    return ""
 
 
 def looks_between(settings: LiveSettings) -> int | str | None:
@@ -319,7 +325,9 @@ def page_settings(settings: LiveSettings, where: object) -> OperatorSettings:
     page = OperatorSettings(s.page_address, s.page_port, certificate=s.page_certificate, key=s.page_key)
     page = replace(page, elsewhere=not address.is_loopback, names=s.page_names)
     _check_certificate(page, where)
-    _check_free(page, where)
+    if reason := _port_problem(page.host, page.port):
+        allowed = f"one that is this machine's and free ({reason})"
+        raise InputError(where, "page.address", f"{page.host} port {page.port}", allowed)
     return page
 
 
@@ -331,13 +339,3 @@ def _check_certificate(settings: OperatorSettings, where: object) -> None:
     except (OSError, ssl.SSLError):
         allowed = f"a PEM certificate with the key in {settings.key}, which has no password"
         raise InputError(where, "page.certificate", settings.certificate, allowed) from None
-
-
-def _check_free(settings: OperatorSettings, where: object) -> None:
-    """That this machine has that address, and nobody listens there."""
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    try:
-        socket.create_server((settings.host, settings.port), family=family).close()
-    except OSError as error:
-        allowed = f"one that is this machine's and free ({error.strerror})"
-        raise InputError(where, "page.address", f"{settings.host} port {settings.port}", allowed) from None

@@ -133,12 +133,9 @@ class TimelineRow:
 
     def add(self, other: TimelineRow) -> None:
         """Take in a later one."""
-        self.error, self.true_error = _larger(self.error, other.error), _larger(self.true_error, other.true_error)
+        self.error = float(np.fmax(self.error, other.error))
+        self.true_error = float(np.fmax(self.true_error, other.true_error))
         self.limit, self.held = other.limit, self.held or other.held
-
-
-def _larger(a: float, b: float) -> float:
-    return b if math.isnan(a) or a < b else a
 
 
 class ErrorHistory:
@@ -152,18 +149,13 @@ class ErrorHistory:
         """Add a moment, which is later than the last."""
         if self.rows and row.stamp - self.rows[-1].stamp < self.step:
             self.rows[-1].add(row)
-            return
-        self.rows.append(row)
-        if len(self.rows) <= TIMELINE_ROWS:
-            return
-        self.step *= 2
-        merged = self.rows[:1]
-        for row_before in self.rows[1:]:
-            if row_before.stamp - merged[-1].stamp < self.step:
-                merged[-1].add(row_before)
-            else:
-                merged.append(row_before)
-        self.rows = merged
+        else:
+            self.rows.append(row)
+        if len(self.rows) > TIMELINE_ROWS:
+            self.step *= 2
+            rows, self.rows = self.rows, []
+            for each in rows:
+                self.add(each)
 
 
 class Broadcast:

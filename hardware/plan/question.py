@@ -79,16 +79,18 @@ def scan_colour(scan: Scan, points: Array, colours: Colours | None, where: objec
     return ScanColour(points_on(above, above.grid.nodes[known]), mask[known].astype(float))
 
 
-def parse_clicks(text: str, what: str) -> Array:
+def parse_clicks(text: str) -> Array:
     """Points (N, 3) mm of a text X,Y,Z/X,Y,Z/X,Y,Z with three places or more."""
     try:
         points = np.array([[float(word) for word in place.split(",")] for place in text.split("/")])
     except ValueError:
         points = np.empty((0, 0))
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
-        raise InputError("command line", what, text, "X,Y,Z/X,Y,Z/X,Y,Z: three places or more on the wound's rim, mm")
+        raise InputError(
+            "command line", "--clicks", text, "X,Y,Z/X,Y,Z/X,Y,Z: three places or more on the wound's rim, mm"
+        )
     if np.linalg.svd(points - points.mean(axis=0))[1][1] < 1.0:
-        raise InputError("command line", what, text, "places that do not lie in one line")
+        raise InputError("command line", "--clicks", text, "places that do not lie in one line")
     return points
 
 
