@@ -27,10 +27,9 @@ from hardware.live.recorder_process import RecorderSender, record
 from hardware.live.records import RecorderReport, SetEntry
 from hardware.live.settings import LiveSettings
 from hardware.offline.track import region_search
-from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
-from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import OperatorLink, Polygons, RecordingStage, RecordingView, scene_from
-from hardware.operator.view import CameraView, CheckVerdict, Wish, refusal
+from hardware.operator.process import CameraShot, StatusPage
+from hardware.operator.shared_state import Polygons, RecordingStage, RecordingView, scene_from
+from hardware.operator.view import CameraView, CheckVerdict, Wish
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
 from hardware.process.system import SPAWN, SharedLatest, handled_signals
@@ -44,7 +43,6 @@ READY_POLL = 0.05  # s between looks at a recorder that starts
 PICTURE_WAIT = 0.1  # s of a wait for pictures, after which signals and the page are looked at
 VIEW_PERIOD = 0.3  # s between views for the page
 SHARPNESS_PERIOD = 1.0  # s between looks at the pictures' sharpness, which takes some ms each
-LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 WRITE_TIMEOUT = 30.0  # s in which the recorder writes what waits
 BLUNT_SHARE = 0.6  # of the sharpest picture so far, below which a camera is perhaps out of focus
 MEGABYTE = 1e6
@@ -81,17 +79,14 @@ def check_order(order: RecordOrder, force: bool) -> RecordOrder:
     return order
 
 
-class RecordingPage:
-    """The page beside a recording; `address` is for the browser. Nothing here waits for it."""
+class RecordingPage(StatusPage):
+    """The page beside a recording."""
 
     def __init__(self, clock: Clock, rig: Rig) -> None:
-        self._clock, self.link = clock, OperatorLink()
-        self._page = OperatorPage(self.link, OperatorSettings(page="recording.html"))
-        self._thumbnailer = Thumbnailer(self.link.pictures, self.link.status, near=False)
+        super().__init__(clock, "recording.html")
         self._names = [camera.name for camera in rig.cameras]
         self._view = RecordingView(clock.now(), 1, RecordingStage.RECORD, 0.0, 0, 0, 0)
         self.link.scene.put(scene_from(rig))
-        self.address = self._page.address
 
     def show(self, view: RecordingView) -> bool:
         """Show the state; its turn is filled in here. Returns whether the end was requested on the page."""
@@ -100,23 +95,13 @@ class RecordingPage:
         offers = (Wish.END,) if view.stage is RecordingStage.RECORD else ()
         self._view = replace(view, turn=turn, offers=offers)
         self.link.views.put(self._view)
-        self._page.tend(self._clock.now())
-        requests = self.link.requests.take()
-        wishes = [each.wish for each in requests if not refusal(each.wish, each.turn, offers, turn)]
-        return Wish.STOP in wishes or Wish.END in wishes
+        return bool(self.wishes(self._view))
 
     def pictures(self, frames: FrameSet) -> None:
         """Offer the pictures, where anybody has the page open."""
         if self.link.status.windows:
             shots = [CameraShot(self._names[frame.camera], frame.image) for frame in frames.frames]
-            self._thumbnailer.offer(frames.stamp, shots)
-
-    def close(self) -> None:
-        """End the page, once its windows had time for the last view."""
-        if self.link.status.windows:
-            self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
-        self._thumbnailer.close()
-        self._page.close()
+            self.thumbnailer.offer(frames.stamp, shots)
 
 
 @dataclass(slots=True)

@@ -25,8 +25,16 @@ import numpy as np
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.operator.settings import LOOPBACK, OperatorSettings, WindowLimits, allowed_hosts, check_settings
-from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, PageStatus
-from hardware.process.clock import WallClock
+from hardware.operator.shared_state import (
+    CameraPicture,
+    OperatorLink,
+    PagePictures,
+    PageStatus,
+    RecordingView,
+    WavingView,
+)
+from hardware.operator.view import Wish, refusal
+from hardware.process.clock import Clock, WallClock
 from hardware.process.system import NICE_LEVEL, SPAWN, SharedLatest, ask_to_go_first, blocked_sigint, step_back
 from perception.frames import Image
 
@@ -35,6 +43,7 @@ if TYPE_CHECKING:
 
 RESTART_AFTER = 1.0  # s between two starts of a page that died
 REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
+LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 EXIT_TIMEOUT = 0.5  # s for the page's process: 0.2 in which its windows show that the run is gone, and to close them
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
@@ -197,6 +206,29 @@ class Thumbnailer:
             size = (FINE_CROP_WIDTH, FINE_QUALITY) if self._status.fine else (CROP_WIDTH, THUMBNAIL_QUALITY)
             near = small_jpeg(shot.image[y : y + height, x : x + width], *size)
         return CameraPicture(shot.camera, whole, shot.outline, shot.tracks, near, crop)
+
+
+class StatusPage:
+    """The page beside a command that moves no arm; `address` is for the browser. Nothing but `close` waits for it."""
+
+    def __init__(self, clock: Clock, file: str) -> None:
+        self.clock, self.link = clock, OperatorLink()
+        self.page = OperatorPage(self.link, OperatorSettings(page=file))
+        self.thumbnailer = Thumbnailer(self.link.pictures, self.link.status, near=False)
+        self.address = self.page.address
+
+    def wishes(self, view: RecordingView | WavingView) -> list[Wish]:
+        """What windows have asked for and may ask for under this view: STOP and END; keeps the page alive."""
+        self.page.tend(self.clock.now())
+        requests = self.link.requests.take()
+        return [each.wish for each in requests if not refusal(each.wish, each.turn, view.offers, view.turn)]
+
+    def close(self) -> None:
+        """End the page, once its windows had time for the last view."""
+        if self.link.status.windows:
+            self.clock.wait_until(self.clock.now() + LAST_VIEW_TIME)
+        self.thumbnailer.close()
+        self.page.close()
 
 
 def crop_around(shot: CameraShot, present: Crop | None) -> Crop | None:

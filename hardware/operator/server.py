@@ -231,7 +231,6 @@ class OperatorServer:
             await self._wait(self._clock.now())
 
     async def _wait(self, now: float) -> None:
-        """Wait until it is time to look again."""
         asked = self.broadcast.request_event
         if asked.is_set():
             asked.clear()
