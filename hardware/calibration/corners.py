@@ -159,11 +159,6 @@ class BoardCoverage:
     depth: float  # ratio of the far views' distance to the near ones', 1 without views
 
 
-def coverage_of(pixels: Array, size: tuple[int, int], camera_from_board: Array) -> BoardCoverage:
-    """Coverage by views with corners (V, P, 2) px, nan where not seen, and poses (V, 4, 4); size: (W, H) px."""
-    return coverage_from_parts(parts_of(pixels, size), board_orientations(camera_from_board))
-
-
 def coverage_from_parts(parts: Array, orientations: Array) -> BoardCoverage:
     """Coverage by numbers of corners in the parts (rows, columns) and the board's orientations (V, 3)."""
     if not len(orientations):
@@ -193,7 +188,7 @@ def coverage(calibration: Calibration, camera: int) -> BoardCoverage:
     views, state = calibration.views, calibration.fit.state
     rows = views.camera == camera
     camera_from_board = se3.inverse(state.base_from_camera[camera]) @ state.base_from_board[views.instant[rows]]
-    return coverage_of(views.pixels[rows], views.sizes[camera], camera_from_board)
+    return coverage_from_parts(parts_of(views.pixels[rows], views.sizes[camera]), board_orientations(camera_from_board))
 
 
 def missing_coverage(name: str, covered: BoardCoverage) -> list[tuple[float, str]]:

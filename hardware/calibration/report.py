@@ -46,15 +46,12 @@ class CalibrationVerdict:
     hints: tuple[str, ...]  # what to do; empty if passed
 
 
-def median_residual(calibration: Calibration, camera: int | None = None) -> float:
-    """Median reprojection error, px, of one camera or of all."""
-    away = np.linalg.norm(calibration.fit.residuals, axis=-1)
-    return float(np.nanmedian(away if camera is None else away[calibration.views.camera == camera]))
+def median_residual(calibration: Calibration, camera: int | None = None, held_out: bool = False) -> float:
+    """Median reprojection error, px, of one camera or of all; NaN of no view.
 
-
-def held_out_residual(calibration: Calibration, camera: int | None = None) -> float:
-    """The same under rigs calibrated without the view's own stretch of the recording."""
-    away = np.linalg.norm(calibration.held_out, axis=-1)
+    held_out: under rigs calibrated without the view's own stretch of the recording.
+    """
+    away = np.linalg.norm(calibration.held_out if held_out else calibration.fit.residuals, axis=-1)
     away = away if camera is None else away[calibration.views.camera == camera]
     return float(np.nanmedian(away)) if np.isfinite(away).any() else float("nan")
 
@@ -68,7 +65,7 @@ def judge_rig(calibration: Calibration, error: VolumeError, limit: float, hints:
         f"{word} to print: points in the working volume are off by {error.typical:.3f} mm (one sigma), 19 of 20 by "
         f"less than {spread:.3f} mm; {limit:g} mm is allowed",
         f"corners lie {off:.2f} px from where they should (median); {MAX_RESIDUAL:g} px is allowed; "
-        f"{held_out_residual(calibration):.2f} px in stretches of the recording that were held out",
+        f"{median_residual(calibration, held_out=True):.2f} px in stretches of the recording that were held out",
     ]
     if calibration.jitter:
         lines.append(f"pictures are late by {1e3 * calibration.jitter:.1f} ms each for itself: the cameras run free")
@@ -172,11 +169,12 @@ def _cameras(result: Calibration) -> str:
     lone = [next((s.held_out for s in result.scores[c] if s.model == result.models[c]), np.nan) for c in cameras]
     lenses = [lens_parameters(camera) for camera in result.rig.cameras]
     sigmas = [np.sqrt(np.diag(result.covariance_of(c))) for c in cameras]
+    held_out = [median_residual(result, c, held_out=True) for c in cameras]
     rows = [
         ["views", *(str(int((result.views.camera == c).sum())) for c in cameras)],
         ["distortion model", *result.models],
         ["residual, median px", *(f"{median_residual(result, c):.2f}" for c in cameras)],
-        ["in stretches held out of the whole, median px", *(f"{held_out_residual(result, c):.2f}" for c in cameras)],
+        ["in stretches held out of the whole, median px", *(f"{v:.2f}" for v in held_out)],
         ["lens alone, on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in lone)],
     ]
     for i, name in enumerate(PARAMETERS):
@@ -269,7 +267,7 @@ def rig_json(result: Calibration, error: VolumeError, verdict: CalibrationVerdic
             "model": result.models[i],
             "sigma": dict(zip(numbers, np.sqrt(np.diag(result.covariance_of(i))).tolist(), strict=True)),
             "residual_median_px": median_residual(result, i),
-            "residual_held_out_median_px": held_out_residual(result, i),
+            "residual_held_out_median_px": median_residual(result, i, held_out=True),
             "lens_held_out_rms_px": {s.model: s.held_out for s in result.scores[i]},
             "mm_per_px": millimetres_per_pixel(result, i),
         }
@@ -279,7 +277,7 @@ def rig_json(result: Calibration, error: VolumeError, verdict: CalibrationVerdic
         "passed": verdict.passed,
         "predicted_error_mm": {"typical": error.typical, "worst": error.worst},
         "residual_median_px": median_residual(result),
-        "residual_held_out_median_px": held_out_residual(result),
+        "residual_held_out_median_px": median_residual(result, held_out=True),
         "board_distances_rms_mm": board_scatter(result),
         "jitter_s": result.jitter,
         "numbers": numbers,

@@ -167,6 +167,11 @@ class Prepared:
         """Whether live cameras are used, rather than a recorded session shown."""
         return self.session.suffix == ".toml"
 
+    @property
+    def inked(self) -> bool:
+        """Whether the run has a dispenser, real or simulated."""
+        return bool(self.task.dispensers) or self.settings.simulated is not None
+
 
 def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fault, ...] = ()) -> Prepared:
     """A new run. InputError where a file makes no sense or the recording exists and `force` is not set.
