@@ -711,7 +711,7 @@ def test_what_a_recorder_has_not_taken_when_its_sender_is_closed_is_counted() ->
         sender.put(EventEntry(0.0, "x" * size, 2, "y"))
     sender.close(0.2)
     assert sender.dropped == 4 and len(list(receiver.take())) == 2
-    receiver.close()
+    ours.close()
 
 
 def test_a_sender_whose_recorder_has_ended_is_no_failure_of_its_own() -> None:

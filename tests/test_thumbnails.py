@@ -105,7 +105,6 @@ def test_nothing_is_taken_while_nobody_looks_nor_sooner_than_is_due() -> None:
         accepted += taker.offer(1.0, [shot()])
     taker.close()
     assert 1 <= accepted <= 1.0 / THUMBNAIL_PERIOD + 2
-    assert taker.made <= accepted
 
 
 def test_offering_never_waits_for_the_pictures_to_be_made() -> None:
@@ -126,10 +125,9 @@ def test_pictures_that_do_not_fit_are_dropped_and_the_next_ones_come() -> None:
     noise = np.random.default_rng(1).integers(0, 255, (360, 640, 3)).astype(np.uint8)
     assert taker.offer(1.0, [CameraShot("camera0", noise)])
     time.sleep(THUMBNAIL_PERIOD + 0.1)
-    assert taker.offer(2.0, [shot()])
+    assert pictures.get() is None and taker.offer(2.0, [shot()])
     assert taken(pictures).stamp == 2.0
     taker.close()
-    assert (taker.made, taker.dropped) == (1, 1)
 
 
 PROFILE = ArmProfile()

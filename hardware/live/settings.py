@@ -28,7 +28,7 @@ from hardware.process import checks
 
 FROM_CAMERAS = "from the cameras"  # instead of a scan's file: they scan, and it is planned, before the run
 VIRTUAL_ARM = "virtual"  # the arm that needs no device
-RANGES = {  # of numbers: lowest, highest, unit; higher in a dry run the arm may leave the checked space
+RANGES = {  # of numbers: lowest, highest, unit; lifted by more, the arm may leave the checked space
     "lift": (0, 100, "mm"), "patience": (1, 600, "s"), "jpeg_quality": (0, 100, ""),
 }  # fmt: skip
 MAX_CORES = 1024

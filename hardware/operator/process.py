@@ -73,7 +73,6 @@ class OperatorPage:
         self._listener = socket.create_server((settings.host, settings.port), family=family, backlog=32)
         self.process: BaseProcess | None = None
         self._started = float("-inf")
-        self.restarts = 0
 
     @property
     def address(self) -> str:
@@ -88,7 +87,6 @@ class OperatorPage:
         """Start the process if it does not run, at most once a second; whether it was started. now: s."""
         if (self.process is not None and self.process.is_alive()) or now - self._started < RESTART_AFTER:
             return False
-        self.restarts += self.process is not None
         self._started = now
         arguments = (self._link, self._settings, self._listener)
         self.process = SPAWN.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
@@ -162,14 +160,13 @@ class CameraShot:
 
 
 class Thumbnailer:
-    """Makes thumbnails in a thread. made: instants whose pictures were put out; dropped: those too large."""
+    """Makes thumbnails in a thread; those larger than their place are left out."""
 
     def __init__(self, pictures: SharedLatest[PagePictures], status: PageStatus, near: bool = True) -> None:
         """near: whether the part around outline and tracks is shown as well."""
         self._pictures, self._status, self._clock, self._near = pictures, status, WallClock(), near
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
-        self.made = self.dropped = 0
         self._thread = ThreadPoolExecutor(1, "live pictures", step_back)
         self._job: Future[None] | None = None  # the last one
 
@@ -189,11 +186,8 @@ class Thumbnailer:
 
     def _make(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None) -> None:
         pictures = PagePictures(stamp, tuple(map(self._picture, shots)), base_from_surface)
-        try:
+        with suppress(InputError):  # larger than their place: the next ones may be smaller
             self._pictures.put(pictures)
-            self.made += 1
-        except InputError:  # larger than their place: the next ones may be smaller
-            self.dropped += 1
 
     def _picture(self, shot: CameraShot) -> CameraPicture:
         from hardware.files.images import small_jpeg  # OpenCV is for the process that has the images
